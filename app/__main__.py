@@ -20,7 +20,8 @@ def main() -> int:
     """Serve until the process is stopped.
 
     Returns:
-        The exit status: 2 for invalid settings, otherwise the exit status of `serve`.
+        Exit status of the process: 2 for invalid settings, otherwise the exit status that `serve`
+        returns.
     """
     began = monotonic()
     try:
@@ -33,12 +34,13 @@ def main() -> int:
     return serve(settings, began)
 
 
-# Number of new objects that starts a garbage collection. Reference counting already frees the
-# about 200 containers of an answer. The default of 700 costs 4 to 8 % of a request's time.
+# Number of new objects after which Python starts a garbage collection. Python's default of 700
+# costs 4 to 8 % of a request's time. Reference counting already frees the containers of an answer
+# (about 200).
 _YOUNG = 10_000
 
 
-# Name and value of the option for mallopt(3).
+# The C function mallopt(3) takes these two numbers: option M_MMAP_THRESHOLD, limit in bytes.
 _M_MMAP_THRESHOLD, _LARGE = -3, 128 * 1024
 
 
@@ -71,10 +73,11 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
     """Bind sockets to all addresses of a host, without listening.
 
     Args:
-        host: name or address.
-        port: number of the port, or 0 for any free port.
+        host: host name or IP address to listen on.
+        port: TCP port to listen on. 0 means any free port.
         send_timeout: seconds after which Linux closes a connection whose client does not
-            acknowledge the bytes sent. On other systems only a proxy can limit this time.
+            acknowledge the bytes sent. On other operating systems, only a proxy can limit this
+            time.
 
     Raises:
         OSError: the host does not have a usable address, or the port is in use.
@@ -88,7 +91,7 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
             place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if family == socket.AF_INET6:
                 place.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            if hasattr(socket, "TCP_USER_TIMEOUT"):  # connections inherit the option
+            if hasattr(socket, "TCP_USER_TIMEOUT"):  # accepted connections inherit the option
                 milliseconds = int(send_timeout * 1e3)
                 place.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, milliseconds)
             place.bind(address)
@@ -124,16 +127,21 @@ def serve(settings: Settings, began: float) -> int:
         began: `time.monotonic()` at the start of the process.
 
     Returns:
-        The exit status: 0, or 3 if the service could not start.
+        Exit status of the process: 0, or 3 if the service could not start.
     """
     try:
         sockets = _bind(settings.host, settings.port, settings.client_timeout)
     except OSError as error:
         return _refuse_address(settings, error)
     tune()
+    from app.registry import StoreError
     from app.server import build
 
-    server = build(settings, began)
+    try:
+        server = build(settings, began)
+    except StoreError as error:
+        sys.stderr.write(f"SCENE_STORE: {error.reason}\n")
+        return 3
     # On Ctrl-C, the server finishes its shutdown and then raises KeyboardInterrupt.
     with suppress(KeyboardInterrupt):
         try:

@@ -1,7 +1,7 @@
 """``python -m app.compile``: compile kernels and sources for this machine before the first start.
 
-Otherwise, the first start compiles the kernels. This takes about a minute. If the service cannot
-store the compiled kernels, every start compiles them again.
+Without this command, the first start of the service compiles the kernels in about a minute. If the
+service cannot store the compiled kernels, every start compiles the kernels again.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from app.settings import Settings
 def main() -> int:
     """Warm up every model of the store, then compile all Python sources to bytecode.
 
-    The warm-up compiles the kernels.
+    A warm-up asks a model each question once. The first question compiles the kernels.
 
     Returns:
-        The exit status: 1 if a model, an alias or the store is not usable, else 0.
+        Exit status of the process: 1 if a model, an alias or the store is not usable, else 0.
     """
     settings = Settings()
     dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))

@@ -1,12 +1,12 @@
-"""Compilation of kernels with numba. The module caches compiled kernels on disk.
+"""Compilation of kernels (numeric functions) with numba. Compiled kernels are cached on disk.
 
 A cached kernel must match its sources. numba checks only the file that defines the kernel. But the
-compiled code also contains functions and constants of other files. So the name of the cache
-directory is a digest of all these files, of the versions of Python, numba, llvmlite and numpy, and
-of the CPU. `python -m app.compile` fills the directory before the first start.
+compiled code also contains functions and constants of other source files. So the name of the cache
+directory contains a digest of all kernel sources, of the versions of Python, numba, llvmlite and
+numpy, and of the CPU. `python -m app.compile` fills the cache directory before the first start.
 
-The directory contains pickled code: a user who can write to it can run code in the service. So
-the service refuses a directory that other users can change.
+The cache directory contains pickled code: a user who can write to this directory can run code in
+the service. So the service refuses a cache directory that other users can change.
 """
 
 from __future__ import annotations
@@ -36,23 +36,24 @@ _PACKAGE: Final = Path(__file__).parent
 
 _NAMES: Final = "loops-" + 16 * "[0-9a-f]"
 
-# The digest covers all files of these packages.
+# The digest in the name of the cache directory covers all files of these packages of `app`.
 _KERNELS: Final = ("inference", "scene")
 
-# Number of cache directories of other versions to keep. After a downgrade, the service then finds
-# its compiled kernels.
+# Number of cache directories of other versions to keep. After a downgrade, the service can then use
+# the compiled kernels of the older version.
 _KEPT: Final = 2
-# The service never removes a cache directory within this time in seconds after its last use.
+# The service keeps each cache directory for at least this time in seconds after its last use.
 _RECENT: Final = 600.0
-# Maximum time in seconds to wait for another process that compiles. After it, both processes
-# compile. This is safe.
+# Maximum time in seconds to wait while another process compiles the kernels. After this time, both
+# processes compile the same kernels, which is safe.
 _PATIENCE: Final = 600.0
 
 
 def sources(package: Path) -> list[Path]:
     """Return the files whose code a kernel may contain.
 
-    These are all files of the packages in `_KERNELS`, and all modules that mention this module.
+    The list contains all files of the packages in `_KERNELS`, and all modules that import
+    `app.compiling`.
     """
     paths = sorted(package.rglob("*.py"))
     return [
@@ -74,7 +75,7 @@ def digest(package: Path) -> str:
 
 
 def _cpu() -> str:
-    """Return the model and the features of the CPU, as far as the operating system reports them."""
+    """Return the CPU's model name and feature flags, if the operating system reports them."""
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
         return "".join(line for line in lines if line.startswith(("model name", "flags", "Feat")))
@@ -82,19 +83,19 @@ def _cpu() -> str:
 
 
 def _prepare(root: str) -> tuple[Path | None, str]:
-    """Create the directory of compiled code.
+    """Create the cache directory of compiled kernels.
 
     Args:
-        root: parent of the directory. With "", the function tries `.numba_cache` beside the
-            package, then the user's cache directory.
+        root: parent of the cache directory. With "", the function tries `.numba_cache` beside the
+            package `app`, then the user's cache directory.
 
     Returns:
-        The directory, or None if no directory is usable, and a text that gives the reason for each
-        unusable directory.
+        A pair. The first value is the cache directory, or None if no directory is usable. The
+        second value is a text with the reason for each unusable directory.
     """
     name, problems = f"loops-{digest(_PACKAGE)}", []
     roots = [Path(root)] if root else [_PACKAGE.parent / ".numba_cache", *_user_cache()]
-    if fnmatch(roots[0].name, _NAMES):  # chosen by the parent process
+    if fnmatch(roots[0].name, _NAMES):  # the parent process has set `root`
         roots = [roots[0].parent]
     for candidate in roots:
         folder = candidate.absolute() / name
@@ -117,7 +118,7 @@ def _user_cache() -> list[Path]:
 
 
 def _make_private(folder: Path) -> None:
-    """Create a directory that only this user can write to. If this fails, raise OSError."""
+    """Create a directory that only this user can write to. Raise OSError on failure."""
     folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     folder.mkdir(mode=0o700, exist_ok=True)
     own, root = folder.lstat(), folder.parent.stat()
@@ -125,8 +126,8 @@ def _make_private(folder: Path) -> None:
         raise NotADirectoryError(f"{folder} is not a directory")
     if own.st_uid != os.geteuid() or root.st_uid not in {os.geteuid(), 0}:
         raise PermissionError(f"{folder} or its parent belongs to another user")
-    # A parent with the sticky bit, such as /tmp, is safe: other users can add files to it, but
-    # cannot replace files of this user.
+    # A parent with the sticky bit, such as /tmp, is safe. Other users can add files to this parent,
+    # but they cannot replace files of this user.
     is_open = root.st_mode & stat.S_IWOTH and not root.st_mode & stat.S_ISVTX
     if is_open or own.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise PermissionError(f"other users can write to {folder} or to its parent")
@@ -137,7 +138,7 @@ def _make_private(folder: Path) -> None:
 def _remove_old(current: Path) -> None:
     others = []
     for folder in current.parent.glob(_NAMES):
-        with suppress(FileNotFoundError):  # another process has removed it
+        with suppress(FileNotFoundError):  # another process has removed the directory
             status = folder.lstat()
             is_ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid()
             if is_ours and folder != current:
@@ -150,14 +151,15 @@ def _remove_old(current: Path) -> None:
 
 _FOLDER, _PROBLEM = _prepare(os.environ.get("NUMBA_CACHE_DIR", ""))
 if _FOLDER is not None:
-    # Child processes read this variable.
+    # Child processes read this variable and use the same cache directory.
     os.environ["NUMBA_CACHE_DIR"] = str(_FOLDER)
 
 from numba import config, njit  # noqa: E402
 from numba.core import event  # noqa: E402
 
 if _FOLDER is not None:
-    # numba reads the variable at its import, and the import may have happened earlier.
+    # numba reads the variable NUMBA_CACHE_DIR only at its import. Another module may have imported
+    # numba earlier.
     config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
 _LOOPS: Final[list[Any]] = []
@@ -173,15 +175,15 @@ def _compile(function: Function, **options: Any) -> Function:
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function. Division by zero then gives infinity or NaN instead of an exception."""
+    """Compile a function. In compiled code, division by zero gives infinity or NaN."""
     return _compile(function)
 
 
 def compiled_in_any_order(function: Function) -> Function:
     """Compile a function, and let the compiler reorder sums to use vector instructions.
 
-    The compiler chooses the order once, so results are reproducible. Such a function must not call
-    `elementary`, because exp and log depend on the order of their operations.
+    The compiler chooses the order of the terms once, so results are reproducible. The function must
+    not call the module `elementary`, because its exp and log depend on the order of operations.
     """
     return _compile(function, fastmath={"reassoc", "contract"})
 
@@ -189,17 +191,17 @@ def compiled_in_any_order(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """Inline a function into each compiled function that calls it.
 
-    The compiler options of the caller then apply to the inlined code.
+    The compiler options of the calling function then apply to the inlined code.
     """
     found: Function = njit(inline="always", error_model="numpy")(function)
     return found
 
 
 def check_cache() -> None:
-    """Log the directory of compiled kernels, unless it is the first choice."""
+    """Log the cache directory of compiled kernels, unless it is the preferred directory."""
     if _FOLDER is None:
         _logger.warning(
-            "no directory for compiled kernels is usable, so each start compiles: %s", _PROBLEM
+            "each start compiles the kernels, because no cache directory is usable: %s", _PROBLEM
         )
     elif _PROBLEM:
         _logger.info("compiled kernels are stored in %s: %s", _FOLDER, _PROBLEM)
@@ -215,7 +217,7 @@ def progress() -> Iterator[None]:
     try:
         _wait(descriptor)
         if not (_FOLDER / "complete").exists():
-            _logger.info("compiling kernels (about a minute, once for this version)")
+            _logger.info("compiling kernels, which takes about a minute, once for this version")
         with event.install_listener("numba:compile", _Progress()):
             yield
         (_FOLDER / "complete").touch()
@@ -224,14 +226,14 @@ def progress() -> Iterator[None]:
 
 
 class _Progress(event.Listener):
-    """Listener that logs at most one line per second while numba compiles kernels."""
+    """Event listener that logs at most one line per second while numba compiles kernels."""
 
     def __init__(self) -> None:
         self._begun: set[int] = set()
         self._logged = float("-inf")
 
     def on_start(self, event: Any) -> None:
-        """Log the start of a compilation. Ignore functions of numba itself."""
+        """Log the start of a kernel's compilation. Ignore functions of numba itself."""
         loop = event.data["dispatcher"]
         if not any(loop is known for known in _LOOPS):
             return
@@ -252,10 +254,10 @@ def _wait(descriptor: int) -> None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if not is_waiting:
-                _logger.info("waiting for another process that compiles the same kernels")
+                _logger.info("waiting until another process has compiled the same kernels")
                 is_waiting = True
             time.sleep(0.1)
-        except OSError:  # the file system does not support locks
+        except OSError:  # the file system does not support file locks
             return
         else:
             return

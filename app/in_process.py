@@ -23,7 +23,7 @@ from scene_client.schemas import FieldError
 class _Given(Settings):
     """Settings that ignore environment variables.
 
-    The variables configure services that run in their own process.
+    Environment variables configure only services that run in a separate process.
     """
 
     @classmethod
@@ -45,7 +45,7 @@ class InProcess(httpx.BaseTransport):
         store: directory of published models.
 
     Attributes:
-        admin_key: random admin key of this application.
+        admin_key: random key for the administration routes of this application.
 
     Raises:
         InvalidRequestError: the store is not a directory.
@@ -55,7 +55,7 @@ class InProcess(httpx.BaseTransport):
         self.admin_key = secrets.token_hex()
         try:
             settings = _Given(
-                store=store,
+                store=str(store),
                 admin_key=SecretStr(self.admin_key),
                 metrics=False,
                 access_log=False,
@@ -72,21 +72,21 @@ class InProcess(httpx.BaseTransport):
         thread = Thread(target=_live, args=(app, started, ending), daemon=True, name="scene")
         thread.start()
         self._loop = started.result()
-        # This ends the thread when the transport is closed or deleted, or at the program's exit.
+        # The finalizer ends the thread when the transport is closed or deleted, or at program exit.
         self._finalize = weakref.finalize(self, _end, self._loop, ending, thread)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        """Answer one request; see `httpx.BaseTransport`."""
+        """Send one request to the application and return its response."""
         future = asyncio.run_coroutine_threadsafe(self._answer(request), self._loop)
         try:
             return future.result(request.extensions["timeout"]["read"])
         except TimeoutError:
             future.cancel()
-            raise httpx.ReadTimeout("the answer did not come in time", request=request) from None
+            raise httpx.ReadTimeout("the timeout has expired", request=request) from None
 
     async def _answer(self, request: httpx.Request) -> httpx.Response:
         response = await self._asgi.handle_async_request(request)
-        # Only this event loop can read the body.
+        # The caller runs on another thread, so this event loop must read the whole body.
         body = await response.aread()
         return httpx.Response(response.status_code, headers=response.headers, content=body)
 

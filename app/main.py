@@ -26,17 +26,18 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     """Create the application of the service.
 
     Args:
-        settings: settings of the service. With None, the function reads them from the environment.
+        settings: settings of the service. None means that the function reads the settings from
+            environment variables.
 
     Raises:
-        pydantic.ValidationError: the environment holds an invalid setting.
+        pydantic.ValidationError: an environment variable contains an invalid setting.
     """
     settings = settings or Settings()
     runtime = Runtime(settings)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        # The server accepts connections only after the models are loaded.
+        # The server accepts connections only after this call has loaded the models.
         await runtime.start()
         yield
         runtime.stop()

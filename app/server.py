@@ -21,10 +21,11 @@ from app.serving.stream import Streams
 from app.settings import Settings
 
 # The server closes a connection after this idle time in seconds. A proxy must close its idle
-# connections earlier. Otherwise it may send a request on a connection that the server is closing.
+# connections earlier. Otherwise the proxy may send a request while the server closes the
+# connection.
 KEEP_ALIVE: Final = 20
 
-# Minimum time in seconds that streams have for their last message during a shutdown.
+# Minimum time in seconds that the server leaves to each stream for its last message at shutdown.
 LEAVE: Final = 0.3
 
 _logger = logging.getLogger("app.server")
@@ -33,15 +34,16 @@ _logger = logging.getLogger("app.server")
 class Server(uvicorn.Server):
     """A server that shuts down in three steps on SIGTERM.
 
-    First, the server refuses new requests, answers readiness checks with 503 and closes the
-    streams. Load balancers have ``drain_seconds`` to notice this. Then the server closes the
-    listening socket. Last, it finishes the requests in progress. A second signal, or Ctrl-C, skips
-    the wait of the first step.
+    1. The server refuses new requests, answers readiness checks with 503 and closes the streams.
+       This step takes ``drain_seconds``, so that load balancers notice the failing readiness check.
+       A second signal, or Ctrl-C, ends this step at once.
+    2. The server closes the listening socket.
+    3. The server finishes the requests in progress.
 
     Args:
         config: configuration of uvicorn.
-        runtime: the runtime, which refuses new requests during the shutdown.
-        streams: the open streams, which the server closes in the first step.
+        runtime: the runtime of the service. It refuses new requests during the shutdown.
+        streams: the open streams. The server closes them in the first step.
         drain_seconds: time in seconds from SIGTERM until the server closes the listening socket.
         began: `time.monotonic()` at the start of the process.
     """
@@ -62,14 +64,14 @@ class Server(uvicorn.Server):
         self._began = began
 
     async def startup(self, sockets: list[socket] | None = None) -> None:
-        """Load the models, accept connections and log the address.
+        """Load the models, accept connections and log the addresses of the service.
 
         Raises:
             OSError: another program has started to listen on the same port.
         """
         try:
             await super().startup(sockets)
-            # uvloop does not report an error if a socket cannot listen.
+            # uvloop does not raise an exception if a socket cannot listen, so check each socket.
             if not all(map(_listens, sockets or [])):
                 raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE))
         except OSError:
@@ -92,7 +94,7 @@ class Server(uvicorn.Server):
             _logger.info("ready: %s", details)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Handle a signal to end the process."""
+        """Start the shutdown. A second signal ends the first step of the shutdown at once."""
         if sig == signal.SIGTERM and not self._runtime.draining:
             self._runtime.drain()
             self._closing_at = monotonic() + max(self._drain_seconds, LEAVE)
@@ -101,8 +103,9 @@ class Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
     async def on_tick(self, counter: int) -> bool:
-        """Return whether to stop serving now. uvicorn calls this method ten times per second."""
-        # handle_exit() must not close streams: a signal can interrupt the event loop at any point.
+        """Return whether the server must stop. uvicorn calls this method ten times per second."""
+        # This method closes the streams, because handle_exit() can interrupt the event loop at any
+        # point.
         if self._runtime.draining:
             self._streams.drain()
         if self._closing_at is not None and monotonic() >= self._closing_at:
@@ -119,7 +122,7 @@ def _listens(place: socket) -> bool:
 
 
 def _page(host: str, port: int) -> str:
-    """Return the address of the page for a browser on the same machine."""
+    """Return the URL of the service for a browser on the same machine."""
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 # nosec B104
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
@@ -148,7 +151,7 @@ def build(settings: Settings, began: float) -> Server:
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
         access_log=False,
         server_header=False,
-        # The service uses neither the client's address nor its scheme, so it ignores X-Forwarded-*.
+        # X-Forwarded-* headers contain the client's address and scheme. The service uses neither.
         proxy_headers=False,
         timeout_graceful_shutdown=settings.drain_timeout,
     )

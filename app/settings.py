@@ -26,7 +26,7 @@ _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT
 def _is_installed(module: str) -> bool:
     try:
         return find_spec(module) is not None
-    except ModuleNotFoundError:  # the parent package is missing
+    except ModuleNotFoundError:  # the parent package is not installed
         return False
 
 
@@ -39,17 +39,17 @@ def _words(value: object) -> object:
 
 
 LOOPBACK: Final = frozenset(("127.0.0.1", "localhost", "[::1]"))
-"""Names in a Host header that mean the machine itself."""
+"""Values of a Host header that mean the local machine."""
 
 _ANY_HOST: Final = "*"
 _HOST: Final = re.compile(r"[a-z0-9_]([a-z0-9._-]*[a-z0-9_])?")
 
 
 def _in_host_header(text: str) -> str:
-    """Return a name or an address in the spelling of a Host header.
+    """Convert a host name or an IP address to the spelling of a Host header.
 
     Raises:
-        ValueError: the text is neither a name nor an address.
+        ValueError: the text is neither a host name nor an IP address.
     """
     name = text.lower()
     if _HOST.fullmatch(name):
@@ -94,7 +94,45 @@ class Settings(BaseSettings):
     port: Annotated[
         int, Field(ge=0, le=65535, description="port to listen on; 0 = any free port")
     ] = 8000
-    store: Annotated[Path, Field(description="directory of published models")] = Path("model_store")
+    store: Annotated[
+        str,
+        BeforeValidator(str),
+        Field(
+            description="folder of published models, or the URL of a remote store: s3://, gs:// or "
+            "az://"
+        ),
+    ] = "model_store"
+    store_cache: Annotated[
+        Path | None,
+        Field(
+            description="folder for the local copy of a remote store; default: a folder in the "
+            "user's cache folder"
+        ),
+    ] = None
+    store_cache_bytes: Annotated[
+        int, Field(ge=2**20, le=2**44, description="maximum size of this local copy in bytes")
+    ] = 8 * 2**30
+    store_max_age: Annotated[
+        float,
+        Field(
+            ge=0,
+            allow_inf_nan=False,
+            description="seconds without contact to a remote store after which the service is not "
+            "ready; 0 = no limit",
+        ),
+    ] = 0
+    trusted_keys: Annotated[
+        tuple[str, ...],
+        NoDecode,
+        BeforeValidator(_words),
+        Field(
+            description="public keys that may sign the index of a remote store, in base64, "
+            "separated by commas"
+        ),
+    ] = ()
+    unsigned_store: Annotated[
+        bool, Field(description="accept a remote store without a signature")
+    ] = False
     store_poll: Annotated[
         float,
         Field(
@@ -107,15 +145,15 @@ class Settings(BaseSettings):
     admin_key: Annotated[
         SecretStr | None,
         Field(
-            description="key of the admin routes, at least 16 characters; without it, these routes "
-            "refuse every request"
+            description="key of the administration routes, at least 16 characters; without a key, "
+            "these routes refuse every request"
         ),
     ] = None
     api_key: Annotated[
         SecretStr | None,
         Field(
-            description="key of all routes except health checks and pages; at least 16 characters, "
-            "different from the admin key; without it, these routes are open"
+            description="key of all routes except health checks and pages, at least 16 characters, "
+            "different from the admin key; without a key, these routes are open"
         ),
     ] = None
     cors_origins: Annotated[
@@ -123,7 +161,7 @@ class Settings(BaseSettings):
         NoDecode,
         BeforeValidator(_words),
         Field(
-            description="origins whose pages may use the service, separated by commas, for example "
+            description="web origins whose pages may use the service, separated by commas, such as "
             "`https://panel.example:8443`; none by default"
         ),
     ] = ()
@@ -132,8 +170,8 @@ class Settings(BaseSettings):
         NoDecode,
         BeforeValidator(_words),
         Field(
-            description="names and addresses that clients may use for this service, separated by "
-            "commas, without ports; `*` allows all; default: the names of this machine, and "
+            description="host names and addresses that clients may use for this service, separated "
+            "by commas, without ports; `*` allows all; default: the names of this machine, and "
             "SCENE_HOST if it is a single address"
         ),
     ] = ()
@@ -142,7 +180,7 @@ class Settings(BaseSettings):
         Field(
             ge=1,
             le=2**20,
-            description="maximum number of connections; beyond it, requests get a plain 503",
+            description="maximum number of connections; the service answers further ones with 503",
         ),
     ] = 1024
     max_body_bytes: Annotated[
@@ -174,7 +212,7 @@ class Settings(BaseSettings):
         Field(
             ge=256,
             le=2**20,
-            description="maximum number of scenes that wait for a model or are being computed",
+            description="maximum number of scenes per model that wait or are being computed",
         ),
     ] = 4096
     queue_requests: Annotated[
@@ -185,7 +223,7 @@ class Settings(BaseSettings):
         Field(
             ge=1,
             le=600_000,
-            description="deadline in milliseconds of requests without X-Request-Timeout-Ms",
+            description="time limit in milliseconds of a request without X-Request-Timeout-Ms",
         ),
     ] = 10_000
     max_request_timeout_ms: Annotated[
@@ -193,7 +231,7 @@ class Settings(BaseSettings):
         Field(
             ge=1,
             le=600_000,
-            description="maximum deadline in milliseconds that a client may choose",
+            description="maximum time limit in milliseconds that a client may choose",
         ),
     ] = 60_000
     max_streams: Annotated[
@@ -213,7 +251,12 @@ class Settings(BaseSettings):
         Field(ge=0, le=300, description="seconds from SIGTERM until the listening socket closes"),
     ] = 1.0
     drain_timeout: Annotated[
-        int, Field(ge=1, le=3600, description="seconds after that for requests in progress")
+        int,
+        Field(
+            ge=1,
+            le=3600,
+            description="maximum seconds for requests in progress after the socket closes",
+        ),
     ] = 25
     client_timeout: Annotated[
         float,
@@ -226,15 +269,18 @@ class Settings(BaseSettings):
         ),
     ] = 20
     retry_after: Annotated[
-        int, Field(ge=1, le=3600, description="seconds in the Retry-After header of 429 and 503")
+        int,
+        Field(
+            ge=1, le=3600, description="seconds in the Retry-After header of responses 429 and 503"
+        ),
     ] = 2
     metrics: Annotated[bool, Field(description="answer GET /metrics")] = True
     opentelemetry: Annotated[
         bool, Field(description="send traces to the collector in OTEL_EXPORTER_OTLP_ENDPOINT")
     ] = False
-    docs: Annotated[bool, Field(description="serve the board, /docs, /redoc and /openapi.json")] = (
-        True
-    )
+    docs: Annotated[
+        bool, Field(description="serve the scene editor, /docs, /redoc and /openapi.json")
+    ] = True
     root_path: Annotated[
         str, Field(description="path prefix that a reverse proxy strips", pattern=r"^(/[^/?#]+)*$")
     ] = ""
@@ -248,7 +294,7 @@ class Settings(BaseSettings):
 
     @property
     def secrets(self) -> list[str]:
-        """The configured keys. The log masks them."""
+        """The configured keys, which every log line masks."""
         return [key.get_secret_value() for key in (self.admin_key, self.api_key) if key]
 
     @property
@@ -293,11 +339,27 @@ class Settings(BaseSettings):
                 "contain a scheme, a port or a wildcard"
             ) from None
 
+    @property
+    def is_remote(self) -> bool:
+        """Whether the store is in object storage."""
+        return "://" in self.store
+
     @field_validator("store")
     @classmethod
-    def _is_directory(cls, value: Path) -> Path:
-        if not value.is_dir():
-            raise ValueError(f"SCENE_STORE must be an existing directory, but is {value}")
+    def _is_location(cls, value: str) -> str:
+        if "://" not in value and not Path(value).is_dir():
+            raise ValueError(f"SCENE_STORE must be an existing directory or a URL, but is {value}")
+        return value
+
+    @field_validator("unsigned_store")
+    @classmethod
+    def _is_signed_or_allowed(cls, value: bool, info: ValidationInfo) -> bool:
+        is_remote = "://" in info.data.get("store", "")
+        if is_remote and not value and not info.data.get("trusted_keys"):
+            raise ValueError(
+                "a remote store needs SCENE_TRUSTED_KEYS, or SCENE_UNSIGNED_STORE=true to accept "
+                "an index without a signature"
+            )
         return value
 
     @field_validator("max_request_timeout_ms")
@@ -319,7 +381,7 @@ class Settings(BaseSettings):
                 "SCENE_OPENTELEMETRY needs the packages of the dependency group telemetry "
                 "(pip install '.[telemetry]')"
             )
-        # Without an endpoint, the service would start but never send a trace.
+        # Without the URL of a collector, the service would start but never send a trace.
         if not any(map(os.environ.get, _ENDPOINTS)):
             raise ValueError(
                 f"SCENE_OPENTELEMETRY needs the URL of a collector: set {_ENDPOINTS[0]}"
@@ -332,7 +394,7 @@ class Settings(BaseSettings):
         if value is None:
             return None
         key = value.get_secret_value()
-        # The key must be a valid header value. An attacker could guess a short key.
+        # The key must be valid in an HTTP header. An attacker could guess a short key.
         if len(key) < 16 or not (key.isascii() and key.isprintable()) or " " in key:
             raise ValueError(
                 f"SCENE_{str(info.field_name).upper()} must have at least 16 printable ASCII "

@@ -1,1 +1,1 @@
-"""Benchmarks: each compares our code with a yardstick in the same run. See docs/benchmarks.md."""
+"""Benchmarks. Each compares our code with a reference in the same run; see docs/benchmarks.md."""

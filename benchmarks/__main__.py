@@ -1,4 +1,4 @@
-"""``python -m benchmarks``: run all benchmarks, or those named on the command line."""
+"""``python -m benchmarks``: run all benchmarks, or the benchmarks named on the command line."""
 
 from __future__ import annotations
 
@@ -29,13 +29,16 @@ class Name(StrEnum):
 
 
 def main(
-    names: Annotated[list[Name] | None, typer.Argument(help="benchmarks; by default all")] = None,
+    names: Annotated[list[Name] | None, typer.Argument(help="benchmarks; default: all")] = None,
     json_path: Annotated[
-        Path | None, typer.Option("--json", help="also write all samples to this file")
+        Path | None, typer.Option("--json", help="also write all timings to this JSON file")
     ] = None,
     store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
 ) -> None:
-    """Measure speed ratios against yardsticks; contender and yardstick alternate."""
+    """Measure the speed of our code relative to other implementations.
+
+    Our code and the other implementations run alternately.
+    """
     console = Console()
     machine = describe_machine()
     for key, value in machine.items():

@@ -54,7 +54,7 @@ def main(
     """Send the same requests to both engines in alternating windows until both are steady."""
     with ExitStack() as stack:
         ports = tuple(
-            stack.enter_context(engine(replicas)) for engine in (_ray_serve, _plain_processes)
+            stack.enter_context(engine(replicas)) for engine in (_ray_serve, plain_processes)
         )
         url = f"http://127.0.0.1:{ports[1]}/models/default/vocabulary"
         entries = httpx.get(url).raise_for_status().json()["objects"]
@@ -84,7 +84,8 @@ def _ray_serve(replicas: int) -> Iterator[int]:
 
 
 @contextmanager
-def _plain_processes(replicas: int) -> Iterator[int]:
+def plain_processes(replicas: int) -> Iterator[int]:
+    """Start plain processes behind HAProxy, and yield the proxy's port."""
     with ExitStack() as stack:
         text = _PROXY.format(port=(port := free_port()))
         for number in range(replicas):

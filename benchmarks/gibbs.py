@@ -1,4 +1,4 @@
-"""Gibbs sampling of an RBM over objects: sweeps per second of many chains."""
+"""Benchmark of Gibbs sampling: sweeps per second of many chains of an RBM over objects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ S = TypeVar("S")
 
 
 class Chains(Generic[S]):
-    """A chain state; each call advances it by one sweep."""
+    """Gibbs chains. Each call advances the state of all chains by one sweep."""
 
     def __init__(self, state: S, sweep: Callable[[S], S]) -> None:
         self.state, self.sweep = state, sweep
@@ -33,7 +33,17 @@ class Chains(Generic[S]):
 def gibbs(
     *, V: int = 417, H: int = 200, chains: int = 512, objects: int = 12, rounds: int = 41
 ) -> Result:
-    """Time sweeps over all chains; all samplers use the same weights and initial scenes."""
+    """Time one sweep over all chains, for our sampler and the samplers of other packages.
+
+    All samplers use the same weights and the same initial scenes.
+
+    Args:
+        V: number of object classes.
+        H: number of hidden units.
+        chains: number of chains.
+        objects: mean number of objects per scene.
+        rounds: number of rounds; each round times every sampler.
+    """
     machine = object_machine(MachineSpec("rbm", V=V, A=4, H1=H), objects)
     generator = torch.Generator().manual_seed(1)
     v = presence(random_scenes(chains, V, objects, generator), V)

@@ -1,4 +1,4 @@
-"""Time to compute the log-odds of every object class for one scene."""
+"""Benchmark of missing objects: time to compute the log-odds of all classes for one scene."""
 
 from __future__ import annotations
 
@@ -25,7 +25,18 @@ ONE_COPY = "scikit-learn, V + 1 copies"
 def log_odds(
     *, V: int = 417, H: int = 200, objects: int = 12, K: int = 32, rounds: int = 31
 ) -> Result:
-    """Time the local Triway machine in closed form, and scikit-learn with copies of the scene."""
+    """Time the closed form of the Triway machine, and scikit-learn with one scene copy per class.
+
+    In the local form of the Triway machine, unobserved relations have no effect on objects. Its
+    log-odds therefore equal those of a plain RBM such as scikit-learn's.
+
+    Args:
+        V: number of object classes.
+        H: number of hidden units.
+        objects: number of objects in the scene.
+        K: rank of the relation weights.
+        rounds: number of rounds; each round times every method.
+    """
     spec = MachineSpec("triway", V=V, A=4, H1=H, K=K, form="local")
     machine = object_machine(spec, objects)
     scorer, rbm = ContextScorer(machine.W.detach().numpy()), scikit_learn(machine)
@@ -39,7 +50,10 @@ def log_odds(
         return object_log_odds(machine, Evidence(v))
 
     def two_copies() -> Any:
-        """Compare each scene with the class present and absent; valid for all classes."""
+        """For each class, compare the scene with the class and the scene without the class.
+
+        The result is valid for all classes.
+        """
         present = np.repeat(v.numpy(), V, axis=0)
         absent = present.copy()
         np.fill_diagonal(present, 1)
@@ -47,7 +61,10 @@ def log_odds(
         return rbm._free_energy(absent) - rbm._free_energy(present)
 
     def one_copy() -> Any:
-        """Compare the scene with the class added and unchanged; valid for absent classes."""
+        """For each class, compare the scene with the class added and the unchanged scene.
+
+        The result is valid only for absent classes.
+        """
         present = np.repeat(v.numpy(), V, axis=0)
         np.fill_diagonal(present, 1)
         return rbm._free_energy(v.numpy()) - rbm._free_energy(present)

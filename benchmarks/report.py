@@ -1,4 +1,4 @@
-"""Results as tables and as JSON, with a description of the machine."""
+"""Benchmark results as tables and as JSON, and a description of the computer."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ class Result:
     Attributes:
         name: name of the benchmark.
         title: description of the measurement.
-        subject: name of our contender.
-        timings: timings of all contenders.
-        work, unit: amount of work of one call and its unit; without a unit, only times are shown.
-        targets: target of the speed ratio (minimum), by yardstick.
-        facts: further results.
+        subject: name of our implementation in `timings`.
+        timings: timings of all implementations.
+        work: amount of work of one call, for example the number of chains.
+        unit: unit of `work` per second. None shows only times.
+        targets: minimum of our speed divided by the speed of another implementation, by name of the
+            other implementation.
+        facts: further results, by name.
     """
 
     name: str
@@ -45,7 +47,7 @@ class Result:
     facts: Mapping[str, Fact] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
-        """Return all samples and the ratios computed from them."""
+        """Return a dictionary for JSON, with all timings and the speed ratios."""
         return {
             "name": self.name,
             "title": self.title,
@@ -63,9 +65,9 @@ class Result:
         }
 
     def table(self) -> Group:
-        """Return a table with one row per contender.
+        """Return a table with one line per implementation.
 
-        The ratio is our speed divided by the contender's speed, with quartiles.
+        The ratio is our speed divided by the speed of the implementation, with quartiles.
         """
         table = Table(title=self.title, title_justify="left")
         table.add_column("")
@@ -101,12 +103,12 @@ def duration(seconds: float) -> str:
 
 
 def document(results: Sequence[Result], machine: Mapping[str, object]) -> dict[str, object]:
-    """Return the JSON document of a run."""
+    """Return the JSON document with all results and the description of the computer."""
     return {"machine": dict(machine), "results": [result.to_dict() for result in results]}
 
 
 def describe_machine() -> dict[str, object]:
-    """Describe the machine and its current load."""
+    """Describe this computer, its current load, and the installed packages."""
     load = os.getloadavg() if hasattr(os, "getloadavg") else ()
     return {
         "taken": datetime.now(UTC).isoformat(timespec="seconds"),

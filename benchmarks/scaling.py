@@ -1,9 +1,10 @@
-"""Cost of larger vocabularies: memory of the loaded model, and latency of every question.
+"""Benchmark of larger vocabularies: memory of the loaded model, and latency of every question.
 
-The weights are random, with the sizes and standard deviations of the shipped default model and the
-same number of objects per scene. Latency depends on these properties, not on the learnt values.
-Random relation weights have a higher rank than trained weights, so `/relations` takes longer here.
-The benchmark therefore only compares vocabulary sizes.
+The models have random weights. Their sizes, their standard deviations and the number of objects per
+scene are those of the shipped default model. Latency depends on these properties, not on the learnt
+values. One exception: random relation weights have a higher rank than trained weights, so
+`/relations` takes longer here than in the service. The benchmark therefore only compares vocabulary
+sizes.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ from training.machines.chain_samples import pack_scenes
 CLASSES = (417, 2_000, 10_000)
 OBJECTS, SCENES = 12, 8
 
-# Standard deviations of the default model's weights; `object_machine` draws the other weights.
+# Standard deviations of the relation weights in the default model, by parameter name.
+# `object_machine` draws the other weights.
 _SPREAD = {"S": 0.065, "O": 0.065, "R": 0.32, "M": 0.23, "P": 0.06, "B": 0.14}
 _TRIPLES_A_CLASS = 17
 _MEGABYTE = 1e6
@@ -47,12 +49,15 @@ def scaling(
     objects: int = OBJECTS,
     rounds: int = 31,
 ) -> list[Result]:
-    """Return one result per question; machines that differ only in V are called in turns.
+    """Time every question for several vocabulary sizes, and return one result per question.
 
     Args:
-        classes: vocabulary sizes V in increasing order; the first is the yardstick.
-        N: number of persistent-chain samples.
-        objects: number of objects of the scene, equal for all sizes.
+        classes: vocabulary sizes in increasing order. The first size is the reference.
+        H1: number of hidden units.
+        K: rank of the relation weights.
+        N: number of stored samples for the generation of scenes.
+        objects: number of objects in the scene, equal for all sizes.
+        rounds: number of rounds; each round times every size.
     """
     scene = _scene(classes[0], objects)
     with TemporaryDirectory() as folder:
@@ -103,7 +108,7 @@ def _questions(scene: Scene) -> Mapping[str, Question]:
 
 
 def _scene(V: int, objects: int) -> Scene:
-    """Draw a scene of objects among the first V classes, by frequency."""
+    """Draw a scene of objects from the first V classes. Frequent classes are more probable."""
     drawn = random_scenes(1, V, objects, torch.Generator().manual_seed(1))[0].tolist()
     return Scene(tuple(SceneObject(_label(i), _label(i), i) for i in drawn))
 
@@ -148,9 +153,10 @@ def _machine(spec: MachineSpec, objects: int) -> BoltzmannMachine:
         parameter = machine.get_parameter(name)
         parameter.copy_(torch.randn(parameter.shape, generator=generator) * spread)
     machine.d.fill_(-2.0)
-    # Random implication weights at full strength would turn on hundreds of relations.
+    # gamma lets observed relations change other relations. Random weights of full size would turn
+    # on hundreds of relations.
     machine.get_parameter("gamma").mul_(0.2)
-    # Distinct sorted triples (a, i, j), evenly spread over all triples.
+    # Distinct sorted triples (relation, subject, object), evenly spread over all possible triples.
     units = spec.A * spec.V**2
     keys = (torch.arange(spec.T, dtype=torch.float64) * (units / spec.T)).long()
     square = spec.V**2
@@ -163,8 +169,8 @@ def _machine(spec: MachineSpec, objects: int) -> BoltzmannMachine:
 
 
 def _memory(first: Path, path: Path, scene: Scene) -> int:
-    """Return the resident bytes that loading and querying a model adds to a new process."""
-    # The process queries another model first, so that compiled loops are already loaded.
+    """Return the resident memory in bytes that a new process needs to load and query a model."""
+    # The process first queries another model, so that the compiled kernels are already loaded.
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(_resident, (first, path, scene))
 

@@ -1,4 +1,4 @@
-"""Start-up time of the service, and latency of one warm question on one connection."""
+"""Benchmark of the service: start-up time, and latency of /missing on one warm connection."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ _ROOT = Path(__file__).resolve().parent.parent
 
 
 class NoModelError(RuntimeError):
-    """The store is missing, or none of its models is ready."""
+    """The service cannot be measured: the model store is missing, or the service is not ready."""
 
 
 @dataclass(frozen=True)
 class Service:
-    """A service that is ready.
+    """A service that is ready to answer.
 
     Attributes:
-        client: client with one keep-alive connection.
-        seconds: time from the start of the process to the first status 200 of /health/ready.
+        client: HTTP client with one keep-alive connection to the service.
+        seconds: time from the start of the process until /health/ready returns status 200.
     """
 
     client: httpx.Client
@@ -45,19 +45,20 @@ class Service:
 def service(
     *, store: Path = Path("model_store"), objects: int = 12, requests: int = 500, rounds: int = 3
 ) -> list[Result]:
-    """Measure start-up, and latency on one connection.
+    """Measure the start-up time of the service, and the latency on one connection.
 
     Args:
-        store: directory of published models; the default model is queried.
+        store: directory of the model store. The default model is queried.
         objects: number of objects in the scene.
-        requests: number of requests of each kind, alternating, after 10 % warm-up requests.
-        rounds: number of starts.
+        requests: number of measured requests to each of two routes. Requests to the routes
+            alternate. Additional warm-up requests (10 %) are not measured.
+        rounds: number of times that the service is started.
 
     Raises:
         NoModelError: the service cannot be measured.
     """
     if not store.is_dir():
-        raise NoModelError(f"{store} does not exist: publish a model or name another store")
+        raise NoModelError(f"the store {store} does not exist: publish a model or use --store")
     ready: list[float] = []
     imports: list[float] = []
     requested: dict[str, list[float]] = {}
@@ -87,7 +88,7 @@ def service(
 
 @contextmanager
 def running(store: Path) -> Iterator[Service]:
-    """Run the service in a separate process and stop it at the end.
+    """Run the service in a separate process, and stop the process at the end of the context.
 
     Raises:
         NoModelError: the process ended, or the service was not ready in time.
@@ -127,7 +128,7 @@ def _wait(client: httpx.Client, process: subprocess.Popen[bytes], start: float) 
             continue
         if response.is_success:
             return
-        # The service listens only after loading, so it will not become ready later.
+        # The service listens only after loading its models. Now it cannot become ready any more.
         answer = response.json()["title"]
         break
     raise NoModelError(f"the service is not ready: {answer}")

@@ -1,10 +1,10 @@
 """``python -m benchmarks.stream``: updates over a stream, compared with requests of whole scenes.
 
-At each tick one object of a room with poses moves, and the client asks all three questions. Blocks
-of ticks alternate between the stream and requests, so that both run under the same conditions.
-Without the stream, a tick takes three requests on a keep-alive connection. A ping between two
-updates measures the round-trip time. Latency runs from the scheduled time of a tick, so it includes
-delays of the client.
+At each tick, one object of a room moves, and the client asks three questions about the new scene.
+Over the stream, the client sends one update per tick. Without the stream, the client sends three
+requests per tick on a keep-alive connection. Blocks of ticks with and without the stream alternate,
+so that both run under the same conditions. A ping between two updates measures the round-trip time.
+Latency runs from the scheduled time of a tick, so it includes delays of the client.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from benchmarks.report import describe_machine
 ASK: Final = {"missing": {"top_k": 10}, "outliers": {}, "relations": {"top_k": 20}}
 STREAM, PING, REQUESTS = "update, answered", "ping, answered", "three requests, answered"
 AIM: Final = 0.020
-"""Target: 99 % of the updates take less than this time in seconds."""
+"""Target for the 99th percentile of the latency of an update, in seconds."""
 
 _BLOCK: Final = 100
 _QUANTILES: Final = (0.5, 0.9, 0.99)
@@ -44,10 +44,10 @@ class Measured:
     """Results of one run.
 
     Attributes:
-        seconds: time from the schedule of each tick to its answer.
-        answers: number of messages that answered updates.
-        superseded: number of updates covered by the answer to a newer update.
-        bytes: size of all answers of the stream, and of all responses to requests.
+        seconds: seconds from the scheduled time of each tick to its answer, by kind of message.
+        answers: number of answers over the stream.
+        superseded: number of updates without an own answer, because a newer update was answered.
+        bytes: total size of the answers over the stream, and of the responses to requests.
     """
 
     seconds: dict[str, list[float]] = field(
@@ -58,12 +58,12 @@ class Measured:
     bytes: dict[str, int] = field(default_factory=lambda: {STREAM: 0, REQUESTS: 0})
 
     def quantile(self, name: str, q: float) -> float:
-        """Quantile of the latency in seconds."""
+        """Return a quantile of the latency of one kind of message, in seconds."""
         return float(np.quantile(self.seconds[name], q))
 
 
 def room(labels: list[str], objects: int, seed: int = 0) -> list[dict[str, Any]]:
-    """Return detections with poses in a room of three metres."""
+    """Return objects with random positions in a cube of three metres."""
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(labels), objects, replace=False)
     return [
@@ -78,7 +78,7 @@ def room(labels: list[str], objects: int, seed: int = 0) -> list[dict[str, Any]]
 
 
 def moves(things: list[dict[str, Any]], count: int, seed: int = 1) -> list[dict[str, Any]]:
-    """Return ``count`` detections, each with one object at a new position."""
+    """Return ``count`` updates. Each update is one object of the room at a new position."""
     rng = np.random.default_rng(seed)
     found = []
     for number in range(count):
@@ -88,11 +88,11 @@ def moves(things: list[dict[str, Any]], count: int, seed: int = 1) -> list[dict[
 
 
 async def measure(port: int, *, updates: int, rate: float, objects: int) -> Measured:
-    """Send updates at a fixed rate, and the same number of scenes as requests.
+    """Send updates over the stream at a fixed rate, and send the same scenes as requests.
 
     Args:
         port: port of a service on this machine.
-        updates: number of updates, without the warm-up block.
+        updates: number of measured updates. Additional warm-up updates are not measured.
         rate: updates per second.
         objects: number of objects in the room.
     """
@@ -116,7 +116,7 @@ async def measure(port: int, *, updates: int, rate: float, objects: int) -> Meas
 
 
 class _Run:
-    """One run, which alternates between a stream and a connection for requests."""
+    """One run of the benchmark. It alternates between the stream and requests of whole scenes."""
 
     def __init__(
         self,
@@ -211,7 +211,7 @@ def main(
     rate: Annotated[float, typer.Option(min=1, help="updates per second")] = 50.0,
     objects: Annotated[int, typer.Option(min=1, max=256, help="objects in the room")] = 12,
 ) -> None:
-    """Stream updates to the service, and send the same scenes as requests."""
+    """Measure the latency of updates over a stream, and of the same questions as requests."""
     console = Console(width=120)
     for key, value in describe_machine().items():
         console.print(f"{key}: {value}", highlight=False)
@@ -231,7 +231,7 @@ def main(
     console.print(table)
     share = found.bytes[STREAM] / found.bytes[REQUESTS]
     each = found.bytes[STREAM] / found.answers
-    console.print(f"answers: {found.answers}; they also cover {found.superseded} older updates")
+    console.print(f"answers: {found.answers}; they also answer {found.superseded} older updates")
     console.print(f"bytes: {each:.0f} per answer; {share:.2f} of the bytes of the requests")
     verdict = "met" if own < AIM else "MISSED"
     console.print(f"p99 of an update: {1e3 * own:.2f} ms; below {1e3 * AIM:.0f} ms: {verdict}")

@@ -1,8 +1,8 @@
-"""Interleaved timing: contenders take turns, so that all run under the same conditions.
+"""Interleaved timing of several implementations, so that all run under the same conditions.
 
-The speed of a shared machine varies within seconds. Contenders run alternately in short slices, and
-the first contender changes from round to round. The speed ratio is computed within each round. The
-result is the median ratio over the rounds.
+The speed of a shared computer varies within seconds. In each round, every implementation runs for a
+short time slice. The order of the implementations rotates from round to round. The speed ratio is
+computed within each round. The result is the median ratio over the rounds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,13 @@ from threadpoolctl import threadpool_limits
 
 @dataclass(frozen=True)
 class Ratio:
-    """Speed ratio: median over rounds, and the first and third quartile."""
+    """Speed ratio of two implementations over all rounds.
+
+    Attributes:
+        median: median ratio.
+        low: first quartile of the ratios.
+        high: third quartile of the ratios.
+    """
 
     median: float
     low: float
@@ -28,7 +34,11 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Timings:
-    """Seconds per call by contender, one value per round."""
+    """Timings of several implementations.
+
+    Attributes:
+        seconds: seconds per call in each round, by name of the implementation.
+    """
 
     seconds: Mapping[str, list[float]]
 
@@ -36,7 +46,7 @@ class Timings:
         return median(self.seconds[name])
 
     def ratio(self, name: str, yardstick: str) -> Ratio:
-        """Return how many times faster `name` is than `yardstick`."""
+        """Return the speed of `name` divided by the speed of `yardstick`."""
         pairs = zip(self.seconds[yardstick], self.seconds[name], strict=True)
         ratios = [other / own for other, own in pairs]
         if len(ratios) == 1:
@@ -51,11 +61,13 @@ def interleave(
     rounds: int,
     slice_seconds: float = 0.02,
 ) -> Timings:
-    """Time every contender in every round, on one thread and without garbage collection.
+    """Time every implementation in every round, on one thread and without garbage collection.
 
     Args:
-        rounds: at least 1.
-        slice_seconds: approximate time of a slice; a contender is called repeatedly within it.
+        contenders: the implementations by name, as functions without arguments.
+        rounds: number of rounds, at least 1.
+        slice_seconds: approximate length of a time slice. Within a slice, one implementation is
+            called repeatedly.
     """
     if rounds < 1:
         raise ValueError(f"rounds must be at least 1, not {rounds}")

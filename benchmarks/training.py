@@ -1,4 +1,8 @@
-"""Time of a contrastive-divergence step: active pairs with shared weights, and a dense machine."""
+"""Benchmark of training: time of one contrastive-divergence step.
+
+Our Triway machine has relation units only for pairs of present objects (active pairs), and shares
+weights between them. The dense machine has a unit and weights for every pair of classes.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +37,18 @@ def training_step(
     objects: int = 12,
     rounds: int = 5,
 ) -> Result:
-    """Time CD-1 of the Triway machine on active pairs and on all V + A·V² units."""
+    """Time one CD-1 step of our Triway machine, and of a dense machine with all V + A·V² units.
+
+    Args:
+        V: number of object classes.
+        A: number of relations.
+        H1: number of units in the first hidden layer.
+        H2: number of units in the second hidden layer.
+        K: rank of the relation weights.
+        scenes: number of scenes per step.
+        objects: number of objects per scene.
+        rounds: number of rounds; each round times every machine.
+    """
     generator = torch.Generator().manual_seed(0)
     classes = random_scenes(scenes, V, objects, generator)
     pairs = (scenes, A, objects, objects)
@@ -73,7 +88,7 @@ def training_step(
 def _triway_step(
     spec: MachineSpec, batch: Batch, objects: int, generator: torch.Generator
 ) -> Callable[[], None]:
-    """Return a step: forward pass, gradients by autograd, and update, as in training."""
+    """Return a function that runs one training step: loss, gradients by autograd, and update."""
     machine = build(spec).initialise(generator, scale=0.05)
     with torch.no_grad():
         machine.b.copy_(frequencies(spec.V, objects).logit())
@@ -93,11 +108,11 @@ def _triway_step(
 
 
 def _dense_step(batch: Batch, A: int, H: int, generator: torch.Generator) -> Callable[[], None]:
-    """Return the same step with all units and weights in memory, one hidden layer, plain torch.
+    """Return a function that runs one training step of a dense machine with one hidden layer.
 
-    Objects and all A·V² relations form one visible layer x. Gates are products over x, and objects
-    that active relations force on are maxima over x. The step adds gradients directly to the
-    weights.
+    The visible layer x has a unit for each object class and for each of the A·V² relations. A
+    relation can be on only if both its objects are on, and it then forces these objects on. The
+    step adds gradients directly to the weights, without autograd.
     """
     scenes, V = batch.v.shape
     x = torch.zeros(scenes, V + A * V * V)

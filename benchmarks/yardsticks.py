@@ -1,4 +1,4 @@
-"""Our machines, and other packages' models with the same weights."""
+"""Machines with random weights for benchmarks, and models of other packages with equal weights."""
 
 from __future__ import annotations
 
@@ -12,38 +12,39 @@ from training.machines import BoltzmannMachine, MachineSpec, build
 
 
 def frequencies(V: int, objects: float) -> Tensor:
-    """Return the frequency of each class (V,) by a Zipf–Mandelbrot law; the sum is `objects`.
+    """Return the frequency of each class, (classes,), by a Zipf–Mandelbrot law.
 
-    As in real rooms, a few classes are in most scenes, and most classes are rare.
+    As in real rooms, a few classes are in most scenes, and most classes are rare. A scene with
+    these frequencies has about `objects` objects.
     """
     share = 1 / torch.arange(3.0, V + 3)
     return (objects * share / share.sum()).clamp(max=0.95)
 
 
 def object_machine(spec: MachineSpec, objects: float) -> BoltzmannMachine:
-    """Return a machine with random weights; its scenes hold about this number of objects."""
+    """Return a machine with random weights. Its scenes contain about `objects` objects."""
     machine = build(spec).requires_grad_(False)
     machine.initialise(torch.Generator().manual_seed(0), scale=0.1)
     p = frequencies(spec.V, objects)
-    # Half of the hidden units are on; the biases compensate their effect on the objects.
+    # Half of the hidden units are on. The object biases compensate the effect of these units.
     machine.b.copy_(p.logit() - machine.W.sum(1) / 2 - machine.W.square().sum(1) / 8)
     machine.c1.copy_(-(p @ machine.W))
     return machine
 
 
 def random_scenes(scenes: int, V: int, objects: int, generator: torch.Generator) -> Tensor:
-    """Draw distinct sorted classes by frequency, (scenes, objects) int64."""
+    """Draw scenes of distinct classes by frequency. Return class indices (scenes, objects)."""
     weights = frequencies(V, objects).expand(scenes, V)
     return weights.multinomial(objects, generator=generator).sort(1).values
 
 
 def presence(classes: Tensor, V: int) -> Tensor:
-    """Convert class indices (B, n) to presence (B, V) float32."""
+    """Convert class indices (scenes, objects) to presence (scenes, classes) float32."""
     return torch.zeros(len(classes), V).scatter_(1, classes, 1.0)
 
 
 def scikit_learn(machine: BoltzmannMachine) -> BernoulliRBM:
-    """Copy the objects and hidden layer of a machine into a fitted `BernoulliRBM`, float32."""
+    """Return a fitted scikit-learn RBM with the object and hidden weights of a machine."""
     rbm = BernoulliRBM(machine.spec.H1)
     rbm.components_ = machine.W.T.contiguous().numpy()
     rbm.intercept_hidden_ = machine.c1.numpy().copy()
@@ -53,5 +54,5 @@ def scikit_learn(machine: BoltzmannMachine) -> BernoulliRBM:
 
 
 def rbms(machine: BoltzmannMachine) -> BBRBM:
-    """Copy the objects and hidden layer of a machine into an RBM of the `rbms` package."""
+    """Return an RBM of the `rbms` package with the object and hidden weights of a machine."""
     return BBRBM(machine.W.clone(), machine.b.clone(), machine.c1.clone())

@@ -2,9 +2,12 @@
 
 Usage: python scripts/audit.py [--may-be-unreachable]   (or `make audit`)
 
-Exit status: 0 if all parts ran without findings; 1 if a part has findings or failed; 3 if a part
-is NOT RUN because no advisory service answered. With --may-be-unreachable the status is 0 instead
-of 3; the last line still says NOT RUN.
+Exit status:
+
+    0   all parts of the audit ran without findings
+    1   a part has findings or failed
+    3   a part did not run, because no vulnerability database answered. With --may-be-unreachable,
+        the status is 0 instead, and the last line of the output still says NOT RUN
 """
 
 from __future__ import annotations
@@ -19,21 +22,21 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 LOCKS = ("requirements.lock", "requirements-training.lock", "requirements-dev.lock")
-# Lock files of the two images; images contain no development tools.
+# Lock files of the two container images. The images contain no development tools.
 SHIPPED = {"service": "requirements.lock", "training": "requirements-training.lock"}
 SOURCES = ("app", "training")
 BILLS = ROOT / "build"
 
-# Advisory services, tried in this order until one works.
+# Vulnerability databases that pip-audit can query. The first one that works is used.
 SERVICES = ("pypi", "osv")
-# Permanently vulnerable package (CVE-2019-10906). A package index without advisories returns an
-# empty list, which pip-audit reports as "no known vulnerabilities". So a service counts as working
-# only if it reports this vulnerability.
+# Package version with a known vulnerability (CVE-2019-10906). A package index without advisories
+# returns an empty list, and pip-audit then reports "no known vulnerabilities". A database therefore
+# counts as working only if it reports this vulnerability.
 CANARY = "jinja2==2.10"
 
 
 class Verdict(Enum):
-    """Result of a part of the audit."""
+    """Result of one part of the audit."""
 
     OK = "ok"
     FOUND = "FOUND"
@@ -42,14 +45,19 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A verdict and its reasons, one per line."""
+    """Outcome of one part of the audit.
+
+    Attributes:
+        verdict: result of the part.
+        lines: reasons for the result, one per line.
+    """
 
     verdict: Verdict
     lines: tuple[str, ...]
 
 
 def run(*command: str) -> subprocess.CompletedProcess[str]:
-    """Run a tool of this environment in the root of the repository."""
+    """Run a Python module (`python -m`) in the root of the repository."""
     return subprocess.run(
         [sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, check=False
     )
@@ -59,8 +67,8 @@ def judge(output: str, trouble: str, required: set[str]) -> Outcome:
     """Interpret the output of pip-audit.
 
     Args:
-        output: standard output; JSON if pip-audit received an answer for every package.
-        trouble: standard error.
+        output: standard output of pip-audit. It is JSON if every package was checked.
+        trouble: standard error of pip-audit.
         required: names of the packages to check.
     """
     try:
@@ -79,29 +87,29 @@ def judge(output: str, trouble: str, required: set[str]) -> Outcome:
     if found:
         return Outcome(Verdict.FOUND, tuple(found))
     if unknown:
-        return Outcome(Verdict.NOT_RUN, (f"no answer about {', '.join(unknown)}",))
+        return Outcome(Verdict.NOT_RUN, (f"no answer about the packages {', '.join(unknown)}",))
     return Outcome(Verdict.OK, (f"no known vulnerability in {len(looked_at)} packages",))
 
 
 def ask(service: str, *arguments: str) -> tuple[str, str]:
-    """Run pip-audit on pinned requirements without resolving them; return output and error."""
+    """Run pip-audit on pinned requirements. Return its standard output and standard error."""
     fixed = ("--no-deps", "--disable-pip", "--progress-spinner=off", "--format=json")
     done = run("pip_audit", f"--vulnerability-service={service}", *fixed, *arguments)
     return done.stdout, done.stderr
 
 
 def knows_advisories(service: str) -> Outcome:
-    """Return `FOUND` if the service reports the vulnerability of `CANARY`."""
+    """Return `FOUND` if the vulnerability database reports the vulnerability of `CANARY`."""
     canary = BILLS / "canary.txt"
     canary.write_text(CANARY + "\n", "utf-8")
     outcome = judge(*ask(service, f"--requirement={canary}"), {CANARY.partition("==")[0]})
     if outcome.verdict is Verdict.OK:
-        return Outcome(Verdict.NOT_RUN, (f"the service has no advisory about {CANARY}",))
+        return Outcome(Verdict.NOT_RUN, (f"the database has no advisory about {CANARY}",))
     return outcome
 
 
 def pinned(lock: str) -> set[str]:
-    """Return the package names of a lock file that apply to this platform."""
+    """Return the names of the packages in a lock file that this platform needs."""
     lines = (ROOT / lock).read_text("utf-8").splitlines()
     apply = [line for line in lines if "==" in line and not line.startswith("#")]
     if sys.platform == "win32":
@@ -118,7 +126,7 @@ def advisories() -> Outcome:
             files = [f"--requirement={lock}" for lock in LOCKS]
             return judge(*ask(service, *files), set().union(*map(pinned, LOCKS)))
         reasons.append(f"{service}: {known.lines[0]}")
-    return Outcome(Verdict.NOT_RUN, ("all advisory services failed", *reasons))
+    return Outcome(Verdict.NOT_RUN, ("all vulnerability databases failed", *reasons))
 
 
 def risky_code() -> Outcome:
@@ -130,7 +138,7 @@ def risky_code() -> Outcome:
 
 
 def bills_of_materials() -> Outcome:
-    """Write a CycloneDX document for each image and validate it against the schema."""
+    """Write a CycloneDX bill of materials for each container image, and validate its format."""
     lines = []
     for name, lock in SHIPPED.items():
         bill = BILLS / f"sbom-{name}.cdx.json"
@@ -142,13 +150,13 @@ def bills_of_materials() -> Outcome:
             return Outcome(Verdict.FOUND, (f"{lock}: {done.stderr.strip()[-300:]}",))
         held = {component["name"] for component in json.loads(bill.read_text())["components"]}
         if missing := sorted(pinned(lock) - held):
-            return Outcome(Verdict.FOUND, (f"{lock}: not in the bill: {', '.join(missing)}",))
+            return Outcome(Verdict.FOUND, (f"{lock}: missing in the bill: {', '.join(missing)}",))
         lines.append(f"{bill.name}: {len(held)} packages")
     return Outcome(Verdict.OK, tuple(lines))
 
 
 def exit_status(verdicts: list[Verdict], *, may_be_unreachable: bool) -> int:
-    """Return the exit status of the whole audit."""
+    """Return the exit status of the whole audit, from the results of its parts."""
     if Verdict.FOUND in verdicts:
         return 1
     return 3 if Verdict.NOT_RUN in verdicts and not may_be_unreachable else 0
@@ -159,7 +167,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--may-be-unreachable",
         action="store_true",
-        help="exit with status 0 if no advisory service answers",
+        help="exit with status 0 if no vulnerability database answers",
     )
     options = parser.parse_args(arguments)
     BILLS.mkdir(exist_ok=True)

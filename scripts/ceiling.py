@@ -1,10 +1,12 @@
-"""Agreement of two scans of the same room: an upper bound for models of rooms.
+"""Measure how well one scan of a room predicts another scan: an upper bound for models of rooms.
 
-For each scan of a room with several scans, a random other scan of the room replaces the model:
+Some rooms have several scans. For each scan of such a room, a random other scan of the room serves
+as the prediction:
 
-    relations   its triples predict relations. Metric: R-precision between classes of both scans,
-                with ties in random order
-    objects     its classes predict a removed class. Metric: reciprocal rank, expected over ties
+    relations   the relations of the other scan predict the relations of this scan. Metric:
+                R-precision. The remaining predictions are in random order
+    objects     one class is removed from this scan. The classes of the other scan predict the
+                removed class. Metric: mean reciprocal rank (MRR), as expectation over ties
 
 Run as `python -m scripts.ceiling [FOLDER] [SOURCE]`.
 """
@@ -22,7 +24,11 @@ from training.datasets import EncodedScene, encode, indoor_vocabulary, read_scen
 
 
 def agreement(scenes: list[EncodedScene], structure: np.ndarray, seed: int = 0) -> dict[str, float]:
-    """Compute the metrics over all scans of rooms with several scans."""
+    """Compute the metrics over all scans of rooms with several scans.
+
+    Args:
+        structure: (classes,) bool, True for structure classes, which are left out.
+    """
     rooms: dict[str, list[EncodedScene]] = defaultdict(list)
     for scene in scenes:
         if scene.evidence.holds.any():
@@ -52,7 +58,12 @@ def agreement(scenes: list[EncodedScene], structure: np.ndarray, seed: int = 0) 
 def _relations(
     scan: EncodedScene, other: EncodedScene, structure: np.ndarray
 ) -> tuple[float, float, float]:
-    """Return (expected hits, annotated triples, expected hits in random order) of one scan."""
+    """Compare the relations of a scan with the relations of another scan.
+
+    Returns:
+        The expected number of correct predictions, the number of annotated relations, and the
+        expected number of correct predictions in random order.
+    """
     ours, theirs = scan.evidence, other.evidence
     usable = ~structure[ours.classes]
     pair = usable[:, None] & usable[None, :] & ~np.eye(len(usable), dtype=np.bool_)
@@ -70,7 +81,10 @@ def _relations(
 
 
 def _objects(scan: EncodedScene, other: EncodedScene, structure: np.ndarray) -> list[float]:
-    """Return the reciprocal rank of each removed class; classes of the other scan come first."""
+    """Return the reciprocal rank of each class of a scan after its removal.
+
+    The classes of the other scan rank first, as a tie. All remaining classes tie after them.
+    """
     mine = {int(c) for c in scan.evidence.classes if not structure[c]}
     theirs = {int(c) for c in other.evidence.classes if not structure[c]}
     absent = int((~structure).sum()) - len(mine) + 1
@@ -85,7 +99,7 @@ def _objects(scan: EncodedScene, other: EncodedScene, structure: np.ndarray) -> 
 
 
 def main() -> None:
-    """Print the metrics of one source, by default 3dssg."""
+    """Print the metrics of one data source, by default 3dssg."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "../shared/data")
     source = sys.argv[2] if len(sys.argv) > 2 else "3dssg"
     vocabulary = indoor_vocabulary()

@@ -1,13 +1,13 @@
-"""Record the answers of a running service, and compare another version with the record.
+"""Record the answers of a running service, and compare the answers of another version with them.
 
     python -m scripts.corpus record http://127.0.0.1:8000 answers.jsonl.gz --key ADMIN_KEY
     python -m scripts.corpus compare http://127.0.0.1:8001 answers.jsonl.gz --key ADMIN_KEY
 
-Both services serve the `model_store` of the repository; `compare` replays the recorded requests.
-Two answers are equal if status, problem type and fields are equal, with numbers within 1e-5. Order
-and length of a list may differ among entries with equal probabilities. Answers of `/generate` are
-random. They are compared by their fixed fields, and by the shares of classes in many scenes, with a
-test of two proportions per class.
+Both services must serve the `model_store` of the repository. `compare` sends the recorded requests
+again. Two answers are equal if their status, problem type and fields are equal. Numbers may differ
+by 1e-5. Entries of a list that have equal probabilities may change their order, and may be missing
+at the end of the list. Answers of `/generate` are random: only their fixed fields must be equal. A
+test of two proportions also compares how often each class occurs in many generated scenes.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ MODELS: Final = (
 )  # fmt: skip
 RELATIONS: Final = ("left", "right", "front", "behind", "on-top", "under", "above", "below")
 HEADERS: Final = ("content-type", "retry-after", "www-authenticate", "allow", "location")
-# A long deadline, so that requests also finish on a busy machine.
+# Deadline of each request. It is long, so that requests also finish on a busy machine.
 PATIENCE: Final = {"x-request-timeout-ms": "60000"}
-# Fields that differ between answers or between processes.
+# Fields that are not compared, because they differ between answers or processes.
 VOLATILE: Final = frozenset({"request_id", "instance", "session", "seed"})
-# Lists that describe the scene, not the answer.
+# Fields with lists that describe the scene of the request, not the answer.
 NOTES: Final = frozenset({"ignored", "mapped", "warnings"})
-# Probability of at least one false alarm among all compared shares.
+# Maximum probability that any class share in `shares` is reported as different by chance.
 FAILURE: Final = 1e-3
 
 Json = Any
@@ -61,9 +61,11 @@ class Scenes:
     """Generator of random scenes for one model.
 
     Args:
+        rng: random generator.
         labels: labels that the model knows.
         rooms: room types that the model knows.
-        likely: scenes that the model generated; about 60 % of the random scenes extend one.
+        likely: object lists of scenes that the model generated. About 60 % of the random scenes
+            start with one of these lists.
     """
 
     def __init__(
@@ -72,7 +74,7 @@ class Scenes:
         self.rng, self.labels, self.rooms, self.likely = rng, labels, rooms, likely
 
     def classes(self) -> list[str]:
-        """Return 1 to 24 labels, some of them twice."""
+        """Return 1 to 24 random labels. Labels can occur more than once."""
         rng = self.rng
         found = list(rng.choice(self.likely)) if rng.random() < 0.6 else []
         found += rng.sample(self.labels, rng.choice([0, 1, 1, 2, 4, 12]))
@@ -83,7 +85,7 @@ class Scenes:
         return found[:24]
 
     def scene(self) -> dict[str, Json]:
-        """Return random values for the fields that all questions share."""
+        """Return random values for the request fields that all questions have."""
         rng, labels = self.rng, self.classes()
         body: dict[str, Json] = {"objects": labels}
         form = rng.random()
@@ -139,7 +141,7 @@ class Scenes:
         ]
 
     def options(self, question: str, body: dict[str, Json]) -> dict[str, Json]:
-        """Return random values for the fields that only this question has."""
+        """Return random values for the request fields that only the given question has."""
         rng = self.rng
         names = [o if isinstance(o, str) else o.get("id", o["label"]) for o in body["objects"]]
         found: dict[str, Json] = {}
@@ -172,7 +174,7 @@ class Scenes:
 
 
 def post(path: str, body: Json, **headers: str) -> dict[str, Json]:
-    """Return a request in the form of the record."""
+    """Return a POST request in the format of the record file."""
     return {
         "method": "POST", "path": path,
         "headers": {"content-type": "application/json", **PATIENCE, **headers},
@@ -181,7 +183,7 @@ def post(path: str, body: Json, **headers: str) -> dict[str, Json]:
 
 
 def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Json]]:
-    """Generate questions about scenes for every model, single and in batches."""
+    """Generate requests with questions about scenes, for every model, single and in batches."""
     for model in MODELS:
         words = client.get(f"/models/{model}/vocabulary").raise_for_status().json()
         drawn = client.post("/generate", json={"model": model, "count": 64, "seed": 1}).json()
@@ -206,7 +208,7 @@ def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Js
 
 
 def drawn(client: httpx.Client) -> Iterator[dict[str, Json]]:
-    """Generate requests to `/generate` that are compared by the shares of classes."""
+    """Generate requests to `/generate` whose answers are compared by the frequency of classes."""
     for model in MODELS[1:7]:
         words = client.get(f"/models/{model}/vocabulary").json()
         rooms = [room for room in ("kitchen", "bedroom", "bathroom") if room in words["room_types"]]
@@ -277,7 +279,7 @@ def pages(client: httpx.Client) -> Iterator[dict[str, Json]]:
 
 
 def streams(rng: random.Random) -> Iterator[list[dict[str, Json]]]:
-    """Generate conversations: a scene that grows and shrinks, with invalid messages in between."""
+    """Generate the messages of streams. Each stream changes a scene, with some invalid messages."""
     labels = ["bed", "lamp", "pillow", "nightstand", "stove", "desk", "chair", "toilet", "sofa"]
     for number in range(24):
         ask = [{"missing": {"top_k": 5}, "outliers": {}}, {"relations": {"top_k": 5}}][number % 2]
@@ -312,7 +314,7 @@ def streams(rng: random.Random) -> Iterator[list[dict[str, Json]]]:
 
 
 def ask(client: httpx.Client, request: dict[str, Json], key: str) -> dict[str, Json]:
-    """Send a request and return the answer in the form of the record."""
+    """Send a request, and return the answer in the format of the record file."""
     headers = {k: v.replace("KEY", key) if v == "KEY" else v for k, v in request["headers"].items()}
     body = base64.b64decode(request["body"])
     answer = client.request(request["method"], request["path"], headers=headers, content=body)
@@ -328,12 +330,12 @@ def ask(client: httpx.Client, request: dict[str, Json], key: str) -> dict[str, J
 
 
 def _in_order(header: str) -> str:
-    """Sort the methods of an `Allow` header, because their order has no meaning."""
+    """Sort the values of a header such as `Allow`, because their order has no meaning."""
     return ", ".join(sorted(header.split(", ")))
 
 
 def converse(url: str, talk: list[dict[str, Json]]) -> list[Json]:
-    """Return the events of a stream, one per message."""
+    """Send messages over a stream, and return the event that answers each message."""
     events = []
     with connect(url.replace("http", "ws", 1) + "/stream", max_size=2**24) as socket:
         for message in talk:
@@ -343,15 +345,15 @@ def converse(url: str, talk: list[dict[str, Json]]) -> list[Json]:
 
 
 def comparable(event: dict[str, Json]) -> dict[str, Json]:
-    """Return an event of a stream in the form of the record, for every version of the service.
+    """Convert an event of a stream to one format, because the format differs between versions.
 
-    The record has the lists of all answers under `lists`, and their other fields beside it.
+    The field `lists` contains the lists of the answers. All other fields are at the top level.
     """
     event = {k: v for k, v in event.items() if k not in {"alarms", "superseded"}}
     if event["type"] == "opened":
         return {"type": "opened", "seq": event["seq"]}
     if event["type"] == "problem" and event["problem"].get("errors"):
-        # The message about an unknown type lists the known types, which may differ.
+        # This error message lists the known message types, which differ between versions.
         for error in event["problem"]["errors"]:
             error["message"] = error["message"].partition("must be open, ")[0]
     if event["type"] == "answer" and "lists" not in event:
@@ -368,7 +370,11 @@ def comparable(event: dict[str, Json]) -> dict[str, Json]:
 
 
 def differences(old: Json, new: Json, at: str = "") -> Iterator[str]:
-    """Generate descriptions of the differences between two JSON values."""
+    """Generate a description of each difference between two JSON values.
+
+    Args:
+        at: path of the values in the answer.
+    """
     if isinstance(old, bool) or isinstance(new, bool) or old is None or isinstance(old, str):
         if old != new or type(old) is not type(new):
             yield f"{at}: {old!r:.80} → {new!r:.80}"
@@ -393,7 +399,7 @@ def _lists(old: list[Json], new: list[Json], at: str) -> Iterator[str]:
     scored = [e for e in (*old, *new) if isinstance(e, dict) and _score(e) is not None]
     if not scored or len(scored) < len(old) + len(new):
         if len(old) != len(new):
-            yield f"{at}: {len(old)} entries → {len(new)}"
+            yield f"{at}: {len(old)} entries before, {len(new)} now"
         for k, (a, b) in enumerate(zip(old, new, strict=False)):
             yield from differences(a, b, f"{at}/{k}")
         return
@@ -401,7 +407,7 @@ def _lists(old: list[Json], new: list[Json], at: str) -> Iterator[str]:
     for name, entry in before.items():
         if name in after:
             yield from differences(entry, after[name], f"{at}/{name}")
-    # An entry at the end of a list may be replaced by an entry of equal probability.
+    # A list may end with another entry of equal probability.
     for mine, other, when in ((old, after, "before"), (new, before, "now")):
         last = abs(_score(mine[-1]) or 0.0) if mine else 0.0
         for entry in mine:
@@ -415,7 +421,10 @@ def _lists(old: list[Json], new: list[Json], at: str) -> Iterator[str]:
 
 
 def _is_ordered(old: list[Json], before: dict[Json, Json], new: list[Json]) -> bool:
-    """Return True if common entries keep their order; some lists are not sorted by probability."""
+    """Return True if the entries that both lists contain have the same order.
+
+    Some lists are not sorted by probability.
+    """
     common = [_texts(e) for e in new if _texts(e) in before]
     return [_texts(e) for e in old if _texts(e) in set(common)] == common
 
@@ -429,13 +438,21 @@ def _texts(entry: dict[str, Json]) -> Json:
 
 
 def shares(old: Json, new: Json, tests: int) -> Iterator[str]:
-    """Generate classes with different shares: test of two proportions, Bonferroni correction."""
+    """Generate a description of each class whose frequency differs between two answers.
+
+    Each class is tested by a test of two proportions with Bonferroni correction.
+
+    Args:
+        old: recorded answer of `/generate`.
+        new: new answer of `/generate`.
+        tests: total number of tests, for the correction.
+    """
     a, b = (
         Counter(label for scene in answer["json"]["scenes"] for label in set(scene["objects"]))
         for answer in (old, new)
     )
     n, m = len(old["json"]["scenes"]), len(new["json"]["scenes"])
-    # Upper bound of the |z| that a normal variable exceeds with probability FAILURE / tests.
+    # Threshold for |z|: a standard normal z exceeds it with a probability below FAILURE / tests.
     limit = math.sqrt(2 * math.log(tests / FAILURE))
     for label in a.keys() | b.keys():
         p = (a[label] + b[label] + 1) / (n + m + 2)
@@ -445,7 +462,7 @@ def shares(old: Json, new: Json, tests: int) -> Iterator[str]:
 
 
 def undrawn(answer: dict[str, Json]) -> dict[str, Json]:
-    """Return an answer of `/generate` without its random fields."""
+    """Return an answer of `/generate` in which only the fixed fields of the scenes remain."""
     if answer["status"] != 200:
         return answer
     scenes = answer["json"]["scenes"]
@@ -457,7 +474,7 @@ def undrawn(answer: dict[str, Json]) -> dict[str, Json]:
 
 
 def record(url: str, file: Path, key: str) -> int:
-    """Send all requests and write the answers."""
+    """Send all requests, and write the requests and answers to a file. Return exit status 0."""
     rng = random.Random(SEED)
     with httpx.Client(base_url=url, timeout=60) as client, gzip.open(file, "wt") as out:
         asked: Counter[str] = Counter()
@@ -479,7 +496,7 @@ def record(url: str, file: Path, key: str) -> int:
 
 
 def compare(url: str, file: Path, key: str) -> int:
-    """Send all recorded requests again; return 1 if an answer differs."""
+    """Send all recorded requests again. Return exit status 1 if an answer differs, else 0."""
     with gzip.open(file, "rt") as lines:
         entries = [json.loads(line) for line in lines]
     tests = 400 * sum(entry["kind"] == "drawn" for entry in entries)
@@ -509,7 +526,7 @@ def compare(url: str, file: Path, key: str) -> int:
 
 
 def wait_until_ready(url: str) -> None:
-    """Wait until the service is ready; its first start compiles kernels.
+    """Wait until the service is ready. Its first start is slow because it compiles kernels.
 
     Raises:
         TimeoutError: the service is not ready within ten minutes.
@@ -524,7 +541,7 @@ def wait_until_ready(url: str) -> None:
 
 
 def main() -> int:
-    """Run the command line."""
+    """Run the command that the command line names, and return its exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("command", choices=("record", "compare"))
     parser.add_argument("url")

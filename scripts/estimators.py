@@ -1,9 +1,10 @@
-"""`python -m scripts.estimators`: errors of the closed form and of 64 samples.
+"""`python -m scripts.estimators`: errors of two estimators of the answers of a model.
 
-The reference uses many more samples (by default 4,096). The model is a shipped model whose answers
-have a closed form. The scenes are samples of the model in three forms: labels only, with 20 random
-relations, or with random poses, which determine hundreds of relations. Errors of objects are in
-nats of log-odds. Errors of relations and placements are in probability.
+The two estimators are the closed form of the service, and an average over 64 samples of the hidden
+units. The reference is an average over many more samples (by default 4,096). The scenes contain
+objects that the model sampled, with one of three kinds of evidence: labels only, 20 random
+relations, or random poses, which determine hundreds of relations. Errors for objects are
+differences of log-odds. Errors for relations and placements are differences of probabilities.
 """
 
 from __future__ import annotations
@@ -31,7 +32,12 @@ _RELATIONS = 20
 
 
 def scenes(artifact: Artifact, count: int, kind: str) -> Iterator[Scene]:
-    """Generate scenes of objects that the machine sampled."""
+    """Generate scenes from the stored samples of a model.
+
+    Args:
+        count: number of samples to use. Samples with fewer than four classes are skipped.
+        kind: evidence beside the labels: "bare" (none), "relations" or "poses".
+    """
     rng = np.random.default_rng(0)
     for v in artifact.weights.scenes[:count]:
         classes = np.flatnonzero(v)[:_OBJECTS].tolist()
@@ -57,7 +63,12 @@ def scenes(artifact: Artifact, count: int, kind: str) -> Iterator[Scene]:
 
 
 def answers(given: Posterior, absent: NDArray[np.int64]) -> dict[str, Values]:
-    """Return the values behind the answers; placements use a few of the absent classes."""
+    """Return the log-odds or probabilities of four kinds of answers about a scene.
+
+    Args:
+        given: model with the evidence of the scene.
+        absent: (classes,) indices of the absent classes. Placements use about five of them.
+    """
     anchors, likely = np.arange(len(given.present.classes)), absent[:: len(absent) // 5]
     return {
         "absent objects": given.absent_log_odds(absent),
@@ -68,7 +79,12 @@ def answers(given: Posterior, absent: NDArray[np.int64]) -> dict[str, Values]:
 
 
 def errors(artifact: Artifact, count: int, draws: int) -> dict[tuple[str, str, str], list[Values]]:
-    """Return |estimate - reference| by kind of scene, answer and estimate."""
+    """Return the absolute errors, by (kind of evidence, kind of answer, estimator).
+
+    Args:
+        count: number of stored samples that serve as scenes.
+        draws: number of samples of the hidden units in the reference.
+    """
     structure = artifact.vocabulary.structure
     found: dict[tuple[str, str, str], list[Values]] = {}
     few: Callable[[Scene], Any] = lambda scene: DrawnPosterior(artifact, scene)  # noqa: E731

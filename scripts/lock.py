@@ -1,9 +1,10 @@
-"""Write requirements*.lock from both pyproject.toml files: exact versions, tested together.
+"""Write the lock files requirements*.lock, with exact versions, from both pyproject.toml files.
 
-pip resolves the development set first, without installation. The smaller sets are then resolved
-within these pins, so that all files agree.
+pip first resolves the requirements for development, without installing them. Then it resolves the
+smaller sets of requirements with the same versions. A package therefore has the same version in all
+lock files.
 
-Usage: python scripts/lock.py   (or `make lock`; further arguments go to pip)
+Usage: python scripts/lock.py   (or `make lock`; further arguments are passed to pip)
 """
 
 from __future__ import annotations
@@ -19,13 +20,17 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 HEADER = "# {what}. Written by `make lock` from pyproject.toml; do not edit.\n"
 
-# Dependencies of the CUDA builds of torch. The machine determines the build, so these packages are
-# not pinned: a pin would install them on machines without a GPU.
+# Dependencies of the CUDA builds of torch. The lock files leave them out, because a locked package
+# would also be installed on machines without a GPU.
 CUDA_COMPANION = re.compile(r"^(cuda-|nvidia-|triton$)")
 
 
 def resolve(requirements: list[str], pins: Path | None, pip_arguments: list[str]) -> dict[str, str]:
-    """Return the lines `name==version` of `requirements` and their dependencies, by name."""
+    """Resolve requirements. Return a line `name==version` for each package, by package name.
+
+    Args:
+        pins: file with versions that pip must use. None means no restriction.
+    """
     command = [
         *(sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "-qq"),
         *("--dry-run", "--ignore-installed", "--report", "-"),
@@ -39,13 +44,13 @@ def resolve(requirements: list[str], pins: Path | None, pip_arguments: list[str]
         name, version = item["metadata"]["name"], item["metadata"]["version"]
         key = re.sub(r"[-_.]+", "-", name).lower()
         if not CUDA_COMPANION.match(key):
-            # A local version (2.13.0+cpu) names one build; the public version fits all builds.
+            # A local version such as 2.13.0+cpu names one build. The part before "+" fits all.
             locked[key] = f"{key}=={version.partition('+')[0]}"
     return locked
 
 
 def with_markers(locked: dict[str, str], requirements: list[str]) -> list[str]:
-    """Return the sorted pins with the environment markers of pyproject.toml."""
+    """Return the sorted lines of a lock file, with the environment markers of pyproject.toml."""
     markers = {"uvloop": "sys_platform != 'win32'"}
     for requirement in requirements:
         name, _, marker = requirement.partition(";")

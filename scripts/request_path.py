@@ -1,8 +1,8 @@
-"""``python -m scripts.request_path``: files and functions of this project that a request uses.
+"""``python -m scripts.request_path``: list the functions of this project that a request calls.
 
-The script sends one warm request to an application in this process. It counts the Python functions
-of `app` and `scene_client` and the compiled loops that the request calls. Generated methods and
-comprehensions count as part of their function.
+The script sends a request to an application in this process, after 20 warm-up requests. It lists
+the Python functions and compiled kernels of `app` and `scene_client` that the request calls. A
+comprehension or lambda counts as part of the function that contains it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ async def ask(app: Any, path: str, body: bytes) -> int:
 
 @contextmanager
 def compiled_calls(found: set[tuple[str, str]]) -> Iterator[None]:
-    """Record calls of compiled functions, which a profiler does not see."""
+    """Record calls of compiled functions in `found`. A Python profiler does not see these calls."""
     replaced: list[tuple[Any, str, Any]] = []
     for module in [m for name, m in sys.modules.items() if name.startswith("app.")]:
         for name, value in list(vars(module).items()):
@@ -80,7 +80,13 @@ def noted(loop: Any, found: set[tuple[str, str]]) -> Callable[..., Any]:
 
 
 async def passed(path: str, body: bytes, requests: int = 20) -> set[tuple[str, str]]:
-    """Return (file, function) of all functions that one request calls."""
+    """Return (file, function) of all project functions that one request calls.
+
+    Args:
+        path: path of the request.
+        body: JSON body of the request.
+        requests: number of warm-up requests.
+    """
     app = create_app(Settings())
     found: set[tuple[str, str]] = set()
     is_counting = False
@@ -95,7 +101,7 @@ async def passed(path: str, body: bytes, requests: int = 20) -> set[tuple[str, s
         ):
             found.add((str(Path(code.co_filename).relative_to(ROOT)), code.co_qualname))
 
-    # On a busy machine a thread computes the answer; profile new threads too.
+    # Also profile new threads, because a thread computes the answer on a busy machine.
     threading.setprofile(note)
     async with app.router.lifespan_context(app):
         for _ in range(requests):

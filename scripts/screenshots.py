@@ -21,7 +21,7 @@ SETTLED = 1500  # milliseconds to wait until all answers are displayed
 
 
 def bedroom(page: Page) -> None:
-    """Show the page as it opens."""
+    """Show the page in its initial state."""
     page.evaluate("scrollTo(0, 0)")
 
 
@@ -73,10 +73,10 @@ def take(browser: Browser, url: str, name: str) -> Path:
 
 
 def main() -> None:
-    """Take all screenshots, or those named on the command line."""
+    """Take all screenshots, or the screenshots named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("url", help="URL of a running service")
-    parser.add_argument("names", nargs="*", help=f"screenshots: {', '.join(PICTURES)}; default all")
+    parser.add_argument("names", nargs="*", help=f"screenshots, default all: {', '.join(PICTURES)}")
     arguments = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
     with sync_playwright() as playwright:

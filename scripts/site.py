@@ -1,11 +1,12 @@
-"""Hooks of mkdocs for the documentation site, named in mkdocs.yml.
+"""mkdocs hooks that build the documentation site. mkdocs.yml refers to this file.
 
-- A line ``::: package.module:name`` is replaced by the source of that function or class. The source
-  is read from the working tree when the site is built, so excerpts are always current. Indented
-  lines below the directive name tests of the function, ``tests/path.py::test_name``.
+- A directive line ``::: package.module:name`` is replaced by the source of that function or class.
+  The source is read when the site is built, so excerpts are always current. Indented lines below
+  the directive name tests of the function: ``tests/path.py::test_name``.
 - Links to repository files outside docs/ lead to generated pages that show the files.
 - Formulas are converted to MathML, which browsers display without scripts.
-- ``folder/*`` in the navigation lists the pages of a folder; CHANGELOG.md becomes a page.
+- In the navigation, ``folder/*`` stands for all pages of a folder.
+- CHANGELOG.md becomes a page of the site.
 """
 
 from __future__ import annotations
@@ -38,7 +39,13 @@ _LANGUAGES = {".py": "python", ".toml": "toml", ".yml": "yaml", ".json": "json",
 
 
 class Excerpt(NamedTuple):
-    """A piece of a module: path relative to the repository, first line, and text."""
+    """The source of a function or class.
+
+    Attributes:
+        path: path of the module, relative to the repository.
+        first: number of the first line in the module.
+        text: source text.
+    """
 
     path: str
     first: int
@@ -46,7 +53,11 @@ class Excerpt(NamedTuple):
 
 
 def module_path(module: str) -> str:
-    """Return the file of a module, relative to the repository."""
+    """Return the path of a module's file, relative to the repository.
+
+    Raises:
+        PluginError: the module does not exist.
+    """
     base = module.replace(".", "/")
     for path in (f"{base}.py", f"{base}/__init__.py"):
         if (REPOSITORY / path).is_file():
@@ -58,7 +69,7 @@ def excerpt(module: str, name: str) -> Excerpt:
     """Return the source of a function, method or class of the repository.
 
     Raises:
-        PluginError: the module or the name in it does not exist.
+        PluginError: the module does not exist, or it does not contain the name.
     """
     path = module_path(module)
     text = (REPOSITORY / path).read_text(encoding="utf-8")
@@ -76,7 +87,7 @@ def excerpt(module: str, name: str) -> Excerpt:
 
 
 def checks(match: re.Match[str]) -> list[tuple[str, str]]:
-    """Return (path, test) for the tests of a directive."""
+    """Return (path, test name) of each test that a directive names."""
     return [(path, test) for path, _, test in (c.partition("::") for c in match["checks"].split())]
 
 
@@ -84,7 +95,7 @@ def checks(match: re.Match[str]) -> list[tuple[str, str]]:
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Expand ``folder/*`` in the navigation."""
+    """Replace ``folder/*`` in the navigation by the pages of the folder."""
     config.nav = [_expanded(entry, Path(config.docs_dir)) for entry in config.nav or []]
     return config
 
@@ -101,14 +112,14 @@ def _expanded(entry: Any, docs: Path) -> Any:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the changelog, and a page for each repository file that a page shows."""
+    """Add the changelog to the site, and a page for each repository file that a page refers to."""
     changelog = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8").replace("](docs/", "](")
     files.append(File.generated(config, "changelog.md", content=changelog))
     pages = [(page.src_uri, page.content_string) for page in files.documentation_pages()]
     for path in sorted({path for uri, text in pages for path in _shown(uri, text)}):
         language = _LANGUAGES.get(Path(path).suffix, "text")
         source = (REPOSITORY / path).read_text(encoding="utf-8")
-        # Fence with tildes, because a docstring may contain a fence of backticks.
+        # The source may contain a code fence of backticks, so this fence uses tildes.
         text = (
             f"---\ntitle: {path}\nsearch:\n  exclude: true\n---\n\n~~~~ {language}\n{source}~~~~\n"
         )
@@ -120,7 +131,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def _shown(uri: str, text: str) -> Iterator[str]:
-    """Iterate over files outside docs/ that a page links to or quotes, relative to the root."""
+    """Iterate over the files outside docs/ that a page refers to, as paths in the repository."""
     for match in _LINK.finditer(text):
         if path := _outside(uri, match["target"]):
             yield path
@@ -130,14 +141,17 @@ def _shown(uri: str, text: str) -> Iterator[str]:
 
 
 def _outside(uri: str, target: str) -> str | None:
-    """Return the target of a link relative to the root if it is a file outside docs/, else None."""
+    """Return the path of a link's target in the repository, or None.
+
+    The result is None if the target is inside docs/ or is not a file of the repository.
+    """
     path = posixpath.normpath(posixpath.join("docs", posixpath.dirname(uri), target))
     inside = path.startswith(("docs/", "../"))
     return path if not inside and (REPOSITORY / path).is_file() else None
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Insert excerpts, and redirect links to files outside docs/ to their generated pages."""
+    """Replace directives by excerpts. Redirect links to files outside docs/ to generated pages."""
     del config, files
     uri = page.file.src_uri
     if uri.startswith(f"{SOURCES}/"):

@@ -1,6 +1,6 @@
-"""Write the blocking client from the asynchronous client.
+"""Generate the blocking Python client (sync.py) from the asynchronous client (asynchronous.py).
 
-Usage: python scripts/sync_client.py   (part of `make format`)
+Usage: python scripts/sync_client.py   (`make format` runs this script)
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ NAMES: Final = {
 
 
 def generated() -> str:
-    """Return the source of the blocking client, formatted by ruff."""
+    """Return the source code of the blocking client, formatted by ruff."""
     with tempfile.TemporaryDirectory() as scratch:
         folders = Path(scratch, "async"), Path(scratch, "sync")
         folders[0].mkdir()

@@ -1,1 +1,1 @@
-"""Training: turn scenes into versioned artifacts. The service never imports this package."""
+"""Train models from scenes and publish them in a store. The service never imports this package."""

@@ -1,4 +1,4 @@
-"""Encoded scenes as tensors, the input of an objective."""
+"""Encoded scenes as tensors. A training objective reads them."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Batch:
-    """A batch of B scenes as tensors.
+    """A batch of scenes as tensors.
 
     Attributes:
-        v: (B, V) presence.
-        classes: (B, n) int64 class indices; padding is -1.
-        counts: (B, n) int64 instances of each class; 0 means that the source gives no count.
-        holds, observed: (B, A, n, n) relations between those classes.
-        room: (B,) int64 room type; -1 means unknown.
-        source: (B,) int64 index into the source names of the scene tensors.
+        v: presence of each class, (scenes, classes).
+        classes: indices of the n classes present in a scene, (scenes, n) int64. Padding is -1.
+        counts: number of instances of each class in `classes`, (scenes, n) int64. 0 means that the
+            data source gives no number.
+        holds: value of each relation between two classes of `classes`, (scenes, relations, n, n).
+        observed: True where the relation is annotated, shaped like `holds`.
+        room: index of the room type, (scenes,) int64. -1 means unknown.
+        source: index of the data source in `SceneTensors.source_names`, (scenes,) int64.
     """
 
     v: Tensor
@@ -42,24 +44,28 @@ class Batch:
     def __len__(self) -> int:
         return len(self.v)
 
+    def to(self, device: torch.device) -> Batch:
+        """Return the batch on a device."""
+        return Batch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
     def rows(self, index: Tensor) -> Batch:
-        """Return the scenes at the given indices, or where a mask is true."""
+        """Return the scenes at the given indices. A mask selects the scenes where it is True."""
         return Batch(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
 @dataclass(frozen=True)
 class SceneTensors:
-    """A set of N scenes; `batch` returns some of them.
+    """A set of scenes as tensors. `batch` returns some of the scenes.
 
     Attributes:
         scenes: the encoded scenes.
-        v: (N, V) presence of each class.
-        room: (N,) room types.
-        source: (N,) int64 index into annotated_classes and source_names.
-        annotated_classes: (sources, V) bool, True for the classes that a source annotates.
-        source_names: sorted names of the sources.
-        weight: (N,) weight of each scene in object learning.
-        complete: (N,) bool; true if the object list covers nearly the whole scene.
+        v: presence of each class, (scenes, classes).
+        room: index of the room type, (scenes,). -1 means unknown.
+        source: index of the data source in annotated_classes and source_names, (scenes,) int64.
+        annotated_classes: True for classes that a data source mentions, (sources, classes) bool.
+        source_names: sorted names of the data sources.
+        weight: weight of each scene in the training of objects, (scenes,).
+        complete: True if the object list of the scene is nearly complete, (scenes,) bool.
     """
 
     scenes: Sequence[EncodedScene]
@@ -80,11 +86,11 @@ class SceneTensors:
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def batch(self, index: Tensor) -> Batch:
-        """Return the scenes at the given indices as one batch."""
+    def batch(self, index: Tensor, width: int = 0) -> Batch:
+        """Return the scenes at the given indices as one batch, with at least `width` classes."""
         chosen = [self.scenes[k].evidence for k in index.tolist()]
-        n = max((len(e.classes) for e in chosen), default=0)
-        relations = chosen[0].holds.shape[0] if chosen else 0
+        n = max([width, *(len(e.classes) for e in chosen)])
+        relations = self.scenes[0].evidence.holds.shape[0] if self.scenes else 0
         classes = np.full((len(chosen), n), -1, dtype=np.int64)
         counts = np.ones((len(chosen), n), dtype=np.int64)
         holds = np.zeros((len(chosen), relations, n, n), dtype=np.float32)
@@ -110,15 +116,17 @@ def scene_tensors(
     """Return encoded scenes as tensors.
 
     Args:
-        annotated: for each source, (V,) bool of the classes that the source mentions.
-        size: number of classes V.
+        annotated: maps the name of a data source to the classes that it mentions, (classes,) bool.
+        size: number of classes of the vocabulary.
 
     Raises:
         ValueError: `annotated` has no entry for the source of a scene.
     """
     names = sorted(annotated)
     if missing := {scene.source for scene in scenes} - set(names):
-        raise ValueError(f"no annotated classes for the sources {sorted(missing)}")
+        raise ValueError(
+            f"`annotated` has no entry for the sources {sorted(missing)}; add one for each source"
+        )
     v = torch.zeros(len(scenes), size)
     for row, scene in enumerate(scenes):
         v[row, torch.from_numpy(scene.evidence.classes)] = 1.0
@@ -144,12 +152,18 @@ def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
 
 
 def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
-    """Return the relation units of a batch, (edges, r, observed), as the machine arranges them."""
+    """Return the relations of a batch in the layout of the machine.
+
+    The result is (edges, r, observed): layout, values and observed flags of the relation units.
+    """
     return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
 
 
 def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
-    """Return the sorted triples (a, i, j) that hold in at least `minimum` scenes, (T, 3)."""
+    """Return the triples (relation, subject class, object class) of at least `minimum` scenes.
+
+    The result is sorted and has the shape (triples, 3).
+    """
     keys: list[np.ndarray] = []
     for scene in scenes:
         relation, subject, object_ = scene.evidence.holds.nonzero()

@@ -1,17 +1,17 @@
-"""Fit the calibration: it turns log-odds into the probabilities that the service returns.
+"""Fit the calibration, which turns log-odds into the probabilities that the service returns.
 
-All fits use validation scenes. The entries are:
+All fits use validation scenes. The calibration has these entries:
 
-    missing, outlier   see `training.calibrate_objects`
-    relation   p(the relation holds between two instances). One fit uses scenes without observed
-               relations; another fit uses scenes where half of the pairs are observed
-    placement  p(the relation holds), where the subject or the object was removed from the scene
-    misplaced  p(the relation is false), fitted to scenes of which half have one altered triple
+    missing, outlier   See `training.calibrate_objects`.
+    relation   Probability that a relation holds between two instances. A first fit uses scenes
+               without observed relations. A second fit uses scenes with half of the pairs observed.
+    placement  Probability that a relation holds between a removed object and another object.
+    misplaced  Probability that a relation is false. Half of the scenes contain one false relation.
 
-All fits are logistic regressions (Platt scaling) on relations that a source states as true or
-false. Unstated relations are left out. One procedural source has more examples than all other
-sources together. The fit that ranks relations therefore gives large sources a lower weight. The fit
-of the overall level uses equal weights.
+All fits are logistic regressions (Platt scaling) on relations that a data source annotates as true
+or false. Other relations are left out. One source of generated rooms has more examples than all
+other sources together. The fit that ranks relations therefore gives large sources a lower weight.
+The fit of the overall probability gives all examples equal weights.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
@@ -50,27 +50,28 @@ from training.evaluation.outliers import kept_in_each_source
 from training.oracle.units import NO_UNIT
 
 _SCENES = 2500
-# Number of scenes for a machine without a closed form: it samples its answers, which takes a
-# hundred times longer.
+# Number of scenes for a machine whose log-odds have no closed form. Sampling the log-odds takes a
+# hundred times longer than a closed form.
 _SCENES_OF_DRAWS = 300
-# An answer lists the best 20 relations by default.
+# Number of relations that an answer of the service lists by default.
 _LISTED = 20
 _OF_THE_REST = 0.02
 _ROUNDS = 3
-# Columns of an example; column 0 is the scene.
+# Column indices of the table of examples. Column 0 is the scene.
 _RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 5, 6
 # The weight of an example is the number of listed examples of its source, to the power -_POWER.
-# Share of 3DSSG pairs whose likeliest of eight relations is right: .62 at power 0, .73 at .25,
-# .82 at .5. A frequency table reaches .75.
+# Accuracy of the likeliest of eight relations on pairs of 3DSSG: .62 with _POWER 0, .73 with .25,
+# and .82 with .5. A frequency table of the training data has an accuracy of .75.
 _POWER = 0.5
-# The curve of all relations: the number of its bends, its least slope, and the penalty on each
-# change of slope (in log-likelihood).
+# The calibration curve of all relations: number of bends, minimum slope, and penalty on a squared
+# change of slope, in units of log-likelihood.
 _BENDS = 7
 _LEAST_SLOPE = 0.05
 _STIFFNESS = 2.0
-# Truth value of a relation whose truth is unknown.
+# Value in the truth column of an example whose data source does not annotate the relation.
 _UNKNOWN = -1.0
-# Number of placement cases from each scene. With one case, the fit depends too much on chance.
+# Number of objects that are removed from each scene in turn to fit placements. With one removed
+# object, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
 
 
@@ -84,10 +85,11 @@ def calibrate(
     """Fit every entry of the calibration.
 
     Args:
-        artifact: the artifact with the neutral calibration.
+        artifact: the model with the neutral calibration.
         scenes: validation scenes.
-        train: training scenes, which give the popularity of classes.
-        chosen: see `calibrate_objects`.
+        train: training scenes. They give the frequency of each class.
+        seed: seed of the random choices.
+        chosen: a calibration from which some values are copied; see `calibrate_objects`.
     """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     objects = calibrate_objects(artifact, scenes, train, structure, seed, chosen)
@@ -112,9 +114,10 @@ def calibrate(
 
 
 def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[PairSlope, ...]:
-    """Fit p(a relation holds between two instances) to the log-odds of their classes.
+    """Fit the probability that a relation holds between two instances.
 
-    The fit uses scenes without observed relations.
+    The input is the log-odds of the relation between the two classes. The fit uses scenes without
+    observed relations.
     """
     examples = _examples(_asked_pairs(artifact, scenes))
     return _fit_listed(examples, artifact.spec.A, _LISTED)
@@ -123,11 +126,12 @@ def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[P
 def fit_given(
     artifact: Artifact, scenes: Sequence[EncodedScene], alone: tuple[PairSlope, ...], seed: int = 0
 ) -> tuple[PairSlope, ...]:
-    """Fit the relations of one half of the pairs of a scene, given the other half as observed.
+    """Fit the probability of relations when half of the pairs of a scene are observed.
 
-    The ranking of relations comes from `alone`, the fit without observed relations. Separate slopes
-    would depend on the few sources that list many relations. With separate slopes, observed
-    relations made the answers for other sources worse.
+    The fit examines the other half of the pairs. `alone`, the fit without observed relations,
+    determines the ranking of relations. Only the overall curve is fitted again. Separate slopes
+    would depend on the few data sources that list many relations, and made answers for other
+    sources worse.
     """
     blocks = _asked_pairs(artifact, scenes, np.random.default_rng(seed))
     return _as_often_as_it_holds(_examples(blocks), alone, _LISTED)
@@ -136,10 +140,11 @@ def fit_given(
 def _asked_pairs(
     artifact: Artifact, scenes: Sequence[EncodedScene], rng: np.random.Generator | None = None
 ) -> list[NDArray[np.float64]]:
-    """Return the examples of each scene.
+    """Return the examples of each scene, one array for each scene.
 
     Args:
-        rng: chooses which pairs of a scene are observed; without it, all pairs are asked.
+        rng: random generator that chooses the observed pairs of a scene. Without a generator, no
+            pair is observed and all pairs give examples.
     """
     blocks: list[NDArray[np.float64]] = []
     sources = sorted({encoded.source for encoded in scenes})
@@ -161,13 +166,13 @@ def _asked_pairs(
 def fit_placements(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> dict[str, tuple[PairSlope, ...]]:
-    """Fit the relations between an object that was removed from a scene and the remaining objects.
+    """Fit the probability of relations between a removed object and the objects of its scene.
 
     Returns:
-        `placement` is fitted to the likeliest places, because an answer lists these.
-        `asked_place` is fitted to all places with equal weight, because a request may ask for any
-        place. `asked_place` leaves out sources whose unlisted relations are unobserved, such as
-        people's sentences.
+        The entries `placement` and `asked_place`. `placement` is fitted to the likeliest places,
+        because an answer lists the likeliest places. `asked_place` is fitted to all places with
+        equal weight, because a request can name any place. `asked_place` leaves out data sources
+        that never annotate false relations, such as people's sentences.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
@@ -202,15 +207,18 @@ def fit_placements(
 
 
 def _examples(blocks: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the examples of relations with a unit; other relations have no log-odds."""
+    """Return the examples for which the machine has a relation unit.
+
+    Without a relation unit, an example has no log-odds.
+    """
     every = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
     return every[every[:, _LOGIT] > NO_UNIT]
 
 
 def _told(examples: NDArray[np.float64], sources: Sequence[str]) -> NDArray[np.float64]:
-    """Return the examples from sources that state where the relation is false.
+    """Return the examples from data sources that also annotate false relations.
 
-    If no source states this for a relation, return all examples of the relation.
+    If no source annotates a relation as false, return all examples of that relation.
     """
     telling = np.array([[how != "unobserved" for how in meaning_of(s).unlisted] for s in sources])
     relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
@@ -222,11 +230,11 @@ def _told(examples: NDArray[np.float64], sources: Sequence[str]) -> NDArray[np.f
 def _fit_listed(
     examples: NDArray[np.float64], relations: int, listed: int
 ) -> tuple[PairSlope, ...]:
-    """Fit all relations, mainly to the best `listed` examples of each scene, which an answer lists.
+    """Fit all relations, mainly to the `listed` examples of each scene with the highest log-odds.
 
-    A listed example was selected for its high log-odds. Its relation therefore holds less often
-    than other pairs with equal log-odds suggest. Examples that an answer would not list have a
-    small weight. Examples with unknown truth take part in the ranking but not in the fit.
+    An answer lists only these examples. Selection by high log-odds also selects errors, so listed
+    relations hold less often than unselected relations with equal log-odds. Examples outside the
+    list have a small weight. Examples without annotation take part only in the ranking.
     """
     known = examples[:, _TRUTH] != _UNKNOWN
     slopes = _fit_each(examples[known], relations, np.ones(known.sum()))
@@ -240,10 +248,11 @@ def _fit_listed(
 def _as_often_as_it_holds(
     examples: NDArray[np.float64], slopes: tuple[PairSlope, ...], listed: int
 ) -> tuple[PairSlope, ...]:
-    """Fit one rising curve over the logits of all relations to the listed examples.
+    """Fit one rising curve from logits to log-odds, for all relations, to the listed examples.
 
-    With the curve, the average probability over all sources equals the share of true relations.
-    The curve keeps the ranking of relations, which comes from a fit with similar source weights.
+    The curve makes the mean probability equal to the share of true relations over all data sources.
+    A rising curve keeps the ranking of relations. The ranking comes from `slopes`, a fit in which
+    sources have similar weights.
     """
     best = _among_best(examples, slopes, listed) & (examples[:, _TRUTH] != _UNKNOWN)
     examples = examples[best]
@@ -265,13 +274,17 @@ def _as_often_as_it_holds(
 def rising_curve(
     logits: NDArray[np.float64], truth: NDArray[np.bool_]
 ) -> tuple[float, float, tuple[tuple[float, float], ...]]:
-    """Fit the log-odds of the truth values (n,) as a rising, piecewise linear function of logits.
+    """Fit the log-odds that an example is true as a rising, piecewise linear function of its logit.
 
-    A penalty on changes of slope stabilises the curve where there are few examples.
+    A penalty on changes of slope stabilises the curve where examples are few.
+
+    Args:
+        logits: logit of each example, (examples,).
+        truth: truth value of each example, (examples,).
 
     Returns:
-        The intercept and the slope of the line at the lowest logits, and the bends (at, change);
-        see `PairSlope`.
+        Intercept and slope of the line at the lowest logits, and the bends of the curve. A bend is
+        a pair (logit, change of slope); see `PairSlope`.
     """
     at = np.quantile(logits, np.linspace(0, 1, _BENDS + 2)[1:-1])
     edges = np.concatenate([[-np.inf], at, [np.inf]])
@@ -308,9 +321,10 @@ def _logits(examples: NDArray[np.float64], slopes: tuple[PairSlope, ...]) -> NDA
 
 
 def _source_weights(examples: NDArray[np.float64], best: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the weights of the examples, (N,).
+    """Return the weight of each example, (examples,).
 
-    A weight is the number of listed examples with the same source and relation, to a power.
+    The weight is the number of listed examples of the same source and relation, to the power
+    -_POWER.
     """
     relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
     key = relation * (source.max(initial=0) + 1) + source
@@ -323,7 +337,7 @@ def _source_weights(examples: NDArray[np.float64], best: NDArray[np.bool_]) -> N
 def _among_best(
     examples: NDArray[np.float64], slopes: tuple[PairSlope, ...], listed: int
 ) -> NDArray[np.bool_]:
-    """Mark the examples that are among the best `listed` of their scene."""
+    """Mark the `listed` examples of each scene with the highest log-odds, (examples,) bool."""
     logits = _logits(examples, slopes)
     order = np.lexsort((-logits, examples[:, 0]))
     scene = examples[order, 0]
@@ -353,9 +367,9 @@ def _instance_pairs(
 ) -> NDArray[np.float64]:
     """Return the examples of a scene, (examples, 7).
 
-    The columns are: scene, relation, class log-odds, log n_i + log n_j, log of the number of
-    classes, whether the relation holds, and the source. The examples with unknown truth are only
-    those with log-odds high enough for an answer to list them.
+    The columns are: scene, relation, log-odds between the classes, log n_i + log n_j of the
+    instance counts, log of the number of classes, truth value and data source. Relations without
+    annotation are examples only if their log-odds are high enough for the list of an answer.
     """
     evidence = scene.evidence
     place = np.searchsorted(evidence.classes, scene.instance_classes)
@@ -377,7 +391,7 @@ def _instance_pairs(
 
 
 def _so_many_best(values: NDArray[np.floating[Any]], count: int) -> float:
-    """Return the least of the `count` largest values."""
+    """Return the smallest of the `count` largest values."""
     return float(np.partition(values, -count)[-count]) if len(values) > count else -np.inf
 
 
@@ -392,10 +406,11 @@ def _fit_relation(examples: NDArray[np.float64], weight: NDArray[np.float64]) ->
 def fit_misplaced(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[Slope, Thresholds]:
-    """Fit the log-odds that a relation is false to its log-odds given the rest of the scene.
+    """Fit the probability that an observed relation is false, and the thresholds for an alarm.
 
-    The thresholds are fitted to unaltered scenes of the hardest source. In the share of scenes
-    given by `ALARMS`, the relation that is most likely to be false reaches the threshold.
+    The input is the log-odds of the relation given the rest of the scene. A threshold gives an
+    alarm in a fixed share of unaltered scenes (`ALARMS`), measured on the data source with the most
+    alarms.
     """
     rng = np.random.default_rng(seed)
     rows: list[tuple[float, bool]] = []

@@ -1,16 +1,16 @@
 """Fit the calibration of answers about objects.
 
-    coverage   the default coverage and the weight of the partial posterior, chosen by the rank of
-               hidden classes
-    missing    p(present | not listed), fitted to scenes that show 25 %, 50 %, 75 % or all but one
-               of their classes. The weight of a source is the sum of its scene weights, so
-               near-duplicates count less
-    outlier    p(intruder) and its thresholds; half of the scenes have no intruder
-    evidence   the weight of relations and poses in answers about objects
+    coverage   Assumed share of the objects that a scene lists, and the weight of the posterior for
+               partly listed scenes. Both are chosen by the rank of hidden classes.
+    missing    Probability that an unlisted class is present, fitted to scenes that show 25 %, 50 %,
+               75 % or all but one of their classes. Near-duplicate scenes have a lower weight.
+    outlier    Probability that a class is an intruder (an object that does not belong in the
+               scene), with thresholds. Half of the scenes contain an intruder.
+    evidence   Weight of relations and poses in answers about objects.
 
-The prior of an intruder is proportional to popularity^alpha. Alpha and the logistic regression are
-fitted to three kinds of intruders, equally weighted: drawn uniformly, drawn by popularity, and
-typical of another room type.
+The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
+logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
+uniformly, by the frequency of classes, or from the typical classes of another room type.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
@@ -49,49 +49,52 @@ Floats = NDArray[np.float64]
 
 COVERAGES = (0.3, 0.4, 0.5, 0.6, 0.7)
 WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
-# At alpha .5 the share of uniform intruders that is detected in sunrgbd falls from .47 to .35.
+# Tested exponents alpha. With 0.5, the detected share of uniformly drawn intruders in sunrgbd falls
+# from .47 to .35.
 ALPHAS = (0.0, 0.125, 0.25, 0.375)
 PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
 ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
-"""Shares of untouched scenes of the hardest large source that raise an alarm."""
+"""Shares of unaltered scenes with an alarm, on the large data source with the most alarms."""
 
-# Lists of up to `_SHORT_LISTS` classes have their own thresholds if there are enough scenes.
+# Scenes with up to `_SHORT_LISTS` listed classes have separate thresholds if there are enough
+# scenes.
 _SHORT_LISTS = 4
 _SHORT_LIST_SCENES = 30
 _NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 # Number of scenes used from each source.
 _PARTIAL_SCENES = 120
-# Number of draws of the hidden class, for scenes that show all but one class.
+# Number of times that the hidden class is drawn, for scenes that show all but one class.
 _DRAWS_OF_ONE = 4
-# Quantiles of real rooms. A generated scene is too small if its size is below quantile `_SMALL`. It
-# does not suit its room type if its `room_fit` is below quantile `_UNSUITED`. A room type needs
-# `_ROOM_SCENES` scenes for its own limits.
+# Quantiles over real rooms of a room type. A generated scene is too small if its number of classes
+# is below quantile `_SMALL`. A generated scene does not suit its room type if its `room_fit` is
+# below quantile `_UNSUITED`. A room type needs `_ROOM_SCENES` scenes for separate limits.
 _SMALL = 0.1
 _UNSUITED = 0.15
 _ROOM_SCENES = 20
 _EVIDENCE_SCENES = 400
-# Number of scenes for a machine without a closed form: it samples its answers, which takes a
-# hundred times longer.
+# Number of scenes for a machine whose log-odds have no closed form. Sampling the log-odds takes a
+# hundred times longer than a closed form.
 _EVIDENCE_SCENES_OF_DRAWS = 100
-# Accepted losses: of hit@1 and of the detected share for uniform intruders, and of MRR for nearly
-# complete lists.
+# Maximum accepted losses. `_UNIFORM_LOSS`: hit@1 and detected share of uniformly drawn intruders.
+# `_COMPLETE_LOSS`: mean reciprocal rank (MRR) of hidden classes in nearly complete lists.
 _UNIFORM_LOSS = np.array([0.04, 0.06])
 _COMPLETE_LOSS = 0.002
 _NEARLY_COMPLETE = ("75 %", "all but one")
-# Weights whose MRR is within this distance of the best count as equal; the least of them is used.
+# Weights whose MRR differs from the best MRR by at most this value count as equal. The smallest of
+# these weights is used.
 _AS_GOOD = 0.006
-# An answer lists ten classes by default, so the fit uses the ten best classes.
+# Number of classes in the fit of each scene. An answer of the service lists ten by default.
 _LISTED = 10
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
-    """Return scenes with complete object lists, or all scenes if no list is complete.
+    """Return the scenes with complete object lists, or all scenes if no list is complete.
 
-    Near-duplicates are sampled by their weight.
+    A near-duplicate scene is kept with a probability equal to its weight.
     """
     rng = np.random.default_rng(seed)
     complete = scenes.complete.numpy()
-    # A model trained on photographs only has no complete scenes. Its calibration uses all scenes.
+    # Photographs have no complete object lists. If all scenes are photographs, use all of them.
     complete = complete if complete.any() else ~complete
     kept = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
     return subset(scenes, torch.from_numpy(np.flatnonzero(kept)))
@@ -105,14 +108,16 @@ def calibrate_objects(
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> Calibration:
-    """Return the artifact's calibration with every entry about objects fitted.
+    """Return the model's calibration with newly fitted entries about objects.
 
     Args:
+        artifact: the model.
         validation: scenes that were not used in training.
-        train: scenes that give the popularity of classes and the signatures of room types.
-        structure: (V,) bool, true for structure classes.
-        chosen: a calibration with values chosen on other validation scenes: coverage and its
-            weight, weights of evidence, alpha. Without it, these values are chosen here.
+        train: training scenes. They give the frequency of each class, and limits for room types.
+        structure: True for structure classes such as walls, (classes,) bool.
+        seed: seed of the random choices.
+        chosen: a calibration that was fitted on other validation scenes. Its coverage, coverage
+            weight, weights of evidence and alpha are copied. None chooses new values.
     """
     scenes = complete_scenes(validation, seed)
     if not len(scenes):
@@ -135,12 +140,15 @@ def calibrate_objects(
 
 
 def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
-    """Return the artifact with some entries of its calibration replaced."""
+    """Return a copy of the model in which some entries of the calibration are replaced."""
     return replace(artifact, calibration=artifact.calibration.model_copy(update=entries))
 
 
 def popularity(train: SceneTensors) -> Floats:
-    """Return the log-odds (V,) of each class in a complete training scene, smoothed by 1/2."""
+    """Return the log-odds that a complete training scene contains each class, (classes,).
+
+    The count of scenes is smoothed by 1/2.
+    """
     weight = train.weight * (train.complete if bool(train.complete.any()) else 1.0)
     count = (train.v * weight.unsqueeze(1)).sum(0).double().numpy()
     total = float(weight.sum())
@@ -149,9 +157,10 @@ def popularity(train: SceneTensors) -> Floats:
 
 
 def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
-    """Return the 10 % quantile of the class counts of each room type and of all scenes, (C + 1,).
+    """Return the 10 % quantile of the number of classes in a scene, for each room type.
 
-    For a room type with fewer than 20 scenes, the quantile over all scenes is used.
+    The last value is the quantile over all scenes. It also replaces the quantile of a room type
+    with fewer than 20 scenes.
     """
     sizes = ((train.v > 0) & ~structure).sum(1).numpy()
     every = int(np.quantile(sizes, _SMALL))
@@ -161,7 +170,10 @@ def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple
 
 
 def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
-    """Return the 15 % quantile of `room_fit` of each room type, (C,); -1e9 for under 20 scenes."""
+    """Return the 15 % quantile of `room_fit` for each room type, (room types,).
+
+    The value is -1e9 for a room type with fewer than 20 scenes.
+    """
     found = []
     for t in range(artifact.spec.C):
         own = train.v[train.room == t].numpy()
@@ -177,16 +189,17 @@ def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """A scene that shows some of its classes and hides the others.
+    """A scene that lists only some of its classes. The remaining classes are hidden.
 
     Attributes:
-        closed: (n,) log-odds of the unlisted classes in closed form.
-        partial: log-odds (n,) of the unlisted classes in the partial posterior, by coverage.
-        hidden: (n,) bool, True where an unlisted class is in the scene but hidden.
+        closed: log-odds of the unlisted classes if the list were complete, (unlisted classes,).
+        partial: maps an assumed coverage to the log-odds of the unlisted classes, (unlisted
+            classes,). The log-odds allow for an incomplete list.
+        hidden: True for unlisted classes that are in the scene, (unlisted classes,) bool.
         listed: number of listed classes.
-        share: share of shown classes as text, such as "75 %".
-        source: index of the scene's source.
-        weight: weight of the scene: the number of scenes for which it stands.
+        share: share of listed classes as text, such as "75 %".
+        source: index of the data source of the scene.
+        weight: number of scenes of the data source that this sampled scene represents.
     """
 
     closed: Floats
@@ -205,7 +218,7 @@ def fit_coverage(
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
-    """Fit `coverage`, `coverage_weight` and `missing`."""
+    """Fit the entries `coverage`, `coverage_weight` and `missing` of the calibration."""
     cases = list(_shown(artifact, scenes, structure, seed))
     if not cases:
         return {}
@@ -226,9 +239,9 @@ def fit_coverage(
 
 
 def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
-    """Return the coverage and weight with the best MRR.
+    """Return the coverage and the coverage weight with the best MRR of hidden classes.
 
-    Their MRR on nearly complete lists may be at most `_COMPLETE_LOSS` below the best one.
+    On nearly complete lists, their MRR must be at most `_COMPLETE_LOSS` below the MRR of weight 0.
     """
     nearly = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
     least = [_mrr(some, 0.5, 0.0) - _COMPLETE_LOSS for some in nearly]
@@ -256,7 +269,7 @@ def _shown(
     some, weight = subset(scenes, order[chosen]), stands_for[chosen].tolist()
     source_of = source[chosen].tolist()
     whole = recalibrated(artifact, coverage_weight=1.0)
-    # With a single draw of the one hidden class, the choice would depend too much on chance.
+    # If only one class is hidden, several hidden classes are tried to reduce the effect of chance.
     draws = [
         (name, share, seed + draw)
         for name, share in SHARES.items()
@@ -293,7 +306,7 @@ def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
 
 
 def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
-    """Return the mean of 1 / rank of hidden classes; all sources have the same weight."""
+    """Return the mean reciprocal rank of hidden classes. All data sources have the same weight."""
     found: dict[int, list[Floats]] = {}
     for case in cases:
         z = _mixed(case, coverage, weight)
@@ -304,7 +317,10 @@ def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
 
 
 def _rows(case: _Shown, coverage: float, weight: float) -> Floats:
-    """Return rows (n, 3) of the best classes: log-odds, log of the list's length, 1 if hidden."""
+    """Return the data for the fit, one row for each of the best classes, (classes, 3).
+
+    The columns are the log-odds, the log of the number of listed classes, and 1 for a hidden class.
+    """
     z = _mixed(case, coverage, weight)
     first = np.argsort(-z, kind="stable")[:_LISTED]
     size = np.full(len(first), np.log(case.listed))
@@ -324,11 +340,10 @@ def fit_outliers(
 ) -> dict[str, Any]:
     """Fit `popularity_weight`, `outlier`, `outlier_thresholds` and `short_list_thresholds`.
 
-    At the start of a tour, a robot lists few classes. The probability is fitted to whole scenes and
-    is too high for short lists. For example, a stove alone is rare in a procedural room. Short
-    lists therefore have their own thresholds, fitted by the same rule to parts of the same scenes.
-    A threshold for short lists is at least the threshold for whole scenes. It is at most the
-    threshold for shorter lists.
+    A robot that starts to explore a room lists few classes. The probability of an intruder is
+    fitted to whole scenes and is too high for short lists. For example, a stove without other
+    objects is rare in a generated room. Short lists therefore have separate thresholds, fitted by
+    the same rule to parts of the same scenes. The threshold never falls when the list gets shorter.
     """
     score = MachineScore(machine_of(artifact.weights))
     prior = np.array(artifact.calibration.popularity)
@@ -379,10 +394,10 @@ def fit_outliers(
 def listing(
     scenes: SceneTensors, structure: Tensor, listed: int, rng: np.random.Generator
 ) -> tuple[SceneTensors, Tensor]:
-    """Return the scenes with more than `listed` classes, and their shortened lists (N, V).
+    """Return the scenes with more than `listed` classes, and shortened object lists.
 
-    A shortened list contains `listed` classes of the scene, drawn at random. It also contains the
-    structure classes of the scene, which are not counted.
+    A shortened list contains `listed` random classes and all structure classes of the scene. The
+    lists have the shape (scenes, classes).
     """
     plain = (scenes.v > 0) & ~structure
     large = (plain.sum(1) > listed).nonzero().squeeze(1)
@@ -415,8 +430,8 @@ def _between(low: Thresholds, found: Thresholds, high: Thresholds) -> Thresholds
 def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
     """Return the alpha with the best mean of hit@1 and detected share over all intruder kinds.
 
-    Uniform intruders may lose at most .04 of hit@1 and .06 of the detected share compared with
-    alpha 0.
+    For uniformly drawn intruders, hit@1 may be at most .04 lower than with alpha 0, and the
+    detected share at most .06 lower.
     """
     found = {
         alpha: {name: _found(scores.with_prior(alpha * prior)) for name, scores in kinds.items()}
@@ -428,7 +443,10 @@ def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
 
 
 def _found(scores: IntruderScores) -> Floats:
-    """Return hit@1 and the detected share when 10 % of the untouched scenes raise an alarm."""
+    """Return hit@1 and the detected share of intruders.
+
+    The threshold of detection gives an alarm in 10 % of the unaltered scenes.
+    """
     worst = np.full(scores.scenes, np.inf)
     np.minimum.at(worst, scores.scene[scores.clean], scores.log_odds[scores.clean])
     limit = np.quantile(worst[np.isfinite(worst)], ALARMS["medium"])
@@ -442,7 +460,10 @@ def _found(scores: IntruderScores) -> Floats:
 def fit_evidence(
     artifact: Artifact, validation: SceneTensors, structure: Tensor, seed: int = 0
 ) -> EvidenceWeights:
-    """Choose the weights of relations and poses in answers about objects, by MRR."""
+    """Choose the weights of relations and poses in answers about objects.
+
+    The criterion is the mean reciprocal rank (MRR) of removed objects.
+    """
     plain = structure.numpy()
     found = artifact.calibration.evidence
     scenes = complete_scenes(validation, seed)
@@ -467,7 +488,7 @@ def fit_evidence(
 
 
 def least_of_the_best(scores: dict[float, float]) -> float:
-    """Return the least weight whose score is within `_AS_GOOD` of the best score."""
+    """Return the smallest weight whose score is at most `_AS_GOOD` below the best score."""
     enough = max(scores.values()) - _AS_GOOD
     return min(pull for pull, score in scores.items() if score >= enough)
 

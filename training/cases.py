@@ -1,8 +1,7 @@
 """Turn scenes into test questions: choose the parts of a scene to state, hide or alter.
 
-The random choices for a scene depend only on the seed and the scene's name. They do not depend on
-the model, the other scenes or the batches. So every model gets the same questions, whether the
-evaluation uses one source or all sources.
+The random choices for a scene depend only on the seed and the id of the scene. Every model
+therefore gets the same questions, whether the evaluation uses one data source or all sources.
 """
 
 from __future__ import annotations
@@ -27,12 +26,15 @@ _VERTICAL = [CANONICAL.index("on-top"), CANONICAL.index("above")]
 
 
 def scene_rng(scene: EncodedScene, seed: int) -> np.random.Generator:
-    """Return the random generator of one scene."""
+    """Return the random generator of one scene, from the seed and the id of the scene."""
     return np.random.default_rng([seed, crc32(scene.scene_id.encode())])
 
 
 def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> SceneTensors:
-    """Return at most `limit` random scenes in their original order, the same for every model."""
+    """Return at most `limit` random scenes in their original order.
+
+    The choice depends only on the seed and on the names of the scenes and their sources.
+    """
     if limit is None or len(scenes) <= limit:
         return scenes
     place = [crc32(f"{seed} {scene.source} {scene.scene_id}".encode()) for scene in scenes.scenes]
@@ -40,7 +42,7 @@ def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> Scene
 
 
 def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Triple]) -> Scene:
-    """Return the instances at the indices `kept` as a scene, in the form of a request."""
+    """Return a scene, in the form of a request, with the object instances at the indices `kept`."""
     objects = tuple(
         SceneObject(id=str(k), label=str(c), class_index=int(c))
         for k, c in enumerate(encoded.instance_classes[list(kept)])
@@ -50,11 +52,12 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
 
 
 def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
-    """Return (A, N, N) bool: True for relations with known truth, without selection bias.
+    """Return a mask of the relations whose truth is known without selection bias.
 
-    Some sources list left and front occasionally and never state that they do not hold. Such
-    sources do not show how often these relations hold. For such sources, the mask contains only
-    pairs with one object on or above the other. On these pairs, an unlisted left or front is false.
+    The mask has the shape (relations, instances, instances). Some data sources list `left` and
+    `front` only occasionally and never as false. Such sources do not show how often these two
+    relations hold. The mask then contains only pairs with one object on or above the other. For
+    these pairs, an unlisted `left` or `front` is false.
     """
     unlisted = meaning_of(encoded.source).unlisted
     known, holds = encoded.instance_observed.copy(), encoded.instance_holds
@@ -62,7 +65,7 @@ def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
     stacked |= stacked.T
     for a in range(min(len(known), len(unlisted))):
         off = known[a] & ~holds[a]
-        # Without poses, "neighbours" are the pairs that an annotator chose to relate.
+        # Without poses, the "neighbours" are the pairs of objects that an annotator selected.
         chosen = unlisted[a] == "off for neighbours" and encoded.instance_positions is None
         if chosen or (unlisted[a] == "unobserved" and not (off & ~stacked).any()):
             known[a] &= stacked & off.any()
@@ -72,10 +75,10 @@ def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
 def taken_away(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[int, list[int]] | None:
-    """Draw a class to remove; return the class and the indices of all other instances.
+    """Draw a class to remove. Return its index and the indices of the remaining instances.
 
-    Structure classes stay in the scene. The result is None for a scene with fewer than two classes
-    to draw from.
+    Structure classes such as walls stay in the scene. The result is None if the scene has fewer
+    than two other classes.
     """
     classes = encoded.evidence.classes
     removable = classes[~structure[classes]]
@@ -88,13 +91,14 @@ def taken_away(
 def told_pairs(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], list[Triple]]:
-    """Draw half of the pairs of a scene as observed.
+    """Draw half of the object pairs of a scene as observed pairs.
 
-    The draw ignores the relations of the pairs. If half of the relations were drawn instead, pairs
+    The draw ignores whether a pair has relations. If relations were drawn instead of pairs, pairs
     without an observed relation would have fewer relations than other pairs.
 
     Returns:
-        (N, N) bool, True for the unobserved pairs; and the observed triples.
+        A mask of the unobserved pairs, (instances, instances) bool, and the observed triples
+        (relation, subject, object).
     """
     size = len(encoded.instance_classes)
     half = np.triu(rng.random((size, size)) < 0.5, 1)
@@ -110,17 +114,17 @@ def occupied_place(
     shown: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> tuple[int, int] | None:
-    """Draw an occupied place beside a shown object.
+    """Draw a place that is related to a shown object and contains another object.
 
-    The draw ignores whether the object at the place is shown. If only places of hidden objects were
-    drawn, every place would seem more likely to have a missing object.
+    The draw ignores whether the object at the place is shown or hidden. If only places of hidden
+    objects were drawn, a missing object would seem more likely at every place.
 
     Args:
-        shown: (n,) instances.
+        shown: True for shown objects, (instances,) bool.
 
     Returns:
         The canonical relation of the place, and the index of the shown object, which is the object
-        of the relation. None if the scene has no such place.
+        of the relation. None means that the scene has no such place.
     """
     usable = ~structure[encoded.instance_classes]
     stands = encoded.instance_holds & known_relations(encoded) & usable[:, None] & (usable & shown)
@@ -134,10 +138,10 @@ def occupied_place(
 def altered_case(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[Scene, tuple[int, int, int] | None] | None:
-    """Return a scene with its triples, and the altered triple.
+    """Return a scene with observed relations, of which one may be false, and the false relation.
 
-    In half of the cases, a false triple replaces one of the triples. In the other half, all triples
-    are true and the altered triple is None.
+    Half of the scenes have a false triple (relation, subject, object) in place of a true triple. In
+    the other half, all triples are true, and the false triple is None.
     """
     usable = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds & usable[:, None] & usable[None, :]
@@ -169,6 +173,12 @@ def logistic(
     truth: NDArray[np.bool_],
     weight: NDArray[np.float64] | None = None,
 ) -> list[float]:
-    """Return coefficients and intercept of an (almost) unpenalised logistic regression."""
+    """Return the coefficients and then the intercept of a nearly unpenalised logistic regression.
+
+    Args:
+        features: features of each example, (examples, features).
+        truth: truth value of each example, (examples,).
+        weight: weight of each example, (examples,). None means equal weights.
+    """
     fit = LogisticRegression(C=1e6, max_iter=1000).fit(features, truth, weight)
     return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]

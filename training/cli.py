@@ -1,6 +1,7 @@
-"""The command line: init, train, compare, publish, tune, evaluate, list.
+"""The command line of training, with commands such as init, train, compare, publish and evaluate.
 
-Ctrl-C during training keeps a checkpoint of the last finished epoch. The same command then resumes.
+If Ctrl-C stops a training run, the checkpoint of the last finished epoch remains on disk. The same
+command then continues the run.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from app.registry import Artifact, RegistryError, Store, load_model_set
+from app.registry.location import open_for_publisher
 from app.registry.references import AliasTarget
 from training.batches import subset
 from training.config import (
@@ -29,6 +31,7 @@ from training.config import (
     with_settings,
 )
 from training.datasets import DatasetError
+from training.distributed import is_first, process_group
 from training.domain.command import example, fail, init
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
@@ -56,16 +59,16 @@ Data = Annotated[
     Path | None,
     typer.Option(
         "--data",
-        help="folder with the scene files; default: the configuration's own folder, or "
-        f"{DATA} for shipped configurations",
+        help="folder with the scene files; default: the folder of your configuration file, or "
+        f"{DATA} for a shipped configuration",
     ),
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
-StorePath = Annotated[Path, typer.Option("--store", help="the model store")]
+StorePath = Annotated[str, typer.Option("--store", help="the model store: a folder or a URL")]
 Alias = Annotated[
-    str | None, typer.Option("--alias", help="afterwards, point this alias at the version")
+    str | None, typer.Option("--alias", help="point this alias at the published version")
 ]
-_RUNS, _STORE = Path("runs"), Path("model_store")
+_RUNS, _STORE = Path("runs"), "model_store"
 
 
 @app.command()
@@ -79,32 +82,35 @@ def train(
         bool,
         typer.Option(
             "--final",
-            help="train on 90 % of all scenes and calibrate on the rest; --publish then copies "
-            "the test results of the run without --final, which must be finished",
+            help="train on 90 % of all scenes, test scenes included, and calibrate on 10 %; "
+            "--publish then copies the test results of the finished run without --final",
         ),
     ] = False,
     tensorboard: Annotated[
-        Path | None, typer.Option("--tensorboard", help="also write the curves to this folder")
+        Path | None, typer.Option("--tensorboard", help="write TensorBoard logs to this folder")
     ] = None,
     publish: Annotated[str | None, typer.Option(help="publish the run as this version")] = None,
     alias: Alias = None,
     store: StorePath = _STORE,
 ) -> None:
-    """Train a configuration; with --publish also calibrate, evaluate and publish it."""
+    """Train a configuration. With --publish, also calibrate, evaluate and publish the model."""
     try:
-        config = load_config(configuration, seed=seed)
-        root = data_folder(configuration, config, data)
-        scenes = _prepare(config, root)
-        folder = runs / config.name / f"seed-{config.training.seed}"
-        measured = None
-        if final:
-            if publish is not None:
-                measured = load_run(folder), scenes
-            config = with_settings(config, {"data.split": "final"})
+        with process_group():
+            first = is_first()
+            console.quiet = not first
+            config = load_config(configuration, seed=seed)
+            root = data_folder(configuration, config, data)
             scenes = _prepare(config, root)
-            folder = folder.with_name(f"final-{folder.name}")
-        _train(config, scenes, folder, root, fresh, tensorboard)
-        if publish is not None:
+            folder = runs / config.name / f"seed-{config.training.seed}"
+            measured = None
+            if final:
+                if publish is not None:
+                    measured = load_run(folder), scenes
+                config = with_settings(config, {"data.split": "final"})
+                scenes = _prepare(config, root)
+                folder = folder.with_name(f"final-{folder.name}")
+            _train(config, scenes, folder, root, fresh, tensorboard)
+        if publish is not None and first:
             _publish(load_run(folder), scenes, store, publish, alias, measured)
     except (
         *(ConfigError, DatasetError, RegistryError, RunError),
@@ -115,8 +121,8 @@ def train(
 
 @app.command()
 def publish(
-    folder: Annotated[Path, typer.Argument(help="a finished run")],
-    version: Annotated[str, typer.Argument(help="for example 1.0.0")],
+    folder: Annotated[Path, typer.Argument(help="folder of a finished training run")],
+    version: Annotated[str, typer.Argument(help="number of the new version, such as 1.0.0")],
     data: Data = None,
     store: StorePath = _STORE,
     alias: Alias = None,
@@ -124,12 +130,12 @@ def publish(
         bool,
         typer.Option(
             "--promote",
-            help="point `default` (or --alias) at the version, unless it is worse than the served "
-            "version",
+            help="point the alias `default` (or --alias) at the new version, unless the new "
+            "version is worse than the served version",
         ),
     ] = False,
     margin: Annotated[
-        float, typer.Option(min=0, help="with --promote: largest accepted loss of a metric")
+        float, typer.Option(min=0, help="with --promote: maximum accepted loss of a metric")
     ] = MARGIN,
     even_if_worse: Annotated[
         bool, typer.Option("--even-if-worse", "--force", help="promote even a worse version")
@@ -140,10 +146,11 @@ def publish(
 ) -> None:
     """Calibrate, evaluate and publish a finished run.
 
-    With --promote, the run is first compared with the version that the alias serves. The comparison
-    uses test scenes that neither version was trained on. The run is refused if a primary metric is
-    worse by more than the margin (the whole 95 % interval of the paired difference). The run is
-    also refused if only the served version has results for relations. A refused run is not
+    With --promote, the command first compares the new version with the version that the alias
+    serves. The comparison uses test scenes that neither version was trained on. The command refuses
+    the new version if a primary metric is worse by more than the margin. The loss counts as worse
+    if the whole 95 % interval of the paired difference exceeds the margin. The command also refuses
+    the new version if only the served version has results for relations. A refused version is not
     published, and the exit code is 3.
     """
     try:
@@ -152,7 +159,7 @@ def publish(
         scenes = _prepare(run.config, root)
         if promote:
             gate = _Gate(alias or "default", margin, limit, even_if_worse)
-            _promote(run, scenes, root, Store(store), version, gate)
+            _promote(run, scenes, root, open_for_publisher(store), version, gate)
         else:
             _publish(run, scenes, store, version, alias)
     except WorseError as error:
@@ -166,36 +173,38 @@ def publish(
 
 @app.command(name="evaluate")
 def evaluate_command(
-    models: Annotated[list[str], typer.Argument(help="aliases, names or name@version")],
+    models: Annotated[list[str], typer.Argument(help="model: an alias, name or name@version")],
     data: Data = None,
     store: StorePath = _STORE,
-    source: Annotated[list[str] | None, typer.Option(help="only these sources")] = None,
-    part: Annotated[str, typer.Option(help="train, validation or test")] = "test",
-    output: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    source: Annotated[list[str] | None, typer.Option(help="use only these data sources")] = None,
+    part: Annotated[str, typer.Option(help="scenes: train, validation or test")] = "test",
+    output: Annotated[Path | None, typer.Option("--json", help="write figures to a file")] = None,
 ) -> None:
-    """Evaluate stored models on the split of their training, as for the model card.
+    """Evaluate stored models on scenes of the same split as in training.
 
-    The command `benchmark` evaluates the baselines.
+    The figures are those of the model card. The command `benchmark` evaluates the baselines.
     """
     try:
         tables: dict[str, list[Row]] = {}
         for reference in models:
-            artifact = Store(store).load(*Store(store).resolve(reference))
+            found = open_for_publisher(store)
+            artifact = found.load(*found.resolve(reference))
             config = Config.model_validate(artifact.manifest.training["config"])
             wanted = source or [source_name(name) for name in config.data.sources]
             with console.status("reading scenes"):
-                # All sources take part in the split, so that the parts equal those of training.
+                # The split must include all data sources, as in training. Otherwise the test part
+                # could contain training scenes.
                 scenes = split_and_encode(
                     config.data, read_sources(config.data, data or DATA), artifact.vocabulary
                 )
             tensors = scenes.training_data()
             some = {"train": tensors.train, "validation": tensors.validation, "test": tensors.test}
             if part not in some:
-                raise ConfigError(f"part must be one of {', '.join(some)}, not {part!r}")
+                raise ConfigError(f"--part is {part!r}; it must be one of {', '.join(some)}")
             index = [k for k, scene in enumerate(some[part].scenes) if scene.source in wanted]
             if not index:
                 raise ConfigError(
-                    f"{reference}: the {part} part contains no scenes of {', '.join(wanted)}"
+                    f"{reference}: the {part} part has no scenes of the sources {', '.join(wanted)}"
                 )
             test = subset(some[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:
@@ -217,9 +226,9 @@ def evaluate_command(
 
 @app.command(name="list")
 def list_command(store: StorePath = _STORE) -> None:
-    """List the models of the store and the shipped configurations."""
+    """List the models in the store and the shipped configurations."""
     try:
-        models = load_model_set(Store(store))
+        models = load_model_set(open_for_publisher(store))
     except RegistryError as error:
         fail(error)
     table = Table("model", "version", "variant", "state", title="Published")
@@ -249,7 +258,7 @@ def _train(
     fresh: bool,
     tensorboard: Path | None,
 ) -> None:
-    if fresh:
+    if fresh and is_first():
         for name in ("checkpoint.pt", "result.json"):
             (folder / name).unlink(missing_ok=True)
     trainer = Trainer(config, scenes.training_data(), folder)
@@ -257,13 +266,15 @@ def _train(
         console.print(f"resuming after epoch {len(trainer.epochs)}")
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
     try:
-        with Display(trainer, console, tensorboard) as display:
+        with Display(trainer, console, tensorboard if is_first() else None) as display:
             result = trainer.run(display.progress, display.ended, display.objects)
     except KeyboardInterrupt:
-        # Reload the checkpoint: the last epoch may be finished and not saved.
+        # Count the epochs in the checkpoint, because the last epoch may be finished but not saved.
         kept = len(trainer.epochs) if trainer.resume() else 0
-        console.print(f"stopped after epoch {kept}; the same command goes on from there")
+        console.print(f"stopped after epoch {kept}; run the same command to continue")
         raise typer.Exit(130) from None
+    if not is_first():
+        return
     save_run(folder, config, result, data=root, scenes=scenes.digest)
     summarise(result, trainer, folder, console)
 
@@ -271,14 +282,14 @@ def _train(
 def _publish(
     run: FinishedRun,
     scenes: SplitScenes,
-    store: Path,
+    store: str,
     version: str,
     alias: str | None,
     measured: tuple[FinishedRun, SplitScenes] | None = None,
 ) -> None:
     with console.status("publishing") as status:
         artifact = publish_run(
-            *(run, scenes, Store(store), version),
+            *(run, scenes, open_for_publisher(store), version),
             alias=alias,
             measured=measured,
             progress=status.update,
@@ -293,7 +304,7 @@ def _published(artifact: Artifact) -> None:
 
 @dataclass(frozen=True)
 class _Gate:
-    """Settings of the comparison before a promotion, see `publish`."""
+    """Settings of the comparison before a promotion. `publish` describes the comparison."""
 
     alias: str
     margin: float
@@ -304,7 +315,7 @@ class _Gate:
 def _promote(
     run: FinishedRun, scenes: SplitScenes, root: Path, store: Store, version: str, gate: _Gate
 ) -> None:
-    """Publish and promote the version, unless it is worse than the version the alias serves."""
+    """Publish the version and point the alias at it, unless the served version is better."""
     before = seat(store, gate.alias)
     found: list[Comparison] = []
     with console.status("publishing") as status:
@@ -328,7 +339,7 @@ def _promote(
             except ConfigError as error:
                 if not gate.even_if_worse:
                     raise
-                console.print(f"not compared: {error}", soft_wrap=True)
+                console.print(f"the versions were not compared: {error}", soft_wrap=True)
 
         artifact = publish_run(run, scenes, store, version, judge=judged, progress=status.update)
     for comparison in found:
@@ -336,7 +347,7 @@ def _promote(
     if before.note:
         console.print(before.note, soft_wrap=True)
     _published(artifact)
-    # This fails if another process changed the alias during the comparison.
+    # `expected` makes the change fail if another process changed the alias during the comparison.
     target = AliasTarget(name=artifact.manifest.name, version=version)
     store.set_alias(gate.alias, target, expected=before.target)
     was = f", before {before.target}" if before.target is not None else ""

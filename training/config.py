@@ -1,4 +1,4 @@
-"""The validated configuration of a training run; it is stored with the artifact."""
+"""The validated configuration of a training run. The model file contains the configuration."""
 
 from __future__ import annotations
 
@@ -15,21 +15,28 @@ from app.inference.variants import VARIANTS, Form, Variant
 from training.machines import MachineSpec, build
 
 DATA = Path("../shared/data")
-"""Default folder of the named sources."""
+"""Default folder of the shipped data sources."""
 
 
 class ConfigError(ValueError):
-    """A configuration is invalid; the message gives the entry and the reason."""
+    """A configuration is invalid. The message contains the invalid entry and the reason."""
 
 
 def is_file(source: str) -> bool:
-    """Return whether a source is a file rather than a name."""
+    """Return True if a data source is a file name, and False if it is the name of a source."""
     return "." in Path(source).name
 
 
 def source_name(source: str) -> str:
     """Return the name of a source; for a file, the part of its name before the first dot."""
+    if is_sharded(source):
+        return Path(source).name.partition("*")[0].strip("-_.") or Path(source).parent.name
     return Path(source).name.partition(".")[0] if is_file(source) else source
+
+
+def is_sharded(source: str) -> bool:
+    """Return whether a source is a pattern of many files, see `training.shards`."""
+    return "*" in source
 
 
 class _Section(BaseModel):
@@ -37,11 +44,11 @@ class _Section(BaseModel):
 
 
 class DataConfig(_Section):
-    """The scenes, their vocabulary and how the scenes are split.
+    """The data sources of a run, their vocabulary and the split of their scenes.
 
-    A source is a name or a file of any known format. The name `rooms` stands for the built-in
-    generator; any other name stands for the file `<name>.jsonl.gz` in the data folder. The data
-    folder of a configuration that names files is the configuration's own folder, see `data_folder`.
+    A data source is a name or a file in any known format. The name `rooms` means the built-in
+    generator of rooms. Any other name means the file `<name>.jsonl.gz` in the data folder
+    (`data_folder`).
     """
 
     sources: tuple[str, ...] = Field(min_length=1)
@@ -52,10 +59,17 @@ class DataConfig(_Section):
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
     limit: int | None = Field(default=None, ge=10, description="maximum scenes of each source")
+    # Left out of the dump by default, so that digests of earlier runs stay valid.
+    sample: int = Field(
+        default=1,
+        ge=1,
+        exclude_if=lambda count: count == 1,
+        description="number of files of a sharded source whose scenes stay in memory",
+    )
     words: str = Field(
         default="", description="file of word vectors in the data folder; empty: no vectors"
     )
-    # Left out of the dump when empty, so that digests of earlier runs stay valid.
+    # An empty value is left out of the dump, so that digests of earlier runs stay valid.
     terms: str = Field(
         default="", exclude_if=lambda words: not words, description="terms of use of own files"
     )
@@ -66,18 +80,20 @@ class DataConfig(_Section):
         names = [source_name(source) for source in self.sources]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two sources are called {', '.join(twice)}: rename a file")
+        if any(map(is_sharded, self.sources)) and (len(self.sources) > 1 or self.split != "stable"):
+            raise ValueError('a sharded source must be the only source, with data.split = "stable"')
         return self
 
     @property
     def files(self) -> bool:
-        """Whether the configuration names files rather than only shipped sources."""
+        """True if the configuration names a file as a data source or as the vocabulary."""
         return self.vocabulary.endswith(".json") or any(map(is_file, self.sources))
 
 
 class MachineConfig(_Section):
-    """The shape of the machine.
+    """The variant and the sizes of the machine.
 
-    The numbers of classes V, relations A, room types C and triples T follow from the data.
+    The data determine the numbers of classes V, relations A, room types C and triples T.
     """
 
     variant: Variant
@@ -90,14 +106,14 @@ class MachineConfig(_Section):
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
     initial_c1: float = 0.0
-    # Left out of the dump when empty, so that digests of earlier runs stay valid.
+    # An empty value is left out of the dump, so that digests of earlier runs stay valid.
     without: tuple[str, ...] = Field(
         default=(), exclude_if=lambda names: not names, description="names of weights held at zero"
     )
 
 
 class ObjectiveConfig(_Section):
-    """The objective to minimise, and its settings."""
+    """The training objective, and its settings."""
 
     name: Literal["contrastive_divergence", "persistent_cd", "composite", "relations"]
     k: int = Field(default=1, ge=1, description="Gibbs steps for each update (CD, PCD)")
@@ -129,7 +145,10 @@ class ObjectiveConfig(_Section):
 
 
 class ObjectsConfig(_Section):
-    """The first phase: it trains the object part by persistent chains (local form)."""
+    """The first training phase: objects only, by persistent Gibbs chains.
+
+    The phase needs a machine of the local form (`training.machines.machine`).
+    """
 
     epochs: int = Field(default=0, ge=0, description="passes over the scenes; 0 skips the phase")
     learning_rate: float = Field(default=0.2, gt=0, description="initial rate; falls to 0")
@@ -138,7 +157,10 @@ class ObjectsConfig(_Section):
 
 
 class PolishConfig(_Section):
-    """The last phase: it adjusts the object part by persistent chains (local form)."""
+    """The last training phase, which fine-tunes the weights of objects by persistent chains.
+
+    The phase needs a machine of the local form (`training.machines.machine`).
+    """
 
     updates: int = Field(default=0, ge=0)
     chains: int = Field(default=512, ge=1)
@@ -148,7 +170,7 @@ class PolishConfig(_Section):
 
 
 class TrainingConfig(_Section):
-    """Optimiser and stopping."""
+    """The optimiser, and the rules that end training."""
 
     optimiser: Literal["adamw", "sgd"] = "adamw"
     learning_rate: float = Field(default=0.01, gt=0)
@@ -162,6 +184,12 @@ class TrainingConfig(_Section):
     patience: int | None = Field(default=None, ge=1)
     seed: int = 0
     threads: int = Field(default=1, ge=1)
+    # Left out of the dump when auto, so that digests of earlier runs stay valid.
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        default="auto",
+        exclude_if=lambda device: device == "auto",
+        description="device of the epochs; auto: a GPU if there is one",
+    )
 
 
 class Config(_Section):
@@ -188,10 +216,14 @@ class Config(_Section):
                 )
         kind = VARIANTS[self.machine.variant]
         if self.machine.H2 and not kind.two_layers:
-            raise ValueError("an RBM has one hidden layer: machine.H2 must be 0")
+            raise ValueError(
+                "machine.H2 must be 0, because this machine.variant has one hidden layer"
+            )
         local = self.machine.form == "local"
         if self.machine.G and not (local and kind.implications):
-            raise ValueError("machine.G is defined for the local form of the Triway only")
+            raise ValueError(
+                "machine.G is defined for the local form of the Triway only: it must be 0"
+            )
         if self.machine.N and not local:
             raise ValueError("machine.N is defined for the local form only: it must be 0")
         if "rooms" in self.data.sources and not self.data.rooms:
@@ -212,31 +244,38 @@ class Config(_Section):
 
     @property
     def digest(self) -> str:
-        """The sha256 of the configuration. A checkpoint resumes only with the same sha256."""
+        """The sha256 of the configuration. A checkpoint needs a configuration of equal sha256."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 
 def shipped_configs() -> dict[str, Path]:
-    """Return the files of the configurations in this package, by name."""
+    """Return a mapping from the name of each shipped configuration to its file."""
     folder = Path(__file__).parent / "configs"
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def config_path(reference: str) -> Path:
-    """Return the configuration file for the name of a shipped configuration, a file or a folder."""
+    """Return the configuration file for a reference.
+
+    A reference is the name of a shipped configuration, a file, or a folder made by `init`.
+    """
     path = shipped_configs().get(reference, Path(reference))
     return path / f"{path.resolve().name}.toml" if path.is_dir() else path
 
 
 def data_folder(reference: str, config: Config, given: Path | None = None) -> Path:
-    """Return the given folder, else the folder of the configuration's own files, else `DATA`."""
+    """Return the data folder of a configuration.
+
+    The folder is `given` if it is set. If the configuration names files, the folder is that of the
+    configuration file. Otherwise the folder is `DATA`.
+    """
     if given is not None:
         return given
     return config_path(reference).parent if config.data.files else DATA
 
 
 def load_config(reference: str, *, seed: int | None = None) -> Config:
-    """Read a TOML file, a folder that `init` made, or a shipped configuration by its name.
+    """Read a configuration. `config_path` describes the possible references.
 
     Raises:
         ConfigError: the file is missing, is not TOML, or has an invalid entry.
@@ -244,7 +283,9 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     path = config_path(reference)
     if not path.is_file():
         known = ", ".join(shipped_configs())
-        raise ConfigError(f"no configuration {reference!r}: give a TOML file or one of {known}")
+        raise ConfigError(
+            f"there is no configuration {reference!r}: pass a TOML file or one of {known}"
+        )
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
         if seed is not None:
@@ -257,7 +298,10 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
 
 
 def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
-    """Return a configuration with changed entries; names are like "training.epochs".
+    """Return a configuration with changed entries.
+
+    Args:
+        settings: maps the full name of an entry, such as "training.epochs", to its new value.
 
     Raises:
         ConfigError: an entry does not exist, or a value is invalid.
@@ -268,12 +312,14 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
         known = getattr(type(getattr(config, section, None)), "model_fields", {})
         if entry not in known:
             choice = f"{section} has {', '.join(known)}" if known else "name it section.entry"
-            raise ConfigError(f"no setting {name!r}: {choice}")
+            raise ConfigError(f"there is no setting {name!r}: {choice}")
         values[section][entry] = value
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(f"invalid settings {dict(settings)}: {_first_error(error)}") from error
+        raise ConfigError(
+            f"the settings {dict(settings)} are invalid: {_first_error(error)}"
+        ) from error
 
 
 def config_toml(config: Config) -> str:
@@ -282,10 +328,11 @@ def config_toml(config: Config) -> str:
 
 
 def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None = None) -> str:
-    """Return entries and sections as TOML text, with a comment above an entry if a reason is given.
+    """Return entries and sections as TOML text.
 
     Args:
-        reasons: comments by "section.entry".
+        values: maps each entry to its value, and each section to a mapping of its entries.
+        reasons: maps "section.entry" to a comment for the line above the entry.
     """
     sections = {name: own for name, own in values.items() if isinstance(own, Mapping)}
     lines = [_entry(name, value) for name, value in values.items() if name not in sections]

@@ -1,4 +1,4 @@
-"""Displays of a training run: progress bar, final curve and TensorBoard."""
+"""Displays of a training run: progress bar, final curve and TensorBoard log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _LEVELS = "▁▂▃▄▅▆▇█"
 _WIDTH = 21
-# Curves of the summary: title, and attribute of `Epoch`.
+# Curves of the final summary. Each entry is the title and the attribute of `Epoch`.
 _CURVES = (
     ("objective", "loss"),
     ("missing objects, MRR", "mrr_validation"),
@@ -29,10 +29,12 @@ _CURVES = (
 
 
 class Display:
-    """A progress bar over the epochs with updates, objective, validation scores and remaining time.
+    """A progress bar with epoch, updates, loss, validation scores and remaining time.
 
     Args:
-        logs: folder for TensorBoard; None writes no log.
+        trainer: the trainer of the run.
+        console: console of the progress bar.
+        logs: folder of the TensorBoard log. None means no log.
     """
 
     def __init__(self, trainer: Trainer, console: Console, logs: Path | None = None) -> None:
@@ -67,7 +69,7 @@ class Display:
         self._bar.stop()
 
     def progress(self, epoch: int, done: float, loss: float) -> None:
-        """Show the progress after an update."""
+        """Show the progress after an update of the weights."""
         trainer = self._trainer
         total = trainer.config.training.epochs
         note = f"epoch {epoch + 1}/{total}, update {trainer.updates:,}, objective {loss:.3f}"
@@ -76,17 +78,17 @@ class Display:
         self._bar.update(self._task, completed=epoch + done, note=note)
 
     def objects(self, done: float) -> None:
-        """Show the progress of the object phase, before the first epoch."""
+        """Show the progress of the first training phase, which trains only objects."""
         self._bar.update(self._task, completed=0, note=f"objects, {done:.0%}")
 
     def ended(self, epoch: Epoch) -> None:
-        """Log a finished epoch."""
+        """Write a finished epoch to the TensorBoard log."""
         if self._log is not None:
             self._log(epoch, self._trainer.updates)
 
 
 def scores(epoch: Epoch) -> str:
-    """Return the available validation scores as text."""
+    """Return the validation scores of an epoch as text."""
     found = f"MRR {epoch.mrr_validation:.3f}"
     if not math.isnan(epoch.r_precision_validation):
         found += f", R-precision {epoch.r_precision_validation:.3f}"
@@ -94,8 +96,11 @@ def scores(epoch: Epoch) -> str:
 
 
 def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
-    """Return a TensorBoard logger of (epoch, number of updates)."""
-    # TensorBoard is imported only if used, because its import takes longer than a small run.
+    """Return a function that writes an epoch to a TensorBoard log.
+
+    The arguments of the function are the epoch and the number of updates so far.
+    """
+    # TensorBoard is imported only when needed, because the import takes longer than a small run.
     from torch.utils.tensorboard import SummaryWriter
 
     writer = SummaryWriter(str(folder / config.name / f"seed-{config.training.seed}"))
@@ -114,16 +119,16 @@ def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
         for name, attribute in names.items():
             if not math.isnan(value := getattr(epoch, attribute)):
                 writer.add_scalar(name, value, updates)
-        # Flush after each epoch, so that an interrupted run keeps its curve.
+        # Flush after each epoch, so that the log of an interrupted run is complete.
         writer.flush()
 
     return log
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Return the values as a line of block characters, scaled from lowest to highest.
+    """Return the values as a line of at most `width` block characters of different heights.
 
-    If there are more values than `width`, each block shows an average.
+    If there are more values than `width`, each block shows the mean of several values.
     """
     known = [value for value in values if math.isfinite(value)]
     if not known:
@@ -139,7 +144,7 @@ def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
 
 
 def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: Console) -> None:
-    """Print the curve, the best epoch, the duration and the next commands."""
+    """Print the validation curve, best epoch and duration of a run, and commands for next steps."""
     best = result.epochs[result.best_epoch]
     table = Table("curve", "", "first", "best epoch", "last", title_justify="left")
     table.title = f"{trainer.config.name}, seed {trainer.config.training.seed}"
@@ -167,7 +172,7 @@ def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: C
 
 
 def _advice(result: TrainingResult) -> str:
-    """Return advice on the settings, based on which epoch was the best."""
+    """Return advice on the settings that follows from the position of the best epoch."""
     total, best = len(result.epochs), result.best_epoch + 1
     if total >= 10 and best == total:
         return "the last epoch was the best: more epochs may help (training.epochs)"

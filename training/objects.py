@@ -1,21 +1,23 @@
-"""Train the object part of a machine by maximum likelihood with persistent chains.
+"""Train the object weights of a machine by maximum likelihood with persistent Gibbs chains.
 
-In the local form, the relations sum to one, so the gradient of log p(v) does not depend on them:
+In the local form of the energy (`training.machines.machine`), the sum over relations is 1. The
+gradient of log p(v) is therefore independent of relations:
 
     d log p(v) / dW = v' E[h1 | v] - E_model[v' h1]
 
-The gradients of b, c1, c2, J and Q have the same form. The first expectation is a mean field, which
-is exact with one layer. The second expectation uses Gibbs chains that continue between updates. The
-learning rate falls linearly to 0, so that the weights hardly change at the end and the chains can
-follow. The weights are averaged over the last part of the run.
+The gradients of b, c1, c2, J and Q have the same form. Mean field gives the first expectation; it
+is exact with one hidden layer. Gibbs chains give the second expectation. The chains continue from
+one update to the next. The learning rate falls linearly to 0, so the weights change slowly at the
+end, and the distribution of the chains stays close to the model. The weights are averaged over the
+last part of the run.
 
-The weights Q of room types are trained afterwards, with all other weights fixed. Q[t] follows the
-gradient of log p(v | t), with a few chains for each type. In joint training, these few chains could
-not follow the changing weights.
+The weights Q of room types are trained after all other weights, which then stay fixed. Q[t] follows
+the gradient of log p(v | t), with a few chains for each room type t. In joint training, these few
+chains would lag behind the changing weights.
 
-Scenes are drawn in proportion to their weight. Only scenes with a nearly complete object list are
-used. `fine_tune` is a shorter version for use after an objective that trains objects and relations
-together.
+Only scenes with a nearly complete object list are used. Scenes are drawn in proportion to their
+weight. `fine_tune` is a shorter version. It runs after an objective that trains objects and
+relations together.
 
 Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008);
 Salakhutdinov and Hinton, "Deep Boltzmann machines" (2009), for two layers.
@@ -38,21 +40,22 @@ from training.machines.gibbs import Clamp, State, initial_state, run
 from training.machines.mean_field import Evidence, mean_field
 
 OBJECT_WEIGHTS = ("b", "c1", "c2", "W", "J", "Q")
-# The weights are averaged over this last share of the run. Each new weight enters the average with
-# at least the factor `_FORGETTING`.
+# The weights are averaged over this last share of the run. The newest weights have at least the
+# share `_FORGETTING` in the moving average.
 _AVERAGED = 0.3
 _FORGETTING = 0.002
-# Training of the room types: number of chains and scenes of each type in an update, number of
-# updates, learning rate, and precision of the weights' prior (in scenes).
+# Training of the room-type weights Q: number of chains and scenes of each room type in an update,
+# number of updates, learning rate, and precision of the prior of Q, in units of scenes.
 _PER_ROOM = 12
 _ROOM_UPDATES = 1500
 _ROOM_RATE = 0.2
 _ROOM_PRIOR = 0.5
-# Sweeps between the last update and the stored samples.
+# Number of Gibbs sweeps between the last update and the storage of samples.
 _SWEEPS = 200
-# Updates between two calls of `progress`.
+# Number of updates between two calls of `progress`.
 _REPORTED = 100
-# Fine tuning: trained weights, decay of their average, and number of sweeps before storing samples.
+# Settings of `fine_tune`: names of the trained weights, decay of the moving average of the weights,
+# and number of Gibbs sweeps before the storage of samples.
 _FINE_TUNED = ("b", "c1", "c2", "W", "Q")
 _FINE_TUNED_AVERAGING = 0.98
 _FINE_TUNED_SWEEPS = 50
@@ -60,7 +63,11 @@ _FINE_TUNED_SWEEPS = 50
 
 @dataclass
 class _Chains:
-    """Persistent chains: presence (B, V), hidden units (B, H1) and (B, H2), room types (B,)."""
+    """Persistent Gibbs chains.
+
+    The fields are the presence of objects (chains, classes), the two layers of hidden units and the
+    index of the room type of each chain.
+    """
 
     v: Tensor
     h1: Tensor
@@ -75,15 +82,17 @@ def fit_objects(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> None:
-    """Train b, c1, c2, W, J and Q of a local machine in place.
+    """Train the object weights b, c1, c2, W, J and Q of a machine of the local form, in place.
 
     Args:
-        train: training scenes; scenes with incomplete object lists are left out.
-        config: epochs, learning rate, chains and batch size; 0 epochs skip the phase.
-        progress: called with the finished share of the updates.
+        train: training scenes. Scenes with incomplete object lists are left out.
+        config: epochs, learning rate, number of chains and batch size. With 0 epochs, the machine
+            stays unchanged.
+        seed: seed of the random choices.
+        progress: function that is called with the finished share of the updates, from 0 to 1.
 
     Raises:
-        FloatingPointError: the weights diverged.
+        FloatingPointError: a weight became infinite or NaN.
     """
     if not config.epochs:
         return
@@ -105,7 +114,7 @@ def fit_objects(
             if (update + 1) % _REPORTED == 0 or update + 1 == updates:
                 if not all(bool(weight.isfinite().all()) for weight in weights.values()):
                     raise FloatingPointError(
-                        "the weights of the objects diverged: lower objects.learning_rate"
+                        "the object weights diverged in training: lower objects.learning_rate"
                     )
                 progress((update + 1) / updates)
         for name, weight in weights.items():
@@ -118,7 +127,7 @@ def _withheld(v: Tensor, room: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _fit_rooms(machine: BoltzmannMachine, scenes: _Scenes, generator: torch.Generator) -> None:
-    """Train Q by log p(v | t), independently for every room type of the scenes."""
+    """Train Q by maximum likelihood of p(v | t), separately for each room type t."""
     known = scenes.room >= 0
     counts = torch.zeros(len(machine.Q)).index_add_(0, scenes.room[known], scenes.weight[known])
     rooms = counts.nonzero().squeeze(1)
@@ -148,10 +157,12 @@ def _fit_rooms(machine: BoltzmannMachine, scenes: _Scenes, generator: torch.Gene
 def store_samples(
     machine: BoltzmannMachine, train: SceneTensors, room_dropout: float, seed: int
 ) -> None:
-    """Store the final states of N long chains that start at scenes.
+    """Store samples in the machine: the final states of N long Gibbs chains.
 
-    Each sample keeps the room type of its scene. A share `room_dropout` of the chains runs without
-    a room type.
+    Each chain starts at a training scene, and its sample has the room type of that scene.
+
+    Args:
+        room_dropout: share of the chains that run without a room type.
     """
     if not machine.spec.N:
         return
@@ -167,19 +178,22 @@ def store_samples(
 
 
 class _Scenes:
-    """Complete scenes, drawn by weight; `size` is their total weight."""
+    """Scenes with complete object lists, drawn by weight. `size` is the sum of all weights."""
 
     def __init__(self, train: SceneTensors, generator: torch.Generator):
         kept = train.complete.nonzero().squeeze(1)
         if not len(kept):
-            raise ValueError("no training scene has a complete object list")
+            raise ValueError(
+                "no training scene has a complete object list; add such scenes, or set "
+                "objects.epochs to 0"
+            )
         self.v, self.room, self.weight = train.v[kept], train.room[kept], train.weight[kept]
         self.size = float(self.weight.sum())
         self._generator = generator
         self._order, self._place = torch.zeros(0, dtype=torch.int64), 0
 
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
-        """Return presence (B, V) and room types (B,) of the next scenes."""
+        """Return the objects, (scenes, classes), and room types, (scenes,), of the next scenes."""
         parts = []
         while count:
             if self._place == len(self._order):
@@ -191,7 +205,10 @@ class _Scenes:
         return self.v[index], self.room[index]
 
     def _shuffle(self) -> None:
-        """Start a pass in random order, in which the number of draws of a scene is its weight."""
+        """Start a pass over the scenes in random order.
+
+        The expected number of draws of a scene in one pass is its weight.
+        """
         times = self.weight.floor()
         extra = torch.rand(len(times), generator=self._generator) < self.weight - times
         index = torch.arange(len(times)).repeat_interleave(times.long() + extra)
@@ -222,7 +239,10 @@ def _update(
 
 
 def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generator) -> Tensor:
-    """Run the chains for one sweep; return the mean of h1 (B, H1) that the sweep sampled from."""
+    """Run the chains for one Gibbs sweep.
+
+    Return the probabilities from which the sweep sampled h1, (chains, hidden units).
+    """
     chains.v = bernoulli(machine.object_logits(chains.h1).sigmoid(), generator)
     if machine.spec.H2:
         h2 = machine.second_layer_logits(chains.h1).sigmoid()
@@ -236,7 +256,7 @@ def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generato
 
 
 def _add(weights: Mapping[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, rate: float) -> None:
-    """Add the gradient of -E, summed over rows, times the rate."""
+    """Add the gradient of -E to the weights, summed over scenes and multiplied by the rate."""
     weights["b"].add_(v.sum(0), alpha=rate)
     weights["c1"].add_(h1.sum(0), alpha=rate)
     weights["W"].addmm_(v.T, h1, alpha=rate)
@@ -252,17 +272,17 @@ def fine_tune(
     room_dropout: float,
     seed: int,
 ) -> None:
-    """Move the samples of a local machine towards the data and store N samples, in place.
+    """Fine-tune a machine of the local form until its samples match the data, in place.
 
-    Training by conditional likelihoods gives accurate conditionals and biased samples: scenes have
-    50 % too many objects. Persistent contrastive divergence with many chains, on b, c1, c2, W and
-    Q, removes the bias. The penalty anchor · sum (θ - θ_before)² keeps the conditionals accurate.
-    The stored samples come from chains run with the averaged weights, each with the room type of
-    its first scene.
+    After training by conditional likelihoods, conditionals are accurate but samples are biased:
+    sampled scenes contain 50 % too many objects. Persistent contrastive divergence with many chains
+    removes the bias. It changes only b, c1, c2, W and Q. The penalty anchor · sum (θ - θ_before)²
+    keeps the conditionals accurate. The function then stores N samples. They come from chains with
+    the averaged weights, and each sample has the room type of the scene where its chain started.
 
     Args:
-        config: number of updates and chains. With 0 updates and N = 0, the machine is unchanged.
-        room_dropout: share of chains and scenes with a hidden room type.
+        config: number of updates and chains. With 0 updates and N = 0, the machine stays unchanged.
+        room_dropout: share of chains and scenes without a room type.
     """
     if not config.updates and not machine.spec.N:
         return
@@ -311,7 +331,7 @@ def fine_tune(
 def _settled(
     machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
 ) -> State:
-    """Return chains that start at scenes, with hidden units sampled given the scenes."""
+    """Return chains that start at the scenes v, with hidden units sampled given v."""
     field = mean_field(machine, Evidence(v, room=room))
     return replace(
         initial_state(machine, v, generator, Clamp(room=room)),

@@ -1,15 +1,17 @@
-"""Fit the offsets between placed objects to scenes with poses.
+"""Fit the distribution of offsets (position differences) between related objects.
 
-Each canonical relation and each axis have their own model. In it, the offset of an object of class
-i from an object of class j is normal, with a mean m and a variance s for each pair of classes:
+The training data are scenes with poses. Each canonical relation and each axis have a separate
+model. The offset from an object of class j to an object of class i is normal, with a mean m and a
+variance s for each pair of classes:
 
     s ~ inverse-gamma(alpha, beta)    m given s ~ normal(mu + u_i + v_j, s / kappa)
     u_i and v_j given s ~ normal(0, s / (kappa lambda))
 
-mu, kappa, alpha and beta are shared by all pairs of classes. Training maximises the likelihood of
-all pairs over these parameters, in alternation with the class effects u and v. Given these values,
-the distribution of a pair's offset has a closed form. It depends mainly on the pair's own data if
-the pair is frequent, and on its classes and relation if the pair is rare.
+All pairs of classes share mu, kappa, alpha and beta. Training alternates between these parameters,
+by maximum likelihood over all pairs, and the class effects u and v. Given all these values, the
+distribution of the offset of a pair has a closed form. The distribution of a frequent pair depends
+mainly on the data of the pair. The distribution of a rare pair depends mainly on the two classes
+and the relation.
 `docs/decisions/offsets.md` describes the alternatives.
 """
 
@@ -31,27 +33,29 @@ from training.datasets import EncodedScene
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Shrinkage of a class effect, equivalent to `LAMBDA` additional pairs with effect 0.
+# Shrinkage of the class effects u and v. It acts like `LAMBDA` additional pairs with effect 0.
 LAMBDA: Final = 4.0
-# At alpha <= 1 the variance of an unseen pair is not finite.
+# Minimum of alpha. With alpha <= 1, the variance of an unseen pair of classes is not finite.
 _LEAST_ALPHA: Final = 1.5
-# Sources with fewer scenes do not lower the weights of larger sources.
+# Minimum number of scenes for which a data source can lower the weights of larger sources.
 _FEW: Final = 100
 _ROUNDS, _SWEEPS = 4, 10
-# Resolution of annotated box centres in metres. It keeps the variance of equal heights above 0.
+# Resolution of annotated box centres in metres. It keeps the variance above 0 if all heights are
+# equal.
 _RESOLUTION: Final = 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """N offsets between related objects.
+    """Observed offsets between related objects.
 
     Attributes:
-        offset: (N, 3) metres from the relation's object to its subject, in viewer axes.
-        relation: (N,) canonical relation.
-        subject, other: (N,) classes of the relation's subject and object.
-        scene: (N,) index of the scene.
-        source: (N,) index of the scene's source.
+        offset: position of the relation's subject minus position of its object, in metres and
+            viewer axes, (offsets, 3).
+        relation: index of the canonical relation, (offsets,).
+        subject, other: class indices of the relation's subject and object, (offsets,).
+        scene: index of the scene, (offsets,).
+        source: index of the data source of the scene, (offsets,).
     """
 
     offset: Floats
@@ -62,12 +66,12 @@ class Seen:
     source: Ints
 
     def some(self, some: NDArray[np.bool_]) -> Seen:
-        """Return the offsets where `some` (N,) is true."""
+        """Return the offsets where the mask `some`, (offsets,), is True."""
         return Seen(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
 
 
 def seen_offsets(scenes: Sequence[EncodedScene]) -> Seen:
-    """Return the offsets between all pairs of related objects, over all scenes with poses."""
+    """Return the offsets between all related objects in all scenes with poses."""
     sources = sorted({scene.source for scene in scenes})
     offsets, rows = [np.zeros((0, 3))], [np.zeros((0, 5), dtype=np.int64)]
     for place, scene in enumerate(scenes):
@@ -84,10 +88,14 @@ def seen_offsets(scenes: Sequence[EncodedScene]) -> Seen:
 
 
 def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
-    """Fit the offsets of V classes; return None if no scene has poses.
+    """Fit the distribution of offsets. Return None if no scene has poses.
 
-    All instances of a pair of classes in one scene have a total weight of 1, because they are
-    dependent. All sources have the same total weight, because boxes of one source are similar.
+    All offsets of a pair of classes in one scene have a total weight of 1, because they depend on
+    each other. All data sources have the same total weight, because boxes of one source are
+    similar.
+
+    Args:
+        V: number of classes.
     """
     seen = seen_offsets(scenes)
     if not len(seen.offset):
@@ -116,14 +124,15 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
 
 
 class Pairs(NamedTuple):
-    """P pairs of classes in one relation, with the moments of their offsets.
+    """Pairs of classes in one relation, with the moments of their offsets.
 
     Attributes:
-        subject, other: (P,) classes, ascending by subject, then by object.
-        scenes: (P,) number of scenes with the pair.
-        n: (P, 1) total weight of the pair.
-        mean: (P, 3) weighted mean of the offsets.
-        scatter: (P, 3) weighted sum of squares around the mean.
+        subject, other: class indices of the relation's subject and object, (pairs,). The pairs are
+            sorted by subject, then by object.
+        scenes: number of scenes with the pair, (pairs,).
+        n: total weight of the offsets of the pair, (pairs, 1).
+        mean: weighted mean of the offsets, (pairs, 3).
+        scatter: weighted sum of squared deviations from the mean, (pairs, 3).
     """
 
     subject: Ints
@@ -138,7 +147,7 @@ def _pairs(seen: Seen) -> Pairs:
     classes = np.stack([seen.subject, seen.other], axis=1)
     found, pair = np.unique(classes, axis=0, return_inverse=True)
     pair = pair.reshape(-1)
-    # Group the instances of the same pair of classes in one scene.
+    # Group the offsets by scene and pair of classes.
     _, first, group, size = np.unique(
         np.stack([pair, seen.scene]),
         axis=1,
@@ -157,14 +166,14 @@ def _pairs(seen: Seen) -> Pairs:
 
 
 def _sums(group: Ints, values: Floats, groups: int) -> Floats:
-    """Return the sums (G, k) of values (N, k) over each group."""
+    """Return the sum of the values, (rows, k), over each group of rows, (groups, k)."""
     found = np.zeros((groups, values.shape[1]))
     np.add.at(found, group, values)
     return found
 
 
 def _balance(seen: Seen) -> Floats:
-    """Return (N,) weights of the offsets; they balance large and small sources."""
+    """Return weights of the offsets, (offsets,), that balance large and small data sources."""
     count = np.array(
         [len(np.unique(seen.scene[seen.source == s])) for s in range(seen.source.max() + 1)]
     )
@@ -175,12 +184,12 @@ def _balance(seen: Seen) -> Floats:
 
 @dataclass(eq=False)
 class _Fit:
-    """Fitted parameters of one relation; the last axis is x, y and z.
+    """Fitted parameters of one relation. The last dimension of each array is x, y and z.
 
     Attributes:
-        kappa, alpha, beta, mu: (3,) parameters of the prior.
-        u, v: (V, 3) effects of the subject's and the object's class.
-        doubt_u, doubt_v: (V, 3) variances of u and v, in units of s / kappa.
+        kappa, alpha, beta, mu: parameters of the prior (see the module), one for each axis, (3,).
+        u, v: effects of the class of the relation's subject (u) and object (v), (classes, 3).
+        doubt_u, doubt_v: variances of u and v in units of s / kappa, (classes, 3).
     """
 
     kappa: Floats
@@ -193,11 +202,11 @@ class _Fit:
     doubt_v: Floats
 
     def expected(self, pairs: Pairs) -> Floats:
-        """Return the prior mean (P, 3) of the offset of each pair."""
+        """Return the prior mean of the offset of each pair, (pairs, 3)."""
         return self.mu + self.u[pairs.subject] + self.v[pairs.other]
 
     def predict(self, pairs: Pairs) -> tuple[Floats, Floats]:
-        """Return mean and variance, (P, 3), of the next offset of each pair."""
+        """Return mean and variance of a new offset of each pair, both (pairs, 3)."""
         kappa = self.kappa / (1 + self.doubt_u[pairs.subject] + self.doubt_v[pairs.other])
         return posterior(
             *(self.expected(pairs), kappa, self.alpha, self.beta),
@@ -205,10 +214,11 @@ class _Fit:
         )
 
     def tables(self) -> tuple[Floats, Floats, Floats]:
-        """Return mean and variance of unseen pairs as a sum over the two classes of a pair.
+        """Return three tables whose sum gives mean and variance of a pair without data.
 
-        The first array (6,) is for unknown classes. The other two arrays (V, 6) have the
-        contribution of each class. The sum equals `predict` for a pair without data.
+        The first table, (6,), contains three means and three variances for unknown classes. The
+        other tables, (classes, 6), contain the contributions of the subject class and of the object
+        class. The sum equals `predict`.
         """
         spread = self.beta / (self.alpha - 1)
         unknown = 1 / LAMBDA
@@ -229,11 +239,13 @@ def posterior(
     mean: Floats,
     scatter: Floats,
 ) -> tuple[Floats, Floats]:
-    """Return mean and variance of the next draw after n draws, with a normal–inverse-gamma prior.
+    """Return mean and variance of a new value given n values, under a normal–inverse-gamma prior.
 
     Args:
-        expected, kappa, alpha, beta: parameters of the prior; alpha + n / 2 must be above 1.
-        n, mean, scatter: number of draws, their mean, and their sum of squares around the mean.
+        expected, kappa, alpha, beta: parameters of the prior. alpha + n / 2 must be above 1.
+        n: number of values.
+        mean: mean of the values.
+        scatter: sum of the squared deviations from the mean.
     """
     after = kappa + n
     rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
@@ -250,9 +262,9 @@ def log_likelihood(
     mean: Floats,
     scatter: Floats,
 ) -> Floats:
-    """Return the log-likelihood of the draws, with mean and variance integrated out.
+    """Return the log-likelihood of n values, with their mean and variance integrated out.
 
-    The arguments are those of `posterior`.
+    `posterior` describes the arguments.
     """
     after, shape = kappa + n, alpha + n / 2
     rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
@@ -264,7 +276,7 @@ def log_likelihood(
 
 
 def _fit(pairs: Pairs, V: int) -> _Fit:
-    """Fit the hyperparameters and class effects of one relation, in alternation."""
+    """Fit the parameters of one relation, by alternation between the prior and class effects."""
     nothing = np.zeros((V, 3))
     start = (pairs.n * pairs.mean).sum(axis=0) / pairs.n.sum()
     fit = _Fit(
@@ -279,7 +291,7 @@ def _fit(pairs: Pairs, V: int) -> _Fit:
 
 
 def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
-    """Fit kappa, alpha and beta of one axis by maximum likelihood."""
+    """Return kappa, alpha and beta of one axis, fitted by maximum likelihood."""
 
     def loss(logs: Floats) -> float:
         kappa, alpha, beta = np.exp(logs)
@@ -292,8 +304,11 @@ def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
 
 
 def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
-    """Fit mu, u and v in alternation. Each is a weighted mean of residuals; u and v are shrunk."""
-    # Precision of a pair's mean offset as a measurement of the effects, in units of kappa / s.
+    """Fit mu and the class effects u and v of `fit` by alternation, in place.
+
+    Each value is a weighted mean of residuals. u and v are shrunk towards 0.
+    """
+    # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)
 
     below_u = _sums(pairs.subject, weight, V) + LAMBDA
@@ -308,5 +323,5 @@ def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
 
 
 def _stored(table: Floats) -> NDArray[np.float32]:
-    """Round a table to half precision, as artifacts store it."""
+    """Round a table to half precision, the precision of the model file."""
     return table.astype(np.float16).astype(np.float32)

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from app.scene import CANONICAL, Vocabulary
 from training.batches import SceneTensors, scene_tensors
-from training.config import DATA, Config, ConfigError, DataConfig, is_file, source_name
+from training.config import DATA, Config, ConfigError, DataConfig, is_file, is_sharded, source_name
 from training.datasets import (
     AnnotatedScene,
     EncodedScene,
@@ -30,12 +31,13 @@ from training.datasets import (
     with_typical_sizes,
 )
 from training.datasets.words import class_vectors, read_word_vectors
+from training.shards import Shards, read_shard, shard_files, shards_digest
 from training.trainer import TrainingData
 
 
 @dataclass(frozen=True)
 class SplitScenes:
-    """Encoded scenes of every part, and their origin.
+    """The encoded scenes of the train, validation and test part, and their origin.
 
     Attributes:
         data: the configuration section that names the sources.
@@ -44,6 +46,7 @@ class SplitScenes:
         counts, digests: number of scenes and sha256 of their contents, by source.
         shuffle: seed of the permutation of objects; None if the objects are not permuted.
         words: (V, D) unit word vectors of the classes; None without word vectors.
+        shards: files of a sharded source, of which `parts` are a sample.
     """
 
     data: DataConfig
@@ -53,12 +56,13 @@ class SplitScenes:
     digests: dict[str, str]
     shuffle: int | None = None
     words: torch.Tensor | None = None
+    shards: tuple[str, ...] = ()
 
     @property
     def digest(self) -> str:
-        """The sha256 of the training input: contents, vocabulary, split and shuffling.
+        """The sha256 of the training input: scenes, vocabulary, split and permutation.
 
-        It covers the contents of the files, because a corrected file keeps its name.
+        The sha256 depends on the contents of the files, because a corrected file keeps its name.
         """
         decisive = {
             "data": self.data.model_dump(mode="json"),
@@ -69,9 +73,9 @@ class SplitScenes:
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
 
     def training_data(self) -> TrainingData:
-        """Return tensors for the trainer.
+        """Return the tensors for the trainer.
 
-        The training part of a source decides which classes the source annotates.
+        A data source annotates the classes that occur in its training part.
 
         Raises:
             ConfigError: a source has no scene in the training part.
@@ -79,7 +83,10 @@ class SplitScenes:
         annotated = annotated_classes(self.parts["train"], self.vocabulary)
         every = {scene.source for scenes in self.parts.values() for scene in scenes}
         for source in every - set(annotated):
-            raise ConfigError(f"the training part contains no scene of the source {source!r}")
+            raise ConfigError(
+                f"the training part contains no scene of the source {source!r}; add scenes, or "
+                "remove the source from data.sources"
+            )
         tensors: dict[str, SceneTensors] = {
             part: scene_tensors(scenes, annotated, len(self.vocabulary))
             for part, scenes in self.parts.items()
@@ -93,13 +100,21 @@ class SplitScenes:
             room_types=len(self.vocabulary.room_types),
             digest=self.digest,
             words=self.words,
+            shards=self._sharded(annotated) if self.shards else None,
+        )
+
+    def _sharded(self, annotated: dict[str, np.ndarray]) -> Shards:
+        return Shards(
+            files=self.shards,
+            source=source_name(self.data.sources[0]),
+            sample=self.data.sample,
+            vocabulary=self.vocabulary,
+            annotated=annotated,
+            seed=self.data.split_seed,
         )
 
     def shuffled(self, seed: int) -> SplitScenes:
-        """Return a copy with the objects of training and validation scenes permuted between scenes.
-
-        Test scenes are unchanged.
-        """
+        """Return a copy in which objects are permuted between scenes, except in test scenes."""
         structure = self.vocabulary.structure
         permuted = {
             part: shuffle_objects(self.parts[part], structure, seed)
@@ -109,18 +124,24 @@ class SplitScenes:
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
-    """Read the scenes of every source; return them by the source's name.
+    """Read the scenes of every data source. Return a mapping from source names to scenes.
 
-    A source is a file, or `<source>.jsonl.gz` in `root` or in `root/extra`.
+    A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`.
 
     Raises:
         ConfigError: a file is missing.
-        DatasetError: a file is malformed.
+        DatasetError: a file is invalid.
     """
     scenes: dict[str, list[AnnotatedScene]] = {}
     for source in data.sources:
         name = source_name(source)
-        if source == "rooms":
+        if is_sharded(source):
+            found = [
+                scene
+                for file in shard_files(source, root)[: data.sample]
+                for scene in read_shard(file, name)
+            ]
+        elif source == "rooms":
             found = generate_rooms(data.rooms, seed=data.split_seed)
         elif source == priors.SOURCE:
             found = priors.read_prior_scenes(root / "extra" / f"{source}.tsv.gz")
@@ -131,7 +152,8 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
                 path = extra
             if not path.is_file():
                 raise ConfigError(
-                    f"there is no {path.name} in {path.parent}: name its folder with --data"
+                    f"there is no {path.name} in {path.parent}: pass the folder of this file with "
+                    "--data"
                 )
             found = [replace(scene, source=name) for scene in read_scenes(path)]
         scenes[name] = found[: data.limit]
@@ -139,10 +161,15 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
 
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
-    """Return the vocabulary named by the configuration, with the typical sizes from its scenes.
+    """Return the vocabulary of a configuration, with typical object sizes from the scenes.
+
+    Args:
+        data: section `data` of the configuration. It names the vocabulary.
+        scenes: all scenes.
+        root: folder of the vocabulary file.
 
     Raises:
-        ConfigError: the name is unknown, or the file in `root` holds no vocabulary.
+        ConfigError: the vocabulary name is unknown, or the file contains no vocabulary.
     """
     if data.vocabulary == "indoor":
         vocabulary = indoor_vocabulary()
@@ -154,8 +181,8 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
         vocabulary = _read_vocabulary(root / data.vocabulary)
     else:
         raise ConfigError(
-            f"unknown vocabulary {data.vocabulary!r}: must be indoor, source, rooms, or the name "
-            "of a .json file"
+            f"data.vocabulary is {data.vocabulary!r}; it must be indoor, source, rooms, or the "
+            "name of a .json file"
         )
     return with_typical_sizes(vocabulary, scenes)
 
@@ -173,34 +200,44 @@ def split_and_encode(
     vocabulary: Vocabulary | None = None,
     root: Path = DATA,
 ) -> SplitScenes:
-    """Split all sources together, because they share groups, and encode each part.
+    """Split the scenes into train, validation and test parts, and encode them.
+
+    The split includes all data sources at once, because sources can contain the same room.
 
     Args:
-        vocabulary: vocabulary of a published model; default: the vocabulary of the configuration.
-        root: folder of the configuration's vocabulary file.
+        data: section `data` of the configuration.
+        scenes: maps source names to scenes.
+        vocabulary: vocabulary of a published model. The default is the vocabulary of the
+            configuration.
+        root: folder of the vocabulary file.
 
     Raises:
-        ConfigError: see `build_vocabulary`.
+        ConfigError: the vocabulary is invalid; see `build_vocabulary`.
     """
     everything = [scene for source in scenes.values() for scene in source]
     parts = split(everything, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
         vocabulary = build_vocabulary(data, list(parts["train"]), root)
+    shards = shard_files(data.sources[0], root) if is_sharded(data.sources[0]) else ()
+    digests = {source: digest_of(some) for source, some in scenes.items()}
+    if shards:
+        digests = {source: shards_digest(shards) for source in scenes}
     return SplitScenes(
         data=data,
         vocabulary=vocabulary,
         parts={part: encode(some, vocabulary) for part, some in parts.items()},
         counts={source: len(some) for source, some in scenes.items()},
-        digests={source: digest_of(some) for source, some in scenes.items()},
+        digests=digests,
         words=_word_vectors(data, vocabulary, root),
+        shards=shards,
     )
 
 
 def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch.Tensor | None:
-    """Return the word vectors of the classes, (V, D).
+    """Return the word vectors of the classes, (classes, dimensions), or None if none are set.
 
     Raises:
-        DatasetError: the file is missing or holds no vectors.
+        DatasetError: the file of word vectors is missing or invalid.
     """
     if not data.words:
         return None
@@ -209,7 +246,7 @@ def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch
 
 
 def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
-    """Return the sha256 of the scenes' contents, independent of the file format."""
+    """Return the sha256 of the contents of the scenes. It does not depend on the file format."""
     sha = hashlib.sha256()
     for scene in scenes:
         sha.update(repr(scene).encode())
@@ -217,5 +254,5 @@ def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
 
 
 def prepare(config: Config, root: Path) -> SplitScenes:
-    """Read, split and encode the scenes of a configuration."""
+    """Read the scenes of a configuration from the folder `root`, split and encode them."""
     return split_and_encode(config.data, read_sources(config.data, root), root=root)

@@ -1,4 +1,4 @@
-"""Publish a finished run as a version in the store: calibrate, evaluate, describe, publish."""
+"""Publish a finished training run as a new model version in the store."""
 
 from __future__ import annotations
 
@@ -52,16 +52,23 @@ def publish_run(
 ) -> Artifact:
     """Calibrate on validation scenes, fit offsets to training scenes, evaluate, and publish.
 
-    Weights are stored in half precision. Calibration and evaluation use the stored precision.
+    The store keeps weights in half precision. Calibration and evaluation use the same precision.
 
     Args:
-        measured: a run of the same configuration that did not use test scenes, and its scenes. The
-            test results and chosen values of this run are published, because the weights of `run`
-            are trained on all scenes.
-        judge: called with the calibrated model; an exception from it stops the publication.
+        run: the finished run.
+        scenes: scenes of the run.
+        store: store for the new version.
+        version: number of the new version.
+        alias: alias that points at the new version afterwards. None changes no alias.
+        measured: second run of the same configuration, and its scenes, for a `run` that was trained
+            on test scenes. The second run did not use test scenes. Its test results and chosen
+            calibration values are published.
+        judge: function that is called with the calibrated model. An exception stops the
+            publication.
+        progress: function that is called with messages about the progress.
 
     Raises:
-        RunError: the run was trained on other scenes.
+        RunError: the run was trained on other scenes than `scenes`.
         StoreError, ArtifactError: see `Store.publish`.
     """
     run.require(scenes.digest)
@@ -109,10 +116,10 @@ def calibrated_draft(
     offsets: Offsets | None = None,
     chosen: Calibration | None = None,
 ) -> Artifact:
-    """Return the calibrated artifact of a run, with weights rounded to the stored precision.
+    """Return the calibrated model of a run, with weights rounded to half precision.
 
     Args:
-        chosen: see `calibrate_objects`.
+        chosen: a calibration from which some values are copied; see `calibrate_objects`.
     """
     machine = as_stored(run.machine)
     calibration = calibrate(
@@ -127,7 +134,7 @@ def calibrated_draft(
 
 @torch.no_grad()
 def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
-    """Round the matrices of the machine to half precision in place, as the store keeps them."""
+    """Round the weight matrices to half precision, the precision of the store, in place."""
     for parameter in machine.parameters():
         if parameter.dim() > 1:
             parameter.copy_(parameter.half().float())
@@ -140,7 +147,7 @@ def draft_artifact(
     calibration: Calibration | None = None,
     offsets: Offsets | None = None,
 ) -> Artifact:
-    """Return an artifact that exists in memory only; its default calibration is neutral."""
+    """Return a model in memory, without files. The default calibration leaves log-odds as is."""
     return Artifact(
         manifest=None,  # type: ignore[arg-type]  # questions never read it
         weights=weights_of(machine),
@@ -155,7 +162,7 @@ def draft_artifact(
 
 
 def _measure(artifact: Artifact, data: TrainingData, progress: Callable[[str], None]) -> list[Row]:
-    """Return the metrics on the test part; an empty list without test scenes."""
+    """Return the metrics on test scenes, or an empty list if there are no test scenes."""
     if not len(data.test):
         return []
     return evaluate(
@@ -174,7 +181,7 @@ def _training(run: FinishedRun, measured: tuple[FinishedRun, SplitScenes] | None
 
 
 def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
-    """Return the sources of the training data, with digests and terms."""
+    """Return the data sources with the digests of their scenes and their terms of use."""
     sources = []
     for source, count in scenes.counts.items():
         words, research_only = terms_of(source, scenes.data)
@@ -191,7 +198,7 @@ def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
 
 
 def metrics(rows: list[Row]) -> tuple[Metric, ...]:
-    """Convert the rows of the evaluation to the metrics of the manifest."""
+    """Convert the result rows of the evaluation to metrics for the manifest of the model."""
     return tuple(
         Metric(
             task=row.task,
@@ -207,9 +214,9 @@ def metrics(rows: list[Row]) -> tuple[Metric, ...]:
 
 
 def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
-    """Return the terms of use of a source as text, and whether they allow research only.
+    """Return the terms of use of a data source, and True if they allow only research.
 
-    The terms of the user's own files come from the configuration.
+    The configuration contains the terms of the user's own files.
     """
     if source in SOURCES and source in data.sources:
         return SOURCES[source].terms, SOURCES[source].research_only
@@ -218,7 +225,7 @@ def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
 
 
 def terms(scenes: SplitScenes) -> str:
-    """Return a sentence about the allowed use of the weights."""
+    """Return a sentence about the permitted use of the trained weights."""
     every = {source: terms_of(source, scenes.data) for source in scenes.counts}
     if research := [source for source, (_, research_only) in every.items() if research_only]:
         return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."

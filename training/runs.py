@@ -1,8 +1,8 @@
-"""The folder of a training run.
+"""The folder of a training run. It contains these files:
 
 config.json        the validated configuration
-checkpoint.pt      training state after the last finished epoch, for resuming
-model.safetensors  the best weights; its header holds the shape of the machine
+checkpoint.pt      training state after the last finished epoch, to resume an interrupted run
+model.safetensors  weights of the best epoch; the header contains the sizes of the machine
 curve.csv, .png    reconstruction error of each epoch
 result.json        best epoch, duration in seconds, data folder and digest of the scenes
 """
@@ -25,12 +25,12 @@ from training.machines import BoltzmannMachine, MachineSpec, build
 
 
 class RunError(RuntimeError):
-    """A folder holds no finished run, or its checkpoint cannot be resumed; the message says why."""
+    """A folder contains no finished run, or a run cannot be resumed from its checkpoint."""
 
 
 @dataclass(frozen=True)
 class Epoch:
-    """One row of the curve; `evaluation.reconstruction` defines the errors."""
+    """Loss, errors and scores of one epoch. `evaluation.reconstruction` defines the errors."""
 
     epoch: int
     loss: float
@@ -45,7 +45,7 @@ class Epoch:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """The machine with its best weights, the curve, and the index of the best epoch."""
+    """The result of training: the machine with its best weights, and figures of each epoch."""
 
     machine: BoltzmannMachine
     epochs: list[Epoch]
@@ -55,11 +55,12 @@ class TrainingResult:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A finished run, as loaded from its folder.
+    """A finished training run, loaded from its folder.
 
     Attributes:
-        data: folder of the scenes, on the computer of the run.
-        scenes: digest of the scenes, their vocabulary and split; "" if the run has no digest.
+        data: folder of the scenes on the computer that trained the run.
+        scenes: digest of the scenes, their vocabulary and split. An empty text means that the run
+            has no digest.
     """
 
     config: Config
@@ -71,7 +72,10 @@ class FinishedRun:
     scenes: str = ""
 
     def require(self, scenes: str) -> None:
-        """Check that the run was trained on the scenes with the given digest.
+        """Check that the run was trained on given scenes.
+
+        Args:
+            scenes: digest of the scenes.
 
         Raises:
             RunError: the run was trained on other scenes.
@@ -79,7 +83,7 @@ class FinishedRun:
         if self.scenes and self.scenes != scenes:
             raise RunError(
                 "the scenes, vocabulary or split have changed since the training of "
-                f"{self.config.name}: train it again (--fresh)"
+                f"{self.config.name}: train this configuration again with --fresh"
             )
 
 
@@ -91,10 +95,11 @@ def save_run(
     data: Path | None = None,
     scenes: str = "",
 ) -> None:
-    """Write the weights, then `result.json`, which marks the run as finished.
+    """Write the weights and then `result.json`. The file `result.json` marks the run as finished.
 
     Args:
-        data, scenes: see `FinishedRun`.
+        data: folder of the scenes.
+        scenes: digest of the scenes, their vocabulary and split.
     """
     machine = result.machine
     state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
@@ -119,12 +124,17 @@ def load_run(folder: Path) -> FinishedRun:
     """
     for name in ("config.json", "model.safetensors", "result.json"):
         if not (folder / name).is_file():
-            raise RunError(f"{folder} holds no finished run: {name} is missing")
+            raise RunError(
+                f"{folder} contains no finished run: the file {name} is missing; finish the "
+                "training first"
+            )
     try:
         config = Config.model_validate_json((folder / "config.json").read_text(encoding="utf-8"))
         outcome = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     except ValueError as error:
-        raise RunError(f"{folder} holds a run that this release cannot read: {error}") from error
+        raise RunError(
+            f"{folder} contains a training run that this release cannot read: {error}"
+        ) from error
     with safe_open(folder / "model.safetensors", "pt") as file:
         spec = MachineSpec.from_dict(json.loads(file.metadata()["spec"]))
         state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -135,7 +145,7 @@ def load_run(folder: Path) -> FinishedRun:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint atomically; after a crash the old checkpoint remains."""
+    """Write a checkpoint atomically. After a crash, the previous checkpoint remains."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     with temporary.open("wb") as file:
@@ -146,13 +156,16 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
-    """Read a checkpoint of the configuration and scenes with the given digest.
+    """Read a checkpoint.
+
+    Args:
+        digest: digest of the configuration and the scenes.
 
     Raises:
         RunError: the file cannot be read, or belongs to another configuration or other scenes.
     """
     try:
-        state: dict[str, Any] = torch.load(path, weights_only=True)
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         raise RunError(f"{path.name} cannot be read: {error}") from error
     if state.get("digest") != digest:
@@ -164,7 +177,7 @@ def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
 
 
 def write_csv(path: Path, epochs: list[Epoch]) -> None:
-    """Write one row for each epoch."""
+    """Write the figures of each epoch to a CSV file, one row for each epoch."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(Epoch)])
         writer.writeheader()
@@ -172,7 +185,7 @@ def write_csv(path: Path, epochs: list[Epoch]) -> None:
 
 
 def write_plot(path: Path, epochs: list[Epoch], title: str) -> None:
-    """Plot the reconstruction error by epoch, objects and relations side by side."""
+    """Plot the reconstruction errors of objects and of relations against the epoch."""
     import matplotlib
 
     matplotlib.use("Agg")

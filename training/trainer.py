@@ -1,23 +1,27 @@
 """The trainer of every machine and objective: updates, early stopping, checkpoints, curves.
 
 With one thread, two runs with the same seed give bit-identical weights, even if a run is
-interrupted and resumed after an epoch.
+interrupted and resumed after an epoch. `training.distributed` splits the batches between processes.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from app.inference.variants import FACTORISED
-from training.batches import SceneTensors, seen_triples, subset
+from training import distributed
+from training.batches import Batch, SceneTensors, seen_triples, subset
 from training.config import Config
 from training.evaluation.missing import MachineScore, leave_one_out
 from training.evaluation.reconstruction import reconstruction_error
@@ -36,28 +40,33 @@ from training.runs import (
     write_plot,
 )
 
+if TYPE_CHECKING:
+    from training.shards import Shards
+
 _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
-# Called during the training of the objects, with the finished share.
+# Function that is called in the first training phase (objects only) with the finished share of it.
 ObjectProgress = Callable[[float], None]
-# Weights with the full learning rate. The setting `relation_rate` can lower the rate of all other
-# weights, because relation weights may overfit within an epoch.
+# Names of the weights with the full learning rate. The setting `relation_rate` can lower the rate
+# of all other weights. Relation weights can overfit within one epoch.
 _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
-# Called after every update with (epoch, finished share of the epoch, mean loss so far).
+# Function that is called after every update. The arguments are the epoch, the finished share of the
+# epoch and the mean loss in the epoch so far.
 Progress = Callable[[int, float, float], None]
-# Called with every finished epoch.
+# Function that is called with the figures of every finished epoch.
 Ended = Callable[[Epoch], None]
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Tensors of the three parts, and the data that determines the machine's shape.
+    """Scenes of the train, validation and test part, and data for the sizes of the machine.
 
     Attributes:
         digest: digest of the scenes, their vocabulary and split. A run resumes only if the digest
             is unchanged.
         words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
+        shards: the training scenes of a sharded source, of which `train` is a sample.
     """
 
     train: SceneTensors
@@ -68,10 +77,14 @@ class TrainingData:
     room_types: int
     digest: str = ""
     words: Tensor | None = None
+    shards: Shards | None = None
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
-    """Return a machine with small random matrices and with biases at the training frequencies."""
+    """Return an untrained machine.
+
+    Its weight matrices are small random numbers, and its biases are log-odds of training counts.
+    """
     shape = config.machine
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
@@ -91,8 +104,8 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
     with torch.no_grad():
         annotated = data.train.annotated_classes[data.train.source].sum(0)
-        # A class that no source annotates must start as rare. The formula alone would give even
-        # odds.
+        # If no data source annotates a class, its bias must mean a rare class. The formula alone
+        # would give a probability of 1/2.
         annotated = torch.where(annotated > 0, annotated, len(data.train))
         machine.b.copy_(log_odds_of(data.train.v.sum(0), annotated))
         machine.c1.fill_(shape.initial_c1)
@@ -104,12 +117,15 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
-    """Return the log-odds of a frequency; 1/2 is added to both counts for smoothing."""
+    """Return the smoothed log-odds of `count` events in `total` trials.
+
+    1/2 is added to the number of events and to the number of other trials.
+    """
     return ((count + 0.5) / (total - count + 0.5)).log()
 
 
 def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
-    """Set the relation biases to the frequencies in scenes with annotated relations."""
+    """Set the relation biases to the log-odds of relations in scenes with annotated relations."""
     A, V, T = machine.spec.A, machine.spec.V, machine.spec.T
     held, seen, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
     logs, times, annotated = torch.zeros(V), torch.zeros(V), 0
@@ -134,29 +150,47 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
     )
 
 
+class _Loss(nn.Module):
+    """The loss of this process' share of a batch; the mean over processes is the global loss."""
+
+    def __init__(self, objective: Objective, machine: BoltzmannMachine) -> None:
+        super().__init__()
+        self.objective, self.machine = objective, machine
+        self.more = nn.ParameterList(objective.parameters())
+
+    def forward(self, batch: Batch, generator: torch.Generator) -> Tensor:
+        """Return the loss, times the number of processes."""
+        return self.objective.loss(self.machine, batch, generator) * distributed.size()
+
+
 class Trainer:
     """Train one configuration on one set of scenes.
 
     Args:
         config: the configuration.
         data: tensors of the split scenes.
-        folder: folder of `checkpoint.pt`, `curve.csv` and `curve.png`; None writes no files.
+        folder: folder of `checkpoint.pt`, `curve.csv` and `curve.png`; None writes no files. Only
+            the first process writes.
     """
 
     def __init__(self, config: Config, data: TrainingData, folder: Path | None = None) -> None:
         self.config, self.data, self.folder = config, data, folder
         torch.set_num_threads(config.training.threads)
-        self.generator = torch.Generator().manual_seed(config.training.seed)
-        self.machine = new_machine(config, data, self.generator)
+        self.device = distributed.device_of(config.training.device)
+        self.generator = distributed.new_generator(config.training.seed)
+        self.machine = new_machine(config, data, self.generator).to(self.device)
+        self.machine.index_triples()
         kind = OBJECTIVES[config.objective.name]
-        self.objective: Objective = kind.of(config.objective, self.machine, data)
+        with self._placed():
+            self.objective: Objective = kind.of(config.objective, self.machine, data)
         self.train = data.train
         if config.objects.epochs:
             self.train = _with_relations(data.train)
             for name in OBJECT_WEIGHTS:
                 self.machine.get_parameter(name).requires_grad_(False)
+        self.loss = distributed.parallel(_Loss(self.objective, self.machine))
         self.optimiser = self._optimiser()
-        self.steps_per_epoch = max(1, math.ceil(len(self.train) / config.training.batch_size))
+        self.steps_per_epoch = self._steps()
         self.scheduler = self._scheduler()
         self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
         self.updates = 0
@@ -166,6 +200,18 @@ class Trainer:
         self.seconds = 0.0
         self.objects_trained = not config.objects.epochs
         self._drawn = -math.inf
+
+    def _placed(self) -> torch.device | nullcontext[None]:
+        """Return a context in which new tensors are on the device."""
+        return nullcontext() if self.device.type == "cpu" else self.device
+
+    def _on_cpu(self) -> BoltzmannMachine:
+        """Return the machine, on a GPU a copy; objects and validation use the CPU."""
+        if self.device.type == "cpu":
+            return self.machine
+        machine = copy.deepcopy(self.machine).cpu()
+        machine.index_triples()
+        return machine
 
     def _optimiser(self) -> torch.optim.Optimizer:
         t = self.config.training
@@ -189,7 +235,11 @@ class Trainer:
         return torch.optim.AdamW(groups, lr=t.learning_rate, fused=True)
 
     def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
-        """One cycle: linear rise over a tenth of the updates, then a cosine down to zero."""
+        """Return the schedule of the learning rate.
+
+        In the one-cycle schedule, the rate rises linearly over the first tenth of the updates. It
+        then falls to 0 along a cosine.
+        """
         t = self.config.training
         if t.schedule == "constant":
             return torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda _: 1.0)
@@ -199,21 +249,25 @@ class Trainer:
         def factor(step: int) -> float:
             if step < rise:
                 return (step + 1) / rise
-            return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(total - rise, 1)))
+            return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(total - rise, 1))))
 
         return torch.optim.lr_scheduler.LambdaLR(self.optimiser, factor)
 
     # -- the run --------------------------------------------------------------------------------
 
     def resume(self) -> bool:
-        """Continue from the folder's checkpoint; return False without a checkpoint.
+        """Load the checkpoint in the folder of the run. Return False if there is no checkpoint.
 
         Raises:
             RunError: the checkpoint cannot be read or belongs to another configuration.
         """
-        if self.folder is None or not (self.folder / "checkpoint.pt").exists():
+        if self.folder is None:
             return False
-        state = load_checkpoint(self.folder / "checkpoint.pt", self._digest)
+        state = distributed.on_first(partial(_checkpoint, self.folder, self._digest))
+        if state is None:
+            return False
+        for name in ("objective", "average", "best"):
+            state[name] = {key: value.to(self.device) for key, value in state[name].items()}
         self.machine.load_state_dict(state["machine"])
         self.objects_trained = state["objects_trained"]
         self.optimiser.load_state_dict(state["optimiser"])
@@ -232,16 +286,16 @@ class Trainer:
         ended: Ended | None = None,
         objects: ObjectProgress = lambda _: None,
     ) -> TrainingResult:
-        """Train the objects if they have their own phase, then the epochs.
+        """Run the first training phase (objects only) if there is one, then all epochs.
 
-        Training ends after the last epoch, or earlier if the validation score stops improving
-        (patience). On KeyboardInterrupt, the checkpoint of the last finished epoch is on disk.
+        Training ends after the last epoch. It ends earlier if the validation score does not improve
+        for `training.patience` epochs. After a KeyboardInterrupt, the checkpoint of the last
+        finished epoch is on disk.
         """
         if not self.objects_trained:
             began = time.perf_counter()
-            seed = self.config.training.seed
-            fit_objects(self.machine, self.data.train, self.config.objects, seed, objects)
-            store_samples(self.machine, self.data.train, self.config.objective.room_dropout, seed)
+            state = distributed.on_first(partial(self._fit_objects, objects))
+            self.machine.load_state_dict(state)
             self.objects_trained = True
             self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
             self.seconds += time.perf_counter() - began
@@ -256,6 +310,7 @@ class Trainer:
         with torch.no_grad():
             for name, value in self.best.items():
                 parameters[name].copy_(value)
+        self.machine.cpu().index_triples()
         machine = self.objective.finish(self.machine, self.train)
         if not self.config.objects.epochs:
             fine_tune(
@@ -266,6 +321,12 @@ class Trainer:
                 self.config.training.seed,
             )
         return TrainingResult(machine, self.epochs, self.best_epoch, self.seconds)
+
+    def _fit_objects(self, progress: ObjectProgress) -> dict[str, Tensor]:
+        machine, seed = self._on_cpu(), self.config.training.seed
+        fit_objects(machine, self.data.train, self.config.objects, seed, progress)
+        store_samples(machine, self.data.train, self.config.objective.room_dropout, seed)
+        return machine.state_dict()
 
     @property
     def _digest(self) -> str:
@@ -278,33 +339,53 @@ class Trainer:
     def _epoch(self, progress: Progress | None) -> None:
         began = time.perf_counter()
         number = len(self.epochs)
-        order = torch.randperm(len(self.train), generator=self.generator)
-        total = 0.0
-        size = self.config.training.batch_size
-        for step in range(self.steps_per_epoch):
-            batch = self.train.batch(order[step * size : (step + 1) * size])
-            total += self._update(batch)
-            if progress is not None:
-                progress(number, (step + 1) / self.steps_per_epoch, total / (step + 1))
-        loss = total / self.steps_per_epoch
+        total, steps = 0.0, 0
+        for scenes in self._parts():
+            order = torch.randperm(len(scenes), generator=self.generator)
+            for index in order.split(self.config.training.batch_size):
+                total, steps = total + self._update(scenes, index), steps + 1
+                if progress is not None:
+                    progress(number, min(1.0, steps / self.steps_per_epoch), total / steps)
+        everyone = distributed.total(torch.tensor(total, dtype=torch.float64))
+        loss = float(everyone) / distributed.size() / steps
         finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
         if not math.isfinite(loss) or not finite:
             raise FloatingPointError(
-                f"epoch {number} diverged at a loss of {loss}: lower the learning rate"
+                f"the training diverged in epoch {number}, with a loss of {loss}: lower the "
+                "learning rate (training.learning_rate)"
             )
         self._close_epoch(number, loss, began)
 
-    def _update(self, batch: Any) -> float:
-        loss = self.objective.loss(self.machine, batch, self.generator)
-        self.optimiser.zero_grad()
-        loss.backward()
-        self.objective.adjust_gradients(self.machine)
+    def _steps(self) -> int:
+        """Return the updates of an epoch; with shards an estimate from the sample."""
+        scenes = len(self.train)
+        if self.data.shards is not None:
+            scenes = round(scenes * self.data.shards.scale)
+        return max(1, math.ceil(scenes / self.config.training.batch_size))
+
+    def _parts(self) -> Iterator[SceneTensors]:
+        """Yield the scenes of an epoch, shard by shard."""
+        if self.data.shards is None:
+            yield self.train
+            return
+        for scenes in self.data.shards.parts(self.generator):
+            yield _with_relations(scenes) if self.config.objects.epochs else scenes
+
+    def _update(self, scenes: SceneTensors, index: Tensor) -> float:
+        width = max(len(scenes.scenes[k].evidence.classes) for k in index.tolist())
+        batch = scenes.batch(distributed.share(index), width).to(self.device)
+        with self._placed():
+            loss = self.loss(batch, self.generator)
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.objective.adjust_gradients(self.machine)
         self.optimiser.step()
         self.scheduler.step()
         self.updates += 1
         decay = self.config.training.averaging
         if decay:
-            # Bias correction: during the first updates, old weights count less.
+            # During the first updates, a smaller decay reduces the share of the initial weights in
+            # the average.
             weight = 1 - min(decay, self.updates / (self.updates + 10))
             for name, parameter in self.machine.named_parameters():
                 self.average[name].lerp_(parameter.detach(), weight)
@@ -312,15 +393,20 @@ class Trainer:
 
     @torch.no_grad()
     def _close_epoch(self, number: int, loss: float, began: float) -> None:
-        """Evaluate the (averaged) weights on validation scenes and keep the best."""
+        """Evaluate the weights, or their average, on validation scenes. Keep the best weights."""
         parameters = dict(self.machine.named_parameters())
         current = {name: p.detach().clone() for name, p in parameters.items()}
         if self.config.training.averaging:
             for name, p in parameters.items():
                 p.copy_(self.average[name])
-        mrr, precision = self._validate()
-        object_train, relation_train = reconstruction_error(self.machine, self.data.train)
-        object_val, relation_val = reconstruction_error(self.machine, self.data.validation)
+        machine = self._on_cpu()
+        works: list[Callable[[], tuple[float, ...]]] = [
+            partial(self._rank_objects, machine),
+            partial(self._rank_relations, machine),
+            partial(reconstruction_error, machine, self.data.train),
+            partial(reconstruction_error, machine, self.data.validation),
+        ]
+        (mrr,), (precision,), train, validation = distributed.spread(works)
         score = mrr + (0.0 if math.isnan(precision) else precision)
         if score > self.best_score or self.objective.keeps_last:
             self.best_score, self.best_epoch = score, number
@@ -333,36 +419,40 @@ class Trainer:
             Epoch(
                 epoch=number,
                 loss=loss,
-                object_error_train=object_train,
-                relation_error_train=relation_train,
-                object_error_validation=object_val,
-                relation_error_validation=relation_val,
+                object_error_train=train[0],
+                relation_error_train=train[1],
+                object_error_validation=validation[0],
+                relation_error_validation=validation[1],
                 mrr_validation=mrr,
                 r_precision_validation=precision,
                 seconds=seconds,
             )
         )
 
-    def _validate(self) -> tuple[float, float]:
-        """Return MRR of removed objects and R-precision of relations on fixed validation scenes."""
+    def _rank_objects(self, machine: BoltzmannMachine) -> tuple[float]:
+        """Return the MRR of removed objects on fixed validation scenes."""
         generator = torch.Generator().manual_seed(0)
         pick = torch.randperm(len(self.data.validation), generator=generator)[:_VALIDATION_SCENES]
         sample = subset(self.data.validation, pick)
-        result = leave_one_out(sample, self.data.structure, MachineScore(self.machine))
-        mrr = float(result.reciprocal_rank().mean()) if len(result.target) else float("nan")
+        result = leave_one_out(sample, self.data.structure, MachineScore(machine))
+        return (float(result.reciprocal_rank().mean()) if len(result.target) else math.nan,)
+
+    def _rank_relations(self, machine: BoltzmannMachine) -> tuple[float]:
+        """Return the R-precision of relations on fixed validation scenes."""
         annotated = [
             k for k, scene in enumerate(self.data.validation.scenes) if scene.evidence.holds.any()
         ][:_VALIDATION_SCENES]
         if not annotated:
-            return mrr, float("nan")
+            return (math.nan,)
         sample = subset(self.data.validation, torch.tensor(annotated))
-        ranking = rank_relations(
-            sample, self.data.structure, relation_score(self.machine, draws=16)
-        )
-        return mrr, float(ranking.hits.sum() / max(ranking.annotated.sum(), 1))
+        ranking = rank_relations(sample, self.data.structure, relation_score(machine, draws=16))
+        return (float(ranking.hits.sum() / max(ranking.annotated.sum(), 1)),)
 
     def _save(self) -> None:
         if self.folder is None:
+            return
+        objective = self.objective.state()
+        if not distributed.is_first():
             return
         save_checkpoint(
             self.folder / "checkpoint.pt",
@@ -372,7 +462,7 @@ class Trainer:
                 "objects_trained": self.objects_trained,
                 "optimiser": self.optimiser.state_dict(),
                 "scheduler": self.scheduler.state_dict(),
-                "objective": self.objective.state(),
+                "objective": objective,
                 "generator": self.generator.get_state(),
                 "average": self.average,
                 "best": self.best,
@@ -386,17 +476,23 @@ class Trainer:
         if not self.epochs:
             return
         write_csv(self.folder / "curve.csv", self.epochs)
-        # Limit the number of plots: with few scenes, a plot takes longer than an epoch.
+        # Plot at most once in _DRAWN_EVERY seconds. With few scenes, a plot takes longer than an
+        # epoch.
         if time.perf_counter() - self._drawn > _DRAWN_EVERY:
             self._draw()
 
     def _draw(self) -> None:
-        if self.folder is not None:
+        if self.folder is not None and distributed.is_first():
             write_plot(self.folder / "curve.png", self.epochs, self.config.name)
             self._drawn = time.perf_counter()
 
 
+def _checkpoint(folder: Path, digest: str) -> dict[str, Any] | None:
+    path = folder / "checkpoint.pt"
+    return load_checkpoint(path, digest) if path.exists() else None
+
+
 def _with_relations(scenes: SceneTensors) -> SceneTensors:
-    """Return the scenes with any observed relation, or all scenes if there are none."""
+    """Return the scenes with an annotated relation, or all scenes if no scene has one."""
     kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
     return subset(scenes, torch.tensor(kept, dtype=torch.int64)) if kept else scenes

@@ -33,8 +33,8 @@ def build(
 
     Args:
         settings: settings of the service, such as limits, keys and allowed origins.
-        runtime: the models and the queue of requests.
-        lifespan: starts and stops ``runtime``.
+        runtime: owner of the models and of the queue of requests.
+        lifespan: context manager that starts and stops ``runtime``.
         **metadata: title, description and version of the API for the documentation.
     """
     app = openapi.DocumentedAPI(
@@ -55,7 +55,7 @@ def build(
     problems.install(app)
     routes = (*questions.router.routes, *batches.router.routes)
     asked = [route for route in routes if isinstance(route, JSONRoute)]
-    # FastAPI creates the traces, so traced requests must pass through its router.
+    # FastAPI creates the OpenTelemetry traces, so traced requests must pass through its router.
     direct = (
         {}
         if settings.opentelemetry
@@ -65,8 +65,8 @@ def build(
     app.router.routes.extend(asked)
     for router in (
         stream.router,
-        # Before `models.router`: of several routes with one path, the first sets the Allow header
-        # of a 405 response.
+        # `models.administration` stands before `models.router`, because both have the same paths.
+        # The first route with a path sets the Allow header of a 405 response.
         models.administration,
         models.changes,
         models.router,

@@ -1,4 +1,4 @@
-"""Batch routes: many scenes in one request, answered in order and independently."""
+"""Batch routes: one request contains many scenes. The answer has one entry for each scene."""
 
 from __future__ import annotations
 
@@ -64,21 +64,21 @@ async def _answer_each(
                 )
                 results.append(b'{"status":200,"result":%b}' % answer)
                 count(SUCCESS)
-            except Exception as error:  # noqa: BLE001 — even a defect fails only one entry
+            except Exception as error:  # noqa: BLE001 — any error fails only this scene
                 outcome, failed = _failed(error, place, request.id)
                 count(outcome)
                 results.append(failed)
             left = max(0, left - len(results[-1]))
-            # Let other tasks run between two scenes, above all health checks.
+            # Let other tasks, such as health checks, run between two scenes.
             await asyncio.sleep(0)
     return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
 
 
 def _failed(error: Exception, place: int, request_id: str) -> tuple[str, bytes]:
-    """The outcome and the entry of a failed scene.
+    """Return the outcome for the metrics and the answer's entry of a failed scene.
 
-    The local variables of the batch's frame must not refer to the error, since the error refers to
-    that frame. A separate function avoids this reference cycle.
+    This is a separate function, because an error refers to the frame of `_answer_each`. A local
+    variable of that frame must not refer to the error, to avoid a reference cycle.
     """
     failure = from_exception(error, at=("scenes", place))
     problem = failure.describe(request_id)
@@ -89,7 +89,7 @@ def _failed(error: Exception, place: int, request_id: str) -> tuple[str, bytes]:
 
 
 def _reference(scene: Any) -> str:
-    """The model of a scene that has not been validated yet."""
+    """Return the field `model` of a scene that is not validated yet, or the default model."""
     found = scene.get("model", DEFAULT) if isinstance(scene, dict) else DEFAULT
     return found if isinstance(found, str) else DEFAULT
 
@@ -98,12 +98,13 @@ def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
     try:
         return kind.model_validate(scene)
     except ValidationError as error:
-        # Only this validation error is the client's. A later one would be a defect of the service.
+        # The client caused this validation error. Any later validation error is a defect of the
+        # service.
         raise unfit(error, scene, at=("scenes", place)) from None
 
 
 def _answering(question: Question[Any]) -> Callable[..., Awaitable[bytes]]:
-    """Create the endpoint function of a question's batch route."""
+    """Create the endpoint function of the batch route of a question."""
 
     async def answer(asked: Any, http: Request) -> bytes:
         return await _answer_each(http, asked, question)

@@ -1,4 +1,4 @@
-"""Strict reading of JSON bodies; docs/decisions/http.md gives the reason for each rule."""
+"""Strict reading of JSON bodies. docs/decisions/http.md gives the reason for each rule."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from scene_client.schemas import FieldError
 MAX_MEMBERS: Final = 32
 """Maximum number of members of a JSON object. Objects of valid requests have fewer members.
 
-The limit bounds the memory of error reports: each unknown member needs a report, and the report
-takes a hundred times the memory of the member.
+Validation reports each unknown member, and a report takes a hundred times the memory of the member.
+So the limit on the number of members bounds the memory of the reports.
 """
 
 SMALL: Final = 64 * 1024
 """The service always accepts a body of at most this size in bytes if it arrives in one piece.
 
-So incomplete bodies of one client cannot block small requests of other clients.
+This rule lets small requests through when incomplete bodies of other clients fill the budget.
 """
 
 
 class Bodies:
-    """Limits on the size and the transfer time of each body, and on the size of all bodies.
+    """Reader of request bodies. It limits size and transfer time, and the size of all bodies.
 
     Args:
         settings: settings of the service.
@@ -50,11 +50,13 @@ class Bodies:
         self.held = 0
 
     async def read(self, receive: Receive) -> bytes:
-        """Read a whole body. After the answer, the caller subtracts the body's length from `held`.
+        """Read a whole body and add its length to `held`.
+
+        After the answer, the caller must subtract the length of the body from `held`.
 
         Raises:
-            ProblemError: the body is too large, too slow or incomplete, or the bodies of all
-                requests in progress are too large together.
+            ProblemError: the body is too large, too slow or incomplete, or the total size of the
+                bodies of all requests in progress exceeds the limit.
         """
         body: bytes | bytearray = b""
         try:
@@ -78,7 +80,7 @@ class Bodies:
                     if len(body) > self.limit:
                         raise too_large(self.limit)
                     if self.held > self.budget and not (is_whole and len(body) <= SMALL):
-                        detail = f"The bodies of all requests exceed {self.budget} bytes."
+                        detail = f"All bodies in progress exceed {self.budget} bytes together."
                         raise ProblemError(catalogue.BODIES_FULL, detail)
         except TimeoutError:
             self.held -= len(body)
@@ -94,11 +96,11 @@ class Bodies:
 
 
 def parse(body: bytes) -> Any:
-    """Parse one JSON value. Refuse texts that JSON parsers read in different ways.
+    """Parse one JSON value. Refuse texts that different JSON parsers read in different ways.
 
     The function refuses encodings other than UTF-8, a byte order mark, NaN and Infinity, lone
-    surrogates, nesting deeper than 200, integers of more than 4,300 digits, and duplicate names in
-    an object.
+    surrogates, nesting deeper than 200 levels, integers of more than 4,300 digits, and duplicate
+    names in an object.
 
     Raises:
         ProblemError: `catalogue.NOT_JSON` for a refused text, or `catalogue.INVALID_REQUEST` for an
@@ -153,10 +155,11 @@ def _is_json(content_type: bytes) -> bool:
 
 
 class JSONRoute(APIRoute):
-    """A route that parses and validates the JSON body itself. Its endpoint returns bytes.
+    """A route that parses and validates the JSON body without FastAPI.
 
-    FastAPI only documents the route, because its JSON parser is too lenient. The endpoint receives
-    the validated body as ``asked``, the HTTP request as ``http`` and the path parameters.
+    FastAPI only documents the route, because FastAPI's JSON parser is too lenient. The endpoint
+    receives the validated body as ``asked``, the HTTP request as ``http`` and the path parameters.
+    It returns the answer as bytes.
     """
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -196,7 +199,7 @@ class JSONRoute(APIRoute):
             bodies.held -= len(body)
 
     def check(self, http: Request) -> None:
-        """Subclasses may refuse a request here, before its body is read. Default: do nothing."""
+        """Check a request before its body is read. Subclasses may raise `ProblemError`."""
 
 
 class AdminJSONRoute(JSONRoute):

@@ -1,4 +1,4 @@
-"""The problem types of the service: stable name, HTTP status, title and remedy."""
+"""The problem types (RFC 9457) of the service. Each has a name, a status, a title and a remedy."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ class ProblemType:
     """A problem type (RFC 9457).
 
     Attributes:
-        slug: last segment of the ``type`` member. It never changes, so clients can compare it.
-        status: HTTP status.
+        slug: stable name and last path segment of the ``type`` member. Clients can compare it.
+        status: HTTP status code.
         title: short summary. All problems of this type have the same title.
         explanation: cause and remedy. The page of the problem type shows this text.
     """

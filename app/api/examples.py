@@ -1,7 +1,8 @@
-"""Worked examples for the documentation: requests and an answer of each operation, by its id.
+"""Example requests and answers of the HTTP operations, for the documentation.
 
-The documentation page and the tests send the requests unchanged. Figures in the answers are only
-illustrative. The examples of a question are in its module in `app.serving.questions`.
+The dictionaries map an operation id to its examples. The documentation page and the tests send the
+example requests unchanged. Figures in the example answers are only illustrative. The module of each
+question in `app.serving.questions` contains the examples of this question.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _UNKNOWN: Final = {
     "type": "/problems/unknown-labels",
     "title": "The model does not know some of the labels",
     "status": 422,
-    "detail": "The request has 1 error; see errors.",
+    "detail": "The request has 1 error, listed in `errors`.",
     "instance": f"/problems/unknown-labels#{_ID}",
     "request_id": _ID,
     "errors": [
@@ -66,9 +67,9 @@ REQUESTS: Final[dict[str, dict[str, Example]]] = {
     **{question.name: dict(question.examples) for question in QUESTIONS},
     **{f"{question.name}_batch": BATCH for question in QUESTIONS if question.has_batch},
     "move_alias": {
-        "promote": Example("move the alias to a version", {"model": "home@1.1.0"}),
+        "promote": Example("point the alias at a version", {"model": "home@1.1.0"}),
         "guarded": Example(
-            "move the alias only if it still refers to the expected version",
+            "change the alias only if it still points at the expected version",
             {"model": "home@1.1.0", "expected": "home@1.0.0"},
         ),
         "create": Example(

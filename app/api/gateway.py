@@ -1,4 +1,4 @@
-"""The only ASGI middleware of the service. `Gateway` lists its steps."""
+"""The ASGI middleware of the service. The class `Gateway` documents the steps of a request."""
 
 from __future__ import annotations
 
@@ -31,17 +31,20 @@ ADMIN_KEY: Final = "X-Admin-Key"
 CANCELLED: Final = "cancelled"
 """Outcome of a request that the server cancelled during its shutdown."""
 OTHER: Final = "other"
-"""Outcome of a failure without a problem document, such as an invalid Range of a static file."""
+"""Outcome of a failure without a problem document.
 
-HEALTH: Final = ("/health/live", "/health/ready")
-"""Suffixes of the paths that answer to every Host header.
-
-Orchestrators and load balancers send the address of a replica as Host header. The answer of a
-health check contains only its status.
+An example is an invalid Range header in a request for a static file.
 """
 
-# Paths that need no key. Orchestrators check health without credentials. The pages are the same in
-# every installation and contain no private data. docs/security.md gives the reasons.
+HEALTH: Final = ("/health/live", "/health/ready")
+"""Suffixes of the paths of health checks. These paths accept every Host header.
+
+Orchestrators and load balancers send the address of a replica as Host header. The answer of a
+health check contains only a status, so it reveals no data.
+"""
+
+# Paths that need no API key. Orchestrators send health checks without credentials. The HTML pages
+# contain no private data. docs/security.md gives the reasons.
 OPEN_ROUTES: Final = frozenset(
     {
         "/health/live",
@@ -56,19 +59,20 @@ OPEN_ROUTES: Final = frozenset(
     }
 )
 _OPEN_FOLDERS: Final = ("/docs/", "/redoc/", "/static/", "/problems/")
-# Suffixes of the paths without admission control. A proxy may leave a prefix in the path.
+# Suffixes of the paths without admission control. These are suffixes, because some proxies add a
+# prefix to the path.
 _NOT_QUEUED: Final = (*HEALTH, "/metrics")
 
 _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
 _TIMEOUT: Final = re.compile(rb"[1-9][0-9]{0,5}")
 _HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{1,5})?")
-# Methods of RFC 9110 and RFC 5789. The metrics count all other methods as "-", because clients
-# could otherwise create any number of series.
+# HTTP methods of RFC 9110 and RFC 5789. The metrics count all other methods as "-". Otherwise,
+# clients could create any number of series by inventing methods.
 _METHODS: Final = frozenset(
     ("GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH")
 )
 _SWITCHED: Final = 101
-# Close code of RFC 6455 for an internal error.
+# WebSocket close code (RFC 6455) for an internal error.
 _DEFECT: Final = 1011
 
 # These headers stop browsers from guessing the media type and from sending a Referer.
@@ -83,23 +87,23 @@ _access = logging.getLogger("app.access")
 
 
 class Gateway:
-    """Middleware that applies these steps to every request, in this order.
+    """Middleware that applies five steps to every request, in the order of this list.
 
-    1. Request id: the response contains the id as `X-Request-Id`, and the access log contains it
-       too. The client may choose an id of 1 to 128 unreserved URI characters or colons.
+    1. Request id: the header `X-Request-Id` of the response and the access log contain the id. The
+       client may choose an id of 1 to 128 unreserved URI characters or colons.
     2. Host header: the header must name this service. This check prevents DNS rebinding, where
        an attacker points the host name of a web page at this machine.
     3. Origin: pages of other origins get an answer only if the settings list the origin.
     4. Key: if the settings contain an API key, the request needs this key or the admin key.
-    5. Admission: the gateway sets a deadline, and the request waits in the backlog until it may
-       start.
+    5. Admission: the gateway sets the deadline of the request. Then the request waits in the
+       backlog until it may start.
 
     Args:
-        app: the application.
+        app: the ASGI application that answers the requests.
         settings: settings of the service.
         runtime: owner of the backlog and the metrics.
-        direct: maps paths to routes that bypass the router of the framework. The router takes
-            15 µs.
+        direct: dictionary from paths to routes. Requests to these paths bypass the router of
+            Starlette, which takes 15 µs per request.
     """
 
     def __init__(
@@ -162,7 +166,7 @@ class Gateway:
             self._note(scope, record, perf_counter() - began)
 
     def _is_known(self, headers: Sequence[tuple[bytes, bytes]], path: str) -> bool:
-        """Return whether the Host header names this service or the path is a health check."""
+        """Return True if the Host header names this service, or the path is a health check."""
         given = [value for name, value in headers if name == b"host"]
         host = _HOST.fullmatch(given[0].lower()) if len(given) == 1 else None
         return (host is not None and host[1] in (self._hosts or ())) or path.endswith(HEALTH)
@@ -211,14 +215,15 @@ class Gateway:
             return
         record.outcome = problem.kind.slug
         if scope["type"] == "http":
-            # The response is incomplete: raising the error makes the server close the connection.
+            # A part of the response has been sent already. The raised error makes the server close
+            # the connection.
             record.status = 500
             raise error
         with suppress(OSError):  # the client has closed the connection
             await send({"type": "websocket.close", "code": _DEFECT})
 
     def _draining(self) -> ProblemError:
-        # Without the Connection header, a client would send its next request on this connection.
+        # Without this header, the client would send its next request on the same connection.
         return ProblemError(
             catalogue.DRAINING,
             "The service finishes the requests in progress and then stops.",
@@ -243,7 +248,7 @@ class Gateway:
 
     def _check_size(self, value: bytes) -> None:
         limit = self._settings.max_body_bytes
-        # The limit on len() protects int() from very long numbers.
+        # int() must not parse very long numbers, so the length is checked first.
         if value.isdigit() and (len(value) > 18 or int(value) > limit):
             raise too_large(limit)
 
@@ -254,7 +259,7 @@ class Gateway:
             record.outcome = OTHER
         asked = scope.get("method", "GET")
         method = asked if asked in _METHODS else "-"
-        # Template of the route: a raw path may contain private data.
+        # The log contains the template of the route, because a raw path may contain private data.
         route = getattr(scope.get("route"), "path", "-")
         took = None if status == _SWITCHED else seconds
         self._metrics.answered(route, method, record.outcome, took, record.serialise_seconds)
@@ -268,7 +273,7 @@ class Gateway:
                 **record.known(),
             }
             message = f"{method} {route} {status} {seconds * 1e3:.2f} ms"
-            # `_access.info` is slower, because it searches the stack for its caller.
+            # `_access.info` would be slower, because it searches the call stack for the caller.
             _access.handle(
                 _access.makeRecord(
                     "app.access", logging.INFO, "", 0, message, (), None, extra={"entry": entry}
@@ -293,18 +298,20 @@ def too_large(limit: int) -> ProblemError:
 
 
 def carries(headers: Headers, name: str, expected: SecretStr | None) -> bool:
-    """Return whether a request carries a key, in the header ``name`` or else as a bearer token.
+    """Return whether a request contains the configured key.
+
+    The key may be in the header ``name`` or, without this header, in a bearer token.
 
     Args:
         headers: headers of the request.
         name: name of the header for the key.
-        expected: the configured key. With None, the result is False.
+        expected: the configured key. None means that no key is configured, and the result is False.
     """
     scheme, _, token = headers.get("authorization", "").partition(" ")
     given = headers.get(name) or (token.strip() if scheme.lower() == "bearer" else "")
     secret = expected.get_secret_value() if expected else ""
-    # The comparison takes constant time and always runs, because the response time must not reveal
-    # the key, or whether a key is configured.
+    # The comparison always runs and takes constant time. Otherwise the response time would show
+    # whether a key is configured, or how many characters match.
     equal = hmac.compare_digest(given.encode(), secret.encode())
     return equal and bool(secret)
 
@@ -313,7 +320,7 @@ class CrossOrigin(CORSMiddleware):
     """Allow pages of the listed origins to send GET and POST requests, without cookies.
 
     Args:
-        app: the application.
+        app: the ASGI application that answers allowed requests.
         origins: allowed values of the Origin header.
     """
 
@@ -321,8 +328,8 @@ class CrossOrigin(CORSMiddleware):
         super().__init__(
             app,
             allow_origins=origins,
-            # PUT and the admin key header are missing, because pages must not administer the
-            # service.
+            # The lists do not contain PUT and the admin key header, because pages of other origins
+            # must not administer the service.
             allow_methods=("GET", "POST"),
             allow_headers=(
                 "Authorization",
@@ -354,8 +361,8 @@ def may_connect(headers: Headers, origins: Sequence[str]) -> bool:
     """Return whether a client may open a WebSocket.
 
     The function accepts pages of the service, pages of the listed origins, and clients without an
-    Origin header. Browsers send no preflight request for a WebSocket, so the Origin header is the
-    only protection. A page cannot change this header.
+    Origin header. Browsers send no preflight request before they open a WebSocket. So the service
+    must check the Origin header, which a page cannot change.
 
     Args:
         headers: headers of the handshake.

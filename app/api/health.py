@@ -1,7 +1,7 @@
 """Liveness and readiness, on `/health` routes and on the routes of the Open Inference Protocol.
 
-A process is live if it answers. It is ready if its default model has answered a question during
-the warm-up.
+The process is live if it answers a request. The process is ready if its default model has answered
+a question during the warm-up.
 """
 
 from __future__ import annotations
@@ -28,41 +28,54 @@ _NOT_READY = problems(catalogue.NOT_READY, catalogue.DRAINING)
 _NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
 
 
-@router.get("/health/live", summary="Is the process alive?", responses=problems())
+@router.get(
+    "/health/live",
+    summary="Is the process alive?",
+    responses=problems(),
+    response_model_exclude_none=True,
+)
 async def health_live() -> Health:
-    """Status 200 while the process runs, even if its models are not usable."""
+    """Return status 200 while the process runs, even if the models are not usable."""
     return Health(status="live")
 
 
-@router.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
+@router.get(
+    "/health/ready",
+    summary="Is the default model usable?",
+    responses=_NOT_READY,
+    response_model_exclude_none=True,
+)
 async def health_ready(runtime: RuntimeDep) -> Health:
-    """Status 200 if the default model is usable, else 503."""
+    """Return status 200 if the default model is usable, else status 503.
+
+    A replica of a remote store stays ready while it cannot reach the store.
+    """
     runtime.check_ready()
-    return Health(status="ready")
+    return Health(status="ready", store=runtime.store_health)
 
 
 @protocol.get("", summary="Server metadata", responses=queued())
 async def server_metadata() -> ServerMetadata:
-    """Name and version of the server."""
+    """Return the name and the version of the server."""
     return ServerMetadata(name="scene-boltzmann", version=__version__, extensions=[])
 
 
 @protocol.get("/health/live", summary="Is the process alive?", responses=problems())
 async def server_live() -> ServerLive:
-    """Same check as `GET /health/live`."""
+    """Run the same check as `GET /health/live`."""
     return ServerLive(live=True)
 
 
 @protocol.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
 async def server_ready(runtime: RuntimeDep) -> ServerReady:
-    """Same check as `GET /health/ready`."""
+    """Run the same check as `GET /health/ready`."""
     runtime.check_ready()
     return ServerReady(ready=True)
 
 
 @protocol.get("/models/{name}", summary="Model metadata", responses=_NO_MODEL)
 async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
-    """Versions and variant of a model. Name the model by an alias, `name` or `name@version`."""
+    """Return versions and variant of a model, named by an alias, `name` or `name@version`."""
     models = runtime.models
     reference = models.resolve(name).reference
     return ModelMetadata(
@@ -74,6 +87,6 @@ async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
 
 @protocol.get("/models/{name}/ready", summary="Is this model usable?", responses=_NO_MODEL)
 async def model_ready(name: Reference, runtime: RuntimeDep) -> ModelReady:
-    """Status 200 if the model is usable, else 404 or 503."""
+    """Return status 200 if the model is usable, 404 if it does not exist, or else 503."""
     model = runtime.models.resolve(name)
     return ModelReady(name=model.reference.name, ready=True)

@@ -32,20 +32,21 @@ _USABLE: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogu
 Reference = Annotated[
     str,
     Path(
-        description="an alias, `name` (its newest version) or `name@version`",
+        description="an alias, `name` (the newest version of a model) or `name@version`",
         openapi_examples={"alias": {"summary": "the default model", "value": "default"}},
     ),
 ]
 Version = Annotated[str, Path(description="a version that GET /models lists")]
 
-# These schemes are only for the documentation. The routes check the key before they read the body.
+# These security schemes are only for the documentation. The routes themselves check the key, before
+# they read the body.
 _SCHEMES: Final = [
     Security(APIKeyHeader(name=ADMIN_KEY, scheme_name="admin-key", auto_error=False)),
     Security(HTTPBearer(scheme_name="admin-key-as-bearer-token", auto_error=False)),
 ]
 
 
-# This is a coroutine, because FastAPI runs plain functions in a thread. The thread costs 100 µs.
+# `_runtime` is a coroutine, because FastAPI runs plain functions in a thread. This takes 100 µs.
 async def _runtime(http: Request) -> Runtime:
     runtime: Runtime = http.app.state.runtime
     return runtime
@@ -70,13 +71,13 @@ changes = APIRouter(
     response_model_exclude_none=True,
 )
 async def list_models(runtime: RuntimeDep) -> ModelList:
-    """All models, versions and aliases of the store. Each refused version has a reason."""
+    """List the models, versions and aliases of the store. Each refused version has a reason."""
     return describe.everything(runtime.models)
 
 
 @router.get("/{name}", summary="One model", responses=_PROBLEMS, response_model_exclude_none=True)
 async def show_model(name: Reference, runtime: RuntimeDep) -> ModelSummary:
-    """The versions of a model, newest first."""
+    """List the versions of a model, newest version first."""
     return describe.model(runtime.models, name)
 
 
@@ -87,23 +88,23 @@ async def show_model(name: Reference, runtime: RuntimeDep) -> ModelSummary:
     response_model_exclude_none=True,
 )
 async def show_version(name: Reference, version: Version, runtime: RuntimeDep) -> VersionDetails:
-    """Metrics, training data, terms of use and model card of a version, or why it was refused."""
+    """Return metrics, training data, terms and model card of a version, or why it is refused."""
     return describe.version(runtime.models, name, version)
 
 
 @router.get("/{name}/vocabulary", summary="The vocabulary of a model", responses=_USABLE)
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> VocabularyAnswer:
-    """Object classes with their aliases, spatial relations, and room types of a model."""
+    """List the object classes with their aliases, the relations and the room types of a model."""
     return describe.vocabulary(runtime.models.resolve(name))
 
 
 @router.get("/{name}/contexts", summary="The hidden units of a model", responses=_USABLE)
 async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
-    """Hidden units with the classes of their largest weights.
+    """List the hidden units of a model with the classes of their largest weights.
 
-    `context` of `/generate` takes the numbers of these units.
+    The field `context` of `POST /generate` accepts the numbers of these units.
     """
-    # This runs in a thread, because the first call takes 0.2 s.
+    # `describe.contexts` runs in a thread, because the first call for a model takes 0.2 s.
     return await asyncio.to_thread(describe.contexts, runtime.models.resolve(name))
 
 
@@ -116,8 +117,8 @@ async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
 async def refresh_models(http: Request) -> RefreshAnswer:
     """Load, verify and warm up all versions in the store, then replace all served models at once.
 
-    The previous models answer in the meantime. If a new model fails, the service keeps the previous
-    models.
+    The previous models answer requests until then. If a new model fails, the service keeps the
+    previous models.
     """
     check_admin(http)
     runtime: Runtime = http.app.state.runtime

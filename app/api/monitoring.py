@@ -21,10 +21,10 @@ router = APIRouter(tags=["monitoring"])
     responses=problems(),
 )
 async def show_metrics(runtime: RuntimeDep) -> PlainTextResponse:
-    """Counters, gauges and histograms in the text format of Prometheus.
+    """Return counters, gauges and histograms in the text format of Prometheus.
 
     docs/operations.md explains each metric.
     """
-    # This runs in a thread, because the formatting of many series takes more than 10 ms.
+    # The formatting runs in a thread, because it takes more than 10 ms for many series.
     text = await asyncio.to_thread(runtime.metrics.exposition)
     return PlainTextResponse(text, media_type=CONTENT_TYPE)

@@ -52,7 +52,7 @@ TAGS: Final = [
 
 
 def problems(*kinds: ProblemType) -> Responses:
-    """Return the ``responses`` of a route that may answer these problems or an internal error."""
+    """Return the error responses of a route: the given problems and an internal error."""
     responses: Responses = {}
     for kind in (*kinds, catalogue.INTERNAL_ERROR):
         response = responses.setdefault(
@@ -76,7 +76,7 @@ def problems(*kinds: ProblemType) -> Responses:
 
 
 def queued(*kinds: ProblemType) -> Responses:
-    """Return the ``responses`` of a route whose requests pass through admission control."""
+    """Return the error responses of a route, including the problems of admission control."""
     return problems(
         *kinds,
         catalogue.BAD_REQUEST,
@@ -99,12 +99,12 @@ def described(example: Example) -> dict[str, Any]:
 
 
 def operation_id(route: APIRoute) -> str:
-    """Return the name of the route's function; generated clients use it as the method name."""
+    """Return the name of the route's function. Generated clients use this name for the method."""
     return route.name
 
 
 def _state_whole_numbers(node: Any) -> None:
-    """Write the bounds of integers as integers. FastAPI writes floats, which round large bounds."""
+    """Convert the bounds of integers from float to int, because a float rounds large bounds."""
     if isinstance(node, dict):
         if node.get("type") == "integer":
             for bound in ("minimum", "maximum"):
@@ -118,10 +118,10 @@ def _state_whole_numbers(node: Any) -> None:
 
 
 class DocumentedAPI(FastAPI):
-    """FastAPI with an OpenAPI document that describes the real answers of the service."""
+    """FastAPI application whose OpenAPI document also contains examples and problems."""
 
     def openapi(self) -> dict[str, Any]:
-        """Return FastAPI's document, with examples, and with problems as its error responses."""
+        """Return FastAPI's OpenAPI document with examples and with problems as error responses."""
         if self.openapi_schema is None:
             document = super().openapi()
             schemas = document["components"]["schemas"]
@@ -164,7 +164,7 @@ def _timeout_parameter(most: int) -> dict[str, Any]:
 
 
 def _refuse_other_hosts(document: dict[str, Any]) -> None:
-    """Add the host-refused problem to each operation except health checks."""
+    """Add the problem `host-refused` to each operation except health checks."""
     kind = catalogue.HOST_REFUSED
     for path, operations in document["paths"].items():
         for operation in () if path.endswith(HEALTH) else operations.values():
@@ -172,7 +172,7 @@ def _refuse_other_hosts(document: dict[str, Any]) -> None:
 
 
 def _ask_for_keys(document: dict[str, Any]) -> None:
-    """Add the API key to each operation that is neither open nor for administration."""
+    """Add the API key to each operation that needs this key."""
     document["components"].setdefault("securitySchemes", {}).update(_KEY_SCHEMES)
     for path, operations in document["paths"].items():
         for operation in operations.values():

@@ -1,6 +1,6 @@
 """HTML pages: the scene editor (board), the API documentation and a page for each problem type.
 
-The Content-Security-Policy of each page lets a browser load files from this service only. So a
+With the Content-Security-Policy of these pages, a browser loads files only from this service. So a
 page cannot contact another host by mistake.
 """
 
@@ -24,8 +24,8 @@ STATIC: Final = Path(__file__).parents[1] / "static"
 _BOARD: Final = "board.html"
 _VENDOR: Final = "vendor/"
 
-# Swagger UI and Redoc need inline styles. The search of Redoc runs in a web worker that Redoc
-# creates from a blob. Inline scripts stay forbidden.
+# Policy of the API documentation. Swagger UI and Redoc need inline styles. Redoc searches in a web
+# worker, which Redoc creates from a blob. The policy forbids inline scripts.
 _POLICY: Final = "; ".join(
     (
         "default-src 'none'",
@@ -42,7 +42,7 @@ _POLICY: Final = "; ".join(
 )
 _HEADERS: Final = {"Content-Security-Policy": _POLICY}
 
-# Policy of the scene editor (board.html). Its page has no inline styles.
+# Policy of the scene editor (board.html), which needs no inline styles.
 _STRICT_POLICY: Final = "; ".join(
     (
         "default-src 'none'",
@@ -81,7 +81,7 @@ def _page(title: str, body: str, *, root: str) -> HTMLResponse:
 
 @problems.get("/problems")
 async def list_problem_types() -> HTMLResponse:
-    """List all problem types, with links."""
+    """Return the HTML page with links to the pages of all problem types."""
     entries = "\n".join(
         f'<dt><a href="problems/{kind.slug}"><code>{kind.slug}</code></a> ({kind.status})</dt>'
         f"<dd>{escape(kind.title)}</dd>"
@@ -92,7 +92,7 @@ async def list_problem_types() -> HTMLResponse:
 
 @problems.get("/problems/{slug}")
 async def show_problem_type(slug: str) -> HTMLResponse:
-    """Show the cause and the remedy of a problem type."""
+    """Return the HTML page with the cause and the remedy of a problem type."""
     kind = catalogue.PROBLEM_TYPES.get(slug)
     if kind is None:
         raise ProblemError(catalogue.NOT_FOUND, "No problem type has this name.")
@@ -104,18 +104,18 @@ async def show_problem_type(slug: str) -> HTMLResponse:
 
 
 class Assets(StaticFiles):
-    """Static files with entity tags.
+    """Static files with entity tags (the header ETag).
 
-    Browsers may cache the files of vendored libraries for a year. They never change, because the
-    folder name of a library contains its version.
+    Browsers may cache the files of vendored libraries for a year. These files never change, because
+    the folder name of a library contains the version of the library.
     """
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        """Return a file, or 304 if the browser already has it."""
+        """Return a file, or status 304 if the browser has the current version of the file."""
         response = await super().get_response(path, scope)
         if response.status_code in {200, 304}:
-            # "no-cache" makes the browser check each file for a newer version. Otherwise it could
-            # mix JavaScript modules of two releases.
+            # With "no-cache", a browser checks each file for a newer version. Otherwise the browser
+            # could mix JavaScript modules of two releases.
             kept = path.startswith(_VENDOR)
             response.headers["Cache-Control"] = (
                 "public, max-age=31536000, immutable" if kept else "no-cache"
@@ -124,7 +124,7 @@ class Assets(StaticFiles):
 
 
 def install(app: FastAPI, *, docs: bool) -> None:
-    """Serve the pages and their assets. With ``docs`` False, omit /, /docs and /redoc."""
+    """Serve the HTML pages and their assets. If ``docs`` is False, omit /, /docs and /redoc."""
     app.include_router(problems)
     static = Assets(directory=STATIC)
     app.mount("/static", static, name="static")

@@ -42,8 +42,8 @@ from scene_client.validation import MAX_ERRORS, field_errors, pointer
 
 MEDIA_TYPE: Final = "application/problem+json"
 
-# With this ASGI extension, the server can refuse a handshake with any response. Without the
-# extension, the response is always 403.
+# With this ASGI extension, the server can answer a refused WebSocket handshake with any response.
+# Without the extension, the server always answers a refused handshake with status 403.
 _DENIAL: Final = "websocket.http.response"
 
 _logger = logging.getLogger("app.api")
@@ -65,8 +65,8 @@ _OF_REASON: Final = {
 class ProblemError(HTTPException):
     """A failure with its problem type.
 
-    It extends `HTTPException`, because Starlette wraps all other exceptions that occur while it
-    reads a body.
+    This class extends `HTTPException`, because Starlette wraps all other exceptions that occur
+    while Starlette reads a body.
     """
 
     def __init__(
@@ -98,11 +98,11 @@ class ProblemError(HTTPException):
 
 
 def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
-    """Return the problem for an exception. For an unexpected one, it is an internal error.
+    """Return the problem for an exception, or an internal error for an unexpected exception.
 
     Args:
         error: the raised exception.
-        at: location of the failing request in the body, for an entry of a batch.
+        at: location of the scene in the body of a batch request. It is empty for other requests.
     """
     match error:
         case ProblemError():
@@ -143,20 +143,20 @@ def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
         case StoreBusyError():
             return ProblemError(catalogue.STORE_BUSY, str(error))
         case RefreshRefusedError():
-            detail = "The service still serves the previous versions; see failures."
+            detail = "The service still serves the previous versions. `failures` gives the reasons."
             return ProblemError(catalogue.REFRESH_REFUSED, detail, failures=error.failures)
         case HTTPException() if error.status_code in _OF_STATUS:
             kind = _OF_STATUS[error.status_code]
             return ProblemError(kind, kind.title + ".", headers=error.headers)
         case _:
             return ProblemError(
-                catalogue.INTERNAL_ERROR, "The request failed; the log of the service says why."
+                catalogue.INTERNAL_ERROR, "The service failed. Its log contains the error."
             )
 
 
 def _faulty(kind: ProblemType, errors: list[FieldError], count: int) -> ProblemError:
     faults = f"{count} error{'' if count == 1 else 's'}"
-    return ProblemError(kind, f"The request has {faults}; see errors.", errors=errors)
+    return ProblemError(kind, f"The request has {faults}, listed in `errors`.", errors=errors)
 
 
 def unfit(
@@ -166,18 +166,18 @@ def unfit(
 
     Args:
         error: the validation error.
-        body: the validated value.
-        at: location of ``body`` in the request, for an entry of a batch.
+        body: the value that does not match the schema.
+        at: location of ``body`` in a batch request. It is empty for other requests.
     """
     faults = error.errors()
-    # FastAPI puts "body" in front of each location.
+    # FastAPI puts "body" in front of the location of each error.
     skip = 1 if isinstance(error, RequestValidationError) else 0
     errors = field_errors(faults, body, at=at, skip=skip)
     return _faulty(catalogue.INVALID_REQUEST, errors, len(faults))
 
 
 def report_defect(error: Exception, request_id: str) -> None:
-    """Log an internal error; the client receives no details."""
+    """Log an internal error. The client receives only the problem type, without details."""
     _logger.error("request failed", exc_info=error, extra={"request_id": request_id})
 
 
@@ -186,7 +186,7 @@ def _request_id(request: HTTPConnection) -> str:
 
 
 def respond(request: HTTPConnection, problem: ProblemError) -> Response:
-    """Return the problem as a response, and store its slug in the record of the request."""
+    """Return a response with the problem. Store the problem's slug in the request's record."""
     record = request.scope.get("state", {}).get("record")
     if record is not None:
         record.outcome = problem.kind.slug
@@ -204,7 +204,7 @@ def respond(request: HTTPConnection, problem: ProblemError) -> Response:
 async def answer(problem: ProblemError, scope: Scope, receive: Receive, send: Send) -> None:
     """Answer a request, or the handshake of a WebSocket, with a problem."""
     if scope["type"] == "websocket" and _DENIAL not in scope.get("extensions", {}):
-        # The server answers the handshake with 403 if the stream closes before it is accepted.
+        # A close message before the stream is accepted makes the server answer with status 403.
         await send({"type": "websocket.close", "code": 1008})
     else:
         await respond(HTTPConnection(scope), problem)(scope, receive, send)
@@ -218,10 +218,10 @@ Handler = Callable[[Request, Exception], Any]
 
 
 def install(app: FastAPI) -> None:
-    """Replace the exception handlers of the framework by handlers that answer with problems.
+    """Replace the exception handlers of FastAPI by handlers that answer with problems.
 
-    `app.api.gateway.Gateway` answers unexpected exceptions. The framework would raise such an
-    exception again after its answer. The server would then close the connection.
+    `app.api.gateway.Gateway` answers unexpected exceptions. FastAPI would answer an unexpected
+    exception and then raise the exception again. The server would then close the connection.
     """
     for kind in (HTTPException, RequestValidationError, ServingError):
         app.add_exception_handler(kind, _handle)

@@ -1,4 +1,4 @@
-"""Routes of the questions about one scene: one `POST` for each entry of `QUESTIONS`."""
+"""Routes of the questions about one scene: one `POST` route for each entry of `QUESTIONS`."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ router = APIRouter(
     generate_unique_id_function=operation_id,
 )
 
-# The service does not validate its answers: validation would take as long as writing the JSON. The
-# tests validate answers against the schemas of the routes.
+# The service does not validate its own answers: validation takes as long as writing the JSON.
+# The tests validate answers against the schemas of the routes.
 
 
 def begin(http: Request) -> serving.Request:

@@ -41,16 +41,20 @@ PATH: Final = "/stream"
 READING_SHARE: Final = 0.2
 """Maximum share of one core that the service uses to read the messages of one stream.
 
-Above this share, the service reads the stream more slowly. The limit applies to processor time,
-because a small update takes 0.05 ms, but an invalid update of 256 objects takes 36 ms.
+Above this share, the service reads the stream more slowly. The share limits the processor time
+instead of the number of messages, because messages differ: a small update takes 0.05 ms, an invalid
+update of 256 objects 36 ms.
 """
 READING_BURST: Final = 1.0
 """Processor time in seconds that the service may spend on one burst of messages of a stream."""
 LEAST_COST: Final = 0.25e-3
-"""Minimum time in seconds that a message costs. It covers the frame and the answer."""
+"""Minimum processor time in seconds that the limit counts for a message.
+
+It covers the WebSocket frame and the answer.
+"""
 
 Closing = tuple[int, str]
-"""Code and reason of a close frame (RFC 6455, section 7.4)."""
+"""Code and reason of a WebSocket close frame (RFC 6455, section 7.4)."""
 
 router = APIRouter()
 
@@ -67,7 +71,7 @@ async def plain_http() -> None:
 
 @router.websocket(PATH)
 async def stream(socket: WebSocket) -> None:
-    """Run one stream, or refuse its handshake."""
+    """Accept a WebSocket handshake and run the stream, or refuse the handshake."""
     streams: Streams = socket.app.state.streams
     refusal = _refusal(socket, streams)
     if refusal is not None:
@@ -86,17 +90,19 @@ def _refusal(connection: HTTPConnection, streams: Streams) -> ProblemError | Non
     if not may_connect(connection.headers, settings.cors_origins):
         return ProblemError(catalogue.ORIGIN_REFUSED, "Pages of this origin may not open a stream.")
     if runtime.draining:
-        return ProblemError(catalogue.DRAINING, "The service is closing its streams.")
+        return ProblemError(catalogue.DRAINING, "The service is stopping and closes its streams.")
     if streams.is_full:
-        return ProblemError(catalogue.TOO_MANY_STREAMS, f"{streams.limit} streams are open.")
+        return ProblemError(
+            catalogue.TOO_MANY_STREAMS, f"The limit of {streams.limit} open streams is reached."
+        )
     return None
 
 
 class _Conversation:
     """One open stream, with a task that reads messages and a task that sends answers.
 
-    The service never queues answers. While it computes or sends an answer, new messages only update
-    the scene. The next answer covers all these messages.
+    The service never queues answers. While the service computes or sends an answer, new messages
+    only update the scene. The next answer covers all these messages.
     """
 
     def __init__(self, socket: WebSocket) -> None:
@@ -117,7 +123,7 @@ class _Conversation:
         self._due.set()
 
     async def run(self) -> None:
-        """Run the two tasks until one of them ends, then close the stream."""
+        """Read messages and send answers until one of the two tasks ends, then close the stream."""
         listening = asyncio.create_task(self._listen())
         answering = asyncio.create_task(self._answer())
         closing = None
@@ -142,8 +148,8 @@ class _Conversation:
         bucket = TokenBucket(READING_SHARE, READING_BURST)
         settings = self._settings
         while True:
-            # Before the message `open`, the timeout is short, because each connection counts
-            # towards the maximum number of streams.
+            # Before the message `open`, the timeout is short. Otherwise, unopened connections could
+            # use up the maximum number of streams.
             patience = settings.stream_idle if self._is_open else settings.client_timeout
             try:
                 async with asyncio.timeout(patience):
@@ -161,7 +167,7 @@ class _Conversation:
             await asyncio.sleep(bucket.take(cost))
 
     async def _hear(self, event: Mapping[str, Any]) -> None:
-        """Process one message. If this fails, send a problem."""
+        """Process one message. If the message is not acceptable, send a problem."""
         kind, seq, outcome = "-", None, SUCCESS
         try:
             value, kind, seq = _parsed(event)
@@ -180,7 +186,9 @@ class _Conversation:
             return
         is_first = isinstance(command, Open)
         if is_first == self._is_open:
-            raise _unfit("the first message must have type open, and later messages another type")
+            raise _unfit(
+                "the first message must have the type `open`, and later messages another type"
+            )
         self._check_deadline(command)
         self._scene.take(command, self._request())
         if is_first:
@@ -192,7 +200,7 @@ class _Conversation:
     def _check_deadline(self, message: SceneMessage) -> None:
         most = self._settings.max_request_timeout_ms
         if (message.timeout_ms or 0) > most:
-            raise _unfit(f"must be at most {most}", "timeout_ms")
+            raise _unfit(f"`timeout_ms` must be at most {most} milliseconds", "timeout_ms")
 
     def _opened(self) -> Opened:
         settings = self._settings
@@ -226,9 +234,9 @@ class _Conversation:
             await self._send(written(message).decode())
 
     def _request(self) -> Request:
-        """Return a request on the current snapshot of the models.
+        """Return a request that uses the current snapshot of the models.
 
-        So the next answer already uses the new target of an alias.
+        After an alias gets a new target, the next answer already uses the new target.
         """
         timeout = self._scene.timeout_ms or self._settings.request_timeout_ms
         return self._runtime.request(monotonic() + timeout / 1e3, self._request_id, self._record)
@@ -239,7 +247,7 @@ class _Conversation:
         await self._send(message.model_dump_json(exclude_none=True))
 
     async def _send(self, text: str) -> None:
-        """Send a message. If the client does not read it in time, it counts as disconnected."""
+        """Send a message. If the client does not read it in time, treat the client as gone."""
         try:
             async with asyncio.timeout(self._settings.client_timeout):
                 await self._socket.send_text(text)
@@ -250,11 +258,14 @@ class _Conversation:
 def _parsed(event: Mapping[str, Any]) -> tuple[Any, str, int | None]:
     """Parse a message. Return its value, its type and its sequence number.
 
-    The type is "-" if it is missing or unknown. The number is None if it is missing or invalid.
+    A missing or unknown type is returned as "-", and a missing or invalid number as None.
     """
     text = event.get("text")
     if text is None:
-        raise ProblemError(catalogue.UNSUPPORTED_MEDIA_TYPE, "Send JSON in text frames.")
+        raise ProblemError(
+            catalogue.UNSUPPORTED_MEDIA_TYPE,
+            "The message is a binary frame. Send JSON in text frames.",
+        )
     value = parse(text.encode())
     fields = value if isinstance(value, dict) else {}
     kind, seq = fields.get("type"), fields.get("seq")
@@ -266,7 +277,7 @@ def _parsed(event: Mapping[str, Any]) -> tuple[Any, str, int | None]:
 def _command(kind: str, value: Any) -> Command:
     form = COMMANDS.get(kind)
     if form is None:
-        raise _unfit("must be one of " + ", ".join(COMMANDS))
+        raise _unfit("`type` must be one of " + ", ".join(COMMANDS))
     try:
         return form.model_validate(value)
     except ValidationError as error:
@@ -275,5 +286,5 @@ def _command(kind: str, value: Any) -> Command:
 
 def _unfit(message: str, field: str = "type") -> ProblemError:
     fault = FieldError(pointer=f"#/{field}", message=message)
-    detail = "The message has 1 error; see errors."
+    detail = "The message has 1 error, listed in `errors`."
     return ProblemError(catalogue.INVALID_REQUEST, detail, errors=[fault])

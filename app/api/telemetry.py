@@ -1,7 +1,8 @@
-"""Traces for OpenTelemetry: FastAPI creates the spans. Traces are off by default.
+"""OpenTelemetry traces. FastAPI creates the spans. Traces are off by default.
 
-The service exports only traces. Prometheus reads the metrics (`app/serving/metrics.py`). The
-service exports no log records, because they contain exception messages.
+The service sends only traces to OpenTelemetry. Prometheus reads the metrics
+(`app/serving/metrics.py`). The service does not send log records, because these contain exception
+messages.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from app import __version__
 
 _SERVICE: Final = "scene-boltzmann"
 # Orchestrators and Prometheus poll these paths every few seconds, and pages load static files.
-# Spans of these requests would outnumber all other spans.
+# So spans of these requests would be more numerous than all other spans.
 _UNTRACED: Final = ("/health", "/v2/health", "/metrics", "/static")
-# FastAPI copies these attributes unchecked from the request, so they may contain private data.
+# FastAPI copies these span attributes from the request, so they may contain private data.
 _MADE_UP: Final = ("url.path", "url.query", "http.request.method_original")
 _REDACTED: Final = "REDACTED"
 
@@ -26,18 +27,18 @@ _REDACTED: Final = "REDACTED"
 def configuration(*, enabled: bool) -> TelemetryConfig:
     """Return the telemetry configuration for `FastAPI`.
 
-    The variables of OpenTelemetry (``OTEL_EXPORTER_OTLP_ENDPOINT`` and others) set the destination
-    of the spans. `Settings` has checked that the packages are installed.
+    Environment variables such as ``OTEL_EXPORTER_OTLP_ENDPOINT`` set the destination of the spans.
+    `Settings` has already checked that the OpenTelemetry packages are installed.
     """
     if not enabled:
         return TelemetryConfig(tracing=False, metrics=False, logs=False, auto_configure=False)
-    # Only importable if the dependency group `telemetry` is installed.
+    # These packages are installed only with the dependency group `telemetry`.
     from opentelemetry.context import Context
     from opentelemetry.sdk.resources import SERVICE_NAME, SERVICE_VERSION, Resource
     from opentelemetry.sdk.trace import Span, SpanProcessor, TracerProvider
 
     class Redaction(SpanProcessor):
-        """Redact attributes with text from the client. `http.route` still names the route."""
+        """Redact the span attributes that contain text from the client."""
 
         def on_start(self, span: Span, parent_context: Context | None = None) -> None:
             for name in _MADE_UP:
@@ -52,7 +53,7 @@ def configuration(*, enabled: bool) -> TelemetryConfig:
         tracing=True,
         metrics=False,
         logs=False,
-        # The exporter starts together with the application, in the worker process.
+        # With True, FastAPI starts the exporter together with the application.
         auto_configure=True,
         tracer_provider=provider,
         exclude=_is_untraced,

@@ -1,40 +1,40 @@
 """Completions of a scene: the probability of classes that are present but unlisted.
 
-The machine must have the local form and stored chain samples. `posterior` defines v, h1, y and b.
-Each present class is listed with probability c, the coverage. So, for the listed classes L,
+A completion is the scene with some unlisted classes added. The machine must have locally normalised
+relations (local form) and stored samples of its Gibbs chains. `posterior` defines v, h1, y and b.
+The coverage c is the probability that a request lists a present class. The listed classes are L:
 
     p(v, h | L) ∝ p(v, h) (1 - c)^{|v \\ L|}   for v ⊇ L
 
-This is the same machine with log(1 - c) added to the biases of unlisted classes. Its posterior is
-estimated from the chain samples v_f that the machine stores (`fantasies`). σ is the logistic
-function.
+The same distribution results from adding log(1 - c) to the biases of unlisted classes. The module
+estimates its posterior from the stored chain samples v_f (`fantasies`). σ is the logistic function.
 
- 1. Each sample has a context h_f ~ p(h1 | v_f), drawn once, and logits l = b + W h_f. Its
-    importance weight for a scene is
+ 1. Each sample v_f has hidden units h_f ~ p(h1 | v_f), drawn once, and logits l = b + W h_f. The
+    importance weight of the sample for a scene is
 
         log w_f = sum_{i in L} log σ(l_i) + sum_{i not in L} log(1 - c σ(l_i)) + room
 
-    Both sums exclude structure (walls …). `room` is 0 without a room type.
- 2. Systematic resampling with offsets (m + 1/2) / M selects M samples.
- 3. Each selected sample m becomes a completion of the scene. It adds each unlisted class j, except
-    structure, for which l_j + log(1 - c) > logit u_mj. The numbers u are fixed: one in each of M
-    equal strata of [0, 1) for each class.
- 4. Given a completion, the context is summed out in closed form. Class i is first subtracted from
-    y:
+    Both sums exclude structure (walls …). `room` is 0 for a scene without a room type.
+ 2. Systematic resampling by these weights selects M samples, at the quantiles (m + 1/2) / M.
+ 3. Each selected sample m yields one completion of the scene. The completion adds each unlisted
+    class j with l_j + log(1 - c) > logit u_mj, except structure. The numbers u are fixed. For each
+    class, each of M equal strata of [0, 1) contains one number.
+ 4. For each completion m, the hidden units are summed out in closed form. y are the logits of h1
+    given the completion without class i:
 
         log-odds_mi = b_i + log(1 - c) + sum_k [softplus(y_k + W_ik) - softplus(y_k)]
 
-    The answer is the log-odds of the mean of σ(log-odds_mi) over the completions.
+    The answer for class i is the log-odds of the mean of σ(log-odds_mi) over the completions.
 
 All requests use the same random numbers, so the same scene always gets the same answer.
 
 The chain samples may have different room types. Then they follow a mixture over these types, in
-which n_s samples have type s. For a scene of room type t,
+which n_s samples have type s. For a scene of room type t, the term of log w_f is
 
     room = Q[t]·h_f - log sum_s n_s exp(Q[s]·h_f) / Z_s
 
-with Z_s from the multistate Bennett acceptance ratio. A scene without a room type uses the mixture
-itself.
+The multistate Bennett acceptance ratio gives the normalising constants Z_s. A scene without a room
+type uses the mixture itself.
 
 Sources: self-normalised importance sampling with resampling and one Rao–Blackwellised Gibbs step;
 Shirts and Chodera, "Statistically optimal analysis of samples from multiple equilibrium states"
@@ -60,17 +60,18 @@ Mask = NDArray[np.bool_]
 
 COMPLETIONS = 16
 SEED = 20180521
-"""Seed of the contexts h_f and the numbers u."""
+"""Seed of the random hidden units h_f and of the random numbers u; see the module."""
 
-# For smaller logits l, e^-l would overflow float32.
+# Lower limit of logits l, because e^-l of a smaller l would overflow float32.
 _LEAST_LOGIT = np.float32(-80.0)
-# Number of coverage values whose weights of an empty scene are cached, 4 N bytes each.
+# Number of coverage values with a cached sum of `_unlisted_evidence`. Each sum takes 4 N bytes.
 _KEPT = 32
-# Products of _FACTORS factors of at least _LEAST stay within the range of float32.
+# A product of _FACTORS factors, each at least _LEAST, stays within the range of float32.
 _FACTORS, _LEAST = 4, np.float32(1e-7)
 _ROOM_SWEEPS = 100
 _SETTLED = 1e-7
-# Smallest log p of a sample relative to its best room: products of two stay within float64.
+# Lower limit of Q[s]·h_f for a sample f, relative to the room type s with the largest value. With
+# this limit, a product of two exponentials of such values stays within float64.
 _LEAST_PULL = -300.0
 
 
@@ -79,12 +80,13 @@ class Completions:
 
     Args:
         weights: weights and stored samples of the machine.
-        structure: (V,) which classes are structure; completions ignore these classes.
+        structure: (V,) bool, True for structural classes such as walls. Completions ignore these
+            classes.
         scorer: scorer of the same machine.
-        count: M, number of completions of a scene.
+        count: number M of completions of a scene.
 
     Raises:
-        ValueError: the machine has no stored samples, or its weights are too large; see `fits`.
+        ValueError: the machine has no stored samples, or its weights are too large for float32.
     """
 
     def __init__(
@@ -95,7 +97,10 @@ class Completions:
         count: int = COMPLETIONS,
     ) -> None:
         if not self.fits(weights):
-            raise ValueError("completions require stored samples and bounded float32 weights")
+            raise ValueError(
+                "completions require a machine with stored samples and float32 weights W between "
+                "-64 and 64"
+            )
         self._scorer, self._structure = scorer, structure
         self._W, self._b = weights["W"], weights["b"]
         generator = np.random.Generator(np.random.Philox(SEED))
@@ -110,7 +115,7 @@ class Completions:
 
     @staticmethod
     def fits(weights: Weights) -> bool:
-        """Whether the machine stores samples, and its weights are small enough for float32."""
+        """Return whether the machine stores samples and its W is float32 between -64 and 64."""
         return weights.spec.N > 0 and group_size(weights["W"]) > 0
 
     def log_odds(
@@ -121,16 +126,16 @@ class Completions:
         coverage: float,
         room: int | None = None,
     ) -> Floats:
-        """Log-odds that each class is present but unlisted, (V,).
+        """Return the log-odds that each class is present but unlisted, (V,).
 
-        Entries of listed classes have no meaning.
+        The result also has entries for listed classes, but these entries have no meaning.
 
         Args:
             y: (H1,) logits of h1 given the evidence, with unlisted classes absent.
-            classes: (n,) the listed classes.
+            classes: (n,) indices of the listed classes.
             presence: (n,) probability that each listed class is present.
-            coverage: c, below 1.
-            room: index of the room type; None if unknown.
+            coverage: probability c that a present class is listed. It must be below 1.
+            room: index of the room type, or None if the room type is unknown.
         """
         base = self._empty(coverage)
         if room is not None and len(self._rooms):
@@ -150,7 +155,7 @@ class Completions:
         return found
 
     def _unlisted_evidence(self, coverage: float) -> Floats:
-        """Sum of log(1 - c σ(l_i)) over all classes i except structure, for each sample, (N,)."""
+        """Return sum_i log(1 - c σ(l_i)) for each sample, (N,). The sum excludes structure."""
         chance = 1 / (1 + self._odds_against[~self._structure])
         total = np.zeros(chance.shape[1], np.float32)
         for start in range(0, len(chance), _FACTORS):
@@ -160,7 +165,10 @@ class Completions:
 
 
 def _contexts(weights: Weights, generator: np.random.Generator) -> Floats:
-    """Draw h_f ~ p(h1 | v_f), (N, H1), with a second layer fixed at its mean field."""
+    """Draw hidden units h_f ~ p(h1 | v_f) for each of the N stored samples, (N, H1).
+
+    If the machine has a second layer, its units are fixed at their means by a mean-field iteration.
+    """
     base = weights["c1"] + weights.scenes @ weights["W"]
     if weights.spec.C:
         rooms = weights["fantasy_rooms"]
@@ -171,7 +179,10 @@ def _contexts(weights: Weights, generator: np.random.Generator) -> Floats:
 
 
 def _stratified_logits(count: int, classes: int, generator: np.random.Generator) -> Floats:
-    """Logits of uniform numbers, (M, V), one in each of M equal strata for each class."""
+    """Return logits of random numbers in (0, 1), (M completions, V classes).
+
+    For each class, each of M equal parts of (0, 1) contains one of the M numbers.
+    """
     strata = generator.random((count, classes)).argsort(0)
     uniform = (strata + generator.random((count, classes))) / count
     uniform = uniform.clip(1e-12, 1 - 1e-12)
@@ -179,17 +190,17 @@ def _stratified_logits(count: int, classes: int, generator: np.random.Generator)
 
 
 def _room_weights(weights: Weights, contexts: Floats) -> Floats:
-    """The term `room` of log w for each room type and sample, (C, N)."""
+    """Return the term `room` of log w_f for each room type and each stored sample, (C, N)."""
     spec = weights.spec
     if not spec.C:
         return np.zeros((0, 0), dtype=np.float32)
     pull = contexts.astype(np.float64) @ weights["Q"].T.astype(np.float64)
-    # The last state is "no room type".
+    # The last column stands for "no room type".
     pull = np.concatenate([pull, np.zeros((len(pull), 1))], 1)
     rooms = weights["fantasy_rooms"]
     drawn, sizes = np.unique(np.where(rooms < 0, spec.C, rooms), return_counts=True)
-    # p(sample | room) up to a factor per sample, so that both sums of the iteration are matrix
-    # products. The lower bound keeps every entry, and so every sum, above 0.
+    # share[f, s] is exp(Q[s]·h_f), divided by the largest entry of the row. With this array, both
+    # sums of the iteration are matrix products. The lower limit keeps the sums above 0.
     top = pull[:, drawn].max(1)
     share = np.exp(np.maximum(pull[:, drawn] - top[:, None], _LEAST_PULL))
     log_z = np.zeros(len(drawn))

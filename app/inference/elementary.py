@@ -1,8 +1,9 @@
-"""sigmoid and softplus for arrays; exp, log and logistic in float32 for compiled kernels.
+"""Elementary functions: sigmoid and softplus for arrays; exp, log and logistic for kernels.
 
-Functions of the C library take one number at a time. The exp and log of this module are plain
-arithmetic, so the compiler can apply them to a whole vector register. Their errors are below
-2 units in the last place (`tests/machines/test_elementary.py`).
+The functions for compiled kernels take float32 numbers. Functions of the C library take one number
+at a time. The exp and log of this module consist of arithmetic operations, so the compiler can
+apply them to a whole vector register. The errors of exp and log are below 2 units in the last place
+(`tests/machines/test_elementary.py`).
 
 Source: range reduction and minimax polynomials of Moshier's Cephes library (`expf`, `logf`).
 """
@@ -24,9 +25,10 @@ Floats = NDArray[np.floating[Any]]
 _f = np.float32
 _i = np.int32
 
-# exp() clips its argument to these bounds. So the result is positive and finite.
+# exp() clips its argument to these limits, so that its result is positive and finite.
 _LEAST, _LARGEST = _f(-87.0), _f(88.0)
-# The two parts add up to ln 2. The first part has few digits, so that its multiples are exact.
+# The sum of both constants is ln 2. _LN2_HIGH has few binary digits, so that its products with
+# small integers are exact.
 _LN2_HIGH, _LN2_LOW = _f(0.693359375), _f(-2.12194440e-4)
 _SQRT_HALF_BITS = _i(0x3F3504F3)
 _MANTISSA_BITS = _i(0x007FFFFF)
@@ -34,7 +36,7 @@ _ONE_BITS = _i(0x3F800000)
 
 
 def sigmoid(x: Floats) -> Floats:
-    """Compute 1 / (1 + e^-x). Clip x at -80, because e^89 exceeds float32."""
+    """Compute 1 / (1 + e^-x). Replace x below -80 by -80, because e^89 would overflow float32."""
     found: Floats = np.exp(np.minimum(-x, 80))
     found += 1
     return np.reciprocal(found, out=found)

@@ -1,15 +1,17 @@
 """Fast log-odds of classes.
 
-The hidden units contribute a sum of logs to the log-odds of class i, called the gain of the class:
+The gain of class i is the contribution of the hidden units k to the log-odds of the class. x are
+the logits of the hidden units, and W are the weights between classes and hidden units:
 
     gain_i = sum_k [softplus(x_k + W_ik) - softplus(x_k)]
            = sum_k log(sigmoid(-x_k) + sigmoid(x_k) exp(W_ik))
 
-The module computes exp(W) once. Every factor (the argument of a log) lies between 1 and exp(W_ik).
-So the module multiplies a group of factors and takes one log of the product, if the product stays
-within float32. Both terms of a factor are positive, so digits do not cancel. The form
-1 + sigmoid(x) (exp(W) - 1) would be 0 for large x and W below -17.
-If the weights are float64 or too large for float32, the module takes each log separately.
+The module computes exp(W) once. A factor is the argument of a log in the second line. Each factor
+lies between 1 and exp(W_ik). The module multiplies a group of factors and takes one log of the
+product. The group is small enough to keep the product within float32. Both terms of a factor are
+positive, so their sum loses no digits. The equivalent form 1 + sigmoid(x) (exp(W) - 1) would be 0
+for large x and W below -17. If the weights are float64 or too large for float32, the module
+computes the first line directly.
 """
 
 from __future__ import annotations
@@ -38,18 +40,18 @@ _LARGEST_GROUP = 25
 _TILE = 800
 # The width of a tile is a multiple of this number, so that it fills whole vector registers.
 _LANES = 16
-# Number of parallel products in `_gain`. Each product multiplies every 32nd factor.
+# Number of products that `_gain` computes in parallel. Each product takes every 32nd factor.
 _SIDE_BY_SIDE = 32
 _LN2 = np.float32(0.6931471805599453)
 _ONE = np.float32(1.0)
-# Maximum |logit| at which the odds and both probabilities are normal numbers in float32.
+# Maximum |logit| for which float32 can represent the odds, p and 1 - p as normal numbers.
 _MOST_LOGIT = np.float32(80.0)
 
 
 def group_size(W: Floats) -> int:
-    """Return the maximum number of factors between 1 and exp(W) in one float32 product.
+    """Return the maximum number of factors in one float32 product; see the module.
 
-    The result is 0 if products in float32 are not safe.
+    The result is 0 if W is float64 or too large for products in float32.
     """
     largest = float(np.abs(W).max()) if W.size else 0.0
     if W.dtype == np.float64 or largest > _LARGEST_WEIGHT:
@@ -67,9 +69,9 @@ class ContextScorer:
         W: (V, H1) weights between classes and hidden units.
 
     Attributes:
-        group: number of factors per product, see `group_size`.
-        exp_w: (tiles, H1, classes of a tile) exp(W). The attribute exists only if ``group`` is
-            not 0.
+        group: maximum number of factors per product; see `group_size`.
+        exp_w: (tiles, H1, classes per tile) exp(W), split into tiles of classes. The attribute
+            exists only if ``group`` is not 0.
 
     Raises:
         ValueError: W contains NaN or infinity.
@@ -79,7 +81,7 @@ class ContextScorer:
 
     def __init__(self, W: Floats) -> None:
         if not np.isfinite(W).all():
-            raise ValueError("W must be finite")
+            raise ValueError("W contains NaN or infinity; all weights must be finite")
         self.V, self.H1 = W.shape
         self._W, self.group = W, group_size(W)
         if self.group:
@@ -118,7 +120,8 @@ class ContextScorer:
 def _set_halves(x, off, on):
     """Set off = sigmoid(-x) and on = sigmoid(x).
 
-    One exponential gives both. 1 - sigmoid(x) would lose digits.
+    The function computes both from one exponential. The difference 1 - sigmoid(x) would lose
+    digits.
     """
     for k in range(len(x)):
         fall = exp(min(-x[k], _MOST_LOGIT))
@@ -130,13 +133,14 @@ def _set_halves(x, off, on):
 def gains(x, exp_w, group, classes):
     """Return the gains of all V classes for M rows of logits, (M, V).
 
-    After each group, the function moves the exponent of the product to an integer. So one log at
-    the end is enough.
+    After each group of factors, the function splits the product into mantissa and exponent, and
+    adds the exponent to an integer. So one log at the end is enough.
 
     Args:
         x: (M, H1) logits of the hidden units.
-        exp_w, group: attributes of `ContextScorer`.
-        classes: number of classes V.
+        exp_w: exp(W) in tiles; see `ContextScorer`.
+        group: maximum number of factors per product.
+        classes: number V of classes.
     """
     (tiles, units, width), M = exp_w.shape, len(x)
     found, off, on = np.empty((M, classes), np.float32), np.empty_like(x), np.empty_like(x)
@@ -150,7 +154,8 @@ def gains(x, exp_w, group, classes):
             product[:], exponents[:] = _ONE, np.int32(0)
             for start in range(0, units, group):
                 end = min(start + group, units)
-                # Two factors at a time halve the number of reads and writes of the product.
+                # The loop takes two factors at a time. This halves the reads and writes of the
+                # product.
                 for k in range(start, end - 1, 2):
                     a1, b1, row1 = offs[k], ons[k], tile[k]
                     a2, b2, row2 = offs[k + 1], ons[k + 1], tile[k + 1]
@@ -170,9 +175,13 @@ def gains(x, exp_w, group, classes):
 
 @compiled
 def _gain(off, on, growth, group, product):
-    """Return sum_k log((off + on growth) / (off + on)), where growth (H1,) is e^W.
+    """Return the gain of one class: sum_k log((off_k + on_k growth_k) / (off_k + on_k)).
 
-    ``product`` is a buffer.
+    Args:
+        off, on: (H1,) sigmoid(-x) and sigmoid(x) of the logits x of the hidden units.
+        growth: (H1,) e^W of the class.
+        group: maximum number of factors per product; see `ContextScorer`.
+        product: (32,) buffer for intermediate products.
     """
     size, total = len(off), np.float32(0.0)
     for first in range(0, size, group * _SIDE_BY_SIDE):
@@ -193,13 +202,13 @@ def _gain(off, on, growth, group, product):
 
 @compiled
 def gains_without(y, share, W, group):
-    """Return the gain of each class, (n,), after its own share is removed from the logits y.
+    """Return the gain of each class i at the logits y without the share of class i, (n,).
 
     Args:
         y: (H1,) logits of the hidden units.
         share: (n, H1) contribution of each class and its relations to y.
-        W: (n, H1) weights of the classes.
-        group: attribute of `ContextScorer`.
+        W: (n, H1) weights between each class and the hidden units.
+        group: maximum number of factors per product; see `ContextScorer`.
     """
     found, growth = np.empty(len(W), np.float32), _exps(W)
     off, on, product = np.empty_like(y), np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
@@ -211,17 +220,18 @@ def gains_without(y, share, W, group):
 
 @compiled
 def gains_without_others(y, share, W, rows, common, index, group):
-    """Return the gain of class i without its own share and without the share of class j, (N, n).
+    """Return the gain of class i at the logits y without the shares of classes i and j, (N, n).
 
-    Each row is a class i of ``rows``, and each column is a class j.
+    Each row of the result is a class i of ``rows``, and each column is a class j.
 
     Args:
         y: (H1,) logits of the hidden units.
         share: (n, H1) contribution of each class and its relations to y.
-        W: (n, H1) weights of the classes.
-        rows: (N,) row i in ``share`` of each class whose gain is computed.
-        common, index: results of `RelationUnits.common`.
-        group: attribute of `ContextScorer`.
+        W: (n, H1) weights between each class and the hidden units.
+        rows: (N,) row of each class i in ``share`` and W.
+        common: (P, H1) contribution to y of the relations between two classes, for P pairs.
+        index: (n, n) row of each pair of classes in ``common``, or -1 for a pair without relations.
+        group: maximum number of factors per product; see `ContextScorer`.
     """
     n, size = share.shape
     found, both = np.zeros((len(rows), n), np.float32), np.empty_like(y)
@@ -236,8 +246,8 @@ def gains_without_others(y, share, W, rows, common, index, group):
             for k in range(size):
                 both[k] = left[k] * down[k]
             if index[i, j] >= 0:
-                # Both shares contain the relations between the two classes, but they must be
-                # removed only once.
+                # The relations between i and j are part of both shares. They must be removed once,
+                # not twice.
                 again = twice[index[i, j]]
                 for k in range(size):
                     both[k] *= again[k]
@@ -247,15 +257,16 @@ def gains_without_others(y, share, W, rows, common, index, group):
 
 @compiled
 def reasons_for_absent(y, share, W, group):
-    """Return how much each present class changes the gain of each absent class, (N, n).
+    """Return how much each of n present classes changes the gain of each absent class, (N, n).
 
-    The change is the gain with the present class minus the gain without it.
+    The change is the absent class's gain with the present class minus its gain without the present
+    class.
 
     Args:
         y: (H1,) logits of the hidden units.
-        share: (n, H1) contribution of each present class to y.
-        W: (N, H1) weights of the absent classes.
-        group: attribute of `ContextScorer`.
+        share: (n, H1) contribution of each present class and its relations to y.
+        W: (N, H1) weights between each absent class and the hidden units.
+        group: maximum number of factors per product; see `ContextScorer`.
     """
     n, growth = len(share), _exps(W)
     found, all_of = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)
@@ -283,17 +294,18 @@ def _exps(x):
 
 @compiled
 def resampled(weight, against, classes, presence, closed, count):
-    """Resample N samples by their weights given a scene (systematic resampling).
+    """Select M of N stored samples by their weights for a scene (systematic resampling).
 
     Args:
-        weight: (N,) log weights of the samples before the listed classes count.
-        against: (V, N) odds against each class in each sample: e^-l for log-odds l.
-        classes, presence: (n,) indices of the listed classes and their presence.
-        closed: 1 - c, where c is the coverage.
-        count: number M of samples to return.
+        weight: (N,) log weights of the samples for a scene without listed classes.
+        against: (V, N) odds against each class in each sample. For log-odds l, they are e^-l.
+        classes: (n,) indices of the listed classes.
+        presence: (n,) probability that each listed class is present.
+        closed: 1 - c. The coverage c is the probability that a present class is listed.
+        count: number M of samples to select.
 
     Returns:
-        (M,) indices of the chosen samples, ascending.
+        (M,) indices of the selected samples, in ascending order.
     """
     weight, below = weight.copy(), np.empty(len(weight))
     for i in range(len(classes)):
@@ -319,17 +331,19 @@ def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
     """Average the probability of each class over M completions and return its log-odds, (V,).
 
     A completion is the scene with some unlisted classes added. Each completion belongs to one
-    sample. It adds the usable classes whose odds against them in this sample are below ``most``.
+    stored sample. The completion adds a usable class if the odds against this class in the sample
+    are below ``most``.
 
     Args:
         y: (H1,) logits of h1 without unlisted classes.
         picked: (M,) index of the sample of each completion.
         against: (V, N) odds against each class in each sample.
-        most: (V, M) limit for ``against``: the completion adds a class with odds below it.
+        most: (V, M) limit of ``against`` for each class and completion.
         usable: (V,) bool, classes that a completion may add.
         bias: (V,) log-odds of each class without the hidden units.
         W: (V, H1) weights between classes and hidden units.
-        exp_w, group: attributes of `ContextScorer`.
+        exp_w: exp(W) in tiles; see `ContextScorer`.
+        group: maximum number of factors per product.
     """
     (V, size), M = W.shape, len(picked)
     completed, added = np.empty((M, size), np.float32), np.zeros((M, V), np.bool_)
@@ -355,7 +369,8 @@ def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
                     fall[k] = exp(-row[k])
                 gain[m, i] = -_gain(off, on, fall, group, product)
         for i in range(V):
-            # One exponential gives p and 1 - p. The difference 1 - p would lose digits.
+            # One exponential gives p and 1 - p = odds * p. Computing 1 - p as a difference would
+            # lose digits.
             odds = exp(min(max(-bias[i] - gain[m, i], -_MOST_LOGIT), _MOST_LOGIT))
             p = _ONE / (_ONE + odds)
             here[i] += p

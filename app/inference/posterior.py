@@ -1,24 +1,25 @@
 """The posterior given a scene: log-odds of objects, relations and unlisted classes.
 
-The machine must have the local form. v are the object units, h1 the hidden units of the first
-layer, and x their logits given the objects. Without observed relations p(h1 | v) is factorial, with
-means m:
+The machine must have the local form: each relation unit is normalised separately. v are the object
+units, h1 are the hidden units of the first layer, and x are the logits of h1 given the objects.
+Without observed relations, the units of h1 are independent given v. Their means m are:
 
     m = sigmoid(x),   x = c1 + Q[t] + v'W + J m2
 
-t is the room type. A second layer is fixed at its mean field m2 given the objects.
+t is the room type. m2 are the mean-field means of a second layer, given the objects.
 
-Observed relations e change the logits of h1 from x to their mean field y, see
-`RelationUnits.fixed_point`. `Pull` can reduce this effect by a factor ω: x + ω (y - x) replaces y,
-and ω slope_e replaces slope_e. Questions about objects and questions about relations have different
-factors ω. Then
+Observed relations e change the logits of h1 from x to y = x + sum_e slope_e U_e. U_e are the
+weights between relation e and h1. `RelationUnits.fixed_point` computes y and the slopes by a
+mean-field iteration. `Pull` can reduce this effect by a factor ω: x + ω (y - x) replaces y, and
+ω slope_e replaces slope_e. Questions about objects and questions about relations have different
+factors ω. The answers are:
 
     object     log-odds_i = b_i + sum_k [softplus(y_k + W_ik) - softplus(y_k)]
     relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))], see `relations`
 
-The judged unit is first subtracted from y. For an observed relation, this is its own slope. For a
-present object it is W_i, the slopes of all its relations, and its effect through the second layer.
-The slopes of other relations are not computed again.
+The contribution of the judged unit is first subtracted from y. An observed relation e contributes
+slope_e U_e. A present object i contributes W_i, the terms slope_e U_e of all its relations, and its
+effect through the second layer. The slopes of other relations are not computed again.
 """
 
 from __future__ import annotations
@@ -38,14 +39,19 @@ Floats = NDArray[np.float32]
 Places = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-# Up to this slope, the effect of an observed relation on itself is subtracted to first order
-# (docs/decisions/inference.md).
+# Maximum |slope| of an observed relation for which a first-order formula subtracts the effect of
+# the relation on its own logit (docs/decisions/inference.md).
 _GENTLE = 0.5
 _NO_SLOPES = np.zeros(0, dtype=np.float32)
 
 
 class Pull(NamedTuple):
-    """Factors ω of the effect of observed relations on h1, from 0 to 1, by kind of question."""
+    """Factors ω from 0 to 1 that reduce the effect of observed relations on h1.
+
+    Attributes:
+        objects: factor ω for questions about objects.
+        relations: factor ω for questions about relations.
+    """
 
     objects: float = 1.0
     relations: float = 1.0
@@ -55,17 +61,20 @@ FULL = Pull()
 
 
 class ClosedForm:
-    """A machine prepared for log-odds in closed form; `ScenePosterior` has these for one scene.
+    """A machine prepared for log-odds in closed form. `ScenePosterior` computes them for one scene.
 
-    The same scene always gives bit-identical log-odds. Other questions have no effect on them.
+    The same scene always gives bit-identical log-odds, whatever the other requests.
 
     Raises:
-        ValueError: the machine does not fit this closed form; see `fits`.
+        ValueError: the closed form does not apply to the machine; see `fits`.
     """
 
     def __init__(self, weights: Weights) -> None:
         if not self.fits(weights):
-            raise ValueError("the closed form requires the local form and bounded float32 weights")
+            raise ValueError(
+                "the closed form requires a machine in the local form with float32 weights W "
+                "between -64 and 64"
+            )
         self._weights = weights
         self.W, self.b = weights["W"], weights["b"]
         self._c1, self._Q = weights["c1"], weights["Q"]
@@ -74,7 +83,7 @@ class ClosedForm:
 
     @staticmethod
     def fits(weights: Weights) -> bool:
-        """Whether the machine has the local form and bounded float32 weights."""
+        """Return whether the machine has the local form and its W is float32 between -64 and 64."""
         return (
             weights.spec.is_local
             and weights["W"].dtype == np.float32
@@ -90,15 +99,15 @@ class ClosedForm:
         given: Given | None = None,
         pull: Pull = FULL,
     ) -> Context:
-        """Logits of h1 given the objects, the room type and the given relations.
+        """Compute the logits of h1 given the objects, the room type and the observed relations.
 
         Args:
-            classes: (n,) distinct classes of the scene.
+            classes: (n,) indices of the distinct classes of the scene.
             presence: (n,) probability that each class is present.
             log_counts: (n,) log of the number of instances of each class.
-            room: index of the room type; None if unknown.
-            given: observed relations; None without any.
-            pull: factors of the effect of the observed relations.
+            room: index of the room type, or None if the room type is unknown.
+            given: observed relations, or None if the scene has no observed relations.
+            pull: factors that reduce the effect of the observed relations.
         """
         x: Floats = self._c1 + presence @ self.W[classes]
         if room is not None and len(self._Q):
@@ -122,7 +131,7 @@ class ClosedForm:
     def _second_layer(
         self, base: Floats, classes: Places, presence: Floats
     ) -> tuple[Floats, Floats]:
-        """x, (H1,), and the effect of each class on x through the second layer, (n, H1)."""
+        """Return x (H1,), and the effect of each class on x through the second layer (n, H1)."""
         without = base - presence[:, None] * self.W[classes]
         bases = np.concatenate([base[None], without]).astype(np.float32)
         x, _ = self._weights.with_second_layer(bases)
@@ -131,12 +140,12 @@ class ClosedForm:
 
 
 class ScenePosterior:
-    """Log-odds of objects and relations given the context of a scene, in closed form.
+    """Log-odds of objects and relations given the logits of h1 (`Context`), in closed form.
 
-    Shapes: V classes of the vocabulary, A canonical relations, n classes of the scene. The
-    log-odds of objects are exact for one hidden layer and a scene without observed relations.
-    Logits of relations are approximated by normal variables. `NO_UNIT` is the smallest log-odds of
-    a relation.
+    Shapes contain V (classes of the vocabulary), A (canonical relations), n (classes of the scene)
+    and H1 (hidden units of the first layer). The log-odds of objects are exact for a machine with
+    one hidden layer and a scene without observed relations. The logits of relations are
+    approximated by normal variables. The smallest log-odds of a relation is `NO_UNIT`.
     """
 
     def __init__(self, closed: ClosedForm, context: Context) -> None:
@@ -145,13 +154,13 @@ class ScenePosterior:
 
     @property
     def unit_count(self) -> int:
-        """Number of observed relation units; the cost of judging one class grows with it."""
+        """Number of observed relation units. The time to judge one class grows with this number."""
         return len(self.context.slopes)
 
     def relation_log_odds(self) -> Floats:
-        """Log-odds of every relation between the classes of the scene, (A, n, n).
+        """Return the log-odds of every relation between the classes of the scene, (A, n, n).
 
-        Each relation is judged as if it were unobserved itself.
+        The observation of a relation is not evidence for the same relation.
         """
         found = self._units.log_odds(self._between)
         given, units, slopes = self.context.given, self.context.units, self.context.slopes
@@ -166,11 +175,13 @@ class ScenePosterior:
         return found
 
     def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
-        """Log-odds of E relations, each judged as if it were unobserved itself, (E,).
+        """Return the log-odds of E relations, (E,).
+
+        The observation of a relation is not evidence for the same relation.
 
         Args:
-            relation: (E,) canonical relations.
-            subject, object_: (E,) indices of the classes in the scene.
+            relation: (E,) indices of canonical relations.
+            subject, object_: (E,) indices of the subject and object classes in the scene.
         """
         given, shift, _ = self._units.said(self.context)
         none = np.zeros(len(relation), dtype=np.float32)
@@ -178,13 +189,15 @@ class ScenePosterior:
         return self._units.without_itself(self.context, relation, subject, object_, slopes, shift)
 
     def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
-        """Log-odds of all relations of P pairs, judged as if no relation of the pair were observed.
+        """Return the log-odds of all relations of P pairs of classes.
+
+        The observed relations of a pair are not evidence for the relations of the same pair.
 
         Args:
-            one, other: (P,) indices of the two classes in the scene.
+            one, other: (P,) indices of the first and second class of each pair in the scene.
 
         Returns:
-            (A, P) from `one` to `other`, and (A, P) from `other` to `one`.
+            Log-odds (A, P) with `one` as subject, and log-odds (A, P) with `other` as subject.
         """
         forward, backward = self._units.log_odds_apart(self.context, self._between, one, other)
         return forward, backward
@@ -192,50 +205,53 @@ class ScenePosterior:
     def placement_log_odds(
         self, candidates: Places, anchors: Places, only: int | None = None
     ) -> tuple[Floats, Floats]:
-        """Log-odds of all relations of absent classes to anchors, if these classes were present.
+        """Return the log-odds of relations between absent candidate classes and anchor classes.
 
-        The effect of the observed relations on a candidate's relations is left out.
+        Each candidate is judged as if it were present. The observed relations change the result
+        only through the hidden units h1.
 
         Args:
-            candidates: (N,) absent classes.
-            anchors: (m,) indices of classes in the scene.
-            only: the one canonical relation to judge; None for all.
+            candidates: (N,) indices of absent classes.
+            anchors: (m,) indices of the anchor classes in the scene.
+            only: index of one canonical relation (R = 1), or None for all relations (R = A).
 
         Returns:
-            (N, A, m) from the candidates to the anchors, and (N, A, m) from the anchors back.
+            Log-odds (N, R, m) with the candidate as subject, and log-odds (N, R, m) with the
+            anchor as subject.
         """
         return self._units.placement_log_odds(self.context, candidates, anchors, only)
 
     def placed_log_p(
         self, candidates: Places, relation: int, anchor: int, *, outgoing: bool
     ) -> Floats:
-        """log p(relation between candidate and anchor | candidate is present, evidence), (N,).
+        """Return log p(relation to the anchor | candidate is present, evidence), (N,).
 
         Args:
-            candidates: (N,) absent classes.
-            relation: canonical relation.
+            candidates: (N,) indices of absent classes.
+            relation: index of a canonical relation.
             anchor: index of the anchor's class in the scene.
-            outgoing: whether the candidate is the relation's subject; otherwise the anchor is.
+            outgoing: True if the candidate is the relation's subject, False if the anchor is.
         """
         both = self.placement_log_odds(candidates, np.array([anchor]), relation)
         log_odds = both[0 if outgoing else 1][:, 0, 0]
         return -np.logaddexp(np.float32(0.0), -log_odds)
 
     def log_odds_given_rest(self) -> Floats:
-        """Leave-one-out log-odds of each class: given the scene without it, (n,).
+        """Return the log-odds of each class given the scene without this class, (n,).
 
-        The relations of the class are left out, too.
+        The relations of the class are also left out.
         """
         return self._closed.b[self.context.classes] + self._gains
 
     def reasons(self, rows: Places) -> Floats:
-        """How much each class of the scene changes the leave-one-out log-odds of others, (N, n).
+        """Return how much each class j changes `log_odds_given_rest` of each class i, (N, n).
 
-        An entry is the log-odds with the changing class, minus the log-odds without this class and
-        its relations. The entry of a class for itself is 0.
+        Each row is one of the N classes i of ``rows``. Each column is one of the n classes j of the
+        scene. An entry is the log-odds of i with class j, minus the log-odds of i without class j
+        and the relations of j. An entry with i = j is 0.
 
         Args:
-            rows: (N,) indices of the explained classes in the scene.
+            rows: (N,) indices of the classes i in the scene.
         """
         context, closed = self.context, self._closed
         without: Floats = objects.gains_without_others(
@@ -247,9 +263,11 @@ class ScenePosterior:
         return change
 
     def reasons_for_absent(self, candidates: Places) -> Floats:
-        """How much each class of the scene changes the log-odds of absent classes, (N, n).
+        """Return how much each class of the scene changes the log-odds of absent classes, (N, n).
 
-        An entry is the log-odds with the class, minus the log-odds without it and its relations.
+        Each row is one of the N absent candidates. Each column is one of the n classes of the
+        scene. An entry is the candidate's log-odds with the class of the scene, minus the
+        candidate's log-odds without this class and its relations.
         """
         found: Floats = objects.reasons_for_absent(
             self.context.object_y, self._shares, self._closed.W[candidates], self._closed.group
@@ -262,13 +280,13 @@ class ScenePosterior:
 
     @cached_property
     def _shares(self) -> Floats:
-        """The sum that each class and its relations add to y, (n, H1)."""
+        """The contribution of each class and its relations to y, (n, H1)."""
         share = self._units.shares(self.context)
         return share if self.context.through is None else share + self.context.through
 
     @cached_property
     def _gains(self) -> Floats:
-        """The change of each class's log-odds b_i by the rest of the scene, (n,)."""
+        """The change of the log-odds of each class i from b_i by the rest of the scene, (n,)."""
         found: Floats = objects.gains_without(
             *(self.context.object_y, self._shares, self._closed.W[self.context.classes]),
             self._closed.group,
@@ -277,7 +295,10 @@ class ScenePosterior:
 
 
 def _scaled(pull: float, x: Floats, y: Floats, slopes: Floats) -> tuple[Floats, Floats]:
-    """x + pull (y - x), and pull slopes. A pull of 1 returns y and slopes unchanged."""
+    """Return x + pull (y - x), and slopes multiplied by ``pull``.
+
+    If ``pull`` is 1, the function returns y and slopes unchanged.
+    """
     if pull >= 1:
         return y, slopes
     weight = np.float32(pull)

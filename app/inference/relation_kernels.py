@@ -1,7 +1,7 @@
 """Compiled kernels of relation units: look-up of residual weights, mean field, implications.
 
-The module `relations` has the formulas. `training/machines/triway.py` has the formulas of the
-implications.
+An implication is a change of a relation's logit by other relations that hold. The formulas of the
+implications are in `training/machines/triway.py`. All other formulas are in the module `relations`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ SPREAD, SHIFT = 2654435761, 16
 _DAMPING = np.float32(0.8)
 # `draw_in_groups` samples the relations in 2 * _GROUPS groups.
 _GROUPS = 4
-# Maximum number of neighbours that a degree feature counts. More neighbours add little information.
+# Limit of a degree feature. This feature counts the relations of one kind that a class has. More
+# than three relations add little information.
 _MOST = np.float32(3.0)
 
 
@@ -25,7 +26,10 @@ _MOST = np.float32(3.0)
 def pair_rows(start, keys, pairs):
     """Return the row of each pair of classes in the table of residual weights, (E,).
 
-    A pair (i, j) has the key i V + j. The row of an unknown pair is the last row, which is zero.
+    Args:
+        start: first row of each bucket of the hash table.
+        keys: keys of the pairs in the table. A pair (i, j) of V classes has the key i V + j.
+        pairs: (E,) keys to look up. A key outside the table gets the last row, which is zero.
     """
     # Buckets are faster than binary search, because the processor cannot predict its branches.
     found = np.empty(len(pairs), np.int64)
@@ -41,13 +45,13 @@ def pair_rows(start, keys, pairs):
 
 @compiled_in_any_order
 def unit_terms(w, g, a, ends):
-    """Return the logits of units without U_e·h1, (E,), and their factors z_e (E, K).
+    """Return the logits of E units without the term U_e·h1, (E,), and the factors z_e (E, K).
 
     Args:
-        w: `relations.SharedArrays`.
-        g: (A, K) weights of z_e: each logit contains the product g[a_e]·z_e.
+        w: weights of the units; see `relations.SharedArrays`.
+        g: (A, K) weights of the factors z_e. The logit of unit e contains the product g[a_e]·z_e.
         a: (E,) indices of the relations.
-        ends: `relations.Ends` with arrays of shape (E,).
+        ends: subject and object classes of the relations; see `relations.Ends`.
     """
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
     i, j, log_i, log_j = ends.i, ends.j, ends.log_i, ends.log_j
@@ -66,14 +70,16 @@ def unit_terms(w, g, a, ends):
 
 @compiled
 def pair_terms(w, first, ends, z, base):
-    """Compute the parts of the logits of pairs that do not depend on the context.
+    """Compute the parts of relation logits that do not depend on the hidden units.
+
+    The function writes its results to z and base, for R relations of P pairs in each of B batches.
 
     Args:
-        w: `relations.SharedArrays`.
+        w: weights of the units; see `relations.SharedArrays`.
         first: index of the first of the R consecutive relations.
-        ends: `relations.Ends` with arrays of shape (B, P).
-        z: (B, K, P') array for the factors z_e. P' is at least P.
-        base: (B, R, P') array for the other terms.
+        ends: subject and object classes of the pairs, (B, P); see `relations.Ends`.
+        z: (B, K, P') output array for the factors z_e. P' is P plus padding.
+        base: (B, R, P') output array for the terms without z_e.
     """
     # Local names are faster: each access through the tuple would change a reference count.
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
@@ -93,11 +99,14 @@ def pair_terms(w, first, ends, z, base):
 
 @compiled_in_any_order
 def spreads(C, q):
-    """Return √3 σ = √(3 q'C q) of logits, (B, R, P).
+    """Return √3 σ = √(3 q'C q) of the logits of R relations for P pairs in B batches, (B, R, P).
+
+    σ is the standard deviation of a logit. `relations.SharedUnits` defines C and q.
 
     Args:
-        C: (B, R, r (r + 1) / 2) lower half of each matrix C, with entries off the diagonal doubled.
-        q: (B, R, r, P) coordinates q of each pair; see `relations.SharedUnits`.
+        C: (B, R, r (r + 1) / 2) lower half of each symmetric r x r matrix C. Entries off the
+            diagonal are doubled.
+        q: (B, R, r, P) vectors q of r coordinates.
     """
     B, R, r, P = q.shape
     found, row = np.empty((B, R, P), np.float32), np.empty(P, np.float32)
@@ -120,21 +129,21 @@ def spreads(C, q):
 
 
 _ROOT_3 = np.float32(3.0**0.5)
-# Maximum √3 σ for which quadrature with three nodes is accurate enough.
+# Limit of √3 σ. Below this limit, a quadrature with three nodes is accurate enough.
 _NARROW = np.float32(0.75 * 3.0**0.5)
-# Trapezoidal rule for larger σ: distance between the nodes in units of σ, and the weights of the
-# positive nodes relative to the weight of node 0.
+# Constants of the trapezoidal rule for larger σ. _STEP is the distance between two nodes in units
+# of σ. _TAIL contains the weights of the positive nodes, relative to the weight of node 0.
 _STEP = np.float32(0.25)
 _TAIL = np.exp(-0.5 * (0.25 * np.arange(1, 21)) ** 2).astype(np.float32)
 
 
 @compiled
 def log_odds(means, spreads, least):
-    """Replace means (E,) by log-odds in place; see `relations.to_log_odds`.
+    """Replace the means of E logits by log-odds in place; see `relations.to_log_odds`.
 
     Args:
-        means: (E,) means of the logits.
-        spreads: (E,) √3 σ of the logits.
+        means: (E,) means of the logits. The function overwrites this array with the log-odds.
+        spreads: (E,) √3 σ, where σ is the standard deviation of each logit.
         least: lower limit of the log-odds.
     """
     wide = np.flatnonzero(spreads >= _NARROW)
@@ -175,7 +184,9 @@ def _wide_log_odds(means, spreads):
 
 @compiled
 def accumulate(keys, weights, rows, size):
-    """Return the sum of the weighted rows of each key, (size, K). Ignore rows with key -1.
+    """Return the sum of the weighted rows of each key, (size, K).
+
+    The function ignores rows with the key -1.
 
     Args:
         keys: (E,) key of each row, or (2E,) for two keys per row.
@@ -195,7 +206,7 @@ def accumulate(keys, weights, rows, size):
 
 @compiled
 def expanded(G, a, z):
-    """Compute the weights U_e = G[a_e]'z_e between each unit and h1, (E, H1)."""
+    """Compute the weights U_e = G[a_e]'z_e between each relation unit e and h1, (E, H1)."""
     found = np.zeros((len(a), G.shape[2]), np.float32)
     for e in range(len(a)):
         into, shared, factors = found[e], G[a[e]], z[e]
@@ -224,7 +235,7 @@ def _products(rows, m, out):
 
 @compiled_in_any_order
 def _selected_products(rows, a, through, out):
-    """Write the products rows_e · through[a_e] to ``out``."""
+    """Write the dot product of rows[e] and through[a[e]] to out[e], for each e."""
     for e in range(len(rows)):
         row, other, total = rows[e], through[a[e]], np.float32(0.0)
         for k in range(len(row)):
@@ -234,15 +245,17 @@ def _selected_products(rows, a, through, out):
 
 @compiled
 def normal_without_itself(y, U, base, slopes):
-    """Return mean and √3 σ of the logits of E units, (E,) each.
+    """Return the means (E,) and √3 times the standard deviations (E,) of the logits of E units.
 
-    The function removes slope_e U_e, the contribution of the unit itself, from y.
+    For each unit e, the function first subtracts slope_e U_e from y. This product is the
+    contribution of the unit itself.
 
     Args:
         y: (H1,) logits of h1.
-        U: (E, H1) weights of the units.
-        base: (E,) logits of the units without U_e·h1.
-        slopes: (E,) slopes of the units; see `RelationUnits.fixed_point`.
+        U: (E, H1) weights between the units and h1.
+        base: (E,) logits of the units without the term U_e·h1.
+        slopes: (E,) factor slope_e with which each unit acts on y; see
+            `RelationUnits.fixed_point`.
     """
     mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
     rest, m = np.empty_like(y), np.empty_like(y)
@@ -268,14 +281,16 @@ def _moments(row, m):
 
 @compiled
 def fixed_point(x, G, a, base, z, r, gate, sweeps):
-    """Compute the mean field of `RelationUnits.fixed_point`: y (H1,) and slopes (E,).
+    """Compute y (H1,) and the slopes (E,) by the mean field of `RelationUnits.fixed_point`.
 
     Args:
         x: (H1,) logits of h1 given the objects.
-        G: (A, K, H1) shared weights: U_e = G[a_e]'z_e. If G is empty, z (E, H1) is U itself.
-        a, base, z: attributes of `relations.Units`.
+        G: (A, K, H1) shared weights. U_e is G[a_e]'z_e. If G is empty, z (E, H1) is the array U.
+        a: (E,) indices of the relations.
+        base: (E,) logits of the units without the term U_e·h1.
+        z: (E, K) factors z_e of each unit.
         r: (E,) 1 if the relation holds, else 0.
-        gate: (E,) presence of both ends of the relation.
+        gate: (E,) product of the presence of subject and object class of each relation.
         sweeps: number of iterations.
     """
     E, (A, K, _) = len(a), G.shape
@@ -319,16 +334,17 @@ def _add_rows(weights, rows, out):
 
 @compiled
 def _no_steps(relations, n):
-    """Return the empty step tables of a scene without relations.
+    """Return the empty step tables of a scene of n classes without relations.
 
-    A step leads from one class to another along a relation that holds. A step of kind a leads from
-    the subject to the object of relation a. A step of kind A + a leads back.
+    A step leads from one class to another class along a relation that holds. A step of kind a leads
+    from the subject to the object of relation a. A step of kind A + a leads from the object to the
+    subject of relation a.
 
     Returns:
-        degree: (2A, n) number of steps of each kind that start at each class.
-        near: (2A, n, n) classes at which these steps end.
-        seen: (n, n, 2A) paths of two steps between two classes. The last axis is the kind of the
-            first step. The value is a bit set of the kinds of the second step.
+        degree: (2A kinds, n classes) number of steps of each kind that start at each class.
+        near: (2A kinds, n classes, n) end classes of these steps.
+        seen: (n, n, 2A) paths of two steps from one class to another class. The last axis is the
+            kind of the first step. Each value is a bit set of the kinds of the second step.
         paths: (n, n, A) change of the logit of each relation by the paths between its two classes.
     """
     steps = 2 * relations
@@ -339,7 +355,7 @@ def _no_steps(relations, n):
 
 @compiled
 def _hold(known, weight, a, i, j):
-    """Add relation a between classes i and j to the step tables, with its steps and new paths."""
+    """Add the steps of relation a between classes i and j, and the new paths, to the tables."""
     # The loops use plain indices, because a slice would cost more time.
     degree, near, seen, paths = known
     steps = len(degree)
@@ -351,7 +367,8 @@ def _hold(known, weight, a, i, j):
         for d in range(steps):
             for at in range(degree[d, y]):
                 _add_path(seen, paths, weight, x, near[d, y, at], c, d)
-            # If step d leads from x to a class, the opposite step leads from this class to x.
+            # If a step of kind d leads from x to another class, then a step of the opposite kind
+            # leads from the other class to x.
             back = (d + steps // 2) % steps
             for at in range(degree[d, x]):
                 _add_path(seen, paths, weight, near[d, x, at], y, back, c)
@@ -372,15 +389,16 @@ def _implied(known, weight, direct):
 
     Args:
         known: step tables of the relations that hold; see `_no_steps`.
-        weight: (F, A) implication weights; see `RelationUnits.implication_weights`.
-        direct: whether relations between the same two classes change each other's logits.
+        weight: (F, A) weights of the F features of relations that hold; see
+            `RelationUnits.implication_weights`.
+        direct: True if relations between the same two classes change each other's logits.
     """
     degree, near, _, paths = known
     (steps, n), A = degree.shape, weight.shape[1]
     shift, degrees = paths.copy(), weight[steps + steps * steps :]
     out, into = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
     for c in range(steps):
-        # The number of steps of kind c that end at a class is its number of opposite steps.
+        # Each step of kind c that ends at a class has an opposite step that starts at this class.
         back = (c + A) % steps
         for x in range(n):
             for b in range(A):
@@ -398,7 +416,7 @@ def _implied(known, weight, direct):
                 for b in range(A):
                     if direct:
                         shift[x, y, b] += weight[c, b]
-                    # A degree feature of x and y must not count the step between x and y.
+                    # The degree features for the pair (x, y) must not count the step from x to y.
                     if degree[c, x] <= _MOST:
                         shift[x, y, b] -= degrees[c, b]
                     if degree[back, y] <= _MOST:
@@ -410,14 +428,15 @@ def _implied(known, weight, direct):
 def implied(weight, n, a, i, j):
     """Return how much the relations that hold change the logit of each relation, (2, n, n, A).
 
-    In part 0 of the first axis, all relations count. In part 1, relations between the same two
-    classes do not change each other's logits.
+    Index 0 of the first axis has the changes by all relations that hold. At index 1, relations
+    between the same two classes do not change each other's logits.
 
     Args:
-        weight: (F, A) implication weights; see `RelationUnits.implication_weights`.
+        weight: (F, A) weights of the F features of relations that hold; see
+            `RelationUnits.implication_weights`.
         n: number of classes in the scene.
-        a, i, j: (E,) indices of the relations that hold, and of their subject and object classes.
-            The two classes differ.
+        a, i, j: (E,) indices of the relations that hold, of their subject classes and of their
+            object classes. Subject and object class differ.
     """
     known = _no_steps(weight.shape[1], n)
     for e in range(len(a)):
@@ -429,18 +448,19 @@ def implied(weight, n, a, i, j):
 
 @compiled
 def draw_in_groups(weight, logits, free, uniform, other, r):
-    """Sample relations that imply each other, group after group.
+    """Sample relations that change each other's logits, group after group.
 
-    Each group is sampled given the relations of all earlier groups. The groups are random, but
-    a(i, j) and a(j, i) are always in different groups.
+    Each group is sampled given the relations of all earlier groups. The function assigns relations
+    to groups at random. But a(i, j) and a(j, i) are always in different groups.
 
     Args:
-        weight: (F, A) implication weights; see `RelationUnits.implication_weights`.
-        logits: (A, n, n) logits of the relations without implications.
+        weight: (F, A) weights of the F features of relations that hold; see
+            `RelationUnits.implication_weights`.
+        logits: (A, n, n) logits of the relations without the changes by other relations.
         free: (A, n, n) bool, True for relations to sample. Other relations keep their value.
-        uniform: (A, n, n) random numbers in [0, 1) that decide the relations.
-        other: (A, n, n) random numbers in [0, 1) that decide the groups.
-        r: (A, n, n) bool, the relations. The function writes the samples into it.
+        uniform: (A, n, n) random numbers in [0, 1) that decide whether each relation holds.
+        other: (A, n, n) random numbers in [0, 1) that select the group of each relation.
+        r: (A, n, n) bool, True for relations that hold. The function writes the samples into r.
     """
     A, n, _ = r.shape
     known, group = _no_steps(A, n), np.full(r.shape, -1, np.int64)
@@ -448,7 +468,8 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
         for i in range(n):
             for j in range(n):
                 if free[a, i, j]:
-                    # a(i, j) and a(j, i) share one random number, which decides their order.
+                    # a(i, j) and a(j, i) share one random number, which decides whether a(i, j) or
+                    # a(j, i) is sampled first.
                     later = other[a, min(i, j), max(i, j)] < 0.5
                     half = _GROUPS if later == (i < j) else 0
                     group[a, i, j] = half + np.int64(2 * _GROUPS * other[a, i, j]) % _GROUPS

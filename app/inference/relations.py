@@ -1,12 +1,15 @@
 """Probabilities of relations: p(r_e = 1) = E[sigmoid(ℓ_e(h1))] with ℓ_e(h1) = base_e + U_e·h1.
 
-The logit ℓ_e is a sum of many small independent terms. This module treats it as normal, with
+A relation e is a triple (relation a, subject class i, object class j). r_e is 1 if the relation
+holds, else 0. The logit ℓ_e is a sum of many small independent terms, one for each hidden unit k of
+h1. This module treats the logit as a normal variable with
 
     mean base_e + U_e·m   and variance   σ_e² = sum_k U_ek² m_k (1 - m_k)
 
-where m are the means of h1. Quadrature gives the mean of sigmoid(ℓ_e). For its errors, see
-docs/decisions/inference.md. The variant of the machine defines base and U: each unit of `FreeUnits`
-has its own row of U, and `SharedUnits` computes U from factors. All variants share the other code.
+where m are the means of h1. Quadrature gives the mean of sigmoid(ℓ_e). For the quadrature errors,
+see docs/decisions/inference.md. The variant of the machine defines base and U. Each unit of
+`FreeUnits` has its own row of U. `SharedUnits` computes U from factors. All variants share the
+other code.
 """
 
 from __future__ import annotations
@@ -30,14 +33,14 @@ Places = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 SWEEPS: Final = 10
-"""Number of iterations of a mean field. The shipped machines converge in this number. It is fixed,
-so that answers are reproducible."""
+"""Number of iterations of a mean field. The shipped machines converge within these iterations. The
+number is constant, so that answers are reproducible."""
 
 NO_UNIT: Final = np.float32(-30.0)
 """Lower limit of the log-odds of a relation."""
 
 NEVER: Final = np.float32(-1e4)
-"""Logit of a relation without a unit. Such a relation is off at any temperature."""
+"""Logit of a relation for which the machine has no unit. Such a relation never holds."""
 
 Table = tuple[NDArray[np.int32], NDArray[np.int32]]
 
@@ -46,39 +49,41 @@ NOTHING: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
 # The number of pairs is padded to a multiple of this number, to fill whole vector registers.
 _WHOLE: Final = 32
 
-# Maximum mean variance of a logit that `_directions` may neglect. A probability changes by about
-# 1/20 of the neglected variance. `indoor-triway` keeps 11 of 33 directions. All 33 would double the
-# time of /relations and change p by at most 0.005.
+# Maximum variance of a logit, averaged over units, that `_directions` may neglect. Neglecting a
+# variance changes a probability by about 1/20 of this variance. The model `indoor-triway` keeps 11
+# of 33 directions. All 33 directions would double the time of a /relations request and change
+# probabilities by at most 0.005.
 _LEFT_OUT: Final = 4e-3
 
 
 def to_log_odds(mean: Floats, spread: Floats) -> Floats:
-    """Return the log-odds of the mean of sigmoid(ℓ) for normal logits ℓ. The minimum is `NO_UNIT`.
+    """Return the log-odds of the mean of sigmoid(ℓ) for normal logits ℓ.
 
-    For σ < 0.75, the quadrature has three nodes: 0 and ±√3 σ, with weights 4 : 1 : 1. The error in
-    p is at most 0.0003. With u = e^-|mean| and q = e^spread, the sigmoids are u/(1 + u),
-    uq/(1 + uq) and u/(q + u). These forms cannot overflow. For larger σ, such as 10, the function
+    The smallest result is `NO_UNIT`. σ is the standard deviation of ℓ. For σ < 0.75, the quadrature
+    has three nodes, 0 and ±√3 σ, with weights 4 : 1 : 1. The error in the probability is at most
+    0.0003. With u = e^-|mean| and q = e^spread, the sigmoids at the nodes are u/(1 + u),
+    uq/(1 + uq) and u/(q + u). These forms cannot overflow. For σ of at least 0.75, the function
     uses the trapezoidal rule.
 
     Args:
-        mean: means of the logits.
-        spread: √3 σ of the logits.
+        mean: means of the logits, an array of any shape.
+        spread: √3 σ of the logits. The array has the same shape.
     """
     found = mean.ravel().astype(np.float32)
-    # ravel() makes the arrays contiguous: numba would compile the kernel again for another layout.
+    # ravel() makes the arrays contiguous. For another layout, numba would compile the kernel again.
     kernels.log_odds(found, spread.ravel(), NO_UNIT)
     return found.reshape(mean.shape)
 
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """E observed relation units between the n classes of a scene, each on or off.
+    """E observed relations between the n classes of a scene. Each relation holds or does not hold.
 
     Attributes:
-        a: (E,) indices of the relations.
-        i, j: (E,) indices of subject and object class, from 0 to n - 1.
+        a: (E,) number of the relation (left, on top, ...) of each unit.
+        i, j: (E,) indices of the subject classes and of the object classes, from 0 to n - 1.
         r: (E,) 1 if the relation holds, else 0.
-        g: (E,) presence of both ends.
+        g: (E,) product of the presence of subject and object class.
     """
 
     a: Places
@@ -89,13 +94,13 @@ class Given:
 
 
 class Units(NamedTuple):
-    """The requested relations for which the machine has a unit.
+    """The relation units that `RelationUnits.select` finds for the relations in its arguments.
 
     Attributes:
-        place: (E,) index of each unit in the request.
-        a: (E,) indices of the relations.
-        base: (E,) logit ℓ_e without U_e·h1.
-        z: (E, K') factors of each unit: U_e = G[a]'z_e. If G is empty, z_e is U_e itself.
+        place: (E,) index of each unit's relation in the arguments of `select`.
+        a: (E,) number of the relation (left, on top, ...) of each unit.
+        base: (E,) logits ℓ_e without the term U_e·h1.
+        z: (E, K') factors z_e of the weights U_e = G[a_e]'z_e. If G is empty, z_e is U_e.
     """
 
     place: Places
@@ -110,14 +115,16 @@ class Context:
 
     Attributes:
         classes: (n,) int64, distinct indices of the classes in the scene.
-        presence: (n,) presence of each class.
+        presence: (n,) probability that each class is present.
         log_counts: (n,) log of the number of instances of each class.
         x: (H1,) logits of h1 given the objects.
         y: (H1,) logits of h1 given objects and relations, for questions about relations.
-        given: observed relations, or None without observed relations.
-        units: relation units of `given`.
-        slopes: slopes of `units`, for questions about relations; see `RelationUnits.fixed_point`.
-        object_y, object_slopes: y and slopes for questions about objects.
+        given: observed relations, or None if the scene has no observed relations.
+        units: relation units of `given`, or None if the scene has no observed relations.
+        slopes: (E,) factor slope_e with which each unit of `units` acts on y, for questions about
+            relations; see `RelationUnits.fixed_point`.
+        object_y: (H1,) logits of h1 given objects and relations, for questions about objects.
+        object_slopes: (E,) factor with which each unit of `units` acts on `object_y`.
         through: (n, H1) contribution of each class to y through the second layer, or None for a
             machine with one layer.
     """
@@ -135,15 +142,18 @@ class Context:
     through: Floats | None
 
     def ends(self, i: Places, j: Places) -> Ends:
-        """Return `Ends` for the pairs (i, j) of indices into `classes`."""
+        """Return the `Ends` of pairs (i, j). i and j are arrays of indices into `classes`."""
         p, n = self.presence, self.log_counts
         return Ends(self.classes[i], self.classes[j], n[i], n[j], p[i], p[j])
 
 
 class Ends(NamedTuple):
-    """Both ends of some pairs: subject and object class, log of their counts, and their presence.
+    """Subject and object classes of some pairs. All arrays have the same shape.
 
-    All arrays have the same shape.
+    Attributes:
+        i, j: class indices of the subjects and of the objects.
+        log_i, log_j: log of the number of instances of each class in i and in j.
+        p_i, p_j: probability that each class in i and in j is present.
     """
 
     i: Places
@@ -155,15 +165,19 @@ class Ends(NamedTuple):
 
 
 class Between(NamedTuple):
-    """The logits of all relations between the n classes, and the effects of observed relations.
+    """The logits of all A relations between n classes, and the effects of observed relations.
 
-    Without observed relations, slopes, shift and apart are empty.
+    If the scene has no observed relations, `slopes`, `shift` and `apart` are empty.
 
     Attributes:
-        mean, spread: (A, n, n) mean and √3 σ of the logits; see `RelationUnits.normal`.
-        slopes: (A, n, n) slopes of observed relations, and 0 for other relations.
-        shift: (A, n, n) change of each logit by implications of the observed relations.
-        apart: (A, n, n) like `shift`, but without observed relations between the same two classes.
+        mean: (A, n, n) means of the logits.
+        spread: (A, n, n) √3 σ, where σ is the standard deviation of each logit.
+        slopes: (A, n, n) factors with which observed relations act on h1, and 0 for other
+            relations; see `RelationUnits.fixed_point`.
+        shift: (A, n, n) change of each logit by the observed relations that hold, without the
+            effect through h1.
+        apart: (A, n, n) the same change without the observed relations between the two classes of
+            the logit.
     """
 
     mean: Floats
@@ -177,11 +191,12 @@ class SharedArrays(NamedTuple):
     """Weights of a Triway's units for the compiled kernels.
 
     Attributes:
-        S, O: (V, K + 1) factors of subject and object class. The last column is 1.
-        s, o: (V, A) weights of subject and object class.
-        n: (A, 2) weights of the log counts of both ends.
-        start, key: look-up table of `pair_rows`.
-        residual: (pairs + 1, A) residual weights w'. The last row is 0.
+        S, O: (V, K + 1) factors of each class as subject and as object. The last column is 1.
+        s, o: (V, A) weights of each class as subject and as object of each relation.
+        n: (A, 2) weights of the log number of instances of subject and object class.
+        start, key: look-up table of `relation_kernels.pair_rows`.
+        residual: (pairs + 1, A) residual weight w' of each pair of classes and each relation. The
+            last row is 0.
     """
 
     S: Floats
@@ -198,8 +213,8 @@ class RelationUnits(ABC):
     """The relation units of a machine.
 
     Attributes:
-        G: (A, K', H1) weights that all units of a relation share. G is empty if each unit has its
-            own row of U.
+        G: (A, K', H1) weights that all units of the same relation share. G is empty if each unit
+            has its own row of U.
     """
 
     G: Floats
@@ -209,34 +224,40 @@ class RelationUnits(ABC):
 
     @abstractmethod
     def select(self, a: Places, ends: Ends) -> Units:
-        """Return the units of relations a (E,) between ``ends``, if the machine has these units."""
+        """Return the units of some relations. Relations without a unit are left out.
+
+        Args:
+            a: indices of the canonical relations, an array with one axis.
+            ends: subject and object class of each relation.
+        """
 
     @abstractmethod
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
     ) -> tuple[Floats, Floats]:
-        """Return mean and √3 σ of the logits of R relations for P pairs, both (B, R, P).
+        """Return the means and √3 σ of the logits of R relations for P pairs, both (B, R, P).
 
-        A relation without a unit has the mean `NEVER`.
+        σ is the standard deviation of a logit. B is the number of different means of h1. A relation
+        without a unit has the mean `NEVER`.
 
         Args:
             means: (B, H1) means of h1.
-            ends: both ends of each pair, (B, P).
+            ends: subject and object class of each pair, (B, P).
             only: index of one relation (R = 1), or None for all relations (R = A).
-            known: whether all means are 0 or 1. The variance is then 0.
+            known: True if all means of h1 are 0 or 1. The variance of the logits is then 0.
         """
 
     def rows(self, units: Units) -> Floats:
-        """Return the rows U_e of units, (E, H1)."""
+        """Return the weights U_e between each unit and h1, (E, H1)."""
         if not len(self.G):
             return units.z
         found: Floats = kernels.expanded(self.G, units.a, units.z)
         return found
 
     def rows_of(self, a: Places, i: Places, j: Places) -> Floats:
-        """Return the rows U_e of relations a between classes i and j, (E, H1).
+        """Return the weights U_e of relations a between classes i and j, (E, H1).
 
-        Relations without a unit have no row.
+        The result has no rows for relations without a unit.
         """
         none = np.zeros(len(a), np.float32)
         return self.rows(self.select(a, Ends(i, j, none, none, none, none)))
@@ -244,17 +265,22 @@ class RelationUnits(ABC):
     def fixed_point(
         self, x: Floats, given: Given, ends: Ends, sweeps: int = SWEEPS
     ) -> tuple[Floats, Units, Floats]:
-        """Compute the mean field given observed relations.
+        """Compute the mean field of h1 given E observed relations.
 
-        The result is y (H1,), the units of the observed relations, and their slopes. The iteration
-        starts at y = x. m = sigmoid(y) are the means of h1, and g is the presence of both ends:
+        The iteration starts at y = x, with the means m = sigmoid(y) of h1. g_e is the product of
+        the presence of subject and object class:
 
             y = x + sum_e slope_e U_e,   slope_e = g_e (r_e - sigmoid(base_e + U_e·m))
+
+        The slope of a unit is the factor with which the observed relation acts on y.
+
+        Returns:
+            The logits y (H1,), the units of the observed relations, and their slopes (E,).
         """
         units = self.select(given.a, ends)
         G, z = self.G, units.z
         if 2 * len(z) < G.shape[0] * G.shape[1]:
-            # With few units, products with rows of U are faster than products with G.
+            # For a small number of units, products with U are faster than products with G.
             G, z = NOTHING, self.rows(units)
         r, g = given.r[units.place], given.g[units.place]
         y, slopes = kernels.fixed_point(x, G, units.a, units.base, z, r, g, sweeps)
@@ -294,19 +320,23 @@ class RelationUnits(ABC):
         return shift, apart
 
     def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
-        """Return how much each feature of the observed relations changes each logit, (F, A).
+        """Return how much each of F features of the observed relations changes a logit, (F, A).
 
-        The result is empty for a machine without implications. See `training/machines/triway.py`
-        for the features.
+        `training/machines/triway.py` defines the features. The result is empty for machines in
+        which relations do not change each other's logits directly.
+
+        Args:
+            x: (H1,) logits of h1 given the objects.
+            beta: 1 / temperature.
         """
         del x, beta
         return NOTHING.reshape(0, 0)
 
     def log_odds(self, between: Between) -> Floats:
-        """Return the log-odds of all relations between the classes, (A, n, n).
+        """Return the log-odds of all relations between the n classes of a scene, (A, n, n).
 
-        An observed relation changes its own logit ℓ_e(m) by about slope_e σ_e². The method
-        subtracts this change, which is correct to first order.
+        An observed relation e changes the mean of its own logit by slope_e σ_e², to first order.
+        The method subtracts this change, so that a relation is not evidence for itself.
         """
         mean, spread = between.mean, between.spread
         if len(between.slopes):
@@ -318,16 +348,17 @@ class RelationUnits(ABC):
     def without_itself(
         self, context: Context, a: Places, i: Places, j: Places, slopes: Floats, shift: Floats
     ) -> Floats:
-        """Return the log-odds of some relations, (E,), without their effect on themselves.
+        """Return the log-odds of E relations without the effect of each relation on itself, (E,).
 
-        Unlike `log_odds`, the method removes slope_e U_e from y, which is exact.
+        The method subtracts slope_e U_e from y. Unlike the first-order formula of `log_odds`, this
+        is exact.
 
         Args:
-            context: context of the scene.
+            context: hidden units of the scene.
             a: (E,) indices of the relations.
-            i, j: (E,) indices of their subject and object class in the scene.
-            slopes: (E,) slopes of the relations.
-            shift: (A, n, n) value `shift` of `Between`, or empty.
+            i, j: (E,) indices of the subject and object classes in the scene.
+            slopes: (E,) factor with which each relation acts on y; see `fixed_point`.
+            shift: (A, n, n) value `shift` of `Between`, or an empty array.
         """
         units = self.select(a, context.ends(i, j))
         mean, spread = kernels.normal_without_itself(
@@ -341,15 +372,15 @@ class RelationUnits(ABC):
 
     @abstractmethod
     def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
-        """Return the log-odds of the relations of some pairs, (2, A, P).
+        """Return the log-odds of all relations of P pairs of classes, (2, A, P).
 
-        The observed relations of a pair do not count as evidence for the pair itself.
+        Index 0 of the first axis has the relations from i to j. Index 1 has the relations from j to
+        i. The observed relations of a pair are not evidence for the relations of the same pair.
 
         Args:
-            context: context of the scene.
-            between: logits between the classes of the scene.
-            i, j: (P,) indices of the two classes of each pair in the scene. Part 0 of the result
-                is the direction from i to j, and part 1 is the direction from j to i.
+            context: hidden units of the scene.
+            between: logits of the relations between the classes of the scene.
+            i, j: (P,) indices of the two classes of each pair in the scene.
         """
 
     def placement_log_odds(
@@ -357,17 +388,17 @@ class RelationUnits(ABC):
     ) -> tuple[Floats, Floats]:
         """Return the log-odds of relations between absent candidate classes and anchor classes.
 
-        The method treats each candidate as present.
+        The method computes the log-odds of each candidate as if the candidate were present.
 
         Args:
-            context: context of the scene.
+            context: hidden units of the scene.
             candidates: (N,) indices of the candidate classes.
             anchors: (m,) indices of the anchor classes in the scene.
             only: index of one relation (R = 1), or None for all relations (R = A).
 
         Returns:
-            Log-odds with the candidate as subject, (N, R, m), and with the anchor as subject,
-            (N, R, m).
+            Log-odds (N, R, m) with the candidate as subject, and log-odds (N, R, m) with the
+            anchor as subject.
         """
         m = len(anchors)
         shape = len(candidates), 2 * m
@@ -384,7 +415,7 @@ class RelationUnits(ABC):
         return found[:, :, :m], found[:, :, m:]
 
     def shares(self, context: Context) -> Floats:
-        """Return the contribution of each class and its relations to y, (n, H1)."""
+        """Return the contribution of each class and its relations to `object_y`, (n, H1)."""
         found: Floats = context.presence[:, None] * self._W[context.classes]
         given, units = context.given, context.units
         if given is not None and units is not None:
@@ -394,11 +425,12 @@ class RelationUnits(ABC):
         return found
 
     def common(self, context: Context) -> tuple[Floats, Places]:
-        """Return the contribution of the observed relations of each pair of classes to y.
+        """Return the contribution of the observed relations of each pair of classes to `object_y`.
 
         Returns:
-            (P, H1) contributions, and (n, n) row of each pair of classes in the contributions. The
-            row is -1 for a pair without observed relations.
+            Contributions (P, H1) of the P pairs with observed relations, and an array (n, n) with
+            the row of each pair of classes in the contributions. The row is -1 for a pair without
+            observed relations.
         """
         n = len(context.classes)
         given, units = context.given, context.units
@@ -416,13 +448,14 @@ class RelationUnits(ABC):
         return found, np.maximum(index, index.T)
 
     def _sums(self, units: Units, keys: Places, slopes: Floats, size: int) -> Floats:
-        """Sum slope_e U_e over the units of each key, (size, H1). Ignore units with key -1.
+        """Return the sum of slope_e U_e over the units of each key, (size, H1).
 
         Args:
             units: E relation units.
-            keys: (E,) key of each unit, or (2, E) for two keys per unit.
-            slopes: (E,) slopes of the units.
-            size: number of keys.
+            keys: (E,) key of each unit, or (2, E) for two keys per unit. Units with the key -1 are
+                ignored.
+            slopes: (E,) factor slope_e with which each unit acts on y; see `fixed_point`.
+            size: number of keys. The keys are 0 to size - 1.
         """
         if not len(self.G):
             summed: Floats = kernels.accumulate(keys.reshape(-1), slopes, units.z, size)
@@ -437,14 +470,14 @@ class RelationUnits(ABC):
 class FreeUnits(RelationUnits):
     """One unit for each triple (relation, subject class, object class) of the training scenes.
 
-    ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1
-
-    Other triples have no unit, so they do not act as evidence. Their log-odds are `NO_UNIT`.
+    The logit of unit t is ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1. Triples that do not occur in the
+    training scenes have no unit. Such triples are not evidence, and their log-odds are `NO_UNIT`.
 
     Args:
         weights: weights of the machine.
         U: (T, H1) weights between units and h1.
-        g: (T, 2) weights of the presence of both ends. None means zeros.
+        g: (T, 2) weights of the presence of subject and object class. None means that all these
+            weights are 0.
     """
 
     def __init__(self, weights: Weights, U: Floats, g: Floats | None = None) -> None:
@@ -469,7 +502,7 @@ class FreeUnits(RelationUnits):
         self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
     ) -> tuple[Floats, Floats]:
         """See `RelationUnits`."""
-        del known  # the formula gives variance 0 for means of 0 and 1
+        del known  # unused: the formula gives variance 0 for means of 0 and 1
         asked = _asked(self._A, only)
         shape = len(means), asked.stop - asked.start, ends.i.shape[1]
         b, a, p = (part.reshape(-1) for part in np.indices(shape))
@@ -503,11 +536,13 @@ class FreeUnits(RelationUnits):
 
 
 class SharedUnits(RelationUnits):
-    """A unit for every triple, with shared weights and a sparse residual; see `Triway`.
+    """One unit for every triple (relation a, subject class i, object class j); see `Triway`.
 
-    The factors are z_e = (S_i * O_j, 1), and U_e = G[a]'z_e. The rows of G[a] are the rows of M[a],
-    followed by P[a]. The variance of a logit is q'C q. The vector q = Y[a] z_e has the coordinates
-    of U_e in the directions F_a of largest variance, and C = F_a diag(m (1 - m)) F_a'.
+    The units share weights. A sparse residual adds an own weight for some triples. The factors are
+    z_e = (S_i * O_j, 1), and the weights are U_e = G[a]'z_e. The rows of G[a] are the rows of M[a],
+    followed by P[a]. The variance of a logit is q'C q, with C = F_a diag(m (1 - m)) F_a'. The rows
+    of F_a are the directions with the largest variance. The vector q = Y[a] z_e has the coordinates
+    of U_e in these directions.
     """
 
     def __init__(self, weights: Weights) -> None:
@@ -564,7 +599,13 @@ class SharedUnits(RelationUnits):
         return mean[:, :, :P], spread[:, :, :P]
 
     def _of(self, asked: slice, rows: Floats, columns: Floats) -> Floats:
-        """Return the products of rows (B, H1) with the n columns of each relation, (B, R, n)."""
+        """Return the product of each row with the n columns of each asked relation, (B, R, n).
+
+        Args:
+            asked: slice of the R relations.
+            rows: (B, H1) rows.
+            columns: (H1, A n) columns of all A relations; see `_columns`.
+        """
         n = columns.shape[1] // self._A
         found: Floats = rows @ columns[:, asked.start * n : asked.stop * n]
         return found.reshape(len(rows), -1, n)
@@ -583,7 +624,7 @@ class SharedUnits(RelationUnits):
     def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
         """See `RelationUnits`. The result is correct to first order.
 
-        The observed units e' of the pair, in both directions, change ℓ_e(m) by
+        The observed units e' of the pair, in both directions, change the mean of the logit ℓ_e by
         sum_e' slope_e' cov(ℓ_e, ℓ_e'), where cov = sum_k U_ek U_e'k m_k (1 - m_k).
         """
         A, P = self._A, len(i)
@@ -592,10 +633,10 @@ class SharedUnits(RelationUnits):
         if len(between.slopes):
             m, classes = sigmoid(context.y), context.classes
             z = self._w.S[classes[start]] * self._w.O[classes[end]]
-            # q has the shape (2, P, A, r). The first axis is the direction within a pair.
+            # q has the shape (2 directions within a pair, P, A, r coordinates).
             q = (z @ self._Y.reshape(len(self._F), -1).T).reshape(2, P, A, -1)
             slopes = between.slopes[:, start, end].T.reshape(2, P, A, 1).copy()
-            # For a class with itself, both directions are the same unit.
+            # For a pair of a class with itself, both directions belong to the same unit.
             slopes[1, i == j] = 0
             pull = (slopes * q).sum(0).reshape(P, -1)
             back = (pull @ self._F) * (m * (1 - m)) @ self._F.T
@@ -608,26 +649,35 @@ class SharedUnits(RelationUnits):
 
 @lru_cache(maxsize=128)
 def all_pairs(n: int) -> tuple[Places, Places]:
-    """Return the indices of the first and the second class of all pairs of n classes, (1, n²)."""
+    """Return all n² pairs of n classes: the indices of first and second classes, each (1, n²)."""
     every = np.arange(n)
     return np.repeat(every, n)[None], np.tile(every, n)[None]
 
 
 def _columns(matrices: Floats) -> Floats:
-    """Convert the n rows of each relation (A, n, H1) to columns (H1, A n), for faster products."""
+    """Convert the n rows of each relation (A, n, H1) to columns (H1, A n).
+
+    Matrix products with the columns are faster.
+    """
     return np.ascontiguousarray(matrices.reshape(-1, matrices.shape[2]).T)
 
 
 def _asked(relations: int, only: int | None) -> slice:
-    """Return the slice of one relation, or of all relations for None. A slice avoids a copy."""
+    """Return a slice that selects the relation `only`, or all relations if `only` is None.
+
+    Indexing with a slice does not copy the array.
+    """
     return slice(0, relations) if only is None else slice(only, only + 1)
 
 
 def _pair_table(weights: Weights) -> tuple[Table, tuple[Places, Places]]:
-    """Build the look-up table of `pair_rows`, with each pair of classes that has a triple weight.
+    """Build the look-up table of `pair_rows`.
+
+    The table contains each pair of classes that occurs in `Weights` as part of a triple.
 
     Returns:
-        The table (buckets and keys), and for each triple the row of its pair and its relation.
+        The table: its buckets and its keys. Then two index arrays (T,): the row of each triple's
+        pair in the table, and the relation of each triple.
     """
     size = weights.spec.V**2
     triples = weights.triple_keys
@@ -643,11 +693,11 @@ def _pair_table(weights: Weights) -> tuple[Table, tuple[Places, Places]]:
 
 
 def _directions(weights: Weights) -> tuple[Floats, Floats]:
-    """Return F (A, r, H1) and Y (A, r, K + 1), see `SharedUnits`.
+    """Return F (A, r, H1) and Y (A, r, K + 1); see `SharedUnits`.
 
-    F are the directions of largest variance of U_e·h1. Y gives the coordinates q = Y z of a unit
-    with z = (S_i * O_j, 1). The frequencies of classes and the variance of h1 come from the stored
-    scenes of the machine.
+    The rows of F[a] are the r directions in which U_e·h1 has the largest variance. Y[a] converts
+    the factors z = (S_i * O_j, 1) of a unit to its coordinates q = Y[a] z in these directions. The
+    frequencies of classes and the variance of h1 come from the machine's stored samples.
     """
     spec = weights.spec
     rows = np.concatenate([weights["P"][:, None], weights["M"]], 1).astype(np.float64)
@@ -661,7 +711,7 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     left, right = (
         np.concatenate([ones, weights[name].astype(np.float64)], 1) for name in ("S", "O")
     )
-    # E[z z'] of z = (1, S_i * O_j) for independent i and j, and its Cholesky factor.
+    # moment is E[z z'] of z = (1, S_i * O_j) for independent i and j. root is its Cholesky factor.
     moment = (left.T @ (share[:, None] * left)) * (right.T @ (share[:, None] * right))
     scale = np.trace(moment) / len(moment)
     root = np.linalg.cholesky(moment + 1e-9 * scale * np.eye(len(moment)))

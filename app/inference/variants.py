@@ -1,7 +1,8 @@
 """The variants of the machine, and the specification of its sizes.
 
-Each variant is a class that defines the arrays and the relation units. The service needs no other
-information about a variant. To add a variant, write a class and add it to `VARIANTS`.
+Each variant is a class that defines the arrays and the relation units of the machine. The service
+needs no other information about a variant. To add a variant, write a class and add it to
+`VARIANTS`. docs/models.md defines the symbols in the formulas.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def feature_count(relations: int) -> int:
-    """Return the number of features of observed relations, F = 2A + (2A)² + 4A."""
+    """Return the number of features of observed relations, F = 2A + (2A)² + 4A, for A relations."""
     return 2 * relations * (2 * relations + 3)
 
 
 class RBM:
-    """RBM: it has a relation unit for each of the T triples of the training scenes.
+    """RBM: a machine with one relation unit for each of the T triples of the training scenes.
 
     The logit of unit t is ℓ_t = d_t + U_t·h1.
     """
@@ -38,7 +39,7 @@ class RBM:
 
     @staticmethod
     def shapes(spec: MachineSpec) -> Shapes:
-        """Return names and shapes of the arrays that only this variant has."""
+        """Return the names and shapes of the arrays that this variant adds to `layout`."""
         return {"d": (spec.T,), "U": (spec.T, spec.H1)}
 
     @staticmethod
@@ -48,7 +49,10 @@ class RBM:
 
 
 class GBM(RBM):
-    """GBM: it has a second hidden layer and the logits ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1."""
+    """GBM: a machine with two hidden layers and one relation unit for each training triple.
+
+    The logit of unit t is ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1.
+    """
 
     two_layers = True
 
@@ -64,7 +68,10 @@ class GBM(RBM):
 
 
 class ProductRBM(RBM):
-    """An RBM with factorised weights U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]."""
+    """Product RBM: an RBM with factorised weights U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k].
+
+    e is a triple (relation a, subject class i, object class j).
+    """
 
     factorised = True
 
@@ -86,9 +93,10 @@ class ProductRBM(RBM):
 
 
 class Triway:
-    """Triway: it has a unit for every triple, with shared weights and a sparse residual w'.
+    """Triway: a machine with one relation unit for every triple (a, i, j).
 
-    The logit of unit e is ℓ_e = w_e + U_e·h1, with
+    The units share weights. The sparse residual w' adds an own weight for some triples. The logit
+    of unit e is ℓ_e = w_e + U_e·h1, with
 
     w_e = d_a + s[a,i] + o[a,j] + sum_k S[i,k] R[a,k] O[j,k] + n[a]·(log n_i, log n_j) + w'_e
     U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]
@@ -125,7 +133,7 @@ VARIANTS: Final[dict[str, type[RBM | Triway]]] = {
 }
 
 FACTORISED: Final = frozenset(name for name, variant in VARIANTS.items() if variant.factorised)
-"""Variants whose relation–context weights are products of factors of rank K."""
+"""Variants whose weights between relations and h1 are products of factors of rank K."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,18 +142,21 @@ class MachineSpec:
 
     Attributes:
         variant: ``rbm``, ``gbm``, ``triway``, or ``product_rbm`` (RBM with the Triway's U).
-        V: number of object classes (visible units v). All sizes below are numbers too.
-        A: canonical relations.
-        H1: hidden units of the first layer.
-        H2: hidden units of the second layer. 0 means no second layer.
-        C: room types. A known room type changes the biases of h1.
-        K: rank of the shared tri-way and relation-context weights (Triway, product RBM).
-        G: rank of the effect of h1 on implications between relations (Triway, local form). 0 means
-            no implications.
-        T: relation triples with their own weight. In RBM and GBM, each unit has such a weight. In
-            the Triway, the sparse residual has them.
-        N: stored persistent-chain samples. New chains start at them. 0 means no stored samples.
-        form: ``seed`` (the energy of the paper) or ``local`` (locally normalised relations).
+        V: number of object classes (visible units v).
+        A: number of canonical relations.
+        H1: number of hidden units in the first layer.
+        H2: number of hidden units in the second layer. 0 means no second layer.
+        C: number of room types. A known room type changes the biases of h1.
+        K: rank of the weights that relation units share (Triway, product RBM).
+        G: rank of the effect of h1 on implications between relations (Triway in the local form). An
+            implication is a change of a relation's logit by other relations. 0 means no
+            implications.
+        T: number of relation triples with an own weight. In RBM and GBM, each relation unit has
+            such a weight. In the Triway, only the triples of the sparse residual have own weights.
+        N: number of stored samples from persistent Gibbs chains. New chains start at these samples.
+            0 means no stored samples.
+        form: energy function. ``seed`` is the energy of the paper. In the ``local`` form, each
+            relation unit is normalised separately.
     """
 
     variant: Variant
@@ -188,7 +199,7 @@ class MachineSpec:
 
     @property
     def is_local(self) -> bool:
-        """Whether relations are locally normalised."""
+        """Whether each relation unit is normalised separately (local form)."""
         return self.form == "local"
 
     def to_dict(self) -> dict[str, Any]:
@@ -204,8 +215,8 @@ class MachineSpec:
         """
         known = {field.name for field in fields(cls)}
         if unknown := sorted(set(values) - known):
-            raise ValueError(f"unknown fields in a machine spec: {unknown}")
+            raise ValueError(f"a machine spec has unknown fields: {unknown}")
         try:
             return cls(**values)
         except TypeError as error:
-            raise ValueError(f"incomplete machine spec: {error}") from error
+            raise ValueError(f"a machine spec lacks required fields: {error}") from error

@@ -4,8 +4,9 @@ Given the objects, the logits x of h1 and the means m1 and m2 of the hidden laye
 
     x = c1 + Q[t] + v'W + J m2,   m1 = sigmoid(beta x),   m2 = sigmoid(beta (c2 + m1'J))
 
-A mean-field iteration computes m2. It starts at m2 = sigmoid(beta c2). beta is 1 / temperature.
-With one hidden layer, x is exact.
+v is the presence of the classes, t is the room type, and beta is 1 / temperature. A mean-field
+iteration computes m2. The iteration starts at m2 = sigmoid(beta c2). For a machine with one hidden
+layer, x is exact.
 """
 
 from __future__ import annotations
@@ -29,11 +30,14 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     """Return the type (float or int) and the shape of each array of a machine.
 
     All variants have the arrays below. The classes in `variants` add the arrays of each variant.
+    `MachineSpec` defines the sizes.
 
-        b (V,), c1 (H1,), c2 (H2,), W (V, H1), J (H1, H2), Q (C, H1)
-        triples (T, 3): triples (a, i, j) with their own weight, sorted
-        fantasies (N, ceil(V / 32)): stored scenes as bits
-        fantasy_rooms (N,): room types of the stored scenes, or -1 if unknown
+        b (V,), c1 (H1,), c2 (H2,), W (V, H1), J (H1, H2), Q (C, H1): biases and weights
+        triples (T, 3): sorted triples (relation a, subject class i, object class j) with an own
+            weight
+        fantasies (N, ceil(V / 32)): stored samples of Gibbs chains. Each bit is the presence of
+            one class.
+        fantasy_rooms (N,): room type of each stored sample, or -1 if unknown
     """
     V, H1, H2 = spec.V, spec.H1, spec.H2
     floats: dict[str, tuple[int, ...]] = {
@@ -52,11 +56,12 @@ class Weights:
 
     Attributes:
         spec: sizes and form of the machine.
-        arrays: maps names to arrays. All float arrays have one precision, and integers are int32.
+        arrays: maps names to arrays. All float arrays have the same precision. Integer arrays are
+            int32.
 
     Raises:
-        ValueError: an array is missing, unexpected or of a wrong shape, or the triples are outside
-            (A, V, V), repeated or not sorted.
+        ValueError: an array is missing, unexpected or of a wrong shape, a triple has an invalid
+            index, or the triples are not distinct and sorted.
     """
 
     spec: MachineSpec
@@ -68,39 +73,53 @@ class Weights:
         for name in sorted(expected.keys() | found.keys()):
             if found.get(name) != expected.get(name):
                 raise ValueError(
-                    f"array {name} has the shape {found.get(name)}, but the spec needs "
-                    f"{expected.get(name)} (None means no such array)"
+                    f"array {name} has the shape {found.get(name)}, but the spec needs the shape "
+                    f"{expected.get(name)} (None means that the array does not exist)"
                 )
         table = self["triples"].astype(np.int64)
         if (table < 0).any() or (table >= [self.spec.A, self.spec.V, self.spec.V]).any():
-            raise ValueError("triples must be (a, i, j) within (A, V, V)")
+            raise ValueError(
+                "a triple (a, i, j) has an invalid index: a must be from 0 to A - 1, and i and j "
+                "must be from 0 to V - 1"
+            )
         if (np.diff(self.triple_keys) <= 0).any():
-            raise ValueError("triples must be distinct and sorted by (a, i, j)")
+            raise ValueError(
+                "triples must be distinct and sorted by (a, i, j), but two rows are equal or not "
+                "sorted"
+            )
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self.arrays[name]
 
     @property
     def triple_keys(self) -> NDArray[np.int64]:
-        """(T,) key (a V + i) V + j of each triple, ascending."""
+        """(T,) key (a V + i) V + j of each triple (a, i, j), in ascending order."""
         relation, subject, object_ = self["triples"].astype(np.int64).T
         keys: NDArray[np.int64] = (relation * self.spec.V + subject) * self.spec.V + object_
         return keys
 
     @property
     def scenes(self) -> NDArray[np.float32]:
-        """(N, V) presence of the classes in the stored scenes. Each access unpacks them again."""
+        """(N, V) presence of each class in each stored sample. Each access unpacks all samples."""
         return unpack_scenes(self["fantasies"], self.spec.V)
 
     def room_bias(self, room: int | None) -> NDArray[Any]:
-        """Return the bias of h1, (H1,): c1 + Q[t], or c1 if the room type or Q is missing."""
+        """Return the bias of h1 for a room type t, (H1,): c1 + Q[t].
+
+        The bias is c1 if the room type is None or the machine has no room types.
+        """
         bias: NDArray[Any] = self["c1"]
         return bias if room is None or not self.spec.C else bias + self["Q"][room]
 
     def with_second_layer(
         self, base: NDArray[Any], beta: float = 1.0
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return x (B, H1) and m2 (B, H2) for base = c1 + Q[t] + v'W (B, H1)."""
+        """Return x (B, H1) and m2 (B, H2) for B scenes; see the module.
+
+        Args:
+            base: (B, H1) logits of h1 without the second layer: c1 + Q[t] + v'W.
+            beta: 1 / temperature.
+        """
         if not self.spec.H2:
             return base, np.zeros((len(base), 0), base.dtype)
         J, c2 = self["J"], self["c2"]
@@ -112,7 +131,7 @@ class Weights:
 
 
 def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:
-    """Convert scenes stored as bits, (N, words), to the presence of the classes, (N, V)."""
+    """Convert scenes stored as bits, (N, 32-bit words), to the presence of each class, (N, V)."""
     octets = packed.astype("<i4").view(np.uint8).reshape(len(packed), -1)
     bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
     return bits.astype(np.float32)

@@ -1,13 +1,13 @@
 """The four questions, as functions of a published model and a scene.
 
-    relations   How do these objects stand to each other?
-    missing     What else should be here, and where?
-    outliers    What does not belong here, or stands in the wrong place?
-    generate    What would a scene like this look like?
+    relations   Which spatial relations hold between the objects of the scene?
+    missing     Which unlisted objects are probably in the scene, and where?
+    outliers    Which objects do not belong to the scene, and which stated relations are wrong?
+    generate    Which other scenes contain these objects and relations?
 
 The first three questions compute expectations, in closed form or with fixed random numbers. So the
 same scene always gets the same answer. `generate` draws random scenes. Answers refer to an object
-by its position in the scene's list.
+by its index in `Scene.objects`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,10 @@
-"""Calibration: convert a machine's log-odds into the probabilities of the answers."""
+"""Calibration: convert a machine's log-odds into the probabilities of the answers.
+
+Validation scenes determine the coefficients. They are fields of
+`app.registry.description.Calibration`. `RelationSlopes` contains the coefficients of relations as
+tables with one row for each relation. A row has intercept, slope, log_count, log_classes, and K
+bends (at, change).
+"""
 
 from __future__ import annotations
 
@@ -17,10 +23,11 @@ Floats = NDArray[np.floating[Any]]
 
 @compiled
 def bend(entry: Floats, logits: Floats) -> None:
-    """Apply the bends of a calibration to log-odds (n,) in place, see `PairSlope`.
+    """Add change·(x - at) to each log-odds x above ``at``, for each bend of a relation, in place.
 
     Args:
-        entry: (4 + 2K,), one row of a table in `RelationSlopes`.
+        entry: (4 + 2K,) row of the relation in a table of `RelationSlopes`.
+        logits: (n,) log-odds x.
     """
     for j in range(len(logits) if len(entry) > 4 else 0):
         x = y = logits[j]
@@ -33,12 +40,14 @@ def bend(entry: Floats, logits: Floats) -> None:
 def relation_probability(
     slopes: Floats, log_odds: Floats, log_count: Floats, classes: int
 ) -> Floats:
-    """Probability that a relation holds between one pair of instances, (B, A, N).
+    """Return the probability that each relation holds between two objects, (B, A, N).
+
+    The shape is (B candidate classes, A relations, N pairs of classes). B is 1 without candidates.
 
     Args:
-        slopes: (A, 4 + 2K), one table of `RelationSlopes`.
-        log_odds: (B, A, N), log-odds of the class-level units.
-        log_count: (N,), log of the number of instance pairs of both classes.
+        slopes: (A, 4 + 2K) table of `RelationSlopes`.
+        log_odds: (B, A, N) log-odds of the relation between classes.
+        log_count: (N,) log of the number of object pairs with these two classes.
         classes: number of distinct classes in the scene.
     """
     p = np.empty_like(log_odds)
@@ -51,7 +60,7 @@ def relation_probability(
             for j in range(len(row)):
                 found[j] = intercept + slope * row[j] + weight * log_count[j]
             bend(slopes[a], found)
-    # One loop over all rows, since a single row may be short.
+    # One loop over all rows is faster than one loop per row, because a row may be short.
     logits = p.reshape(-1)
     for e in range(len(logits)):
         logits[e] = logistic(np.float32(logits[e]))
@@ -60,17 +69,20 @@ def relation_probability(
 
 @inlined
 def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
-    """Scale p(a(x,y)) and p(a(y,x)) so that their sum is at most 1: both cannot hold at once."""
+    """Scale p(a(x,y)) and p(a(y,x)) so that their sum is at most 1.
+
+    The reason is that a relation a cannot hold in both directions between the same two objects.
+    """
     total = np.maximum(forward + backward, np.float32(1.0))
     return forward / total, backward / total
 
 
 def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int) -> Floats:
-    """Calibrate the machine's log p(relation | candidate and anchor are present).
+    """Calibrate log p(relation to the anchor | candidate is present) of N candidate classes, (N,).
 
     Args:
-        entry: (4 + 2K,), the relation's row of a table in `RelationSlopes`.
-        log_p: log probability of the class-level unit.
+        entry: (4 + 2K,) row of the relation in a table of `RelationSlopes`.
+        log_p: (N,) log probability of the relation between the classes, not yet calibrated.
         log_count: log of the number of instances of the anchor's class.
         classes: number of distinct classes in the scene, the candidate included.
     """
@@ -83,12 +95,13 @@ def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int
 
 
 def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, listed: int) -> Floats:
-    """Logits of p(present but unlisted) · p(relation holds | present), one per candidate.
+    """Return the logits of p(present but unlisted) · p(relation holds | present), (N,).
 
     Args:
-        log_odds: log-odds of presence, not yet calibrated.
-        log_p: log of the second factor, calibrated.
-        listed: number of listed classes.
+        calibration: calibration of the model.
+        log_odds: (N,) log-odds that each candidate class is present, not yet calibrated.
+        log_p: (N,) calibrated log p(relation holds | present) of each candidate class.
+        listed: number of classes that the scene lists.
     """
     both = log_p - np.logaddexp(0.0, -calibration.missing.log_odds(log_odds, listed))
     found: Floats = both - np.log(-np.expm1(np.minimum(both, -1e-7)))
@@ -96,12 +109,16 @@ def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, lis
 
 
 def intruder_line(calibration: Calibration, classes: int) -> tuple[float, float]:
-    """Intercept and slope of an intruder's log-odds in a scene of `classes` distinct classes."""
+    """Return intercept and slope that convert log-odds of presence to log-odds of an intruder.
+
+    An intruder is an object that does not belong to the scene. The scene has `classes` distinct
+    classes.
+    """
     entry = calibration.outlier
     return entry.intercept + entry.log_count * math.log(classes), entry.slope
 
 
 def false_log_odds(calibration: Calibration, log_odds: Floats) -> Floats:
-    """Convert the log-odds of stated relations to the log-odds that each is false."""
+    """Convert the log-odds that stated relations hold to the log-odds that they are false."""
     entry = calibration.misplaced
     return entry.intercept + entry.slope * log_odds

@@ -15,7 +15,7 @@ from app.scene.relations import CANONICAL
 OBJECTS = 8
 RELATIONS = 3
 ROOM_TYPES = 3
-"""A unit's description holds at most this many objects, relations and room types."""
+"""`OBJECTS`, `RELATIONS` and `ROOM_TYPES` are the maximum numbers in the description of a unit."""
 
 _NAMED = 3
 Floats = NDArray[np.float32]
@@ -24,14 +24,14 @@ Named = TypeVar("Named")
 
 @dataclass(frozen=True, slots=True)
 class ContextUnit:
-    """Description of a hidden unit by the classes that it favours.
+    """Description of a hidden unit by the classes, relations and room types that it favours.
 
     Attributes:
-        unit: its number in the layer.
-        name: readable name.
-        objects: (label, weight) of the objects with the largest weights.
+        unit: index of the unit in its layer.
+        name: readable name of the unit.
+        objects: (label, weight) of the object classes with the largest weights.
         relations: ((subject, relation, object), weight) of the relations with the largest weights.
-            The mean weight over the layer is subtracted.
+            Each weight is the unit's weight minus the mean weight over the units of the layer.
         room_types: (room type, weight) of the room types with the largest weights.
     """
 
@@ -45,15 +45,17 @@ class ContextUnit:
 def contexts(artifact: Artifact) -> dict[str, tuple[ContextUnit, ...]]:
     """Describe the hidden units of each layer by their largest positive weights.
 
-    The weights of layer h1 are the columns of W (objects), U (relations seen in training) and Q
-    (room types). Layer h2 is connected to them only through h1, so its weights are the columns of
-    W J, U J and Q J. Q is empty for a machine without room types. Structure is left out.
+    The weights of a unit of layer h1 are its columns in W (objects), U (relations that occur in
+    training) and Q (room types). Layer h2 is connected to objects, relations and room types only
+    through h1. The weights of a unit of h2 are therefore its columns in W J, U J and Q J. Q is
+    empty for a machine without room types. Structural classes (floor, wall) are left out.
 
-    The mean weight of each relation over the layer is subtracted. So a relation that every unit
-    favours (a faucet on a sink) describes no unit.
+    From the weight of each relation, the function subtracts the mean over the units of the layer.
+    So a relation that every unit favours, such as a faucet on a sink, is not in any description.
 
     Returns:
-        Layer name to its units, in the order of the layer.
+        Maps the name of each layer, "h1" or "h2", to the descriptions of its units. They have the
+        order of the units.
     """
     weights, vocabulary = artifact.weights, artifact.vocabulary
     named = ~vocabulary.structure
@@ -92,7 +94,7 @@ def _name(
     objects: Sequence[tuple[str, float]],
     relations: Sequence[tuple[tuple[str, str, str], float]],
 ) -> str:
-    """Readable name: the first three objects and the first relation."""
+    """Return the readable name of a unit: its first three objects and its first relation."""
     parts = [", ".join(label for label, _ in objects[:_NAMED])]
     parts += [" ".join(triple) for triple, _ in relations[:1]]
     return "; ".join(filter(None, parts)) or f"unit {unit}"
@@ -101,7 +103,13 @@ def _name(
 def _strongest(
     weights: Floats, names: Sequence[Named], count: int
 ) -> list[tuple[tuple[Named, float], ...]]:
-    """The names with the largest positive weights, for each column of weights (names, units)."""
+    """Return (name, weight) of the largest positive weights of each unit, largest first.
+
+    Args:
+        weights: (names, units) weights between each name and each unit.
+        names: the names of objects, relations or room types.
+        count: maximum number of results for each unit.
+    """
     if not len(weights):
         return [()] * weights.shape[1]
     count = min(count, len(weights))

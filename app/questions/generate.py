@@ -1,14 +1,15 @@
-"""The question `generate`: draw scenes that contain the given objects and relations.
+"""The question `generate`: draw scenes that contain the objects and relations of the evidence.
 
-A Gibbs chain sometimes ends between two kinds of rooms. Such a scene is almost empty, or holds an
-object that belongs to neither room. A scene is drawn again in three cases:
+The evidence is the scene in the request. A Gibbs chain sometimes ends in a state between two kinds
+of rooms. The drawn scene is then almost empty, or contains an object that fits neither kind of
+room. A scene is drawn again if one of these conditions is met:
 
-- It has fewer classes than nine in ten real rooms of its type (`Calibration.smallest`).
-- 85 % of the real rooms of its type suit this type better (`Calibration.room_fit`).
-- `/outliers` reports one of its classes as an intruder at the default sensitivity. Classes that the
-  request lists do not count.
+- The scene has fewer classes than 90 % of the real rooms of its type (`Calibration.smallest`).
+- The scene fits its room type worse than 85 % of the real rooms do (`Calibration.room_fit`).
+- The question `outliers` reports a drawn class as an intruder at the default sensitivity. Classes
+  that the request lists do not count.
 
-The last of `ATTEMPTS` draws is always accepted.
+After `ATTEMPTS` draws for the same scene, the last draw is accepted in any case.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ from app.scene.scene import Scene, SceneObject
 Triple = tuple[int, int, int]
 
 STEPS: Final = 50
-"""Default number of Gibbs sweeps of a chain."""
+"""Default number of Gibbs sweeps for one drawn scene."""
 
 ATTEMPTS: Final = 8
 """Maximum number of draws for one scene."""
 
-# Direction of each canonical relation: 1 is left, 2 is front, 0 is up. On-top and above both mean
-# that the subject is higher than the object.
+# Direction of each canonical relation: 1 for left, 2 for front, and 0 (up) for on-top and above.
+# On-top and above have the same direction, because both place the subject higher than the object.
 _DIRECTION: Final = np.array([{LEFT: 1, FRONT: 2}.get(a, 0) for a in range(len(CANONICAL))])
 
 
@@ -48,10 +49,11 @@ class GeneratedScene:
     """A drawn scene.
 
     Attributes:
-        objects: canonical labels of its classes, in the order of the vocabulary.
-        relations: (subject label, canonical relation, object label).
-        log_score: see `ConditionedChains.log_score`. Scores of one model can be compared.
-        context: layer name to its active units.
+        objects: canonical labels of the drawn classes, in the order of the vocabulary.
+        relations: drawn relations, each as (subject label, canonical relation, object label).
+        log_score: score of the scene; see `ConditionedChains.log_score`. Only scores of the same
+            model can be compared.
+        context: maps the name of each layer, "h1" or "h2", to the indices of its active units.
     """
 
     objects: tuple[str, ...]
@@ -71,29 +73,35 @@ def generate(
     context: Mapping[str, Sequence[int]] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[GeneratedScene, ...]:
-    """Draw scenes that contain the evidence, by Gibbs chains that start at stored chain samples.
+    """Draw scenes that contain the evidence, by Gibbs chains.
 
-    Every drawn scene contains the objects of the evidence, whatever their confidence, and its
-    relations. Relations that the evidence rules out stay off. The chain draws all other objects and
-    relations. Structure (floor, wall) outside the evidence is left out of the answer.
+    The chains start at samples that the model stores. Every drawn scene contains all objects and
+    relations of the evidence, whatever the confidence of the objects. Relations observed not to
+    hold are never drawn. The chain draws all other objects and relations. Structural classes
+    (floor, wall) outside the evidence are left out of the answer.
 
-    Every chain has its own random stream. So scene k depends only on the seed and on k, whatever
-    the `count`.
+    Every scene has its own random stream. So scene k depends only on the seed and on k, and does
+    not depend on `count`.
 
-    `staying` removes drawn relations that cannot hold together. Relations of the evidence always
-    stay. A drawn scene holds every class once, so no class is drawn in a relation to itself.
-    Structure has only the relations of the evidence.
+    `staying` removes drawn relations that contradict each other. Relations of the evidence are
+    never removed. A drawn scene contains one object of each class. So a drawn relation never
+    relates a class to itself. Structural classes have only the relations of the evidence.
 
     Args:
+        artifact: the model.
+        scene: the evidence.
         count: number of scenes.
-        seed: seed of the random numbers; the same seed draws the same scenes.
-        steps: Gibbs sweeps of a chain, `STEPS` by default.
-        temperature: temperature of the chains; above 1, scenes are more varied.
-        context: layer name ("h1", "h2") to the hidden units that are held on.
-        stop: called between scenes; after it returns True, the scenes drawn so far are returned.
+        seed: seed of the random numbers. The same seed gives the same scenes.
+        steps: number of Gibbs sweeps for each draw. None means `STEPS`.
+        temperature: temperature of the chains. Above 1, the scenes are more varied.
+        context: maps the name of a layer, "h1" or "h2", to the indices of the hidden units that are
+            held on.
+        stop: function called between draws. After it returns True, `generate` returns the scenes
+            drawn so far.
 
     Raises:
-        ValueError: a number out of range, or a layer or unit that the machine does not have.
+        ValueError: a number is out of range, or the machine does not have a layer or unit in
+            `context`.
     """
     steps = STEPS if steps is None else steps
     if count < 1:
@@ -126,19 +134,24 @@ def generate(
 def _conditions(
     artifact: Artifact, scene: Scene, context: Mapping[str, Sequence[int]]
 ) -> Conditions:
-    """The fixed part of each chain: classes, relations, room type, and hidden units held on.
+    """Return the fixed part of each chain: classes, relations, room type and active hidden units.
 
     Raises:
-        ValueError: a layer or a unit that the machine does not have.
+        ValueError: the machine does not have a layer or unit in `context`.
     """
     spec, classes = artifact.spec, present(scene, artifact.spec)
     sizes = {"h1": spec.H1, "h2": spec.H2}
     for layer, units in context.items():
         if not sizes.get(layer):
-            raise ValueError(f"the model has no layer {layer!r}")
+            raise ValueError(
+                f"the model has no layer {layer!r}; layers are h1, and h2 in two-layer models"
+            )
         for unit in units:
             if not 0 <= unit < sizes[layer]:
-                raise ValueError(f"unit {unit} of {layer} must be below {sizes[layer]}")
+                raise ValueError(
+                    f"unit {unit} of {layer} does not exist: a unit must be at least 0 and below "
+                    f"{sizes[layer]}"
+                )
     held = [np.unique(np.array(context.get(layer, ()), dtype=np.int64)) for layer in sizes]
     return Conditions(
         classes.classes,
@@ -186,23 +199,25 @@ def staying(
     given: Collection[Triple],
     structure: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Select the drawn relations that can hold together, as a mask (m,).
+    """Select drawn relations that do not contradict each other. Return them as a bool mask (m,).
 
-    Relations of the evidence always stay. The others are tried in order of their probability,
+    Relations of the evidence always stay. The function then tries the other relations one by one,
     likeliest first. A tried relation stays if all of these conditions are met:
 
-    - Its two classes have no relation yet (`app.scene.geometry` finds at most one).
-    - It does not close a cycle, such as A left of B, B left of C, C left of A.
-    - If it is *on-top*, its subject does not stand on another class yet.
-    - Its subject and object are different classes.
-    - Neither class is structure. Training drops relations of structure, so a drawn one has no
-      meaning.
+    - The relations kept so far contain no relation between its two classes. `app.scene.geometry`
+      also finds at most one relation between two objects.
+    - The relation does not close a cycle, such as A left of B, B left of C, C left of A.
+    - If the relation is *on-top*, no kept relation places its subject on top of another class.
+    - The subject class and the object class differ.
+    - Neither class is structural (floor, wall). Training drops relations of structural classes, so
+      a drawn relation of such a class has no meaning.
 
     Args:
-        units: (m, 3) distinct (a, i, j): relation, subject class, object class.
-        logits: (m,), one for each unit; of equal logits, the smaller (a, i, j) comes first.
-        given: (a, i, j) of the evidence.
-        structure: (V,) which classes are structure.
+        units: (m, 3) distinct triples (relation a, subject class i, object class j).
+        logits: (m,) logit of each triple. Of triples with equal logits, the smallest (a, i, j) is
+            tried first.
+        given: triples (a, i, j) of the evidence.
+        structure: (V,) bool, True for structural classes.
     """
     fixed = np.array(sorted(given), dtype=np.int64).reshape(-1, 3)
     order = np.lexsort((*units.T[::-1], -logits))
@@ -227,16 +242,17 @@ def _holding(
     given: int,
     count: int,
 ) -> NDArray[np.bool_]:
-    """Select the relations that can hold together with the given ones, as a mask (m,).
+    """Select relations that contradict neither the evidence nor each other, as a bool mask (m,).
 
     Args:
-        relation: (given + m,), the given relations first.
-        places: (given + m, 2), indices of subject and object among the n classes.
-        order: the relations to try, numbers from 0 to m - 1, likeliest first.
-        given: number of given relations.
-        count: n, number of classes.
+        relation: (given + m,) canonical relations. The relations of the evidence come first.
+        places: (given + m, 2) indices of the subject and object classes, from 0 to count - 1.
+        order: indices from 0 to m - 1 of the drawn relations to try, likeliest first.
+        given: number of relations in the evidence.
+        count: number of classes.
     """
-    # beyond[d, x, y]: y is beyond x in direction d, directly or through a chain of relations.
+    # beyond[d, x, y] is True if relations of direction d lead from x to y, directly or through
+    # other classes.
     beyond = np.zeros((3, count, count), np.bool_)
     related, supported = np.zeros((count, count), np.bool_), np.zeros(count, np.bool_)
     stay = np.zeros(len(relation) - given, np.bool_)
@@ -258,10 +274,12 @@ def _holding(
 
 
 class Plausible:
-    """Test whether a drawn scene is plausible, for one request (see the module).
+    """Test whether the drawn scenes of one request are plausible.
+
+    A scene is plausible if none of the three conditions of the module is met.
 
     Args:
-        artifact: the model that draws.
+        artifact: the model that draws the scenes.
         scene: the evidence.
     """
 
@@ -275,7 +293,7 @@ class Plausible:
             self._least = smallest[-1 if scene.room_type is None else scene.room_type]
 
     def __call__(self, classes: list[int]) -> bool:
-        """Whether a drawn scene of these classes is plausible."""
+        """Return whether a drawn scene with these classes is plausible."""
         if len(classes) < self._least or not self._suits_room(classes):
             return False
         if not classes:
@@ -283,7 +301,8 @@ class Plausible:
         labels = self._artifact.vocabulary.labels
         objects = [SceneObject(labels[index], labels[index], index) for index in classes]
         judged = Scene(tuple(objects), room_type=self._room)
-        # A drawn scene is complete, so the thresholds for short lists do not apply.
+        # A drawn scene lists all its objects. So the thresholds for short lists, which are often
+        # incomplete, do not apply.
         whole = self._artifact.calibration.outlier_thresholds.medium
         given = posterior(self._artifact, judged)
         is_intruder = intruder_probability(self._artifact, given) >= whole
@@ -299,11 +318,19 @@ class Plausible:
 
 
 def room_fit(weights: Weights, v: NDArray[np.float32], room: int) -> NDArray[np.float64]:
-    """log p(v | t) / p(v) for presence v (B, V) and room type t, up to a constant of t, (B,).
+    """Return how well B scenes fit a room type: log p(v | t) / p(v) plus a constant, (B,).
 
-    sum_k [softplus(x_k + Q_tk) - softplus(x_k)],   x = c1 + v'W
+    v is the presence of the classes in a scene, and t is the room type. The constant depends only
+    on t. The result is a sum over the hidden units k of the first layer:
 
-    The sum goes over the hidden units k of the first layer. A second layer is left out.
+        sum_k [softplus(x_k + Q_tk) - softplus(x_k)],   x = c1 + v'W
+
+    The formula leaves out a second hidden layer.
+
+    Args:
+        weights: weights of the machine.
+        v: (B, V) presence of each class in each scene.
+        room: index t of the room type.
     """
     x = weights["c1"] + v @ weights["W"]
     change = softplus(x + weights["Q"][room]) - softplus(x)

@@ -1,4 +1,10 @@
-"""The question `missing`: which unlisted objects are probably present, and where?"""
+"""The question `missing`: which unlisted objects are probably present, and where?
+
+The answers are object classes that the scene does not list (candidates). A placement is a relation
+between a candidate and a listed object, called the anchor. An offset is the distance vector between
+the centres of both. Structural classes (floor, wall) are neither candidates nor anchors of
+placements.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +35,12 @@ from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP, RELATIONS, canon
 from app.scene.scene import Scene
 
 VIEWER = viewer_axes()
-"""Axes of a viewer at the origin, with the viewing direction along x."""
+"""Axes of a viewer who looks along the x axis of the frame."""
 
 _BLOCK: Final = 32
 
 PLACES: Final = 3
-"""Number of placements in an answer."""
+"""Maximum number of placements in the answer for one class."""
 
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
 _UNTURNED: Final = np.eye(3)
@@ -42,11 +48,12 @@ _PER_METRE: Final = 1000.0  # answers are rounded to millimetres
 
 
 class Offset(NamedTuple):
-    """Vector from the centre of an anchor to the centre of a missing object, in metres.
+    """Predicted vector from the centre of an anchor to the centre of a missing object, in metres.
 
     Attributes:
-        mean, std: mean and standard deviation along x, y and z.
-        scenes: number of training scenes with the two classes in this relation.
+        mean: mean of the vector along x, y and z.
+        std: standard deviation of the vector along x, y and z.
+        scenes: number of training scenes that contain the two classes in this relation.
     """
 
     mean: tuple[float, float, float]
@@ -55,7 +62,14 @@ class Offset(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """A place of a missing object: its `relation` to `object`, and its `offset` where known."""
+    """A place of a missing object, given by its relation to a listed object.
+
+    Attributes:
+        relation: relation from the missing object to the listed object.
+        object: index of the listed object in `Scene.objects`.
+        probability: probability that the relation holds if the missing object is present.
+        offset: vector from the listed object to the missing object, or None if unknown.
+    """
 
     relation: str
     object: int
@@ -64,15 +78,16 @@ class Placement(NamedTuple):
 
 
 class MissingAnswer(NamedTuple):
-    """An absent class.
+    """An unlisted class and the probability that it is present.
 
     Attributes:
-        label: canonical label.
+        label: canonical label of the class.
         probability: probability that the class is present although the scene does not list it. If
-            the request names a place, the class must also stand there.
-        log_odds: log-odds of its presence.
-        placements: its likeliest places, likeliest first.
-        because: the objects that change its log-odds most, strongest first.
+            the request names a place, it is the probability that the class is present at this
+            place.
+        log_odds: log-odds that the class is present, before calibration.
+        placements: likeliest places of the class, likeliest first.
+        because: listed objects that change the log-odds most, in order of the absolute change.
     """
 
     label: str
@@ -97,22 +112,25 @@ def missing(
 
     The model assumes that a present class is listed with probability `coverage`. If the coverage is
     low, an unlisted class may well be present. Each class is judged separately, so the
-    probabilities do not sum to 1. Listed classes and structure are never proposed.
+    probabilities do not sum to 1. The answer never contains listed or structural classes.
 
     Args:
+        artifact: the model.
+        scene: the listed objects, their relations and the room type.
         top_k: maximum number of answers.
-        candidates: class indices to choose from; listed classes and structure are ignored.
-        at: a place (relation, position of an object). If set, `probability` is the probability that
-            the class is present *and* stands in this relation to the object.
-        coverage: probability that a present class is listed; by default the model's value. At 1,
-            unlisted classes count as absent.
-        axes: the viewer's axes, in the frame of the offsets (`viewer_axes`). None if the viewing
-            direction is unknown.
-        details: whether to add `placements` and `because`.
+        candidates: indices of the classes to rank. Listed and structural classes are ignored. None
+            means all classes.
+        at: a place, as (relation, index of the anchor object). If set, `probability` is the
+            probability that the class is present *and* has this relation to the anchor.
+        coverage: probability that a present class is listed. None means the model's value. At 1,
+            the model treats the other unlisted classes as absent.
+        axes: viewer's axes in the frame of the offsets; see `viewer_axes`. None means that the
+            viewing direction is unknown.
+        details: whether the answers contain `placements` and `because`.
 
     Raises:
-        ValueError: top_k below 1, a coverage outside [0, 1], a candidate outside the vocabulary, an
-            unknown relation, or an anchor outside the scene.
+        ValueError: top_k is below 1, the coverage is outside [0, 1], a candidate is outside the
+            vocabulary, the relation is unknown, or the anchor is outside the scene.
     """
     spec, calibration = artifact.spec, artifact.calibration
     if top_k < 1:
@@ -137,7 +155,7 @@ def missing(
         logits = calibration.missing.log_odds(log_odds, listed)
     else:
         logits = _at_place(artifact, given, place, absent, chosen, log_odds, listed, top_k)
-    # Ranked by logit: probabilities near 0 or 1 may round to the same number.
+    # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
     where = best(logits, chosen, top_k)
     probabilities = sigmoid(logits[where].astype(np.float64))
     found = absent[where]
@@ -169,11 +187,11 @@ def _at_place(
     listed: int,
     top_k: int,
 ) -> NDArray[np.floating[Any]]:
-    """Logits of p(present) · p(relation holds | present), (N,).
+    """Return the logits of p(present) · p(relation to the anchor holds | present), (N,).
 
-    Candidates are scored in blocks, in descending order of p(present), which bounds the product.
-    Scoring stops when the next candidate's p(present) is below the `top_k` best products. The
-    logit of a candidate that was not scored is -inf.
+    The function scores candidates in blocks, in descending order of p(present). The product is at
+    most p(present). So the function stops when p(present) of the next candidate is below the
+    `top_k` largest products. The remaining candidates get the logit -inf.
     """
     relation, anchor, outgoing = place
     row = int(given.present.row[anchor])
@@ -192,7 +210,7 @@ def _at_place(
 
 
 def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, ...]]:
-    """The listed classes that change the log-odds of each found class most."""
+    """Return the listed objects that change the log-odds of each found class most."""
     if not len(given.present.classes):
         return [()] * len(found)
     explained = found[:EXPLAINED]
@@ -201,23 +219,35 @@ def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, 
 
 
 def _place(scene: Scene, relations: int, at: tuple[str, int]) -> tuple[int, int, bool]:
-    """(canonical relation, object, whether the missing object is the relation's subject)."""
+    """Convert the place in a request to canonical form.
+
+    Returns:
+        The index of the canonical relation, the index of the anchor object, and True if the missing
+        object is the relation's subject.
+    """
     name, anchor = at
     if not 0 <= anchor < len(scene.objects):
-        raise ValueError(f"anchor {anchor} is outside the {len(scene.objects)} objects")
+        raise ValueError(
+            f"anchor {anchor} is not the index of one of the {len(scene.objects)} objects"
+        )
     relation, subject, _ = canonicalise("missing", name, "anchor")
     if relation >= relations:
-        raise ValueError(f"the model has no relation {name!r}, only {CANONICAL[:relations]}")
+        raise ValueError(
+            f"the model does not know the relation {name!r}; it knows only "
+            f"{CANONICAL[:relations]} and their opposites"
+        )
     return relation, anchor, subject == "missing"
 
 
 def _chosen(
     absent: NDArray[np.int64], classes: int, candidates: Sequence[int]
 ) -> NDArray[np.bool_]:
-    """Which of the N absent classes are candidates, (N,)."""
+    """Return a bool mask (N,) of the absent classes that are candidates."""
     for index in candidates:
         if not 0 <= index < classes:
-            raise ValueError(f"candidate {index} must be a class index below V = {classes}")
+            raise ValueError(
+                f"candidate {index} is not a class index; class indices are below V = {classes}"
+            )
     return np.isin(absent, np.array(candidates, dtype=np.int64))
 
 
@@ -230,13 +260,15 @@ def place_log_p(
     *,
     outgoing: bool,
 ) -> NDArray[np.floating[Any]]:
-    """Calibrated log p(relation between candidate and anchor | candidate is present), (N,).
+    """Return the calibrated log p(relation to the anchor | candidate is present), (N,).
 
     Args:
-        candidates: (N,) absent classes.
-        relation: canonical relation.
-        anchor: index of the anchor's class among the listed classes.
-        outgoing: whether the candidate is the relation's subject; otherwise the anchor is.
+        artifact: the model.
+        given: posterior of the scene.
+        candidates: (N,) indices of absent classes.
+        relation: index of a canonical relation.
+        anchor: index of the anchor's class among the classes of the scene.
+        outgoing: True if the candidate is the relation's subject, False if the anchor is.
     """
     return placement_log_p(
         artifact.relation_slopes.asked_place[relation],
@@ -253,18 +285,20 @@ def placements(
     at: tuple[int, int, bool] | None = None,
     stated: Collection[tuple[int, int, int]] = (),
 ) -> list[tuple[Placement, ...]]:
-    """The likeliest relations of each candidate to the listed objects, likeliest first.
+    """Return the likeliest relations of each candidate to the listed objects, likeliest first.
 
-    All relations count, in both directions. Structure is never an anchor. If a class has several
-    instances, its first instance is the anchor. If an object stands on another one, candidates are
-    never placed under it.
+    The candidate is subject or object of the relation. Structural classes (floor, wall) are never
+    anchors. If a class has several instances, the first instance is the anchor. If an object stands
+    on top of another object, candidates are never placed under the upper object.
 
     Args:
-        candidates: (N,) absent classes.
-        axes: see `offsets_of`.
-        at: the place in the request, which is listed first: canonical relation, object, and whether
-            the missing object is the relation's subject.
-        stated: canonical relations between the objects of the scene.
+        artifact: the model.
+        given: posterior of the scene.
+        candidates: (N,) indices of absent classes.
+        axes: viewer's axes, or None; see `offsets_of`.
+        at: the place in the request, as returned by `_place`. It comes first in each result, even
+            if other places are likelier. None means that the request names no place.
+        stated: triples (canonical relation, subject, object) between objects of the scene.
     """
     present = given.present
     anchors = np.flatnonzero(~artifact.vocabulary.structure[present.classes])
@@ -316,14 +350,17 @@ def offsets_of(
     outgoing: NDArray[np.bool_],
     axes: Axes | None,
 ) -> Sequence[Offset | None]:
-    """Offsets from n anchors to n missing objects; None where the offset is unknown.
+    """Return the offset from each of n anchors to its missing object, or None if unknown.
 
     Args:
-        relation, missing, anchor: (n,) canonical relation, class of the missing object, and class
-            of its anchor.
-        outgoing: (n,) whether the missing object is the relation's subject.
-        axes: the viewer's axes, in the frame of the offsets. None if the viewing direction is
-            unknown: then left and front have no offset, and other mean offsets are vertical.
+        known: offsets of the model.
+        relation: (n,) indices of canonical relations.
+        missing: (n,) class indices of the missing objects.
+        anchor: (n,) class indices of the anchors.
+        outgoing: (n,) bool, True if the missing object is the relation's subject.
+        axes: viewer's axes in the frame of the offsets. None means that the viewing direction is
+            unknown. The relations left and front then have no offset. The means of other offsets
+            are then vertical.
     """
     ends = (relation, missing, anchor, outgoing)
     if axes is None:
@@ -347,7 +384,11 @@ def _lay(
     axes: NDArray[np.float64],
     looking: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Means and standard deviations (n, 3) of the offsets, and their numbers of scenes (n,)."""
+    """Compute the mean (n, 3), standard deviation (n, 3) and number of scenes (n,) of n offsets.
+
+    ``looking`` is False if the viewing direction is unknown. For the other arguments, see
+    `offsets_of`.
+    """
     subject, other = np.where(outgoing, missing, anchor), np.where(outgoing, anchor, missing)
     offset, scenes = look_up(tables, relation, subject, other)
     n = len(relation)

@@ -1,19 +1,22 @@
 """The question `outliers`: which objects do not belong, and which stated relations are wrong?
 
-The answer for an outlier names its companions: absent classes that usually occur with it. In a
-scene without other objects, the presence of class j raises the log-odds of class i by
+An intruder is an object that does not belong to the scene. An outlier is an object that the service
+reports as a probable intruder. The answer for an outlier names its companions: absent classes that
+usually occur with the class of the outlier. In a scene without other objects, the presence of class
+j raises the log-odds of class i by
 
     increase_ij = gain_j(c1 + W_i) - gain_j(c1)
     gain_j(x)   = sum_k softplus(x_k + W_jk) - softplus(x_k)
 
 Here c1 are the biases of the hidden units k, and W_i are the weights of class i. The increase is
-symmetric in i and j. So one row of gains for class i holds the increase by every class. The formula
-is exact for one hidden layer in the local form. It leaves out a second layer, relations and the
-room type.
+symmetric in i and j. So the gains of all classes at c1 + W_i give the increase by every class j.
+The formula is exact for a machine with one hidden layer in the local form. It leaves out a second
+layer, relations and the room type.
 
-Rare companions have the largest increases: for a toilet, the toilet paper holder. Common classes
-such as chair are likely in any scene. So companions are ranked by the product of the increase and
-the probability in a scene with class i. Increases below half of the largest one are ignored.
+Rare classes have the largest increases, such as a toilet paper holder for a toilet. Common classes
+such as chair are likely in any scene. So companions are ranked by a product: the increase,
+multiplied by the probability of class j in a scene with class i. Classes whose increase is below
+half of the largest increase are ignored.
 """
 
 from __future__ import annotations
@@ -34,28 +37,31 @@ from app.scene.scene import Scene
 
 Sensitivity = Literal["low", "medium", "high"]
 
-# Reasons for one object need n rows of relation units. This limit on the units of all rows bounds
-# the number of explained objects in a scene with very many relations.
+# The time to explain one object grows with the number of classes multiplied by the number of
+# relation units. This limit on the total bounds the number of explained objects in scenes with very
+# many relations.
 _REASON_UNITS: Final = 1 << 22
 
 COMPANIONS: Final = 3
-"""Maximum number of companions in an answer."""
+"""Maximum number of companions in the answer for one outlier."""
 
 _LEAST_SHARE: Final = 0.5  # smallest increase of a companion, as a share of the largest
 
 
 class OutlierAnswer(NamedTuple):
-    """How badly an object fits.
+    """An object and the probability that it does not belong to the scene.
 
     Attributes:
-        object: position in the scene.
-        label: canonical label.
-        probability: probability that it is an intruder, if half of all scenes have no intruder.
-        log_odds: log-odds that its class is present, given the rest of the scene.
-        is_outlier: whether the probability reaches the threshold.
-        because: for an outlier, the objects that lower its log-odds most, strongest first; for
-            other objects, the objects that raise the log-odds most.
-        usually_with: companions of an outlier, at most three (see the module).
+        object: index of the object in `Scene.objects`.
+        label: canonical label of the object's class.
+        probability: probability that the object is an intruder, under the assumption that half of
+            all scenes contain an intruder.
+        log_odds: log-odds that the object's class is present, given the rest of the scene.
+        is_outlier: True if the probability is at least the threshold.
+        because: up to three other objects, in order of their effect on `log_odds`. For an outlier,
+            these objects lower its log-odds. For other objects, they raise the log-odds.
+        usually_with: labels of up to three companions. The tuple is empty for an object that is not
+            an outlier.
     """
 
     object: int
@@ -71,7 +77,10 @@ class MisplacedAnswer(NamedTuple):
     """A stated relation and the probability that it is false.
 
     Attributes:
-        is_misplaced: whether the probability reaches the threshold.
+        subject, object: indices in `Scene.objects`.
+        relation: name of the canonical relation.
+        probability: probability that the relation is false.
+        is_misplaced: True if the probability is at least the threshold.
     """
 
     subject: int
@@ -85,9 +94,9 @@ class OutliersFound(NamedTuple):
     """The objects and the stated relations of a scene, with their probabilities.
 
     Attributes:
-        threshold: smallest probability of an outlier.
-        outliers: every object, least fitting first.
-        misplaced: every stated relation, least likely first.
+        threshold: minimum probability of an outlier.
+        outliers: every object of the scene, probable intruders first.
+        misplaced: every stated relation, probably false relations first.
     """
 
     threshold: float
@@ -105,22 +114,26 @@ def outliers(
 ) -> OutliersFound:
     """Judge every object and every stated relation of a scene.
 
-    The least fitting objects and the least likely relations come first, ties by position.
+    Probable intruders and probably false relations come first. Objects and relations with equal
+    scores keep the order of the request.
 
-    An object is judged by the log-odds of its class given the rest of the scene. The rest excludes
-    all instances of the class and all relations that touch it. So instances of one class have the
-    same score. Intruders are often common objects in the wrong room: their prior is proportional
-    to popularity^alpha. So alpha times the log-odds of the class in a training scene is subtracted.
-    Structure, such as a wall, always has probability 0. A short list gives little evidence about
-    the scene, so its threshold is higher.
+    The score of an object is the log-odds of its class given the rest of the scene. The rest does
+    not contain the instances of the class and their relations. So all instances of a class have the
+    same score. Intruders are often common objects in the wrong room. The prior of an intruder is
+    therefore proportional to popularity^alpha. The popularity of a class is the odds that a
+    training scene has the class. So the function subtracts alpha times the log of the popularity.
+    Structural classes, such as wall, always have the probability 0. A scene with few objects gives
+    little evidence, so its threshold is higher.
 
     Args:
-        sensitivity: selects one of the model's thresholds.
-        threshold: smallest probability of an outlier; replaces the threshold of `sensitivity`.
-        details: whether to add `because` and `usually_with`.
+        artifact: the model.
+        scene: the objects and stated relations to judge.
+        sensitivity: name of one of the model's thresholds.
+        threshold: minimum probability of an outlier. None means the threshold of `sensitivity`.
+        details: whether the answers contain `because` and `usually_with`.
 
     Raises:
-        ValueError: a threshold outside [0, 1].
+        ValueError: the threshold is outside [0, 1].
     """
     calibration = artifact.calibration
     if threshold is not None and not 0 <= threshold <= 1:
@@ -135,7 +148,7 @@ def outliers(
         threshold = _threshold(_presets(calibration, listed), sensitivity)
     log_odds = given.log_odds_given_rest()
     logits = _intruder_logits(artifact, classes, log_odds)
-    # Sorted by logit: probabilities near 0 or 1 may round to the same number.
+    # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
     order = np.argsort(-logits[given.present.row], kind="stable")
     p = _probability(logits)
     row = given.present.row[order]
@@ -161,14 +174,14 @@ def outliers(
 def misplaced(
     artifact: Artifact, scene: Scene, *, sensitivity: Sensitivity = "medium"
 ) -> tuple[MisplacedAnswer, ...]:
-    """Judge every stated relation, least likely first, as `outliers` does, but without objects."""
+    """Judge every stated relation like `outliers`, but do not judge objects."""
     if not scene.objects:
         return ()
     return _misplaced(artifact, posterior(artifact, scene), scene, sensitivity)
 
 
 def intruder_probability(artifact: Artifact, given: Posterior) -> NDArray[np.float64]:
-    """The probability that each class of the scene is an intruder, (n,); see `outliers`."""
+    """Return the probability that each class of the scene is an intruder, (n,); see `outliers`."""
     log_odds = given.log_odds_given_rest()
     return _probability(_intruder_logits(artifact, given.present.classes, log_odds))
 
@@ -176,7 +189,10 @@ def intruder_probability(artifact: Artifact, given: Posterior) -> NDArray[np.flo
 def _intruder_logits(
     artifact: Artifact, classes: NDArray[np.int64], log_odds: NDArray[np.floating[Any]]
 ) -> NDArray[np.float64]:
-    """Logits of the probability that each class is an intruder, (n,); -inf for structure."""
+    """Return the logit of each class's probability of being an intruder, (n,).
+
+    The logit of a structural class is -inf.
+    """
     intercept, slope = intruder_line(artifact.calibration, len(log_odds))
     logits = intercept + slope * _adjusted(artifact, classes, log_odds).astype(np.float64)
     logits[artifact.vocabulary.structure[classes]] = -np.inf
@@ -188,7 +204,7 @@ def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _presets(calibration: Calibration, listed: int) -> Thresholds:
-    """The thresholds for a scene with `listed` classes, not counting structure."""
+    """Return the thresholds for a scene with `listed` classes. Structural classes do not count."""
     if 0 < listed <= len(calibration.short_list_thresholds):
         return calibration.short_list_thresholds[listed - 1]
     return calibration.outlier_thresholds
@@ -201,7 +217,10 @@ def _threshold(presets: Thresholds, sensitivity: Sensitivity) -> float:
 def _adjusted(
     artifact: Artifact, classes: NDArray[np.int64], log_odds: NDArray[np.floating[Any]]
 ) -> NDArray[np.floating[Any]]:
-    """Log-odds of presence minus alpha times the class's log-odds in a training scene, (n,)."""
+    """Return log-odds of presence minus alpha times the class's log-odds in training scenes, (n,).
+
+    alpha is `Calibration.popularity_weight`.
+    """
     popularity = artifact.popularity
     if popularity is None:
         return log_odds
@@ -209,7 +228,7 @@ def _adjusted(
 
 
 def _affordable(given: Posterior) -> int:
-    """Maximum number of objects that get reasons."""
+    """Return the maximum number of objects with reasons in the answer."""
     per_object = len(given.present.classes) * max(1, given.unit_count)
     return min(EXPLAINED, max(1, _REASON_UNITS // per_object))
 
@@ -217,9 +236,10 @@ def _affordable(given: Posterior) -> int:
 def _reasons(
     given: Posterior, explained: list[int], is_outlier: NDArray[np.bool_]
 ) -> dict[int, tuple[Because, ...]]:
-    """The strongest reasons for each explained class.
+    """Return the strongest reasons for each explained class.
 
-    Reasons of an outlier lower its log-odds. Reasons of other classes raise their log-odds.
+    A reason is an object that changes the log-odds of the explained class. The reasons for an
+    outlier lower its log-odds. The reasons for other classes raise their log-odds.
     """
     if len(given.present.classes) < 2:
         return dict.fromkeys(explained, ())
@@ -236,7 +256,10 @@ def _reasons(
 def _misplaced(
     artifact: Artifact, given: Posterior, scene: Scene, sensitivity: Sensitivity
 ) -> tuple[MisplacedAnswer, ...]:
-    """Judge the stated relations that the machine knows, least likely first, ties by position."""
+    """Judge the stated relations that the machine knows, least likely first.
+
+    Relations with equal log-odds keep the order of `Scene.relations`.
+    """
     stated = [triple for triple in scene.relations or () if triple[0] < artifact.spec.A]
     if not stated:
         return ()
@@ -260,10 +283,12 @@ def _misplaced(
 def _companions(
     artifact: Artifact, present: NDArray[np.int64], flagged: NDArray[np.int64]
 ) -> list[tuple[str, ...]]:
-    """Labels of the companions of each flagged class, best first (see the module).
+    """Return the labels of the companions of each outlier, best first; see the module.
 
     Args:
-        present: classes of the scene; these and structure are never companions.
+        artifact: the model.
+        present: class indices of the scene. These classes and structural classes are never
+            companions.
         flagged: class indices of the outliers.
     """
     usable = ~artifact.vocabulary.structure

@@ -1,4 +1,4 @@
-"""The posterior: probabilities of unobserved objects and relations, given an observed scene."""
+"""The posterior: log-odds of unobserved objects and relations, given an observed scene."""
 
 from __future__ import annotations
 
@@ -20,19 +20,22 @@ Floats = NDArray[np.floating[Any]]
 Places = NDArray[np.int64]
 
 FULL: Final = 0.999
-"""From this coverage on, every present class counts as listed."""
+"""Coverage from which on the model assumes that the scene lists every present class.
+
+The coverage is the probability that a present class is listed.
+"""
 
 
 class Present(NamedTuple):
     """The n distinct classes of a scene of N objects.
 
-    Models work on classes; answers list objects.
+    Models compute log-odds for classes, but answers list objects.
 
     Attributes:
-        classes: (n,) int64, class indices, ascending.
-        counts: (n,) int64, number of instances of each class.
-        row: (N,) int64, index into `classes` for each object's class.
-        first: (n,) int64, position of the first object of each class.
+        classes: (n,) int64, class indices in ascending order.
+        counts: (n,) int64, number of objects of each class.
+        row: (N,) int64, index into `classes` of each object's class.
+        first: (n,) int64, index of the first object of each class in `Scene.objects`.
         presence: (n,) float32, probability that at least one instance of the class is present.
         log_counts: (n,) float32, log of `counts`.
     """
@@ -49,7 +52,7 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
     """Group the objects of a scene by class.
 
     Raises:
-        ValueError: an object or a room type that the machine does not know.
+        ValueError: the machine does not know the class of an object or the room type.
     """
     V, indices = spec.V, [thing.class_index for thing in scene.objects]
     for place, index in enumerate(indices):
@@ -57,7 +60,7 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
             name = scene.objects[place].id
             raise ValueError(f"class_index of {name!r} is {index}, but must be below V = {V}")
     if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
-        raise ValueError(f"room_type is {scene.room_type}, but must be in 0 to {spec.C - 1}")
+        raise ValueError(f"room_type is {scene.room_type}, but must be from 0 to {spec.C - 1}")
     confidence = np.array([thing.confidence for thing in scene.objects], dtype=np.float64)
     classes, first, row, counts, presence = pool_classes(
         np.array(indices, dtype=np.int64), confidence
@@ -67,27 +70,31 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
 
 
 def given_relations(scene: Scene, present: Present, relations: int) -> Given | None:
-    """The observed relations between classes; None if the scene has neither relations nor poses.
+    """Return the observed relations between the classes of a scene.
+
+    The result is None if the scene has neither relations nor poses.
 
     Args:
+        scene: the scene.
+        present: the classes of the scene.
         relations: number of canonical relations that the machine knows.
     """
     if not relations_given(scene) and scene.poses is None:
         return None
     on, seen = pooled(present.row, len(present.classes), *instance_evidence(scene))
-    # `np.stack` makes contiguous arrays: for another layout the loops would be compiled again.
+    # np.stack() makes contiguous arrays. For another layout, numba would compile the loops again.
     a, i, j = np.stack(np.nonzero(seen[:relations]))
     gate = present.presence[i] * present.presence[j]
     return Given(a, i, j, on[a, i, j].astype(np.float32), gate)
 
 
 def relations_given(scene: Scene) -> bool:
-    """Whether the scene has observed relations, stated or derived from poses."""
+    """Return whether the scene has observed relations, either stated or derived from poses."""
     return bool(scene.relations or scene.relations_complete or scene.poses)
 
 
 def pull_of(scene: Scene, weights: EvidenceWeights) -> Pull:
-    """Weights of the observed relations in the mean field of the hidden units."""
+    """Return the weights with which the observed relations of a scene act on the hidden units."""
     if scene.poses is None:
         return Pull(weights.relations_on_objects, weights.relations_on_relations)
     return Pull(weights.poses_on_objects, weights.poses_on_relations)
@@ -100,7 +107,7 @@ class Posterior(ScenePosterior):
         present: the classes of the scene.
 
     Raises:
-        ValueError: an object or a room type that the machine does not know.
+        ValueError: the machine does not know the class of an object or the room type.
     """
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
@@ -115,13 +122,21 @@ class Posterior(ScenePosterior):
         super().__init__(artifact.closed_form, context)
 
     def absent_log_odds(self, absent: Places) -> Floats:
-        """Log-odds of presence of absent classes, with their relations unobserved, (N,)."""
+        """Return the log-odds of presence of N absent classes, (N,).
+
+        The relations of these classes are unobserved. All other absent classes count as absent.
+        """
         gain = self._artifact.scorer.gain(self.context.object_y)
         found: Floats = self._closed.b + gain
         return found[absent]
 
     def absent_posterior(self, absent: Places, coverage: float) -> Floats:
-        """Log-odds that absent classes are present but unlisted, given the coverage, (N,)."""
+        """Return the log-odds that each of N unlisted classes is present, (N,).
+
+        Args:
+            absent: (N,) indices of the unlisted classes.
+            coverage: probability that a present class is listed.
+        """
         return with_unlisted(
             *(self._artifact, self.absent_log_odds(absent), absent, self.context.object_y),
             *(self.present, self._room, coverage),
@@ -129,7 +144,7 @@ class Posterior(ScenePosterior):
 
 
 def posterior(artifact: Artifact, scene: Scene) -> Posterior:
-    """The posterior of a scene, computed by the artifact's oracle if it has one."""
+    """Return the posterior of a scene. If the artifact has an oracle, the oracle computes it."""
     found: Posterior = (artifact.oracle or Posterior)(artifact, scene)
     return found
 
@@ -144,23 +159,29 @@ def with_unlisted(
     coverage: float,
     closed: Floats | None = None,
 ) -> Floats:
-    """Mix the closed form and the partial posterior of absent classes, (N,).
+    """Return the log-odds that each of N unlisted classes is present, (N,).
 
-    (1 - λ) (closed + log(1 - c)) + λ partial
+    The result is a weighted mean of two estimates:
+
+        (1 - λ) (closed + log(1 - c)) + λ partial
 
     λ is the calibration's `coverage_weight`, and c is the coverage. `closed` are log-odds in closed
-    form: they count all other unlisted classes as absent, and have no sampling error. `partial` are
-    log-odds estimated from the stored samples (`Completions`). The closed form is used alone for
-    machines without stored samples, and for a coverage of at least `FULL`. Then c = `FULL`, since
-    c = 1 would give log-odds of minus infinity.
+    form. They treat all other unlisted classes as absent and have no sampling error. `partial` are
+    log-odds that `Completions` estimates from the stored samples. For machines without stored
+    samples, the result is log_odds + log(1 - c). For a coverage of at least `FULL`, the result is
+    the same with c = `FULL`, because c = 1 would give minus infinity.
 
     Args:
-        log_odds: (N,) log-odds of the absent classes, with other unlisted classes absent.
-        absent: (N,) class indices.
+        artifact: the model.
+        log_odds: (N,) log-odds of the absent classes. All other unlisted classes count as absent.
+        absent: (N,) class indices of the absent classes.
         y: (H1,) logits of h1 in the closed form.
+        present: classes of the scene.
+        room: index of the room type, or None if the room type is unknown.
         coverage: probability that a present class is listed.
-        closed: (N,) the closed form at y, if `log_odds` are a better estimate. Then λ times the
-            difference between the partial posterior and the closed form is added to `log_odds`.
+        closed: (N,) log-odds in closed form at y. None means that `log_odds` are these log-odds.
+            Otherwise, `log_odds` are a better estimate. The function then adds λ times the
+            difference between `partial` and the closed form to `log_odds`.
     """
     completions, weight = artifact.completions, artifact.calibration.coverage_weight
     unlisted = math.log1p(-min(coverage, FULL))

@@ -1,4 +1,8 @@
-"""Compiled loops that rank the entries of answers, ties by position, and round their numbers."""
+"""Compiled loops that rank the entries of answers and round their numbers.
+
+Entries with equal values keep the order of their indices. Several functions take tables of
+`RelationSlopes`, which contain the calibration of relations.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +20,8 @@ from app.questions.calibration import exclusive, relation_probability
 DIGITS: Final = 6
 """Significant digits of probabilities, log-odds and metres."""
 
-# These doubles are exact. So an integer divided by one of them is the double nearest to the decimal
-# number.
+# Doubles represent these powers of ten exactly. So an integer divided by such a power is the double
+# that is nearest to the decimal number.
 _POWERS: Final = np.array([10.0**power for power in range(23)])
 
 
@@ -28,37 +32,43 @@ REASONS: Final = 3
 """Maximum number of reasons for one entry of an answer."""
 
 EXPLAINED: Final = 32
-"""Only the first entries of an answer, at most this many, have reasons."""
+"""Maximum number of entries with reasons in an answer. The first entries have reasons."""
 
 
 class Because(NamedTuple):
-    """A reason: how much the presence of `object` changes the log-odds of the judged class."""
+    """A reason: an object of the scene that changes the log-odds of the judged class.
+
+    Attributes:
+        object: index of the object in `Scene.objects`.
+        log_odds_change: log-odds of the judged class with this object minus its log-odds without.
+    """
 
     object: int
     log_odds_change: float
 
 
 def entries(kind: type[TupleT], *columns: Iterable[Any]) -> list[TupleT]:
-    """Make named tuples from columns of fields, in half the time of calls to the class."""
+    """Make named tuples from one column per field. This is twice as fast as calls to the class."""
     return list(map(partial(tuple.__new__, kind), zip(*columns, strict=True)))
 
 
 @compiled
 def best(values, usable, count):
-    """Positions of the `count` largest usable values, largest first, ties by position.
+    """Return the indices of the `count` largest usable values, largest first.
 
-    The time is O(N log count).
+    Of equal values, the value with the lower index comes first. The time is O(N log count).
 
     Args:
-        values: (N,).
-        usable: (N,) bool.
+        values: (N,) values to compare.
+        usable: (N,) bool, True for values that the result may contain.
+        count: maximum number of indices.
 
     Returns:
-        At most `count` positions.
+        At most `count` indices.
     """
     size, kept = 0, min(count, len(values))
-    # A heap of the best positions so far. Its root is the worst of them: the smallest value, and
-    # the last position among equal values.
+    # The heap contains the best indices so far. Its root is the worst of these indices: the index
+    # with the smallest value, and of several equal values the largest index.
     heap = np.empty(kept, np.int64)
     for position in range(len(values)):
         if not usable[position]:
@@ -82,13 +92,13 @@ def best(values, usable, count):
 
 @compiled
 def _worse(values, one, other):
-    """Whether position `one` ranks after position `other`."""
+    """Return whether the value at index `one` ranks after the value at index `other`."""
     return values[one] < values[other] or (values[one] == values[other] and one > other)
 
 
 @compiled
 def _sink(values, heap, size, position):
-    """Replace the root of a heap by a position, and restore the heap."""
+    """Replace the root of the heap by the index `position`, and restore the heap order."""
     at = 0
     while 2 * at + 1 < size:
         below = 2 * at + 1
@@ -103,19 +113,21 @@ def _sink(values, heap, size, position):
 
 @compiled
 def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposites, count):
-    """The `count` likeliest relations between objects, likeliest first, ties by position.
+    """Return the `count` likeliest relations between N objects, likeliest first.
 
     Args:
-        slopes: (A, 4 + 2K), see `RelationSlopes`.
-        log_odds: (A, n, n) log-odds of the relations between classes.
+        slopes: (A, 4 + 2K) table of `RelationSlopes`.
+        log_odds: (A, n, n) log-odds of the A relations between the n classes of the scene.
         log_counts: (n,) log of the number of instances of each class.
         row: (N,) index of each object's class among the n classes.
-        asked: (N, N) bool, the ordered pairs to answer.
-        least: relations of a lower probability are left out.
-        opposites: whether to add, as relation A + a, relation a from object to subject.
+        asked: (N, N) bool, True for the ordered pairs of objects to judge.
+        least: minimum probability of a relation in the result.
+        opposites: whether the result also contains opposite relations. The opposite of relation a
+            has the number A + a.
+        count: maximum number k of relations.
 
     Returns:
-        (k,) subjects, objects, relations and probabilities.
+        Four arrays (k,): subjects, objects, relations and probabilities.
     """
     (A, n), size = log_odds.shape[:2], len(row)
     counts = np.empty((n, n), log_counts.dtype)
@@ -143,23 +155,28 @@ def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposit
 
 @compiled
 def likeliest_places(slopes, forward, backward, log_counts, classes, count, first):
-    """The k likeliest places of each candidate, one candidate after the other.
+    """Return the k likeliest places of each of N candidate classes, likeliest first.
 
-    Place (d A + a) m + j stands for relation a and anchor j. The candidate is the subject if d = 0;
-    the anchor is the subject if d = 1.
+    A place is a relation a to an anchor j, which is a class of the scene. The number of the place
+    is (d A + a) m + j. The candidate is the relation's subject if d = 0, and the anchor is the
+    subject if d = 1.
 
     Args:
-        slopes: (A, 4 + 2K), see `RelationSlopes`.
-        forward, backward: (N, A, m) log-odds of relations from the candidates to the anchors, and
-            from the anchors to the candidates.
+        slopes: (A, 4 + 2K) table of `RelationSlopes`.
+        forward: (N, A, m) log-odds of relations with a candidate as subject and an anchor as
+            object.
+        backward: (N, A, m) log-odds of relations with an anchor as subject and a candidate as
+            object.
         log_counts: (m,) log of the number of instances of each anchor's class.
-        classes: number of distinct classes in the scene, the candidate included.
+        classes: number of distinct classes in the scene, including the candidate.
         count: maximum of k.
-        first: the place that is listed first, however likely; -1 for none.
+        first: number of a place that comes first even if other places are likelier. -1 means that
+            the order depends only on the probabilities.
 
     Returns:
-        Five arrays (N k,): number of the candidate, relation, whether the candidate is its subject,
-        number of the anchor, and probability.
+        Five arrays (N k,) with the places of candidate 0, then of candidate 1 and so on: index of
+        the candidate, relation, True if the candidate is the subject, index of the anchor, and
+        probability.
     """
     N, A, m = forward.shape
     size = A * m
@@ -186,12 +203,15 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
 
 @compiled
 def strongest(change, rows, count):
-    """Indices and values of the largest changes of either sign, each (N, k).
+    """Return the indices and values of the k changes with the largest absolute values.
+
+    Both arrays have the shape (N explained classes, k).
 
     Args:
-        change: (N, n) changes of N explained classes by the n classes of the scene.
-        rows: (N,) index of each explained class among the n classes, which is skipped; empty if the
-            explained classes are absent.
+        change: (N, n) change of each explained class's log-odds by each of the n classes of the
+            scene.
+        rows: (N,) index of each explained class among the n classes. The result leaves out the
+            change of a class by itself. If the explained classes are absent, rows is empty.
         count: maximum of k.
     """
     N, n = change.shape
@@ -214,14 +234,17 @@ def strongest_reasons(
     change: NDArray[np.floating[Any]],
     rows: NDArray[np.int64] | None = None,
 ) -> list[tuple[Because, ...]]:
-    """The reasons for each of N explained classes: the largest changes of either sign, first.
+    """Return the reasons for each of N explained classes.
 
-    A reason names the first object of its class.
+    The reasons are the changes with the largest absolute values, largest first. The object of a
+    reason is the first object of the class that causes the change.
 
     Args:
-        first: (n,) position of the first object of each class of the scene.
-        change: (N, n) changes of the explained classes' log-odds by each class of the scene.
-        rows: (N,) indices of the explained classes among the n; None for absent classes.
+        first: (n,) index of the first object of each class in `Scene.objects`.
+        change: (N, n) change of each explained class's log-odds by each of the n classes of the
+            scene.
+        rows: (N,) index of each explained class among the n classes. None means that the explained
+            classes are absent.
     """
     rows = np.zeros(0, np.int64) if rows is None else rows
     places, values = strongest(change, rows, REASONS)
@@ -232,20 +255,22 @@ def strongest_reasons(
 
 @compiled
 def observed_pairs(triples, row, asked, classes, relations):
-    """Pairs of objects with at least one observed relation, with the relations as bit sets.
+    """Return the pairs of objects with at least one observed relation, and their relations.
 
-    Bit a stands for relation a from subject to object. Bit A + a stands for relation a from object
-    to subject.
+    A bit set contains the relations of a pair. Bit a stands for relation a from subject to object.
+    Bit A + a stands for relation a from object to subject.
 
     Args:
-        triples: (T, 3) relation, subject and object.
+        triples: (T, 3) observed relations, each as (relation, subject, object).
         row: (N,) index of each object's class among the n classes.
-        asked: (N, N) bool, the ordered pairs to answer; a pair counts in either order.
-        classes, relations: the numbers n and A.
+        asked: (N, N) bool, True for the ordered pairs of objects to judge. The result contains a
+            pair if one of its two orders is True.
+        classes: number n of classes in the scene.
+        relations: number A of canonical relations.
 
     Returns:
-        Four arrays (P,): subject, object, relations of the pair, and relations between any
-        instances of the two classes.
+        Four arrays (P,): subject, object, bit set of the relations between these two objects, and
+        bit set of the relations between any two objects of their classes.
     """
     size = len(row)
     holds, of_classes = np.zeros((size, size), np.int64), np.zeros((classes, classes), np.int64)
@@ -260,7 +285,7 @@ def observed_pairs(triples, row, asked, classes, relations):
     for x in range(size):
         for y in range(x + 1, size):
             if holds[x, y] and (asked[x, y] or asked[y, x]):
-                # The subject is the object whose first relation, its lowest bit, has the lower
+                # The subject of the pair is the subject of its observed relation with the lowest
                 # number.
                 one, other = holds[x, y] & forward, holds[y, x] & forward
                 swapped = one == 0 or (other != 0 and (other & -other) < (one & -one))
@@ -274,23 +299,27 @@ def observed_pairs(triples, row, asked, classes, relations):
 
 @compiled
 def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classes, least, count):
-    """The `count` pairs with the largest ratio of expected to observed probability.
+    """Return the `count` pairs whose observed relations differ most from the expected relation.
 
-    The expected relation of a pair is its likeliest relation. The observed probability is that of
-    the likeliest observed relation. A pair counts only if its expected relation is unobserved, both
-    for the pair and for its classes.
+    The expected relation of a pair is its likeliest relation. The observed probability is the
+    probability of the likeliest observed relation. Pairs are ranked by the probability of the
+    expected relation divided by the observed probability. The result contains a pair only if its
+    expected relation is not observed between any two objects of its classes.
 
     Args:
-        slopes: (A, 4 + 2K), see `RelationSlopes`.
-        forward, backward: (A, P) log-odds from subject to object, and from object to subject.
-        log_counts: (P,) log of the number of instance pairs of both classes.
+        slopes: (A, 4 + 2K) table of `RelationSlopes`.
+        forward: (A, P) log-odds of the relations from subject to object.
+        backward: (A, P) log-odds of the relations from object to subject.
+        log_counts: (P,) log of the number of object pairs with these two classes.
         classes: number of distinct classes in the scene.
-        holds, of_classes: (P,) relations of the pair and of its classes, see `observed_pairs`.
-        least: smallest probability of an expected relation.
+        holds, of_classes: (P,) bit sets of the relations of the pair and of its classes; see
+            `observed_pairs`.
+        least: minimum probability of an expected relation.
+        count: maximum number k of pairs.
 
     Returns:
-        Four arrays (k,): index of the pair, number of the expected relation, its probability, and
-        the observed probability.
+        Four arrays (k,): index of the pair, number of the expected relation, probability of the
+        expected relation, and observed probability.
     """
     A, P = forward.shape
     to = relation_probability(slopes, forward.reshape(1, A, P), log_counts, classes)[0]
@@ -328,10 +357,11 @@ def significant(numbers: Sequence[float]) -> list[float]:
 
 @compiled
 def _round(values: NDArray[np.float64]) -> bool:
-    """Round numbers in place.
+    """Round numbers to `DIGITS` significant digits in place.
 
     Returns:
-        False if a number is too small or too large for exact powers of ten; it stays unchanged.
+        False if a number is too small or too large for exact powers of ten. Such numbers stay
+        unchanged.
     """
     exact = True
     for k in range(len(values)):

@@ -1,13 +1,15 @@
 """The question `relations`: which relations hold between objects, and which are unexpected?
 
-Disagreements: each pair of objects with an observed relation is judged a second time, with all
-relations between their two classes unobserved, in both directions. Otherwise an observation would
-be evidence for itself: if left is observed, front is observed to be off. The pair is a disagreement
-if the likeliest of the eight relations is unobserved and has a probability of at least `EXPECTED`.
+A disagreement is a pair of objects whose observed relation is not the relation that the rest of the
+scene suggests. To find disagreements, the module judges each pair with an observed relation a
+second time. It then treats all relations between the two classes as unobserved, in both directions.
+Otherwise an observation would be evidence for itself: if left is observed, the model also knows
+that front does not hold. The pair is a disagreement if the likeliest of the eight relations is
+unobserved and has a probability of at least `EXPECTED`.
 
 The model has relation units between classes. If a class has several instances, a relation of any
-instance counts as observed. Example: one chair is to the left of the table, and another one to the
-right. Then both left and right count as observed for each chair.
+instance counts as observed for all instances. Example: one chair is to the left of the table, and
+another chair is to the right. Then left and right both count as observed for each chair.
 """
 
 from __future__ import annotations
@@ -25,18 +27,20 @@ from app.scene.relations import CANONICAL, OPPOSITES, canonicalise
 from app.scene.scene import Scene
 
 EXPECTED = 0.5
-"""Smallest probability of an expected relation.
+"""Minimum probability of the expected relation of a disagreement.
 
-If all relations of a pair are unlikely, the likeliest one is a weak expectation.
+If all relations of a pair are unlikely, the likeliest relation is not a meaningful expectation.
 """
 
 
 class RelationAnswer(NamedTuple):
-    """`relation` from `subject` to `object`, which are positions in the scene.
+    """A relation between two objects and its probability.
 
     Attributes:
+        subject, object: indices in `Scene.objects`.
+        relation: name of the relation from subject to object.
         probability: probability that the relation holds, given that both objects are present.
-        observed: whether the relation was stated or derived from poses.
+        observed: True if the request states the relation, or if poses imply it.
     """
 
     subject: int
@@ -47,14 +51,15 @@ class RelationAnswer(NamedTuple):
 
 
 class Disagreement(NamedTuple):
-    """Two objects with another relation than the rest of the scene suggests, see the module.
+    """A pair of objects whose observed relation the rest of the scene does not suggest.
 
     Attributes:
-        subject, object: positions in the scene.
-        observed: observed relations from subject to object.
-        expected: the likeliest relation, judged without the observed relations of the pair.
-        probability: probability of `expected`.
-        observed_probability: probability of the likeliest observed relation.
+        subject, object: indices in `Scene.objects`.
+        observed: names of the observed relations from subject to object.
+        expected: name of the likeliest relation, without the observed relations of the pair as
+            evidence.
+        probability: probability of the relation `expected`.
+        observed_probability: probability of the likeliest observed relation of the pair.
     """
 
     subject: int
@@ -74,23 +79,30 @@ def relations(
     pairs: Sequence[tuple[int, int]] | None = None,
     include_opposites: bool = False,
 ) -> tuple[tuple[RelationAnswer, ...], tuple[Disagreement, ...]]:
-    """The likeliest relations between the objects of a scene, and its disagreements.
+    """Return the likeliest relations between the objects of a scene, and its disagreements.
 
-    Observed relations are evidence for other relations. Each relation is judged as if it were
-    unobserved itself. Structure (floor, wall) is left out unless `pairs` contains it.
+    Observed relations are evidence for other relations, but an observed relation is not evidence
+    for itself. Structural classes (floor, wall) are left out unless `pairs` contains them.
 
     Args:
-        top_k: maximum number of relations, and of disagreements.
-        min_probability: smallest probability of a relation, and of a disagreement's `expected`.
-        pairs: ordered pairs (subject, object) to answer, as positions in `scene.objects`.
-        include_opposites: also list opposite relations, such as right(y, x) for left(x, y).
+        artifact: the model.
+        scene: the objects, their observed relations and the room type.
+        top_k: maximum number of relations in the answer. The same limit applies to disagreements.
+        min_probability: minimum probability of a relation in the answer. The same limit applies to
+            the expected relation of a disagreement.
+        pairs: ordered pairs (subject, object) to judge, as indices in `scene.objects`. None means
+            all pairs.
+        include_opposites: whether the answer also lists opposite relations, such as right(y, x) for
+            left(x, y).
 
     Returns:
-        The relations, likeliest first. The disagreements, ordered by the ratio of `probability` to
-        `observed_probability`, largest first. Ties are ordered by position.
+        The relations, likeliest first. Then the disagreements, with the largest ratio of
+        `probability` to `observed_probability` first. Entries with equal values are ordered by
+        their indices.
 
     Raises:
-        ValueError: top_k below 1, a probability outside [0, 1], or a pair that is not two objects.
+        ValueError: top_k is below 1, the probability is outside [0, 1], or a pair does not consist
+            of two different objects of the scene.
     """
     if top_k < 1:
         raise ValueError(f"top_k must be at least 1, not {top_k}")
@@ -129,7 +141,7 @@ def relations(
 def _asked(
     artifact: Artifact, present: Present, pairs: Sequence[tuple[int, int]] | None
 ) -> NDArray[np.bool_]:
-    """The requested ordered pairs of objects, as a mask (N, N)."""
+    """Return a bool mask (N subjects, N objects) of the ordered pairs to judge."""
     size = len(present.row)
     if pairs is None:
         things = ~artifact.vocabulary.structure[present.classes][present.row]
@@ -137,7 +149,10 @@ def _asked(
     asked = np.zeros((size, size), dtype=np.bool_)
     for subject, object_ in pairs:
         if subject == object_ or not (0 <= subject < size and 0 <= object_ < size):
-            raise ValueError(f"pair ({subject}, {object_}) must name two of the {size} objects")
+            raise ValueError(
+                f"pair ({subject}, {object_}) must have the indices of two different objects; the "
+                f"scene has {size} objects"
+            )
         asked[subject, object_] = True
     return asked
 
@@ -151,16 +166,20 @@ def _disagreements(
     top_k: int,
     min_probability: float,
 ) -> tuple[Disagreement, ...]:
-    """The disagreements of a scene, largest probability ratio first, ties by position.
+    """Return the disagreements of a scene.
 
-    The subject of a disagreement is the subject of its first observed relation, in the order of
-    `CANONICAL`. Relations without a unit in the machine are never expected.
+    Disagreements with the largest ratio of `probability` to `observed_probability` come first. If a
+    pair has several observed relations, the first of them in `CANONICAL` defines the subject of the
+    disagreement. A relation is never expected if the machine has no unit for it.
 
     Args:
-        given: the posterior of the scene.
-        asked: (N, N) bool, the ordered pairs to answer; a pair counts in either order.
+        artifact: the model.
+        scene: the scene.
+        given: posterior of the scene.
+        asked: (N, N) bool, True for the ordered pairs of objects to judge. The function judges a
+            pair if one of its two orders is True.
         top_k: maximum number of disagreements.
-        min_probability: smallest probability of an expected relation.
+        min_probability: minimum probability of an expected relation.
     """
     A = artifact.spec.A
     stated = [triple for triple in scene.relations or () if triple[0] < A]

@@ -1,4 +1,4 @@
-"""Published models: their file format, the model store, and verified snapshots of the store."""
+"""Published models: their file format, the store of models, and loaded snapshots of the store."""
 
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.description import (
@@ -14,6 +14,7 @@ from app.registry.description import (
     VocabularyEntry,
 )
 from app.registry.errors import ArtifactError, RegistryError, StoreError
+from app.registry.location import open_store
 from app.registry.manifest import Manifest
 from app.registry.models import ArtifactFailure, ModelSet, StoreFailure, load_model_set
 from app.registry.offsets import Offsets
@@ -45,5 +46,6 @@ __all__ = [
     "VocabularyEntry",
     "load_artifact",
     "load_model_set",
+    "open_store",
     "write_artifact",
 ]

@@ -1,6 +1,8 @@
-"""The table of aliases: one small JSON file. Each change replaces the whole file.
+"""The table of aliases: a small JSON file that maps each alias to a model version.
 
-Format: {"default": {"name": "...", "version": "..." or null for the latest version}}
+Each change of an alias replaces the whole file. Format of the file:
+
+    {"default": {"name": "...", "version": "..." or null for the latest version}}
 """
 
 from __future__ import annotations
@@ -33,22 +35,31 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
             text = file.read(MAX_ALIASES_BYTES + 1)
         if len(text) > MAX_ALIASES_BYTES:
             raise StoreError(
-                "invalid_aliases", f"{path.name} has more than {MAX_ALIASES_BYTES} bytes"
+                "invalid_aliases",
+                f"{path.name} has more than the maximum of {MAX_ALIASES_BYTES} bytes",
             )
         return _TABLE.validate_json(text)
     except FileNotFoundError:
         return {}
     except OSError as error:
-        raise StoreError("invalid_aliases", f"{path.name}: {cause(error)}") from None
+        raise StoreError("invalid_aliases", f"{path.name} cannot be read: {cause(error)}") from None
     except ValidationError as error:
         detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        raise StoreError("invalid_aliases", f"{path.name}: {detail['msg']}") from None
+        raise StoreError(
+            "invalid_aliases", f"{path.name} is not a valid table of aliases: {detail['msg']}"
+        ) from None
 
 
 def write_aliases(path: Path, aliases: Mapping[str, AliasTarget], *, prefix: str) -> None:
     """Replace the table of aliases.
 
-    The name of the temporary file starts with `prefix`. A crash may leave this file behind.
+    The function writes a temporary file and renames it. A crash may leave the temporary file
+    behind.
+
+    Args:
+        path: the file of the table.
+        aliases: maps each alias to its target.
+        prefix: start of the temporary file's name.
     """
     table = dict(sorted(aliases.items()))
     replace_file(path, _TABLE.dump_json(table, indent=2) + b"\n", prefix=prefix)

@@ -1,4 +1,7 @@
-"""Artifacts: each holds one version of a model. Each read verifies the artifact."""
+"""Artifacts: the files of one version of a model, and the loaded model.
+
+Every read of an artifact verifies its files.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,10 @@ from app.scene.scene import Scene
 from app.scene.vocabulary import Vocabulary
 
 _DTYPES: Final = {float: "float32", int: "int32"}
-_UNSUPPORTED: Final = "the service needs a machine in the local form, with W between -64 and 64"
+_UNSUPPORTED: Final = (
+    "the service does not support this machine: it needs the local form and weights W between -64 "
+    "and 64"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,15 +47,16 @@ class Artifact:
     Attributes:
         manifest: description of the model and its files.
         weights: weights of the machine.
-        vocabulary: names of its V object classes and C room types.
+        vocabulary: names of the model's V object classes and C room types.
         calibration: conversion of log-odds into probabilities.
-        digest: SHA-256 of the manifest's bytes, hexadecimal. It changes if a file changes.
-        card: the model card in Markdown.
+        digest: SHA-256 of the manifest's bytes as a hexadecimal string. The digest changes if any
+            file of the artifact changes.
+        card: model card in Markdown.
         path: directory of the artifact.
-        offsets: offsets in metres between related objects, or None if the training scenes had no
-            poses.
-        oracle: function that returns the posterior of a scene, for machines without closed form.
-            Only training uses it.
+        offsets: vectors in metres between the centres of related objects. None means that the
+            training scenes had no poses.
+        oracle: function that computes the posterior of a scene in place of the closed form. Only
+            training sets an oracle.
     """
 
     manifest: Manifest
@@ -69,17 +76,17 @@ class Artifact:
 
     @cached_property
     def scorer(self) -> ContextScorer:
-        """Scorer of all object classes. The first access builds it."""
+        """Scorer that computes the log-odds of all object classes. The first access builds it."""
         return ContextScorer(self.weights["W"])
 
     @cached_property
     def closed_form(self) -> ClosedForm:
-        """Log-odds in closed form. The first access builds them."""
+        """The machine, prepared for log-odds in closed form. The first access prepares it."""
         return ClosedForm(self.weights)
 
     @cached_property
     def completions(self) -> Completions | None:
-        """Posterior of unlisted classes, or None for machines without stored samples."""
+        """Posterior of unlisted classes. None means that the machine has no stored samples."""
         if not Completions.fits(self.weights):
             return None
         return Completions(self.weights, self.vocabulary.structure, self.scorer)
@@ -91,18 +98,18 @@ class Artifact:
 
     @cached_property
     def popularity(self) -> NDArray[np.float64] | None:
-        """(V,) log-odds that a training scene has the class. None if the calibration lacks them."""
+        """(V,) log-odds that a training scene has each class. None means that they are unknown."""
         found = self.calibration.popularity
         return np.array(found) if found else None
 
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:
-        """(V,) contribution of h1 to the log-odds of each class in an empty scene."""
+        """(V,) contribution of the hidden units h1 to each class's log-odds in an empty scene."""
         gain: NDArray[np.float32] = self.scorer.gain(self.weights["c1"])
         return gain
 
     def context_rows(self) -> NDArray[np.float32]:
-        """Return the weights between each triple and h1, (T, H1), for triples with own weights."""
+        """Return the weights between h1 and each of the T triples of the weights, (T, H1)."""
         relation, subject, object_ = self.weights["triples"].astype(np.int64).T.copy()
         return self.spec.kind.units(self.weights).rows_of(relation, subject, object_)
 
@@ -123,13 +130,14 @@ def write_artifact(
 
     Args:
         directory: the new directory. Its parent must exist.
-        description: the manifest without its entries about files.
-        state: maps names to arrays: the arrays of `layout`, and optionally `Offsets.tensors()`.
+        description: contents of the manifest without the entries about files.
+        state: maps names to arrays. It contains the arrays of `layout`, and optionally those of
+            `Offsets.tensors()`.
         storage_dtype: dtype of floating-point tensors with two or more axes; see `pack`.
 
     Raises:
         ArtifactError: the artifact format cannot store a tensor; see `pack`.
-        OSError: the file system refused an operation.
+        OSError: the operating system could not write a file.
     """
     weights, tensors = pack(state, storage_dtype)
     card = render_card(description, tensors).encode()
@@ -157,14 +165,14 @@ def load_artifact(
 
     Args:
         directory: directory with exactly the three files of an artifact.
-        previous: an artifact loaded before. If the verified files have its digest, the function
-            returns `previous` instead of a second copy.
+        previous: an artifact that was loaded earlier. If the verified files have the same digest,
+            the function returns `previous` instead of a second copy. None means that no artifact
+            was loaded earlier.
         max_weights_bytes: maximum size of the weights file. The function checks the size before it
             reads the file.
 
     Raises:
-        ArtifactError: the artifact is invalid. The exception has the code and the reason of the
-            first error found.
+        ArtifactError: the artifact is invalid. The exception describes the first error found.
     """
     files = read_verified(directory, max_weights_bytes)
     if previous is not None and previous.digest == files.digest:
@@ -190,12 +198,14 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
         spec = MachineSpec.from_dict(dict(manifest.spec))
         expected = layout(spec)
     except (ValueError, TypeError) as error:
-        raise ArtifactError("invalid_manifest", f"spec: {error}") from None
+        raise ArtifactError(
+            "invalid_manifest", f"the manifest has an invalid spec: {error}"
+        ) from None
     require_equal(
         {name: (array.dtype.name, array.shape) for name, array in tensors.items()},
         {name: (_DTYPES[kind], shape) for name, (kind, shape) in expected.items()},
-        "the artifact holds",
-        f"a {spec.variant} of this spec needs",
+        "the artifact has",
+        f"but a {spec.variant} machine of this spec needs",
     )
     try:
         weights = Weights(spec, tensors)

@@ -70,7 +70,12 @@ _LIMITS = """\
 
 
 def render_card(description: Description, tensors: Mapping[str, TensorEntry]) -> str:
-    """Return the card of a model, in Markdown."""
+    """Return the model card in Markdown.
+
+    Args:
+        description: description of the model.
+        tensors: maps the name of each stored tensor to its dtype and shape.
+    """
     words, spec = description.vocabulary, description.spec
     proposed = sum(not entry.structure for entry in words.objects)
     machine = {name: e for name, e in tensors.items() if not name.startswith(PREFIX)}

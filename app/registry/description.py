@@ -33,8 +33,8 @@ Floats = NDArray[np.floating[Any]]
 
 ItemT = TypeVar("ItemT")
 Many = Annotated[tuple[ItemT, ...], FailFast()]
-"""A tuple whose validation stops at the first invalid item. A million errors would take gigabytes
-of memory."""
+"""A tuple whose validation stops at the first invalid item. Otherwise, errors for a million invalid
+items would take gigabytes of memory."""
 
 
 def _in_utc(moment: datetime) -> datetime:
@@ -53,7 +53,7 @@ def to_json(value: Any) -> str:
 
 
 class Frozen(BaseModel):
-    """Base class of immutable models that refuse unknown fields and non-finite numbers."""
+    """Base class of immutable pydantic models. They refuse unknown fields, NaN and infinity."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -61,7 +61,8 @@ class Frozen(BaseModel):
 class CountSlope(Frozen):
     """Calibration of a logit z: log-odds = intercept + slope·z + log_count·log n.
 
-    The meaning of n depends on the question. For outliers, n is the number of classes in the scene.
+    The attributes of `Calibration` define n for each question. For outliers, n is the number of
+    classes in the scene.
     """
 
     intercept: float = 0.0
@@ -69,7 +70,12 @@ class CountSlope(Frozen):
     log_count: float = 0.0
 
     def log_odds(self, z: Floats, n: int | NDArray[np.integer[Any]]) -> Floats:
-        """Return the log-odds of logits z, both (N,). n is a number or an array (N,)."""
+        """Return the calibrated log-odds of the logits z, (N,).
+
+        Args:
+            z: (N,) logits.
+            n: number n of the formula, or an array (N,) with a number for each logit.
+        """
         found: Floats = self.intercept + self.log_count * np.log(n) + self.slope * z
         return found
 
@@ -77,10 +83,10 @@ class CountSlope(Frozen):
 class PairSlope(CountSlope):
     """Calibration of a relation between two objects.
 
-    It adds log_classes·log(number of classes in the scene) to the formula of `CountSlope`, because
-    annotators list a smaller share of the relations in a larger scene. n is the number of instance
-    pairs of both classes. The result x then runs through a piecewise-linear curve: each bend (at,
-    change) adds change·(x - at) if x is above ``at``.
+    The calibration adds log_classes·log(number of classes in the scene) to the formula of
+    `CountSlope`, because annotators list a smaller share of the relations in a larger scene. n is
+    the number of object pairs with the two classes. The result x is then converted by a
+    piecewise-linear curve. Each bend (at, change) adds change·(x - at) if x is above ``at``.
     """
 
     log_classes: float = 0.0
@@ -91,7 +97,7 @@ PairSlopes = Annotated[Many[PairSlope], Field(max_length=len(CANONICAL))]
 
 
 class Slope(Frozen):
-    """Calibration of a logit z without counts: log-odds = intercept + slope·z."""
+    """Calibration of a logit z that does not depend on counts: log-odds = intercept + slope·z."""
 
     intercept: float = 0.0
     slope: float = 1.0
@@ -104,7 +110,10 @@ _RETIRED = frozenset(
 
 
 class Thresholds(Frozen):
-    """Minimum probability of an alarm for each sensitivity."""
+    """Minimum probability at which the service reports an outlier or a misplaced relation.
+
+    A request selects the threshold by its sensitivity: low, medium or high.
+    """
 
     low: Annotated[float, Field(ge=0, le=1)] = 0.5
     medium: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -112,14 +121,15 @@ class Thresholds(Frozen):
 
 
 class EvidenceWeights(Frozen):
-    """Weights with which observed relations act on the hidden units.
+    """Weights from 0 to 1 with which observed relations act on the hidden units.
 
     Attributes:
         relations_on_objects: weight of relations that a request states, for questions about
             objects.
-        relations_on_relations: weight of these relations for questions about relations.
+        relations_on_relations: weight of relations that a request states, for questions about
+            relations.
         poses_on_objects: weight of relations derived from poses, for questions about objects.
-        poses_on_relations: weight of these relations for questions about relations.
+        poses_on_relations: weight of relations derived from poses, for questions about relations.
     """
 
     relations_on_objects: Annotated[float, Field(ge=0, le=1)] = 1.0
@@ -131,34 +141,44 @@ class EvidenceWeights(Frozen):
 class Calibration(Frozen):
     """The conversion of a machine's log-odds into probabilities.
 
-    With the default values, only `coverage` changes log-odds: those of unlisted classes.
+    With the default values, the calibration changes only the log-odds of unlisted classes, by
+    `coverage`. An intruder is an object that does not belong to the scene. Structural classes are
+    parts of the building (floor, wall) and vague names (object).
 
     Attributes:
-        coverage: probability that a request lists a class of the scene. A request may override it.
-        coverage_weight: weight of the log-odds under partial coverage, chosen on validation scenes.
-            The remaining weight belongs to the closed form, where unlisted classes are absent.
-        missing: calibration of the posterior log-odds of an unlisted class. n is the number of
+        coverage: probability that a request lists a class that is present in the scene. A request
+            may contain another value.
+        coverage_weight: weight of the log-odds that `Completions` estimates for unlisted classes.
+            The remaining weight belongs to the closed form, which treats the other unlisted classes
+            as absent. Training chooses the weight on validation scenes.
+        missing: calibration of the log-odds that an unlisted class is present. n is the number of
             listed classes.
-        evidence: weights of observed relations.
-        popularity: (V,) log-odds that a training scene has the class. If empty, all classes are
-            equal.
-        popularity_weight: exponent alpha. The prior of an intruder is proportional to
-            popularity^alpha.
-        outlier_thresholds: minimum probability of an outlier.
-        short_list_thresholds: outlier thresholds for scenes of 1, 2, ... classes, without
-            structural classes. Larger scenes use `outlier_thresholds`.
-        misplaced_thresholds: minimum probability of a misplaced relation.
-        smallest: (C + 1,) minimum number of classes in a generated room of each type. 90 % of the
-            real rooms reach it. The last entry is for all rooms. If empty, there is no minimum.
-        room_fit: (C,) minimum of log p(v | room type) / p(v), up to a constant, for a generated
-            room of each type. 85 % of the real rooms reach it. If empty, there is no minimum.
-        outlier: calibration from the log-odds of presence to the log-odds of an intruder.
-        relation: one entry for each canonical relation.
-        relation_given: entries for scenes with observed relations. If empty, `relation` applies.
-        placement: entries for a missing object at its most probable places. If empty, `relation`
-            applies.
-        asked_place: entries for the place that a request names. If empty, `placement` applies.
-        misplaced: calibration from the log-odds of a relation to the log-odds that it is false.
+        evidence: weights with which observed relations act on the hidden units.
+        popularity: (V,) log-odds that a training scene has each class. If the tuple is empty, all
+            classes have the same popularity.
+        popularity_weight: exponent alpha. The prior probability of an intruder's class is
+            proportional to popularity^alpha, where popularity is the odds of the class.
+        outlier_thresholds: minimum probability of an outlier in a large scene.
+        short_list_thresholds: minimum probability of an outlier in scenes of 1, 2, ... classes.
+            Structural classes do not count. Larger scenes use `outlier_thresholds`.
+        misplaced_thresholds: minimum probability of a misplaced (probably false) relation.
+        smallest: (C + 1,) minimum number of classes in a generated scene of each room type. 90 % of
+            the real rooms reach this number. The last entry is for scenes without a room type. If
+            the tuple is empty, there is no minimum.
+        room_fit: (C,) minimum of `app.questions.generate.room_fit` for a generated scene of each
+            room type. 85 % of the real rooms reach this value. If the tuple is empty, there is no
+            minimum.
+        outlier: calibration that converts a class's log-odds of presence to the log-odds that its
+            object is an intruder. n is the number of classes in the scene.
+        relation: calibration of each canonical relation in scenes without observed relations.
+        relation_given: calibration of each canonical relation in scenes with observed relations. If
+            the tuple is empty, `relation` applies.
+        placement: calibration of each canonical relation for a missing object at its most probable
+            places. If the tuple is empty, `relation` applies.
+        asked_place: calibration of each canonical relation for a missing object at the place that a
+            request names. If the tuple is empty, `placement` applies.
+        misplaced: calibration that converts the log-odds of a stated relation to the log-odds that
+            the relation is false.
     """
 
     coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -182,19 +202,23 @@ class Calibration(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _without_retired(cls, values: Any) -> Any:
-        """Ignore fields that only earlier releases used."""
+        """Remove fields that only earlier releases used, so that their manifests stay valid."""
         if not isinstance(values, dict):
             return values
         return {name: value for name, value in values.items() if name not in _RETIRED}
 
     @classmethod
     def neutral(cls, relations: int) -> Self:
-        """Return the neutral calibration for A = ``relations`` canonical relations."""
+        """Return the calibration with default values for A = ``relations`` canonical relations."""
         return cls(relation=(PairSlope(),) * relations)
 
 
 class ClassEntry(Frozen):
-    """One object class. `size` is its typical extent (x, y, z) in metres."""
+    """One object class.
+
+    `size` is the typical extent (x, y, z) in metres. None means that the size is unknown. The other
+    fields are those of `app.scene.vocabulary.ObjectClass`.
+    """
 
     label: Text
     aliases: Many[Text] = ()
@@ -203,7 +227,7 @@ class ClassEntry(Frozen):
 
 
 class VocabularyEntry(Frozen):
-    """The object classes, relations and room types of a model, in the order of its units."""
+    """The object classes, relations and room types of a model, in the order of their indices."""
 
     objects: Many[ClassEntry]
     relations: Many[str] = CANONICAL
@@ -221,7 +245,7 @@ class VocabularyEntry(Frozen):
 
     @classmethod
     def of(cls, vocabulary: Vocabulary, relations: int = len(CANONICAL)) -> Self:
-        """Return the entry of a vocabulary for a machine with A = ``relations`` relations."""
+        """Return the manifest entry of a vocabulary for a machine with A = ``relations``."""
         return cls.model_validate({**vocabulary.to_dict(), "relations": CANONICAL[:relations]})
 
     def vocabulary(self) -> Vocabulary:
@@ -230,7 +254,15 @@ class VocabularyEntry(Frozen):
 
 
 class DataSource(Frozen):
-    """One source of training scenes: its name, number of scenes, digest and terms of use."""
+    """One source of training scenes.
+
+    Attributes:
+        source: name of the source.
+        scenes: number of scenes.
+        digest: SHA-256 of the data, hexadecimal.
+        terms: terms of use.
+        research_only: whether the terms allow only research use.
+    """
 
     source: Text
     scenes: Count
@@ -240,9 +272,15 @@ class DataSource(Frozen):
 
 
 class Metric(Frozen):
-    """One measured figure with its 95 % confidence interval [low, high].
+    """One measured figure of the model's quality.
 
-    n is the number of measured units, such as scenes or removed objects.
+    Attributes:
+        task: name of the measured task, such as "T2 missing".
+        source: name of the source of the test scenes.
+        metric: name of the metric.
+        value: measured value of the metric.
+        low, high: limits of the 95 % confidence interval.
+        n: number of measured cases, such as scenes or removed objects.
     """
 
     task: Text
@@ -264,16 +302,16 @@ class Description(Frozen):
     """The description of a model: its manifest without the entries about files.
 
     Attributes:
-        name, version: name and version in the store.
-        created: time of creation, in UTC.
-        spec: `MachineSpec.to_dict()`.
-        vocabulary: V object classes, A relations and C room types, in the order of the units.
+        name, version: name and version of the model in the store.
+        created: time of creation in UTC.
+        spec: sizes and form of the machine, as returned by `MachineSpec.to_dict`.
+        vocabulary: V object classes, A relations and C room types, in the order of their indices.
         calibration: conversion of log-odds into probabilities.
-        training: configuration and seed of the training, as JSON without a schema.
+        training: configuration and seed of the training, as JSON without a fixed schema.
         data: sources of the training scenes.
-        metrics: figures measured on held-out scenes.
+        metrics: figures measured on scenes that training did not use.
         terms: terms of use of the weights.
-        libraries: versions of the libraries used in training.
+        libraries: maps the name of each library used in training to its version.
     """
 
     name: ModelName
@@ -291,7 +329,7 @@ class Description(Frozen):
     @field_validator("spec", "training", "libraries", "terms")
     @classmethod
     def _can_be_written(cls, value: JsonValue) -> JsonValue:
-        # pydantic accepts NaN and lone surrogates in free JSON.
+        # pydantic accepts NaN and lone surrogates in JSON without a schema. Neither can be written.
         to_json(value).encode()
         return value
 
@@ -325,5 +363,5 @@ class Description(Frozen):
 
     @property
     def variant(self) -> str:
-        """Variant of the machine, such as triway."""
+        """Name of the machine's variant, such as "triway"."""
         return str(self.spec.get("variant"))

@@ -1,7 +1,8 @@
 """Writing files so that a crash leaves either the old state or the new state.
 
-A rename is atomic for readers. To survive a power failure, the file's bytes must be on disk before
-the rename, and the directory entry after it. The calls of fsync ensure both.
+A rename is atomic for readers. To survive a power failure, the bytes of a file must be on disk
+before the rename. The directory entry must be on disk after the rename. The calls of fsync write
+the bytes and the directory entry to disk.
 """
 
 from __future__ import annotations
@@ -11,9 +12,13 @@ import secrets
 from pathlib import Path
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Create a new file and sync its bytes to disk. Raise FileExistsError if it exists."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+def write_file(path: Path, data: bytes, mode: int = 0o644) -> None:
+    """Create a new file and sync its bytes to disk.
+
+    Raises:
+        FileExistsError: the path already exists.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     with os.fdopen(descriptor, "wb") as file:
         file.write(data)
         file.flush()
@@ -30,9 +35,9 @@ def sync_directory(path: Path) -> None:
 
 
 def make_directory(path: Path) -> None:
-    """Create a directory and its missing parents, and sync them to disk.
+    """Create a directory and its missing parents, and sync the new directory entries to disk.
 
-    An existing directory is left unchanged.
+    An existing directory stays unchanged.
     """
     if path.is_dir():
         return
@@ -50,8 +55,13 @@ def rename(source: Path, target: Path) -> None:
 def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
     """Replace the contents of a file atomically.
 
-    The new contents are first in a temporary file in the same directory. Its name starts with
-    `prefix`.
+    The function writes the new contents to a temporary file in the same directory. Then it renames
+    the temporary file to `path`.
+
+    Args:
+        path: the file to replace or create.
+        data: the new contents.
+        prefix: start of the temporary file's name.
     """
     temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}")
     try:

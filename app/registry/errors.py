@@ -1,4 +1,4 @@
-"""Errors of the registry. Each error has a machine-readable code and a reason in words."""
+"""Errors of the registry. Each error has a machine-readable code and a reason for people."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ ArtifactCode = Literal[
     "invalid_tensor",
     "unsupported",
     "wrong_place",
+    "revoked",
     "unexpected_error",
 ]
 StoreCode = Literal[
@@ -36,11 +37,17 @@ StoreCode = Literal[
     "unreadable",
     "not_writable",
     "locked",
+    "unreachable",
+    "empty",
+    "invalid_index",
+    "untrusted_index",
+    "rolled_back",
+    "invalid_key",
 ]
 
 
 class RegistryError(Exception):
-    """Base class of the registry errors. Code and reason never contain an absolute path."""
+    """Base class of the registry's errors. The code and the reason never contain absolute paths."""
 
     code: str
     reason: str
@@ -50,11 +57,11 @@ class RegistryError(Exception):
 
 
 class ArtifactError(RegistryError):
-    """An artifact is not usable.
+    """An artifact (the files of one model version) is invalid or cannot be read.
 
     Attributes:
         code: machine-readable kind of failure.
-        reason: description that names the file or tensor, without the folder.
+        reason: description of the failure. It names the file or tensor, but not the folder.
     """
 
     code: ArtifactCode
@@ -66,7 +73,7 @@ class ArtifactError(RegistryError):
 
 
 class StoreError(RegistryError):
-    """A reference does not resolve, or the store refused a change.
+    """A reference (alias, name or name@version) does not resolve, or the store refused a change.
 
     Attributes:
         code: machine-readable kind of failure.

@@ -1,4 +1,4 @@
-"""A lock between processes, so that only one process writes at a time."""
+"""A lock between processes, so that only one process at a time writes to a store."""
 
 from __future__ import annotations
 
@@ -40,7 +40,10 @@ def _wait(descriptor: int, timeout: float) -> None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() >= deadline:
-                waited = f"another process has held the lock of the store for {timeout:g} s"
+                waited = (
+                    f"another process still holds the lock of the store after {timeout:g} s; try "
+                    "again later"
+                )
                 raise StoreError("locked", waited) from None
             time.sleep(0.01)
         else:

@@ -1,8 +1,9 @@
 """The manifest of an artifact: the description of the model and the checksums of its files.
 
-A manifest is a JSON object with one top-level member per line. The last member is the SHA-256 of
-all bytes before it. This checksum reveals a truncated or altered manifest before it is parsed. It
-also protects the checksums of the other files, because the manifest contains them.
+A manifest is a JSON object with one top-level member per line. The last member is a checksum: the
+SHA-256 of all bytes before this member. The checksum reveals a truncated or altered manifest before
+the manifest is parsed. The manifest contains the checksums of the other files, so its checksum also
+protects them.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from app.registry.offsets import PREFIX
 
 FORMAT: Final = 2
 READABLE: Final = (1, FORMAT)
-"""Readable formats. Format 1 has no offsets. In format 2, offsets are optional."""
+"""Manifest formats that this release reads. Format 1 has no offsets between related objects. In
+format 2, offsets are optional."""
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -80,7 +82,9 @@ class Manifest(Description):
         """
         trailer = _TRAILER.search(data)
         if trailer and hashlib.sha256(data[: trailer.start()]).hexdigest().encode() != trailer[1]:
-            raise ArtifactError("checksum_mismatch", f"{MANIFEST} does not match its own checksum")
+            raise ArtifactError(
+                "checksum_mismatch", f"{MANIFEST} does not match its own checksum: it was altered"
+            )
         members = _parse(data, complete=trailer is not None)
         if not _is_known_format(members.get("format")):
             known = " and ".join(map(str, READABLE))
@@ -89,12 +93,16 @@ class Manifest(Description):
                 f"{MANIFEST} has an unknown format; this release reads only formats {known}",
             )
         if not trailer:
-            raise ArtifactError("invalid_manifest", f"{MANIFEST} does not end with its checksum")
+            raise ArtifactError(
+                "invalid_manifest", f"{MANIFEST} does not end with its checksum in the last line"
+            )
         del members["checksum"]
         try:
             return cls.model_validate(members)
         except ValidationError as error:
-            raise ArtifactError("invalid_manifest", f"{MANIFEST}: {_first(error)}") from None
+            raise ArtifactError(
+                "invalid_manifest", f"{MANIFEST} has an invalid field: {_first(error)}"
+            ) from None
 
 
 def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
@@ -114,7 +122,7 @@ def _is_known_format(value: object) -> bool:
 
 
 def _first(error: ValidationError) -> str:
-    """Return the first error and its location, without the invalid value."""
+    """Return the location and message of the first validation error, without the invalid value."""
     detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
     place = ".".join(str(part) for part in detail["loc"])
     return f"{place}: {detail['msg']}" if place else str(detail["msg"])

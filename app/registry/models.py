@@ -1,4 +1,4 @@
-"""The loaded store: an immutable snapshot of all models. A refresh replaces the whole snapshot."""
+"""An immutable snapshot of all models of a store. A refresh replaces the whole snapshot."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _logger = logging.getLogger("app.registry")
 
 @dataclass(frozen=True, slots=True)
 class ArtifactFailure:
-    """The reason why a version was refused.
+    """The reason why a version of a model was not loaded.
 
     Unlike an exception, this object does not keep stack frames or weights in memory.
     """
@@ -40,9 +40,11 @@ class ModelSet:
     """The state of a store at one moment.
 
     Attributes:
-        entries: maps each published (name, version) to its artifact or its failure.
+        entries: maps each published (name, version) to its artifact, or to the reason why the
+            version was not loaded.
         aliases: maps each alias to its target.
-        failure: reason why the store or its aliases could not be read, or None.
+        failure: reason why the store or its aliases could not be read. None means that they could
+            be read.
     """
 
     entries: Mapping[tuple[str, str], Artifact | ArtifactFailure]
@@ -51,7 +53,7 @@ class ModelSet:
 
     @cached_property
     def versions(self) -> Mapping[str, tuple[str, ...]]:
-        """Maps each model to its versions, ascending, including refused versions."""
+        """Maps each model to its versions in ascending order, including versions not loaded."""
         found: dict[str, list[str]] = {}
         for name, version in sorted(self.entries, key=lambda key: (key[0], version_key(key[1]))):
             found.setdefault(name, []).append(version)
@@ -59,7 +61,7 @@ class ModelSet:
 
     @cached_property
     def failures(self) -> Mapping[tuple[str, str], ArtifactFailure]:
-        """Maps each refused (name, version) to its reason."""
+        """Maps each (name, version) that was not loaded to the reason."""
         return MappingProxyType(
             {key: e for key, e in self.entries.items() if isinstance(e, ArtifactFailure)}
         )
@@ -67,11 +69,12 @@ class ModelSet:
     def resolve(self, reference: str) -> Artifact:
         """Return the model that an alias, `name` or `name@version` points at.
 
-        If this version was refused, the method does not fall back to an older version.
+        If this version was not loaded, the method does not return an older version instead.
 
         Raises:
-            ArtifactError: the version was refused.
-            StoreError: see `resolve_reference`, or the store could not be read.
+            ArtifactError: the version was not loaded. The exception has the reason.
+            StoreError: the reference does not resolve (see `resolve_reference`), or the store could
+                not be read.
         """
         try:
             key = resolve_reference(
@@ -89,7 +92,10 @@ class ModelSet:
 
     @cached_property
     def default_failure(self) -> str | None:
-        """The reason why the default model is not usable, or None if it is usable."""
+        """The reason why the default model was not loaded, or None if it was loaded.
+
+        The default model is the target of the alias "default".
+        """
         try:
             self.resolve("default")
         except RegistryError as error:
@@ -98,16 +104,21 @@ class ModelSet:
 
     @property
     def ready(self) -> bool:
-        """Whether the default model is usable."""
+        """Whether the default model was loaded."""
         return self.default_failure is None
 
 
 def load_model_set(store: Store, previous: ModelSet | None = None) -> ModelSet:
     """Load and verify every version of a store.
 
-    The function raises no exception for errors in the store, such as refused versions, unreadable
-    aliases or a missing store. The result contains these errors. The function verifies all files
-    again. It reuses artifacts of `previous` whose digest is unchanged.
+    The function raises no exception for errors in the store, such as invalid versions, unreadable
+    aliases or a missing store. The result contains these errors.
+
+    Args:
+        store: the store.
+        previous: earlier snapshot of the store. The function verifies all files again, but reuses
+            artifacts of this snapshot whose digest is unchanged. None means that there is no
+            earlier snapshot.
     """
     failure: StoreFailure | None = None
     aliases: Mapping[str, AliasTarget]
@@ -138,12 +149,12 @@ def _load(
         return store.load(name, version, known if isinstance(known, Artifact) else None)
     except ArtifactError as error:
         return ArtifactFailure(error.code, error.reason)
-    except StoreError as error:  # the version was removed after it was listed
+    except StoreError as error:  # for example, the version was removed after it was listed
         return ArtifactFailure("missing_file", error.reason)
     except Exception as error:
         # This includes MemoryError, because other versions may need less memory.
         _logger.exception("%s@%s could not be loaded", name, version)
         return ArtifactFailure(
             "unexpected_error",
-            f"loading failed with {type(error).__name__}; the log has the details",
+            f"loading failed with {type(error).__name__}; see the traceback in the service's log",
         )

@@ -34,13 +34,15 @@ class Offsets:
     """Normal distributions of offsets, for A canonical relations, V classes and P observed pairs.
 
     Attributes:
-        relation: (A, 6) mean and variance of x, y and z for any two classes.
-        relation_scenes: (A,) number of training scenes with the relation.
-        subject, object: (A, V, 6) terms that each class adds to mean and variance, as subject and
-            as object of the relation.
-        pair: (P,) key (a V + subject) V + object of each pair in the training scenes, ascending.
-        pair_offset: (P, 6) mean and standard deviation of each pair.
-        pair_scenes: (P,) number of training scenes with the pair in this relation.
+        relation: (A, 6) mean (3) and variance (3) of the offset along x, y and z for each relation,
+            for any two classes.
+        relation_scenes: (A,) number of training scenes with each relation.
+        subject: (A, V, 6) terms that each class adds to `relation` if it is the subject.
+        object: (A, V, 6) terms that each class adds to `relation` if it is the object.
+        pair: (P,) keys of the pairs of classes in the training scenes, in ascending order. The key
+            of a pair in relation a is (a V + subject) V + object.
+        pair_offset: (P, 6) mean (3) and standard deviation (3) of the offset of each pair.
+        pair_scenes: (P,) number of training scenes with each pair in its relation.
     """
 
     relation: Table
@@ -52,15 +54,21 @@ class Offsets:
     pair_scenes: Ints
 
     def tensors(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays under their names in an artifact."""
+        """Return a mapping of tensor names in an artifact to the arrays."""
         return {f"{PREFIX}{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
-        """Rebuild the offsets of a machine with A relations and V classes from `tensors()`.
+        """Build the offsets of a machine with A relations and V classes from stored tensors.
+
+        Args:
+            tensors: result of `tensors()`, read from an artifact.
+            A: number of canonical relations.
+            V: number of object classes.
 
         Raises:
-            ArtifactError: `wrong_shape` or `invalid_tensor`.
+            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
+                `invalid_tensor` if a value is invalid.
         """
         shapes = {
             "relation": (A, 6),
@@ -77,11 +85,12 @@ class Offsets:
             if found != shape:
                 raise ArtifactError(
                     "wrong_shape",
-                    f"tensor '{name}' has the shape {found}, but the shape must be {shape}",
+                    f"tensor '{name}' has the shape {found}, but the shape must be {shape} (None "
+                    "means that the tensor does not exist)",
                 )
         offsets = cls(**{name: tensors[f"{PREFIX}{name}"] for name in shapes})
         if complaint := offsets._complaint(A * V * V):
-            raise ArtifactError("invalid_tensor", f"offsets: {complaint}")
+            raise ArtifactError("invalid_tensor", f"the offset tensors are invalid: {complaint}")
         return offsets
 
     def _complaint(self, most: int) -> str | None:
@@ -89,9 +98,9 @@ class Offsets:
         if not all(np.issubdtype(array.dtype, np.integer) for array in counted):
             return "pair, pair_scenes and relation_scenes must be integers"
         if (np.diff(self.pair) <= 0).any() or (self.pair[:1] < 0).any():
-            return "the keys in pair must be non-negative and in ascending order"
+            return "the keys in the tensor 'pair' must be non-negative and in ascending order"
         if (self.pair[-1:] >= most).any():
-            return "a pair has a class outside the vocabulary"
+            return "a key in the tensor 'pair' has a relation or class that the model does not have"
         if (self.relation_scenes < 0).any() or (self.pair_scenes < 1).any():
             return "relation_scenes must be at least 0 and pair_scenes at least 1"
         least = self.relation + self.subject.min(axis=1) + self.object.min(axis=1)
@@ -102,17 +111,17 @@ class Offsets:
     def find(
         self, relation: Ints, subject: Ints, other: Ints
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the offsets of n pairs of classes in given relations.
+        """Return the offsets of n pairs of classes, each in one relation.
 
         Args:
             relation: (n,) indices of canonical relations.
-            subject, other: (n,) indices of the subject and object classes.
+            subject, other: (n,) indices of the subject classes and of the object classes.
 
         Returns:
-            (n, 6) mean and standard deviation, and (n,) number of training scenes with the pair.
-            For a pair without training scenes, the offset comes from the relation and the two
-            classes separately, and the number is 0. If the relation never occurred in training,
-            the number is `NOTHING`.
+            Offsets (n, 6): mean (3) and standard deviation (3). Then, for each pair, the number of
+            training scenes that contain it, (n,). For a pair without training scenes, the number is
+            0. Its offset is then the sum of a term of the relation and one term of each class. If
+            the relation never occurred in training, the number is `NOTHING`.
         """
         found: tuple[NDArray[np.float64], NDArray[np.int64]]
         found = look_up(self.tables, relation, subject, other)

@@ -1,7 +1,7 @@
 """Names, versions and aliases: the valid spellings, the order of versions, and references.
 
 A reference is an alias, `name` (the latest version of the model) or `name@version`. Every valid
-name is also a safe file name: it is in lower case, without separators or a leading dot.
+name is also a safe file name, because it is in lower case, without path separators or dots.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ _VERSION = re.compile(r"(?:0|[1-9][0-9]{0,8})(?:\.(?:0|[1-9][0-9]{0,8})){2}")
 
 
 def is_name(text: str) -> bool:
-    """Return whether text is a valid name: up to 64 characters a-z, 0-9, inner `_` and `-`."""
+    """Return whether text is a valid name of a model or alias.
+
+    A valid name has 1 to 64 characters a-z, 0-9, `_` or `-`. It starts and ends with a-z or 0-9.
+    """
     return _NAME.fullmatch(text) is not None
 
 
@@ -48,7 +51,10 @@ Version = Annotated[str, AfterValidator(_require_version)]
 
 
 class AliasTarget(BaseModel):
-    """The target of an alias: one version, or the latest version if `version` is null."""
+    """The target of an alias: a version of a model.
+
+    If `version` is None (null in JSON), the target is the latest version.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -60,7 +66,11 @@ class AliasTarget(BaseModel):
 
 
 def check_name(text: str, what: str = "model name") -> str:
-    """Return text if it is a valid name, else raise StoreError (`invalid_reference`)."""
+    """Return ``text`` if it is a valid name.
+
+    Raises:
+        StoreError: `invalid_reference` if ``text`` is not a valid name.
+    """
     try:
         return _require_name(text)
     except ValueError as error:
@@ -68,7 +78,11 @@ def check_name(text: str, what: str = "model name") -> str:
 
 
 def check_version(text: str) -> str:
-    """Return text if it is a valid version, else raise StoreError (`invalid_reference`)."""
+    """Return ``text`` if it is a valid version.
+
+    Raises:
+        StoreError: `invalid_reference` if ``text`` is not a valid version.
+    """
     try:
         return _require_version(text)
     except ValueError as error:
@@ -91,11 +105,13 @@ def resolve_reference(
         reference: alias, `name`, or `name@version`.
         aliases: maps each alias to its target. An alias takes precedence over a model of the same
             name.
-        versions: function that returns the versions of a model, ascending. For an unknown model,
-            it returns an empty sequence.
+        versions: function that returns the versions of a model in ascending order. For an unknown
+            model, the function returns an empty sequence.
 
     Raises:
-        StoreError: `invalid_reference`, `unknown_model`, `unknown_version` or `dangling_alias`.
+        StoreError: the reference does not resolve. The code is `invalid_reference`,
+            `unknown_model`, `unknown_version`, or `dangling_alias` if the target of an alias does
+            not exist.
     """
     name, at, version = reference.partition("@")
     check_name(name)
@@ -106,7 +122,9 @@ def resolve_reference(
     try:
         return _pick(target, versions)
     except StoreError as error:
-        raise StoreError("dangling_alias", f"alias '{name}': {error.reason}") from None
+        raise StoreError(
+            "dangling_alias", f"the target of alias '{name}' does not exist: {error.reason}"
+        ) from None
 
 
 def _pick(target: AliasTarget, versions: Callable[[str], Sequence[str]]) -> tuple[str, str]:

@@ -16,8 +16,8 @@ Table = NDArray[np.float32]
 class RelationSlopes:
     """Calibration tables of the A canonical relations, each (A, 4 + 2K).
 
-    Each row belongs to one relation. It contains intercept, slope, log_count, log_classes and K
-    bends of two numbers each.
+    Each row of a table is the `PairSlope` of one relation: intercept, slope, log_count,
+    log_classes, and K bends of two numbers each.
 
     Attributes:
         alone: table for scenes without observed relations.
@@ -33,7 +33,10 @@ class RelationSlopes:
 
     @classmethod
     def of(cls, calibration: Calibration) -> RelationSlopes:
-        """Build the tables of a calibration. `Calibration` says what replaces empty entries."""
+        """Build the tables of a calibration.
+
+        `Calibration` describes which values replace an empty field.
+        """
         alone = calibration.relation
         placement = calibration.placement or alone
         return cls(

@@ -3,8 +3,9 @@
     <root>/<name>/<version>/{model.safetensors, manifest.json, card.md}
     <root>/aliases.json
 
-Readers need no lock, because writers publish a version or change an alias by one atomic rename.
-Writers hold a lock. So if a writer finds a temporary file, it comes from a crashed writer.
+Readers need no lock, because a writer publishes a version or changes an alias by one atomic rename.
+Only one writer at a time holds the lock. So a temporary file that a writer finds comes from a
+crashed writer.
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ from app.registry.references import (
 from app.registry.tensors import StorageDtype
 from app.registry.verified import MAX_WEIGHTS_BYTES
 
-_ALIASES: Final = "aliases.json"
+ALIASES: Final = "aliases.json"
 _LOCK: Final = ".lock"
-_TEMPORARY: Final = ".publishing-"
+TEMPORARY: Final = ".publishing-"
 
 
 StoreState: TypeAlias = tuple[tuple[str | int, ...], ...]
@@ -53,10 +54,15 @@ class Store:
     """A directory of published models.
 
     Args:
-        root: directory of the store; the first publication creates it.
+        root: directory of the store. The first publication creates it.
         lock_timeout: time in seconds that a writer waits for another writer.
-        max_weights_bytes: maximum size of a version's weights file.
+        max_weights_bytes: maximum size in bytes of the weights file of a version.
+
+    Attributes:
+        error: the reason why the last `sync` with a remote store failed, or None.
     """
+
+    error: StoreError | None = None
 
     def __init__(
         self,
@@ -69,6 +75,14 @@ class Store:
         self._lock_timeout = lock_timeout
         self._max_weights_bytes = max_weights_bytes
 
+    def sync(self) -> None:
+        """Bring the local copy of a remote store up to date. A store in a folder has no copy."""
+
+    @property
+    def age(self) -> float | None:
+        """Seconds since the last successful `sync`, or None for a store in a folder."""
+        return None
+
     # -- reading --------------------------------------------------------------------------------
 
     def names(self) -> tuple[str, ...]:
@@ -80,11 +94,11 @@ class Store:
         return tuple(name for name in self._folders() if self._may_hold_versions(name))
 
     def versions(self, name: str) -> tuple[str, ...]:
-        """Return the published versions of a model, ascending. The result may be empty.
+        """Return the published versions of a model in ascending order. The result may be empty.
 
-        The result leaves out a folder without a manifest, because writers write the manifest last.
-        It contains every other entry with the name of a version, so that `load` reports broken
-        versions.
+        A folder without a manifest is left out, because a writer may still be writing the version.
+        Writers write the manifest last. Every other entry with the name of a version is in the
+        result, so that `load` reports invalid versions.
 
         Raises:
             StoreError: `invalid_reference`, or `unreadable`.
@@ -95,7 +109,9 @@ class Store:
         try:
             found = [entry.name for entry in folder.iterdir() if not _is_unfinished(entry)]
         except OSError as error:
-            raise StoreError("unreadable", f"model '{name}': {cause(error)}") from None
+            raise StoreError(
+                "unreadable", f"the folder of model '{name}' cannot be read: {cause(error)}"
+            ) from None
         return tuple(sorted(filter(is_version, found), key=version_key))
 
     def latest(self, name: str) -> str:
@@ -114,13 +130,14 @@ class Store:
         Raises:
             StoreError: `invalid_aliases`.
         """
-        return MappingProxyType(read_aliases(self.root / _ALIASES))
+        return MappingProxyType(read_aliases(self.root / ALIASES))
 
     def resolve(self, reference: str) -> tuple[str, str]:
         """Return the (name, version) that an alias, `name` or `name@version` points at.
 
         Raises:
-            StoreError: see `resolve_reference`; also `invalid_aliases` or `unreadable`.
+            StoreError: the reference does not resolve (see `resolve_reference`), or the code is
+                `invalid_aliases` or `unreadable`.
         """
         return resolve_reference(reference, self.aliases(), self.versions)
 
@@ -128,12 +145,12 @@ class Store:
         """Load and verify one version.
 
         Args:
-            name, version: name and version in the store.
-            previous: see `load_artifact`.
+            name, version: name and version of the model in the store.
+            previous: an artifact that was loaded earlier; see `load_artifact`.
 
         Raises:
-            ArtifactError: the artifact is not valid. The code is `wrong_place` if its manifest has
-                another name or version.
+            ArtifactError: the artifact is not valid. The code is `wrong_place` if the manifest has
+                another name or version than the folder.
             StoreError: `invalid_reference`, `unreadable`, or `unknown_version`.
         """
         if check_version(version) not in self.versions(name):
@@ -150,11 +167,11 @@ class Store:
         return artifact
 
     def state(self) -> StoreState:
-        """Return a value that changes when a version or an alias changes.
+        """Return a value that changes whenever a version or an alias of the store changes.
 
         The method reads only the metadata of the files.
         """
-        files = [self.root / _ALIASES]
+        files = [self.root / ALIASES]
         with suppress(StoreError):
             for name in self.names():
                 for version in self.versions(name):
@@ -179,30 +196,37 @@ class Store:
         the alias.
 
         Args:
-            description, state, storage_dtype: see `write_artifact`.
-            alias: alias to point at this version.
+            description, state, storage_dtype: contents of the artifact; see `write_artifact`.
+            alias: name of an alias to point at this version. None means that no alias changes.
 
         Returns:
             The published artifact, loaded from its files.
 
         Raises:
             ArtifactError: the artifact is not valid.
-            StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
-                `unsafe_path`, `locked`, or `not_writable`.
+            StoreError: the store refused the version. The code is `version_exists`,
+                `name_conflict`, `invalid_reference`, `invalid_aliases`, `unsafe_path`, `locked`, or
+                `not_writable`.
         """
         name, version = description.name, description.version
         if alias is not None:
             check_name(alias, "alias")
         with self._writing():
             if name == alias or name in self.aliases():
-                raise StoreError("name_conflict", f"'{name}' cannot be both a model and an alias")
+                raise StoreError(
+                    "name_conflict",
+                    f"'{name}' is the name of an alias, so it cannot be the name of a model",
+                )
             if alias is not None:
                 self._require_no_model(alias)
             folder = self._prepare_folder(name)
             place = folder / version
             if os.path.lexists(place):
-                raise StoreError("version_exists", f"{name}@{version} is already published")
-            temporary = folder / f"{_TEMPORARY}{version}-{token_hex(8)}"
+                raise StoreError(
+                    "version_exists",
+                    f"{name}@{version} is already published; publish under another version",
+                )
+            temporary = folder / f"{TEMPORARY}{version}-{token_hex(8)}"
             try:
                 write_artifact(temporary, description, state, storage_dtype=storage_dtype)
                 artifact = load_artifact(temporary, None, self._max_weights_bytes)
@@ -225,13 +249,13 @@ class Store:
         Args:
             alias: name of the alias. The method creates a missing alias.
             target: an existing version or model.
-            expected: required current target of the alias. None means that the alias must not
-                exist. "any" accepts every target.
+            expected: target that the alias must have before the change. None means that the alias
+                must not exist. "any" accepts every target.
 
         Raises:
-            StoreError: `alias_conflict` if the current target is not ``expected``;
-                `unknown_model`, `unknown_version`, `name_conflict`, `invalid_reference`,
-                `invalid_aliases`, `locked`, or `not_writable`.
+            StoreError: the code is `alias_conflict` if the current target is not ``expected``.
+                Other codes are `unknown_model`, `unknown_version`, `name_conflict`,
+                `invalid_reference`, `invalid_aliases`, `locked`, and `not_writable`.
         """
         check_name(alias, "alias")
         with self._writing():
@@ -242,6 +266,10 @@ class Store:
 
     def remove_alias(self, alias: str, *, expected: AliasTarget | Literal["any"] = "any") -> None:
         """Remove an alias.
+
+        Args:
+            alias: name of the alias.
+            expected: target that the alias must have before the change. "any" accepts every target.
 
         Raises:
             StoreError: `unknown_model` if the alias does not exist. For other codes, see
@@ -260,7 +288,7 @@ class Store:
         try:
             return sorted(entry.name for entry in self.root.iterdir() if is_name(entry.name))
         except OSError as error:
-            raise StoreError("unreadable", f"the store: {cause(error)}") from None
+            raise StoreError("unreadable", f"the store cannot be read: {cause(error)}") from None
 
     def _may_hold_versions(self, name: str) -> bool:
         try:
@@ -279,11 +307,14 @@ class Store:
         table = {name: entry for name, entry in self.aliases().items() if name != alias}
         if target is not None:
             table[alias] = target
-        write_aliases(self.root / _ALIASES, table, prefix=_TEMPORARY)
+        write_aliases(self.root / ALIASES, table, prefix=TEMPORARY)
 
     def _require_no_model(self, alias: str) -> None:
         if self.versions(alias):
-            raise StoreError("name_conflict", f"'{alias}' is the name of a model")
+            raise StoreError(
+                "name_conflict",
+                f"'{alias}' is the name of a model, so it cannot be the name of an alias",
+            )
 
     def _require_expected(self, alias: str, expected: AliasTarget | Literal["any"] | None) -> None:
         current = self.aliases().get(alias)
@@ -295,20 +326,22 @@ class Store:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Exclude other writers, and remove temporary files of crashed writers."""
+        """Hold the lock of the store, and remove temporary files of crashed writers."""
         try:
             make_directory(self.root)
             with exclusive(self.root / _LOCK, self._lock_timeout):
                 self._clear_leftovers()
                 yield
         except OSError as error:
-            raise StoreError("not_writable", f"the store: {cause(error)}") from error
+            raise StoreError(
+                "not_writable", f"the store cannot be written: {cause(error)}"
+            ) from error
 
     def _clear_leftovers(self) -> None:
         folders = [self.root, *(self.root / name for name in self._folders())]
         for folder in filter(_is_directory, folders):
             for entry in folder.iterdir():
-                if not entry.name.startswith(_TEMPORARY):
+                if not entry.name.startswith(TEMPORARY):
                     continue
                 if _is_directory(entry):
                     shutil.rmtree(entry)
@@ -317,7 +350,7 @@ class Store:
 
 
 def _appearance(path: Path) -> tuple[int, ...]:
-    """Return inode, size and modification time of a file, or () for a missing file."""
+    """Return the inode, size and modification time of a file, or () for a missing file."""
     try:
         status = path.lstat()
     except OSError:
@@ -326,7 +359,7 @@ def _appearance(path: Path) -> tuple[int, ...]:
 
 
 def _is_unfinished(version: Path) -> bool:
-    """Return whether a path is a readable folder without a manifest."""
+    """Return whether a version is a readable folder without a manifest."""
     try:
         (version / MANIFEST).lstat()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Stored weights: a safetensors file with float32 or float16 weights."""
+"""Reading and writing weights: a safetensors file with float32 or float16 weights."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ def pack(
     """Return the contents of a safetensors file, and the manifest entries of its tensors.
 
     Args:
-        state: maps names to numpy arrays or CPU tensors. Floating-point arrays are stored as
-            `storage_dtype`, or as float32 if they have at most one axis (biases). Other arrays keep
-            their dtype.
-        storage_dtype: float16 halves the file, with a relative error of 2^-11 per weight.
+        state: maps names to numpy arrays or CPU tensors. Arrays of integers and booleans keep their
+            dtype.
+        storage_dtype: dtype of floating-point arrays with two or more axes. float16 halves the size
+            of the file, with a relative error of at most 2^-11 per weight. Floating-point arrays
+            with at most one axis (biases) are stored as float32.
 
     Raises:
         ArtifactError: `not_finite` for NaN, infinity or a weight above the float16 maximum of
@@ -53,17 +54,22 @@ def pack(
 def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray[Any]]:
     """Return writable copies of the tensors of a safetensors file.
 
-    Floating-point tensors become float32.
+    The function converts floating-point tensors to float32.
+
+    Args:
+        data: contents of the file.
+        entries: maps the name of each expected tensor to its dtype and shape in the manifest.
 
     Raises:
-        ArtifactError: `not_safetensors` for another file format; `too_large` for a header over the
-            limit; `wrong_shape` if names, dtypes or shapes differ from the manifest; `not_finite`
-            for NaN or infinity.
+        ArtifactError: `not_safetensors` for another file format; `too_large` for a header with more
+            than `MAX_HEADER_BYTES`; `wrong_shape` if names, dtypes or shapes differ from the
+            manifest; `not_finite` for NaN or infinity.
     """
     # The file begins with the length of its header: 64 bits, little-endian.
     if MAX_HEADER_BYTES < int.from_bytes(data[:8], "little") <= len(data):
         raise ArtifactError(
-            "too_large", f"{WEIGHTS}: the header has more than {MAX_HEADER_BYTES} bytes"
+            "too_large",
+            f"the header of {WEIGHTS} has more than the maximum of {MAX_HEADER_BYTES} bytes",
         )
     try:
         stored = dict(deserialize(data))  # type: ignore[no-untyped-call]
@@ -71,7 +77,7 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
         raise ArtifactError("not_safetensors", f"{WEIGHTS} is not a safetensors file") from None
     found = {name: (_DTYPES.get(e["dtype"]), tuple(e["shape"])) for name, e in stored.items()}
     promised = {name: (entry.dtype, entry.shape) for name, entry in entries.items()}
-    require_equal(found, promised, f"{WEIGHTS} holds", "the manifest says")
+    require_equal(found, promised, f"{WEIGHTS} has", "but the manifest has")
     return {
         name: _loaded(name, entry["data"], entries[name]) for name, entry in sorted(stored.items())
     }
@@ -80,7 +86,17 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
 def require_equal(
     found: Mapping[str, object], expected: Mapping[str, object], holds: str, says: str
 ) -> None:
-    """Raise ArtifactError (`wrong_shape`) for the first tensor that differs from ``expected``."""
+    """Require that ``found`` and ``expected`` have the same names, dtypes and shapes of tensors.
+
+    Args:
+        found: maps the name of each found tensor to its dtype and shape.
+        expected: maps the name of each expected tensor to its dtype and shape.
+        holds: words of the error message before the found tensor.
+        says: words of the error message before the expected tensor.
+
+    Raises:
+        ArtifactError: `wrong_shape` for the first tensor that differs.
+    """
     for name in sorted(found.keys() | expected.keys()):
         if found.get(name) != expected.get(name):
             raise ArtifactError(

@@ -1,4 +1,4 @@
-"""Scenes, canonical relations, vocabularies and geometry. The package needs no trained model."""
+"""Scenes, canonical relations, vocabularies and geometry, independent of any trained model."""
 
 from app.scene.evidence import ClassEvidence, class_evidence, pool_instances
 from app.scene.frames import body_pose, is_optical, is_world_fixed, viewer_axes

@@ -1,8 +1,8 @@
-"""Conversion of the instances of a scene to evidence about classes.
+"""Conversion of the instances (objects) of a scene to evidence about object classes.
 
-Scenes contain instances, but models only know classes. Relation a between classes x and y is on if
-at least one instance of x has relation a to an instance of y. An unlisted pair of instances never
-turns it off.
+Scenes contain instances, but models only know classes. A relation is on if it holds, and off if it
+was observed not to hold. Relation a between classes x and y is on if at least one instance of x has
+relation a to an instance of y. Pairs of instances without an observed relation have no influence.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ class ClassEvidence:
     """The n distinct classes of a scene and their observed relations.
 
     Attributes:
-        classes: (n,) int64, distinct indices of the classes, ascending.
+        classes: (n,) int64, distinct indices of the classes, in ascending order.
         counts: (n,) int64, number of instances of each class.
-        confidence: (n,) float64 in (0, 1], probability that at least one instance exists.
-        holds: (A, n, n) bool, relations observed on. ``holds[a, x, y]`` means that classes[x] has
-            relation a to classes[y].
-        observed: (A, n, n) bool, relations observed on or off. ``holds`` implies ``observed``.
-        room_type: index of the room type, or None.
+        confidence: (n,) float64 in (0, 1], probability that at least one instance of the class
+            exists.
+        holds: (A, n, n) bool, True for relations that hold. ``holds[a, x, y]`` means that
+            classes[x] has relation a to classes[y].
+        observed: (A, n, n) bool, True for relations that were observed, whether they hold or not.
+            ``holds`` implies ``observed``.
+        room_type: index of the room type, or None if the room type is unknown.
     """
 
     classes: NDArray[np.int64]
@@ -51,17 +53,19 @@ def pool_instances(
 ) -> ClassEvidence:
     """Pool the instances of each class by a logical OR.
 
-    A relation between classes is on if it holds for at least one pair of instances. It is off if it
-    was observed for a pair, but is off for all observed pairs. Otherwise it is unobserved. If a
-    class has a single instance, its relations to itself stay unobserved.
+    A relation between classes is on if the relation holds for at least one pair of instances. The
+    relation is off if it was observed for at least one pair, but holds for none. Otherwise the
+    relation is unobserved. If a class has a single instance, the relations between the class and
+    itself stay unobserved.
 
     Args:
         classes: (N,) index of the class of each instance.
         confidence: (N,) probability that the instance exists. Instances count as independent
             detections, so a class exists with probability 1 - prod(1 - confidence).
-        holds: (A, N, N) relations that hold between instances.
-        observed: (A, N, N) relations between instances that were observed, on or off.
-        room_type: index of the room type, or None.
+        holds: (A, N, N) bool, True for relations between instances that hold.
+        observed: (A, N, N) bool, True for relations between instances that were observed, whether
+            they hold or not.
+        room_type: index of the room type, or None if the room type is unknown.
 
     Raises:
         ValueError: the shapes do not match.
@@ -82,14 +86,14 @@ def pool_instances(
 def pool_classes(
     classes: NDArray[np.int64], confidence: NDArray[np.float64]
 ) -> tuple[Places, Places, Places, Places, NDArray[np.float64]]:
-    """Return the n distinct classes of N instances, ascending.
+    """Return the n distinct classes of N instances.
 
     Returns:
-        The classes, (n,).
-        The index of the first instance of each class, (n,).
-        The index of each instance's class in the first array, (N,).
-        The number of instances of each class, (n,).
-        The probability that at least one instance of each class exists, (n,).
+        Class indices in ascending order, (n,).
+        Index of the first instance of each class, (n,).
+        For each instance, index of its class in the first array, (N,).
+        Number of instances of each class, (n,).
+        Probability that at least one instance of each class exists, (n,).
     """
     distinct, row = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
     counts, first = np.zeros(len(classes), np.int64), np.empty(len(classes), np.int64)
@@ -113,11 +117,11 @@ def pooled(
     Args:
         row: (N,) index of each instance's class, from 0 to n - 1.
         n: number of classes.
-        holds: (A, N, N) relations that hold.
-        observed: (A, N, N) observed relations.
+        holds: (A, N, N) bool, True for relations between instances that hold.
+        observed: (A, N, N) bool, True for relations between instances that were observed.
 
     Returns:
-        ``holds`` and ``observed`` of the classes.
+        The arrays ``holds`` and ``observed`` of `ClassEvidence`, each (A, n, n).
     """
     size = len(row)
     on, seen = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
@@ -131,11 +135,12 @@ def pooled(
 
 
 def class_evidence(scene: Scene) -> ClassEvidence:
-    """Return the evidence of a scene, without instances outside the vocabulary.
+    """Return the evidence of a scene about its classes.
 
-    If the scene has poses, ``scene.poses`` defines the relations: on or off for neighbours, and
-    unobserved for other pairs. Otherwise, stated relations are on. All other relations are off if
-    the stated relations are complete, and unobserved if not.
+    Instances whose label is outside the vocabulary are left out. If the scene has poses,
+    ``scene.poses`` defines which relations hold and which are observed. Otherwise, stated relations
+    are on. Relations that are not stated are off if ``scene.relations_complete`` is True, and
+    unobserved otherwise.
     """
     kept = [i for i, thing in enumerate(scene.objects) if thing.class_index is not None]
     size = len(kept)
@@ -148,9 +153,9 @@ def class_evidence(scene: Scene) -> ClassEvidence:
 
 
 def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which relations between the N instances hold, and which are observed.
+    """Return which relations between the N instances of a scene hold, and which are observed.
 
-    Both arrays have the shape (A, N, N).
+    Both bool arrays have the shape (A relations, N subjects, N objects).
     """
     if scene.poses is not None:
         return scene.poses.holds, scene.poses.observed

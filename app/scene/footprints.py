@@ -1,7 +1,8 @@
-"""Overlap and gap of rotated rectangles, exact up to rounding.
+"""Overlap and gap of two rotated rectangles, exact up to rounding.
 
-If the angle between two rectangles is a multiple of 90 degrees, the module compares intervals along
-the common axes. Otherwise it clips each rectangle along the edges of the other.
+The rectangles are the footprints of boxes. If the angle between two rectangles is a multiple of 90
+degrees, the module compares intervals along the common axes. Otherwise it clips the edges of each
+rectangle to the area of the other rectangle.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from app.compiling import compiled
 
 Array = NDArray[np.float64]
 
-# Rectangles with a smaller angle between them (in radians) count as parallel. Parallel rectangles
-# can share an edge, and clipping would count such an edge twice.
+# Maximum deviation in radians from a multiple of 90 degrees at which two rectangles count as
+# parallel. Parallel rectangles can share an edge, and clipping would count such an edge twice.
 _PARALLEL: Final = 1e-6
-# Replaces an edge length of 0, to avoid division by zero.
+# This length replaces an edge length of 0, to avoid division by zero.
 _SHORTEST: Final = 1e-150
 _QUARTER: Final = math.pi / 2
 
@@ -27,16 +28,16 @@ _QUARTER: Final = math.pi / 2
 def overlap_and_gap(
     centre_a: Array, size_a: Array, yaw_a: Array, centre_b: Array, size_b: Array, yaw_b: Array
 ) -> tuple[Array, Array]:
-    """Compute overlap and gap of P pairs of rectangles a, b.
+    """Compute overlap and gap of P pairs of rectangles a and b.
 
     Args:
-        centre_a, centre_b: (P, 2) centres.
-        size_a, size_b: (P, 2) extents along the rectangles' own axes.
+        centre_a, centre_b: (P, 2) centres (x, y) in metres.
+        size_a, size_b: (P, 2) extents in metres along the rectangle's own axes.
         yaw_a, yaw_b: (P,) rotations in radians.
 
     Returns:
-        (P,) overlap: area of the intersection divided by the smaller of the two areas.
-        (P,) gap: distance between the rectangles, or 0 if they touch.
+        Overlap of each pair, (P,): area of the intersection divided by the smaller area.
+        Gap of each pair, (P,): distance between the rectangles in metres, or 0 if they touch.
     """
     share, gap = np.empty(len(yaw_a)), np.empty(len(yaw_a))
     rectangles = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
@@ -54,8 +55,11 @@ def _measure_pairs(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b, share, gap)
 
 @compiled
 def measure(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b):
-    """Compute overlap and gap of one pair. Only x and y of centres and sizes count."""
-    # In its own axes, b is the box |x| <= half_b[0], |y| <= half_b[1] around the origin.
+    """Compute overlap and gap of one pair of rectangles; see `overlap_and_gap`.
+
+    Centres and sizes may have a third component, which the function ignores.
+    """
+    # In its own axes, rectangle b is |x| <= half_b[0], |y| <= half_b[1].
     offset = _turn_back(
         (centre_a[0] - centre_b[0], centre_a[1] - centre_b[1]), math.cos(yaw_b), math.sin(yaw_b)
     )
@@ -72,7 +76,7 @@ def measure(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b):
     smaller = min(size_a[0] * size_a[1], size_b[0] * size_b[1])
     if smaller > 0.0:
         return area / smaller, gap
-    # A rectangle with an area of 0 overlaps fully with a rectangle that it touches.
+    # If a rectangle has an area of 0, the overlap is 1 for touching rectangles and 0 for others.
     return 1.0 if gap == 0.0 else 0.0, gap
 
 
@@ -87,9 +91,10 @@ def _parallel(offset, half_a, half_b):
 
 @compiled
 def _skew(offset, half_a, cos, sin, half_b):
-    """Compute area and gap from the edges of each rectangle in the axes of the other."""
-    # Green's theorem: the border of the intersection consists of the edges of a inside b and the
-    # edges of b inside a. Each part p-q adds cross(p, q) / 2, with the centre of b as origin.
+    """Compute the area of the intersection and the gap of two rectangles that are not parallel."""
+    # By Green's theorem, the area follows from the border of the intersection. The border consists
+    # of the parts of edges of a inside b, and of edges of b inside a. A part from p to q adds
+    # cross(p, q) / 2 to the area, with the centre of b as origin.
     swept_a, swept_b, gap = 0.0, 0.0, math.inf
     for k in range(4):
         start, end = _corner(half_a, k), _corner(half_a, k + 1)
@@ -97,7 +102,7 @@ def _skew(offset, half_a, cos, sin, half_b):
         end = _moved(_turn(end, cos, sin), offset)
         p, q = _inside(start, end, half_b)
         swept_a += p[0] * q[1] - p[1] * q[0]
-        # The shortest line between two disjoint convex polygons ends at a corner of one of them.
+        # The shortest line between two separate convex polygons has an end at a corner.
         gap = min(gap, _distance(start, half_b))
     back = (-offset[0], -offset[1])
     for k in range(4):
@@ -116,7 +121,7 @@ def _skew(offset, half_a, cos, sin, half_b):
 
 @compiled
 def _corner(half, k):
-    """Return corner k of a box around the origin, counter-clockwise."""
+    """Return corner k of a rectangle around the origin, counting counter-clockwise."""
     k = k % 4
     return (half[0] if k in (0, 3) else -half[0], half[1] if k < 2 else -half[1])
 
@@ -138,12 +143,13 @@ def _turn_back(point, cos, sin):
 
 @compiled
 def _inside(start, end, half):
-    """Clip an edge to a box and return the two ends (Liang & Barsky 1984).
+    """Clip an edge to a rectangle around the origin (Liang & Barsky 1984).
 
-    The two ends are equal if the edge lies outside the box.
+    The function returns both ends of the clipped edge. They are equal if the edge lies outside the
+    rectangle.
     """
-    # Edges are never parallel to the box. So x or y is 0 only if rounding has reduced the edge to a
-    # point. Such an edge adds no area.
+    # Edges are never parallel to the axes of the rectangle. So x or y is 0 only if rounding has
+    # reduced the edge to a point. Such an edge adds no area.
     x, y = end[0] - start[0] or _SHORTEST, end[1] - start[1] or _SHORTEST
     one_x, other_x = (-half[0] - start[0]) / x, (half[0] - start[0]) / x
     one_y, other_y = (-half[1] - start[1]) / y, (half[1] - start[1]) / y
@@ -158,5 +164,5 @@ def _inside(start, end, half):
 
 @compiled
 def _distance(point, half):
-    """Return the distance from a point to a box around the origin."""
+    """Return the distance from a point to a rectangle around the origin."""
     return math.hypot(max(abs(point[0]) - half[0], 0.0), max(abs(point[1]) - half[1], 0.0))

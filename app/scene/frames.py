@@ -1,4 +1,7 @@
-"""Conversion of robot frames (ROS REP 103, REP 105) to body axes: x forward, y left, z up."""
+"""Conversion of robot frames to body axes: x forward, y left, z up.
+
+ROS REP 103 and REP 105 define the frames.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ Vector = tuple[float, float, float]
 Axes = tuple[Vector, Vector, Vector]
 Quaternion = tuple[float, float, float, float]
 
-# Frames that are fixed to the world. They do not define a viewer, so the request needs a viewpoint.
+# Names of frames that are fixed to the world. Such a frame does not define a viewer, so left and
+# front need a viewpoint in the request.
 WORLD_FRAMES = frozenset({"map", "odom", "world"})
 
 # Maximum difference between the length of a quaternion and 1 that counts as a rounding error.
@@ -26,7 +30,8 @@ def is_world_fixed(frame_id: str) -> bool:
 
 
 def _plain(frame_id: str) -> str:
-    # "MAP" and "map " also mean "map". As body frames, they would give wrong relations.
+    # "MAP" and "map " also mean "map". If such a frame counted as a body frame, the relations would
+    # be wrong.
     return frame_id.strip().casefold()
 
 
@@ -39,17 +44,17 @@ def body_pose(
 ) -> tuple[Vector, Vector | None, float]:
     """Convert a box in a frame to an upright box in body axes. Return its position, size and yaw.
 
-    The axis of the box that is nearest to the vertical becomes z. The extents change their order
-    accordingly. So the function also accepts a box on its side, or a box with a vertical y axis, as
-    in optical frames. It ignores the remaining tilt. It assumes that the optical axis is
-    horizontal.
+    The box axis that is nearest to the vertical becomes z, and the extents change their order
+    accordingly. So the function also accepts a box that lies on its side, and a box with a vertical
+    y axis, as in optical frames. The function ignores the remaining tilt of the box. For optical
+    frames, it assumes that the viewing direction is horizontal.
 
     Args:
-        position: centre in the frame.
-        size: extents along the box's own axes, or None if unknown.
+        position: centre of the box in the frame, in metres.
+        size: extents along the box's own axes in metres, or None if the size is unknown.
         orientation: quaternion (x, y, z, w) from the box's axes to the frame. None means that the
             box is not rotated.
-        optical: whether the frame has optical axes.
+        optical: whether the frame has optical axes (z forward, x right, y down).
 
     Raises:
         ValueError: the length of the quaternion is not 1.
@@ -61,7 +66,7 @@ def body_pose(
         position = _from_optical(position)
         first, second, third = map(_from_optical, (first, second, third))
     rises = abs(first[2]), abs(second[2]), abs(third[2])
-    # If several axes are equally near to the vertical, the last one becomes z.
+    # If several axes are equally near to the vertical, the last of these axes becomes z.
     if rises[2] >= max(rises):
         up, ahead, aside, heading = 2, 0, 1, first
     elif rises[1] >= rises[0]:
@@ -78,7 +83,7 @@ def viewer_axes(frame_id: str | None = None, yaw: float | None = None) -> Axes |
 
     Args:
         frame_id: name of the frame, or None for body axes.
-        yaw: viewing direction in radians, or None for the direction of x.
+        yaw: viewing direction in radians. None means the direction of the x axis.
 
     Returns:
         The three axes, or None for a world-fixed frame without a viewing direction.

@@ -4,20 +4,23 @@ Viewer axes point away from the viewer (x), to the left (y) and up (z). Units ar
 radians. Boxes are upright. The footprint of a box is the rectangle of its horizontal extents,
 rotated by the yaw.
 
-1. *on-top*(i, j): the footprints overlap by at least 30 % of the smaller footprint, and the bottom
-   of i is within 5 cm of the top of j.
-2. *above*(i, j): the same overlap, and the bottom of i is more than 5 cm above the top of j.
-3. Otherwise, for neighbours, the larger of the distances |dx| and |dy| between the centres decides:
-   *left* means larger y, and *front* means smaller x (nearer to the viewer). If the larger distance
-   is under 10 cm, neither relation holds.
+1. *on-top*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
+   bottom of i is within 5 cm of the top of j.
+2. *above*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
+   bottom of i is more than 5 cm above the top of j.
+3. If neither *on-top* nor *above* holds between two neighbours, their centres decide. dx and dy are
+   the differences of the centres. If |dy| is at least |dx|, the box with the larger y is *left* of
+   the other box. If |dx| is larger, the box with the smaller x, nearer to the viewer, is in *front*
+   of the other box. If both |dx| and |dy| are under 10 cm, neither relation holds.
 
-Neighbours are boxes whose footprints are at most 1 m apart. If a size is unknown, the centres must
-be at most 1.5 m apart in the horizontal plane. Two more rules exclude contradictions. If |dx| and
-|dy| are equal, |dy| decides. If rule 1 applies to two thin boxes in both directions, only the box
-with the higher centre is on top. If both centres have the same height, neither box is on top.
+Two boxes are neighbours if their footprints are at most 1 m apart. If the size of a box is unknown,
+the centres must be at most 1.5 m apart in the horizontal plane. If two thin boxes meet rule 1 in
+both directions, only the box with the higher centre is on top. If both centres have the same
+height, neither box is on top.
 
-All relations of a pair of neighbours are observed. So if a vertical relation holds, the horizontal
-relations are observed off. If a size is unknown, vertical relations stay unobserved.
+All relations between two neighbours are observed, whether they hold or not. So if a vertical
+relation (on-top, above) holds, the horizontal relations (left, front) are observed not to hold. If
+the size of a box is unknown, its vertical relations stay unobserved.
 """
 
 from __future__ import annotations
@@ -34,11 +37,11 @@ from app.compiling import compiled
 from app.scene.footprints import measure
 from app.scene.relations import ABOVE, CANONICAL, FRONT, LEFT, ON_TOP
 
-MIN_OVERLAP: Final = 0.30  # share of the smaller footprint
-CONTACT: Final = 0.05  # m between bottom and top
-NEIGHBOUR_GAP: Final = 1.0  # m between footprints
-NEIGHBOUR_DISTANCE: Final = 1.5  # m between centres, sizes unknown
-MIN_OFFSET: Final = 0.10  # m between centres
+MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
+CONTACT: Final = 0.05  # maximum distance in metres between bottom and top for *on-top*
+NEIGHBOUR_GAP: Final = 1.0  # maximum distance in metres between the footprints of neighbours
+NEIGHBOUR_DISTANCE: Final = 1.5  # maximum distance in metres between centres if a size is unknown
+MIN_OFFSET: Final = 0.10  # minimum |dx| or |dy| in metres for *front* or *left*
 
 _NONE: Final = -1  # index for "no relation"
 
@@ -56,12 +59,12 @@ class Viewpoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseRelations:
-    """Relations between n instances, derived from poses.
+    """Relations between n objects, derived from poses.
 
     Attributes:
-        holds: (A, n, n) bool. ``holds[a, i, j]`` means that instance i has relation a to instance
-            j.
-        observed: (A, n, n) bool, symmetric in i and j. ``holds`` implies ``observed``.
+        holds: (A, n, n) bool. ``holds[a, i, j]`` means that object i has relation a to object j.
+        observed: (A, n, n) bool. ``observed[a, i, j]`` means that relation a between objects i and
+            j was observed, whether it holds or not. The array is symmetric in i and j.
     """
 
     holds: NDArray[np.bool_]
@@ -71,9 +74,13 @@ class PoseRelations:
 def to_viewer_frame(
     positions: Rows, viewpoint: Viewpoint, yaws: ArrayLike | None = None
 ) -> tuple[Array, Array]:
-    """Convert positions (n, 3) and yaws (n,) to the axes of ``viewpoint``. Keep the heights.
+    """Convert positions and yaws of n boxes from a frame to the axes of a viewer.
 
-    Without ``yaws``, the boxes are aligned with the axes of the frame.
+    Args:
+        positions: (n, 3) centres in the frame, in metres. The heights do not change.
+        viewpoint: position and heading of the viewer in the frame.
+        yaws: (n,) rotations about z in radians. None means that the boxes are aligned with the axes
+            of the frame.
 
     Raises:
         ValueError: a shape is wrong, or the viewpoint is not finite.
@@ -98,11 +105,12 @@ def derive_relations(
     """Derive the relations between n boxes by the rules of this module.
 
     Args:
-        positions: (n, 3) centres in viewer axes. A row with NaN means an unknown position. The
-            relations of this box then stay unobserved.
-        sizes: (n, 3) extents before the rotation. A row with NaN means an unknown size.
-        yaws: (n,) rotation of each box about z in radians. The default is 0.
-        horizontal: False if the viewer is unknown. Left and front then stay unobserved.
+        positions: (n, 3) centres in viewer axes, in metres. A row with NaN means an unknown
+            position. The relations of such a box stay unobserved.
+        sizes: (n, 3) extents before the rotation, in metres. A row with NaN means an unknown size.
+        yaws: (n,) rotation of each box about z in radians. None means that all rotations are 0.
+        horizontal: whether to derive left and front. False means that the viewer is unknown, so
+            that left and front stay unobserved.
 
     Raises:
         ValueError: a shape is wrong, a value is infinite, or a size is not positive.
@@ -114,7 +122,7 @@ def derive_relations(
     if not _are_finite(points, extents, turns):
         raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
     if not _are_positive(extents):
-        raise ValueError("sizes must be positive")
+        raise ValueError("sizes must be positive or NaN, but a size is zero or negative")
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     observed = np.zeros_like(holds)
     _relate_all(points, extents, turns, horizontal, holds, observed)
@@ -123,7 +131,7 @@ def derive_relations(
 
 @compiled
 def _are_finite(points, extents, turns):
-    """Return whether all values are finite. Points and extents may also be NaN."""
+    """Return whether all yaws are finite, and all positions and extents are finite or NaN."""
     for i in range(len(points)):
         for k in range(3):
             if math.isinf(points[i, k]) or math.isinf(extents[i, k]):
@@ -158,7 +166,8 @@ def _relate_all(points, extents, turns, horizontal, holds, observed):
             boxed, stacked = sized[i] and sized[j], False
             if not boxed:
                 neighbours = distance <= NEIGHBOUR_DISTANCE
-            # The circles around the rectangles are a fast first check. `measure` is slower.
+            # The distance between the circles around the footprints is a fast first check, because
+            # `measure` is slower.
             elif distance - radius[i] - radius[j] <= NEIGHBOUR_GAP:
                 share, gap = measure(
                     points[i], extents[i], turns[i], points[j], extents[j], turns[j]
@@ -178,7 +187,7 @@ def _is_known(row):
 @compiled
 def _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed):
     """Set the relations of two neighbours."""
-    # Order of the relations: left, front, on-top, above.
+    # The order of relation indices is left, front, on-top, above.
     first, last = LEFT if horizontal else ON_TOP, ABOVE if boxed else FRONT
     for relation in range(first, last + 1):
         observed[relation, i, j] = observed[relation, j, i] = True
@@ -197,7 +206,7 @@ def _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed):
 
 @compiled
 def _vertical(points, extents, i, j):
-    """Return the vertical relation of i to j, whose footprints overlap."""
+    """Return the vertical relation of box i to box j. Their footprints must overlap."""
     lift = (points[i, 2] - extents[i, 2] / 2) - (points[j, 2] + extents[j, 2] / 2)
     if lift > CONTACT:
         return ABOVE
@@ -208,7 +217,7 @@ def _vertical(points, extents, i, j):
 
 @compiled
 def _horizontal(points, i, j):
-    """Return the horizontal relation of i to its neighbour j."""
+    """Return the horizontal relation of box i to its neighbour j."""
     nearer, aside = points[j, 0] - points[i, 0], points[i, 1] - points[j, 1]
     if abs(aside) >= abs(nearer):
         return LEFT if aside >= MIN_OFFSET else _NONE

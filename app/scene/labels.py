@@ -1,8 +1,9 @@
 """Comparison of labels: all spellings of a name have the same key.
 
 Detectors, annotators and programmers spell a name in many ways ("Trash_Cans", "trash can",
-"trashcan"). `label_key` removes the case, separators and a final plural. Two labels with the same
-key are the same label. Alias tables handle synonyms ("tv", "television").
+"trashcan"). The key of a label (`label_key`) has no separators, capitals or final plural. Labels
+with the same key name the same class. The vocabulary lists synonyms ("tv", "television") as
+aliases.
 
 `head_of` returns the object in a phrase with "of": a "bottle of milk" is a bottle, and a "pair of
 shoes" is shoes.
@@ -17,8 +18,8 @@ from typing import Final
 
 _SEPARATORS: Final = re.compile(r"[\s_\-./'’‐-―]+")
 
-# Words with these endings stay unchanged: they are not plurals, or their singular has another
-# meaning or does not exist. The endings also occur in compounds ("rain pants", "camera lens").
+# Words with these endings stay unchanged. Such words are not plurals, or their singular has another
+# meaning or does not exist. Compounds with these endings also stay unchanged ("rain pants").
 _NOT_PLURAL_ENDINGS: Final = (
     *("ss", "us", "is"),
     *("clothes", "pants", "jeans", "shorts", "trousers", "tights", "overalls", "pyjamas"),
@@ -26,9 +27,10 @@ _NOT_PLURAL_ENDINGS: Final = (
     *("sunglasses", "eyeglasses", "readingglasses", "safetyglasses"),
     *("canvas", "lens", "thermos", "atlas", "christmas"),
 )
-# These whole words stay unchanged too: "glasses" means spectacles, but "wine glasses" is a plural.
+# These words also stay unchanged, but compounds that end with them do not. For example, "glasses"
+# means spectacles, but "wine glasses" is a plural.
 _NOT_PLURAL: Final = frozenset({"glasses", "gas", "news", "series", "vhs", "gps", "ups"})
-# Irregular plurals. They also match at the end of a compound ("bookshelves").
+# Irregular plurals and their singulars. Compounds can end with these plurals ("bookshelves").
 _IRREGULAR: Final = (
     ("shelves", "shelf"),
     ("knives", "knife"),
@@ -63,7 +65,8 @@ _IRREGULAR_ENDINGS: Final = tuple(plural for plural, _ in _IRREGULAR)
 
 
 _OF: Final = re.compile(r"[\s_\-.]+of[\s_\-.]+", re.IGNORECASE)
-# "bottle of milk" means the container (bottle). "pile of books" means the members (books).
+# The phrase "bottle of milk" means the container, a bottle. "pile of books" means the members,
+# books.
 _CONTAINERS: Final = frozenset(
     (
         *("bag", "basket", "bottle", "bowl", "box", "bucket", "can", "canister", "carton"),
@@ -77,7 +80,7 @@ _COLLECTIONS: Final = frozenset({"bunch", "pair", "piece", "pile", "row", "slice
 def head_of(label: str) -> str | None:
     """Return the object in a phrase: "bottle" for "bottle of milk", "books" for "pile of books".
 
-    The result is None for other labels.
+    The result is None if the label is not such a phrase.
     """
     parts = _OF.split(label, maxsplit=1)
     if len(parts) != 2:
@@ -111,22 +114,22 @@ def singular(word: str) -> str:
         stem = word[:-2]
     else:
         stem = word[:-1]
-    return singular(stem)  # "childrens" is a double plural
+    return singular(stem)  # repeated for double plurals such as "childrens"
 
 
-# The cache saves work, because the models of a store have mostly the same classes.
+# The cache saves time, because the models of a store mostly have the same classes.
 @lru_cache(maxsize=4096)
 def label_key(label: str) -> str:
-    """Return the key that all spellings of ``label`` share. The key of a key is the key itself.
+    """Return the key that all spellings of ``label`` share.
 
     The key ignores case, Unicode compatibility variants, separators (whitespace, ``_ - . / '``) and
     a final plural: "Night-Stands", "night_stand" and "nightstand" have the key "nightstand". A
-    label that contains only separators has the empty key.
+    label that contains only separators has the empty key. The key of a key is the same key.
     """
     if label.isascii():
         return singular(_SEPARATORS.sub("", label.casefold()))
-    # The loop repeats the fold until the label is stable: after one fold, a separate accent can
-    # combine with its letter.
+    # The loop repeats the normalisation until the label does not change. One pass is not enough: if
+    # it removes a separator, an accent can combine with the letter before the separator.
     while (folded := _fold_unicode(label)) != label:
         label = folded
     return label

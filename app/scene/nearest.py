@@ -1,15 +1,16 @@
 """Search for the known names that are most similar to an unknown name.
 
-    spelling   1 - edits / length of the longer name; two exchanged letters are one edit
-    words      both names have the same last word: "coffee mug" is a "mug"; more words in common
-               raise the value
+The similarity of two names is the larger of two values:
 
-The similarity of two names is the larger of the two values. A second search ignores words for
-size, colour and material: a "big lamp" is a "lamp".
+    spelling   1 - edits / length of the longer name. Two exchanged letters are one edit.
+    words      0 if the last words of the names differ. If the last words are equal ("coffee mug"
+               and "mug"), the value rises with the number of common words.
 
-The module does not use word vectors. The class with the largest cosine is right for only 40 % of
-held-out aliases. With a minimum cosine, the share stays below 85 % (GloVe 6B, 100 dimensions,
-20,000 words).
+A second search ignores words for size, colour and material: a "big lamp" is a "lamp".
+
+The module does not use word vectors, because they find wrong classes too often. The nearest class
+by cosine similarity is right for only 40 % of held-out aliases. Even if distant classes are
+rejected, less than 85 % of the results are right (GloVe 6B, 100 dimensions, 20,000 words).
 """
 
 from __future__ import annotations
@@ -23,24 +24,24 @@ from rapidfuzz.distance import OSA
 from app.scene.labels import split_words
 
 ACCEPTED: Final = 0.8
-"""Minimum similarity at which the nearest name replaces an unknown name.
+"""Minimum similarity at which the nearest known name replaces an unknown name.
 
-It is the lowest multiple of 0.05 at which 90 % of the mappings are right. In the `indoor`
-vocabulary, 2724 of 2895 mappings of held-out aliases and misspelt names are right. For held-out
-aliases alone, 572 of 727 mappings are right.
+This value is the lowest multiple of 0.05 at which 90 % of the replacements are right. The test
+names are aliases that the search does not know, and misspelt names. In the `indoor` vocabulary,
+2724 of 2895 replacements are right. For the aliases alone, 572 of 727 replacements are right.
 """
 
 LONGEST: Final = 64
-"""The search compares the spelling of names up to this length (after folding).
+"""Maximum length of a name whose spelling the search compares, in characters.
 
-The time of a comparison grows with the length, and folding can turn one character into 18. All
-class names have fewer than 32 characters.
+The length counts after Unicode normalisation, which can turn one character into 18. The time of a
+comparison grows with the length. All class names have fewer than 32 characters.
 """
 
 _LEAST: Final = 0.6  # minimum similarity of a suggestion
-_BY_KIND: Final = 0.95  # factor if only the name without size, colour and material is similar
+_BY_KIND: Final = 0.95  # factor if the search ignored words for size, colour or material
 _BY_REST: Final = 0.9  # factor if the first letters differ, because people rarely mistype them
-_FARTHER: Final = 0.1  # maximum difference between a suggestion and the best similarity
+_FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion and the best one
 
 
 _LOOKS: Final = frozenset(
@@ -51,17 +52,22 @@ _LOOKS: Final = frozenset(
 
 
 class Match(NamedTuple):
-    """Index of a known entry, and its similarity in [0, 1]."""
+    """A known entry that is similar to the unknown name.
+
+    Attributes:
+        entry: index of the entry.
+        similarity: similarity of the entry's name and the unknown name, from 0 to 1.
+    """
 
     entry: int
     similarity: float
 
 
 class NameIndex:
-    """Search for entries with similar names.
+    """Search for entries, such as object classes, with names similar to an unknown name.
 
     Args:
-        names: pairs of a name and the index of its entry. An entry may have several names.
+        names: pairs (name, index of the entry). An entry may have several names.
     """
 
     def __init__(self, names: Sequence[tuple[str, int]]) -> None:
@@ -114,17 +120,21 @@ def _keep(best: dict[int, float], index: int, similarity: float) -> None:
 
 
 def _head(words: Sequence[str]) -> str:
-    """Return the head word of a name: the word before "of", else the last word."""
+    """Return the head word of a name: the word before "of", or the last word without "of"."""
     return words[words.index("of", 1) - 1] if "of" in words[1:] else words[-1]
 
 
 def _in_common(words: Sequence[str], known: Sequence[str], *, is_only: bool) -> float:
-    """Return the similarity of two names with the same head word, by their common words.
+    """Return the similarity of two names with the same head word.
 
-    An unknown name with more words than the known name is probably a subclass ("coffee mug"). An
-    unknown name with fewer words may be another subclass. A head word is ambiguous if several
-    entries have it. If only one entry has the head word, 86 % of held-out aliases belong to this
-    entry. If several entries have it, 59 % belong to the entry whose name is the head word.
+    The similarity depends on the common words. If the unknown name has all words of the known name
+    and more, it probably names a subclass ("coffee mug" of "mug"). An unknown name with fewer words
+    may belong to another class.
+
+    A head word is ambiguous if the names of several entries have it. These figures are for aliases
+    that the search does not know. If only one entry has the head word, 86 % of the aliases belong
+    to this entry. If several entries have the head word, 59 % of the aliases belong to the entry
+    whose name is only the head word.
 
     Args:
         words: words of the unknown name.

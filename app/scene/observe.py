@@ -25,22 +25,22 @@ def observe(
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
 
-    Positions and yaws must be in body axes (`app.scene.frames.body_pose`). If there is a viewpoint,
-    the returned scene has positions and yaws in viewer axes. The field ``relations`` of the result
-    lists the relations that hold. The field ``poses`` also contains relations observed not to
-    hold.
+    Positions and yaws must be in body axes (`app.scene.frames.body_pose`). If ``viewpoint`` is
+    given, the returned scene has positions and yaws in viewer axes. The field ``relations`` of the
+    result lists the relations that hold. The field ``poses`` also contains relations observed not
+    to hold.
 
-    The function returns a scene unchanged if it states relations or has no positions. In a
+    The function returns a scene unchanged if the scene states relations or has no positions. In a
     world-fixed frame (map, odom, world) without a viewpoint, left and front are undefined. The
-    function then derives only vertical relations.
+    function then derives only on-top and above.
 
     Args:
         scene: the scene.
         frame_id: name of the frame of the positions.
         viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
             the origin and looks along x.
-        typical_sizes: (V, 3) extents of each class in metres, for objects without a size. NaN means
-            unknown (`Vocabulary.sizes`).
+        typical_sizes: (V, 3) typical extents of each class in metres (`Vocabulary.sizes`). They
+            replace missing sizes of objects. NaN means an unknown size.
     """
     if scene.relations is not None or all(thing.position is None for thing in scene.objects):
         return scene

@@ -1,7 +1,8 @@
 """The eight spatial relations and their four canonical forms.
 
-A relation and its opposite are the same statement with exchanged ends: ``right(i, j)`` is
-``left(j, i)``. So scenes store only four relations. A relation index is an index into `CANONICAL`.
+A relation and its opposite are the same statement with exchanged objects: ``right(i, j)`` is
+``left(j, i)``. So scenes store only the four relations in `CANONICAL`. A relation index is an index
+into `CANONICAL`. The first argument of a relation is its subject, and the second is its anchor.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def opposite(relation: str) -> str:
     """Return the opposite relation: ``opposite("left") == "right"``.
 
     Raises:
-        ValueError: `RELATIONS` does not contain the relation.
+        ValueError: the relation is not one of the eight `RELATIONS`.
     """
     try:
         return _OPPOSITE[relation]
@@ -50,10 +51,10 @@ def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, En
     """Return a statement in canonical form: (relation index, subject, anchor).
 
     For ``right``, ``behind``, ``under`` and ``below``, the function exchanges subject and anchor.
-    Both may have any type.
+    Subject and anchor may have any type.
 
     Raises:
-        ValueError: `RELATIONS` does not contain the relation.
+        ValueError: the relation is not one of the eight `RELATIONS`.
     """
     if (index := _INDEX.get(relation)) is not None:
         return index, subject, anchor
@@ -67,8 +68,9 @@ def contradiction(
 ) -> tuple[tuple[int, End, End], tuple[int, End, End]] | None:
     """Return two canonical triples that contradict each other, or None.
 
-    The ends must be *objects*: ``left(i, j)`` and ``left(j, i)`` contradict each other. Between
-    classes with several instances, both can hold.
+    The result is None if no triples contradict each other. Subjects and anchors must be *objects*.
+    For objects, ``left(i, j)`` and ``left(j, i)`` contradict each other. For classes with several
+    instances, both triples can hold.
     """
     seen: set[tuple[int, End, End]] = set()
     for relation, subject, anchor in triples:

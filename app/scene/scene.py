@@ -13,22 +13,22 @@ from app.scene.relations import CANONICAL, contradiction
 Point = tuple[float, float, float]
 
 
-# The class is not frozen, because the creation of a frozen instance takes four times as long. A
-# scene has dozens of objects.
+# The class is not frozen, because creating a frozen instance takes four times as long. A scene can
+# have dozens of objects.
 @dataclass(slots=True, unsafe_hash=True)
 class SceneObject:
     """One object in a scene. Do not change its attributes.
 
     Attributes:
         id: name of the object in this scene.
-        label: label in the request.
-        class_index: index of the class in the model's vocabulary, or None for a label outside the
-            vocabulary.
+        label: label of the object in the request.
+        class_index: index of the object's class in the model's vocabulary. None means that the
+            vocabulary does not contain the label.
         confidence: probability in (0, 1] that the object exists.
-        position: centre (x, y, z) in metres in viewer axes (x away, y left, z up), or None if
-            unknown.
-        size: extents (x, y, z) in metres before the rotation, or None if unknown.
-        yaw: rotation of the box about z in radians.
+        position: centre (x, y, z) in metres in viewer axes (x away, y left, z up). None means that
+            the position is unknown.
+        size: extents (x, y, z) in metres before the rotation. None means that the size is unknown.
+        yaw: rotation of the object about z in radians.
 
     Raises:
         ValueError: a value is outside its range.
@@ -62,19 +62,22 @@ class Scene:
     """Objects and their relations.
 
     Attributes:
-        objects: the objects. ``relations`` refers to their indices in this tuple.
-        relations: canonical triples (relation, subject, object) that hold, or None if the relations
-            are unobserved.
-        relations_complete: whether all relations that are missing from ``relations`` are off.
-        room_type: index of the room type in the model's vocabulary, or None if unknown.
-        poses: relations derived from poses (see `app.scene.observe`), including relations observed
-            off. They replace ``relations`` as evidence. ``relations`` must then list the same
-            relations that hold. The class does not check this.
+        objects: objects of the scene. ``relations`` refers to their indices in this tuple.
+        relations: triples (canonical relation, subject, object) that hold. None means that all
+            relations are unobserved.
+        relations_complete: True if all relations that are missing from ``relations`` are known not
+            to hold.
+        room_type: index of the room type in the model's vocabulary. None means that the room type
+            is unknown.
+        poses: relations derived from poses by `app.scene.observe`. They include relations observed
+            not to hold, and replace ``relations`` as evidence. ``relations`` must list the derived
+            relations that hold, but the class does not check this condition. None means that no
+            relations were derived from poses.
 
     Raises:
-        ValueError: two objects have the same id, or a triple is invalid, or `relations_complete` is
-            True without relations. A triple is invalid if it has an invalid index, relates an
-            object to itself or contradicts another triple.
+        ValueError: two objects have the same id, a triple is invalid, or `relations_complete` is
+            True although `relations` is None. A triple is invalid if it has an invalid index,
+            relates an object to itself or contradicts another triple.
     """
 
     objects: tuple[SceneObject, ...]
@@ -86,10 +89,12 @@ class Scene:
     def __post_init__(self) -> None:
         n = len(self.objects)
         if len({thing.id for thing in self.objects}) < n:
-            raise ValueError("two objects of the scene have the same id")
+            raise ValueError("two objects of the scene have the same id; each id must be unique")
         if self.relations is None:
             if self.relations_complete:
-                raise ValueError("relations_complete is True, but the scene has no relations")
+                raise ValueError(
+                    "relations_complete is True, but relations is None; pass a tuple of relations"
+                )
         elif self.poses is None:
             for triple in self.relations:
                 relation, subject, anchor = triple
@@ -100,8 +105,8 @@ class Scene:
                 (relation, i, j), _ = clash
                 first, second = self.objects[i].id, self.objects[j].id
                 raise ValueError(
-                    f"{CANONICAL[relation]!r} is stated both for {first!r} to {second!r} and for "
-                    f"{second!r} to {first!r}"
+                    f"{CANONICAL[relation]!r} is stated from {first!r} to {second!r} and also from "
+                    f"{second!r} to {first!r}, but both cannot hold"
                 )
         if self.poses is not None and self.poses.holds.shape != (len(CANONICAL), n, n):
             raise ValueError(
@@ -117,7 +122,10 @@ class Scene:
         for end in (subject, anchor):
             if not 0 <= end < n:
                 raise ValueError(f"the object index {end} of a relation is not from 0 to {n - 1}")
-        raise ValueError(f"{self.objects[subject].id!r} cannot be {CANONICAL[relation]} itself")
+        raise ValueError(
+            f"{self.objects[subject].id!r} has the relation {CANONICAL[relation]} to itself; a "
+            "relation needs two different objects"
+        )
 
 
 def _are_finite(point: Sequence[float]) -> bool:

@@ -25,9 +25,10 @@ class ObjectClass:
     Attributes:
         label: canonical name.
         aliases: synonyms of the label. Other spellings and plurals do not need an alias.
-        structure: whether the class is a part of the building (floor, wall) or a vague name
-            (object). Scenes may contain such classes, but a model never proposes them.
-        size: typical extents (x, y, z) in metres, with z vertical, or None if unknown.
+        structure: True for a structural class: a part of the building (floor, wall) or a vague name
+            (object). Scenes may contain structural classes, but a model never proposes them.
+        size: typical extents (x, y, z) in metres, with z vertical. None means that they are
+            unknown.
 
     Raises:
         ValueError: a name is empty, or the size is not three positive finite numbers.
@@ -52,12 +53,13 @@ class Vocabulary:
     """The V object classes and C room types of a model, in a fixed order.
 
     Args:
-        objects: the classes. Their order defines the class indices.
-        room_types: canonical room types. Their order defines the room indices.
+        objects: object classes. Their order defines the class indices.
+        room_types: canonical names of the room types. Their order defines the room indices.
 
     Raises:
-        ValueError: the list of classes is empty, or two classes (or room types) have the same name
-            after normalisation.
+        ValueError: the list of classes is empty, a room type has an empty name, or a name is
+            ambiguous. A name is ambiguous if two classes, or two room types, have names with the
+            same `label_key`.
     """
 
     __slots__ = ("__dict__", "_by_key", "_by_spelling", "_objects", "_room_by_key", "_room_types")
@@ -125,14 +127,14 @@ class Vocabulary:
 
     @cached_property
     def structure(self) -> NDArray[np.bool_]:
-        """(V,) True for structural and vague classes, which a model never proposes. Read-only."""
+        """(V,) True for structural classes, which a model never proposes. Read-only array."""
         mask = np.array([entry.structure for entry in self._objects], dtype=np.bool_)
         mask.flags.writeable = False
         return mask
 
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
-        """(V, 3) typical sizes in metres, NaN if unknown. Read-only."""
+        """(V, 3) typical extents in metres, or NaN for classes of unknown size. Read-only array."""
         sizes = np.array([entry.size or (math.nan,) * 3 for entry in self._objects])
         sizes.flags.writeable = False
         return sizes
@@ -140,8 +142,8 @@ class Vocabulary:
     def index(self, label: str) -> int | None:
         """Return the index of the class with this label, or None for an unknown label.
 
-        Any spelling is accepted. For an unknown phrase, the method looks up the object in the
-        phrase: "bottle of milk" is a bottle (`head_of`).
+        The method accepts all spellings with the same `label_key`. For an unknown phrase such as
+        "bottle of milk", it looks up the object in the phrase, a bottle (`head_of`).
         """
         found = self._by_spelling.get(label)
         if found is None:
@@ -151,7 +153,10 @@ class Vocabulary:
         return found
 
     def room_index(self, room: str) -> int | None:
-        """Return the index of a room type, or None if unknown. Any spelling is accepted."""
+        """Return the index of a room type, or None for an unknown room type.
+
+        The method accepts all spellings with the same `label_key`.
+        """
         return self._room_by_key.get(label_key(room))
 
     @cached_property
@@ -165,7 +170,7 @@ class Vocabulary:
     def nearest(self, label: str, limit: int = 3) -> tuple[Match, ...]:
         """Return plausible classes with names similar to ``label``, most similar first.
 
-        The method compares ``label`` with every name and alias. So it is much slower than `index`.
+        The method compares ``label`` with every label and alias, so it is much slower than `index`.
         """
         return self._names.nearest(label, limit)
 
@@ -203,7 +208,7 @@ class Vocabulary:
                 reasons.
         """
         if not isinstance(values.get("objects"), list):
-            raise ValueError("a vocabulary must have a list 'objects'")
+            raise ValueError("a vocabulary must have the field 'objects' with a list of classes")
         rooms = values.get("room_types", [])
         if not isinstance(rooms, list):
             raise ValueError(f"'room_types' must be a list, not {rooms!r}")
@@ -220,7 +225,10 @@ def _object_class(entry: Any) -> ObjectClass:
     if not isinstance(entry, Mapping) or not isinstance(entry.get("label"), str):
         raise ValueError(f"an object class must be a mapping with a string 'label', not {entry!r}")
     if unknown := sorted(set(entry) - {"label", "aliases", "structure", "size"}):
-        raise ValueError(f"unknown fields in object class {entry['label']!r}: {unknown}")
+        raise ValueError(
+            f"object class {entry['label']!r} has unknown fields {unknown}; the known fields are "
+            "label, aliases, structure and size"
+        )
     aliases, structure = entry.get("aliases", []), entry.get("structure", False)
     if not isinstance(aliases, list) or not all(isinstance(name, str) for name in aliases):
         raise ValueError(f"aliases of {entry['label']!r} must be a string list, not {aliases!r}")

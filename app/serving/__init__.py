@@ -1,1 +1,1 @@
-"""The serving layer, without HTTP: it reads scenes, loads models and answers questions."""
+"""The serving layer reads scenes, loads models and answers questions. It does not use HTTP."""

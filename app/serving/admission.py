@@ -1,19 +1,20 @@
-"""Admission control: when a request starts, and in which thread its work runs.
+"""Admission control: when a request starts, and in which thread its computation runs.
 
-`Backlog` bounds the number of requests that wait to start. In one tick of the event loop it starts
-at most `PACE` requests, minus the pending ones. It starts fewer requests if they would hold up the
-event loop for more than `TICK` seconds. It refuses at most `REFUSALS` requests per tick. Without
-these bounds, hundreds of simultaneous requests would delay health checks. A request is refused for
-three reasons: the backlog is full, the expected wait is too long, or the deadline has passed.
+The class `Backlog` limits the number of requests that wait to start. In one tick of the event loop,
+the backlog starts at most `PACE` requests minus the started requests without an answer. The backlog
+starts fewer requests if the requests would block the event loop for more than `TICK` seconds. The
+backlog refuses at most `REFUSALS` requests per tick. Without these limits, hundreds of simultaneous
+requests would delay health checks. The backlog refuses a request for three reasons: the backlog is
+full, the expected wait is too long, or the deadline has passed.
 
-`WorkQueue` bounds the rows (scenes) that wait for one model or are computed by it. Each question is
-computed separately, so an answer never depends on other requests. A cheap question runs on the
-event loop, because a change of thread costs as much as most questions. A costly question runs on
-the worker thread of its model: its expected time exceeds `CHEAP`, or its kind was never measured.
-Compiled loops release the interpreter's lock, so the event loop can continue. Drawing scenes may
-take seconds, so all models share another thread for it. Questions of streams run one at a time, one
-per tick. A question is dropped if its deadline has passed or its client has disconnected before it
-starts.
+The class `WorkQueue` limits the number of rows (scenes) that wait for one model or are being
+computed. Each question is computed separately, so an answer never depends on other requests. A
+cheap question runs on the event loop, because a change of thread costs as much as most questions. A
+question is costly if its expected time exceeds `CHEAP`, or if its kind was never measured. A costly
+question runs on the worker thread of its model. Compiled kernels release the interpreter lock, so
+the event loop can continue. Sampling of scenes may take seconds, so all models share another thread
+for sampling. Questions of streams run one at a time, at most one per tick. The queue drops a
+question if its deadline passes or its client disconnects before the question starts.
 """
 
 from __future__ import annotations
@@ -35,32 +36,35 @@ from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFull
 T = TypeVar("T")
 
 TICK: Final = 8e-3
-"""Seconds for which the requests of one tick may block the event loop."""
+"""Maximum total time in seconds for which the requests of one tick may block the event loop."""
 
 PACE: Final = 32
-"""Maximum number of requests started in one tick. Pending requests are subtracted."""
+"""Maximum number of requests that one tick starts.
+
+Requests that earlier ticks have started and that have no answer yet count towards this number.
+"""
 
 REFUSALS: Final = 8
 """Maximum number of requests refused in one tick."""
 
 CHEAP: Final = 2e-3
-"""Seconds for which one job may block the event loop."""
+"""Maximum time in seconds for which one question may block the event loop."""
 
-# Seconds between two ticks if the last one could not start a request.
+# Time in seconds between two ticks if the previous tick could not start a request.
 _PAUSE: Final = 5e-3
-# Maximum expected wait, as a share of the request's time. Even a wait three times as long then ends
-# before the deadline.
+# Maximum expected wait, as a fraction of the request's time limit. Even if the real wait is three
+# times as long, it ends before the deadline.
 _PATIENCE: Final = 0.25
-# Weight of the newest measurement in the moving averages of the backlog.
+# Weight of the newest measurement in the backlog's moving averages of times.
 _NEWEST_PACE: Final = 0.1
-# Seconds between two checks whether the client of costly work is still connected.
+# Time in seconds between two checks of the client's connection during a costly computation.
 _LOOK: Final = 0.25
-# Maximum number of remembered costs.
+# Maximum number of averages that `_Costs` stores.
 _MAX_COSTS: Final = 4096
-# Weight of the newest measurement in the expected cost.
+# Weight of the newest measurement in the expected computation time of a question.
 _NEWEST: Final = 0.2
 
-# Arrival times and wake-up futures, oldest first.
+# Queue of requests, oldest first: for each request its arrival time and the future that wakes it.
 _Line = deque[tuple[float, asyncio.Future[None]]]
 
 
@@ -71,8 +75,8 @@ class Backlog:
         limit: maximum number of waiting requests.
 
     Attributes:
-        pending: number of started questions without a result. Drawings and questions of streams
-            are not counted.
+        pending: number of started questions without a result. Questions of streams and requests
+            that sample scenes are not counted.
         draining: whether the service has stopped accepting requests.
     """
 
@@ -92,12 +96,12 @@ class Backlog:
         """Wait until the request may start.
 
         Args:
-            allowed: total time of the request in seconds.
-            deadline: value of `time.monotonic` at the end of this time.
+            allowed: time limit of the request in seconds.
+            deadline: deadline of the request, as a value of `time.monotonic`.
 
         Raises:
-            QueueFullError: too many requests wait, or the expected wait is too long.
-            DeadlinePassedError: the deadline passed during the wait.
+            QueueFullError: too many requests are waiting, or the expected wait is too long.
+            DeadlinePassedError: the deadline passed while the request was waiting.
         """
         if not self._ticking:
             self._begin_tick()
@@ -108,7 +112,7 @@ class Backlog:
         if self._is_full(allowed):
             count = len(self._waiting)
             await _wait(self._refused)
-            raise QueueFullError(f"{count} requests are already waiting.")
+            raise QueueFullError(f"The backlog is full: {count} requests are waiting.")
         await _wait(self._waiting)
         if monotonic() >= deadline:
             raise DeadlinePassedError("The deadline passed before the request started.")
@@ -136,7 +140,7 @@ class Backlog:
         if self._refused:
             _wake(self._refused, REFUSALS)
         loop = asyncio.get_running_loop()
-        # The next tick follows at once: requests that arrive before it count towards this tick.
+        # Schedule the next tick at once. Requests that arrive before it count towards this tick.
         if begun or not self._ticking:
             self._ticking = True
             loop.call_soon(self._begin_tick)
@@ -160,9 +164,9 @@ async def _wait(line: _Line) -> None:
 
 
 def _wake(line: _Line, most: int) -> int:
-    """Wake at most `most` requests, oldest first, and return their number.
+    """Wake at most `most` requests, oldest request first. Return the number of woken requests.
 
-    Cancelled requests are skipped.
+    Cancelled requests are skipped and not counted.
     """
     count = 0
     while line and count < most:
@@ -173,22 +177,23 @@ def _wake(line: _Line, most: int) -> int:
     return count
 
 
-# Not frozen: creating a frozen dataclass takes three times as long.
+# The dataclass is not frozen, because the creation of a frozen object takes three times as long.
 @dataclass(slots=True)
 class Ticket:
-    """The deadline of a request, and a check of its client's connection.
+    """The deadline of a request, and a check whether its client is still connected.
 
     Attributes:
-        deadline: value of `time.monotonic` at the deadline; work that starts later is dropped.
-        is_gone: function that returns whether the client has disconnected; called before and
-            during costly work.
+        deadline: deadline of the request, as a value of `time.monotonic`. A computation that has
+            not started by then is dropped.
+        is_gone: function that returns whether the client has disconnected. The queue calls the
+            function before and during costly computations.
     """
 
     deadline: float
     is_gone: Callable[[], Awaitable[bool]] | None = None
 
     def check(self) -> None:
-        """Check the deadline.
+        """Check that the deadline has not passed.
 
         Raises:
             DeadlinePassedError: the deadline has passed.
@@ -197,7 +202,7 @@ class Ticket:
             raise DeadlinePassedError("The deadline passed before the computation started.")
 
     async def check_there(self) -> None:
-        """Check the connection to the client.
+        """Check that the client is still connected.
 
         Raises:
             DisconnectedError: the client has disconnected.
@@ -208,14 +213,14 @@ class Ticket:
 
 @dataclass(slots=True)
 class Done(Generic[T]):
-    """The result of a job, with its times in seconds.
+    """The result of a computation, with its times in seconds.
 
     Attributes:
-        result: return value of the job.
-        waited: time before the job started.
-        computed: duration of the job.
-        processor: processor time of the job. Waiting for other processes or, in a worker thread,
-            for the interpreter's lock is not counted.
+        result: return value of the computation.
+        waited: time from the call of the queue to the start of the computation.
+        computed: time from the start to the end of the computation.
+        processor: processor time of the computation. It does not contain times in which the thread
+            waited for a processor or for the interpreter lock.
     """
 
     result: T
@@ -225,24 +230,26 @@ class Done(Generic[T]):
 
 
 class _Costs:
-    """Average cost of questions in seconds per unit of size, by kind and order of magnitude.
+    """Average computation times of questions, in seconds per unit of size.
 
-    Small scenes cost more per unit than large ones. So each order of magnitude has its own average.
+    There is one average for each kind of question and each power of two of the size, because small
+    scenes take more time per unit of size than large scenes.
     """
 
     def __init__(self) -> None:
         self._per_unit: dict[tuple[str, int], float] = {}
 
     def expected(self, kind: str, size: int) -> float:
-        """Expected seconds; infinite before the first measurement."""
+        """Return the expected time in seconds. It is infinite before the first measurement."""
         return self._per_unit.get((kind, size.bit_length()), math.inf) * size
 
     def learn(self, kind: str, size: int, seconds: float) -> None:
         if len(self._per_unit) >= _MAX_COSTS:
-            self._per_unit.clear()  # clients can create many kinds; each is soon measured again
+            self._per_unit.clear()  # clients can cause many kinds, so this bounds the memory
         key, measured = (kind, size.bit_length()), seconds / size
         known = self._per_unit.get(key, measured)
-        # The bound keeps one slow measurement from sending all later questions to the thread.
+        # A measurement counts as at most twice the average. Otherwise, one slow measurement could
+        # move all later questions to the worker thread.
         self._per_unit[key] = known + _NEWEST * (min(measured, 2 * known) - known)
 
 
@@ -255,38 +262,38 @@ class Threads:
     """The worker threads of a process.
 
     Attributes:
-        drawing: thread that draws scenes, shared by all models.
+        drawing: executor whose only thread samples scenes. All models share this thread.
     """
 
     drawing: Executor = field(default_factory=partial(_one_thread, "drawing"))
     _costly: WeakSet[Executor] = field(default_factory=WeakSet)
 
     def for_model(self) -> Executor:
-        """Create a thread for the costly questions of one model.
+        """Return an executor with one thread for the costly questions of one model.
 
-        The thread ends when its executor is garbage-collected.
+        The thread ends when the executor is garbage-collected.
         """
         executor = _one_thread("costly work")
         self._costly.add(executor)
         return executor
 
     def stop(self) -> None:
-        """Stop the threads and drop pending work."""
+        """Stop the threads and drop the computations that have not started."""
         for executor in (self.drawing, *self._costly):
             executor.shutdown(wait=False, cancel_futures=True)
 
 
 @dataclass(eq=False)
 class WorkQueue:
-    """The work of one model.
+    """The queue of the computations of one model.
 
-    A row is one scene, or one scene to draw.
+    A row is one scene of a question, or one scene to sample.
 
     Attributes:
-        limit: maximum number of rows that wait or are computed.
-        threads: worker threads for costly work.
-        backlog: the backlog that counts pending questions.
-        rows: current number of rows.
+        limit: maximum number of rows that wait or are being computed.
+        threads: worker threads for costly computations.
+        backlog: the backlog, which counts started questions without a result.
+        rows: number of rows that wait or are being computed.
     """
 
     limit: int
@@ -295,20 +302,20 @@ class WorkQueue:
     rows: int = 0
     _costs: _Costs = field(default_factory=_Costs)
     _costly: Executor = field(init=False)
-    # Questions of streams run one at a time, so that a request waits for at most one of them.
+    # Questions of streams run one at a time, so a request waits for at most one such question.
     _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
         self._costly = self.threads.for_model()
 
     def take(self, rows: int) -> None:
-        """Reserve rows, until `give_back` releases them.
+        """Reserve rows until `give_back` releases these rows.
 
         Raises:
-            QueueFullError: too few rows are free.
+            QueueFullError: fewer than ``rows`` rows are free.
         """
         if self.rows + rows > self.limit:
-            raise QueueFullError(f"{self.rows} of {self.limit} rows of this model are in use.")
+            raise QueueFullError(f"The queue is full: {self.rows} of {self.limit} rows are in use.")
         self.rows += rows
 
     def give_back(self, rows: int) -> None:
@@ -327,22 +334,22 @@ class WorkQueue:
         """Compute the answer to a question.
 
         Args:
-            call: the computation; it may run in another thread.
-            ticket: deadline and client of the request.
-            kind: kind of the question; the expected cost depends on kind and size.
+            call: function that computes the answer. It may run in another thread.
+            ticket: deadline and connection check of the request.
+            kind: kind of the question. The expected computation time depends on kind and size.
             size: size of the question, at least 1.
-            low_priority: whether the question belongs to a stream. Other questions can run between
-                two of these.
+            low_priority: whether the question belongs to a stream. Between two questions of
+                streams, other questions can run.
 
         Raises:
-            DeadlinePassedError: the deadline passed before the result was there.
+            DeadlinePassedError: the deadline passed before the end of the computation.
             DisconnectedError: the client has disconnected.
             Exception: any error of `call`.
         """
         came = monotonic()
 
         def measured(_: Callable[[], bool] | None = None) -> Done[T]:
-            # The cost is measured here, since the request may have ended before the computation.
+            # Measure the time inside the computation, because the request may end earlier.
             began, busy = monotonic(), thread_time()
             result = call()
             done = Done(result, began - came, monotonic() - began, thread_time() - busy)
@@ -368,12 +375,12 @@ class WorkQueue:
             self.backlog.pending -= 1
 
     async def draw(self, call: Callable[[Callable[[], bool]], T], ticket: Ticket) -> Done[T]:
-        """Draw scenes.
+        """Sample scenes on the thread for sampling.
 
         Args:
-            call: the work for the drawing thread. Its argument returns whether the request has
-                ended; long work should call it from time to time.
-            ticket: deadline and client of the request.
+            call: function that samples the scenes. Its argument is a function that returns whether
+                the request has ended. A long computation should call this function regularly.
+            ticket: deadline and connection check of the request.
 
         Raises:
             DeadlinePassedError, DisconnectedError, Exception: see `run`.
@@ -390,7 +397,7 @@ class WorkQueue:
 
 @asynccontextmanager
 async def _turn(lock: asyncio.Lock, ticket: Ticket) -> AsyncIterator[None]:
-    """Hold the lock for low-priority jobs.
+    """Hold the lock for questions of streams inside the ``with`` block.
 
     Raises:
         DeadlinePassedError: the deadline passed before the lock was free.
@@ -414,7 +421,7 @@ async def _in_thread(
     given_up = False
 
     def unless_given_up() -> Done[T]:
-        # Abandoned work stays in the executor's queue, and is skipped here.
+        # The computation of an ended request is still in the executor's queue, so skip it here.
         if given_up:
             raise DeadlinePassedError("The request ended before the computation started.")
         return call(lambda: given_up)
@@ -432,6 +439,6 @@ async def _in_thread(
     finally:
         given_up = True
         future.cancel()
-        # The frame, the future and its error form a reference cycle. It would keep the whole
-        # request in memory until the garbage collector runs.
+        # The frame, the future and its error form a reference cycle. Without this deletion, the
+        # cycle would keep the whole request in memory until the garbage collector runs.
         del future

@@ -1,8 +1,8 @@
-"""Answers: the common fields, the limit on their size, and their JSON.
+"""Common fields of all answers, the limit on the size of an answer, and the conversion to JSON.
 
-The schemas of `scene_client.schemas` describe the answers. Fields have the order of the schema, and
-null fields are left out. Answers are plain dictionaries: objects would take twice the time
-(docs/decisions/http.md).
+The schemas of `scene_client.schemas` describe the answers. An answer contains its fields in the
+order of the schema, without null fields. Answers are dictionaries, because pydantic objects would
+take twice the time (docs/decisions/http.md).
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from scene_client.schemas import ModelReference, SceneRequest
 
 Answer: TypeAlias = dict[str, Any]
 
-# Upper bounds in bytes on the parts of an answer, without ids and labels.
+# Upper bounds in bytes on the sizes of parts of an answer. Ids and labels are not included.
 RELATION_BYTES: Final = 120
 CAUSE_BYTES: Final = 60
-OBJECT_BYTES: Final = 200  # an entry for one object
+OBJECT_BYTES: Final = 200  # one entry about one object
 _ENVELOPE_BYTES: Final = 4096
 _WARNING_BYTES: Final = 400
-# Bytes of the longest id: 128 characters of at most four bytes each, the quotes and a comma.
+# Size in bytes of the longest id: 128 characters of at most four bytes, two quotes and a comma.
 _LONGEST_NAME: Final = 4 * 128 + 3
 
 
 def envelope(
     request: SceneRequest, request_id: str, model: ModelReference, reading: Reading
 ) -> Answer:
-    """The fields that all answers share, see `scene_client.schemas.Answer`."""
+    """Return the fields that all answers share. `scene_client.schemas.Answer` describes them."""
     fields: Answer = {"model": model, "request_id": request_id}
     if request.frame_id is not None:
         fields["frame_id"] = request.frame_id
@@ -47,7 +47,7 @@ def envelope(
 
 
 def scene_notes(reading: Reading) -> Answer:
-    """Ignored labels, mapped labels and warnings from reading the scene."""
+    """Return the ignored labels, the mapped labels and the warnings of a scene."""
     return {
         "ignored": list(reading.unknown.ignored),
         "mapped": list(reading.unknown.mapped.values()),
@@ -58,7 +58,7 @@ def scene_notes(reading: Reading) -> Answer:
 def reasons(
     causes: Sequence[questions.Because], ids: Sequence[str], numbered: Iterator[float]
 ) -> list[Answer]:
-    """The reasons of one entry; their numbers are the next values of `numbered`."""
+    """Return the reasons of one entry. The next values of `numbered` are the log-odds changes."""
     return [{"object": ids[place], "log_odds_change": next(numbered)} for place, _ in causes]
 
 
@@ -68,14 +68,14 @@ def rounded(number: float) -> float:
 
 
 def require_size(size: Callable[[int], int], reading: Reading, limit: int, parameter: str) -> None:
-    """Refuse an answer that would be too large.
+    """Check that an answer will not be too large.
 
     Args:
-        size: function from the bytes of the longest name to the bytes of the answer without its
-            envelope.
+        size: function that returns the size in bytes of the answer without its common fields. The
+            argument of the function is the size in bytes of the longest id or label.
         reading: the scene of the request.
         limit: maximum size of the answer in bytes.
-        parameter: the request's field that the client can lower.
+        parameter: name of the request's field that the client can lower for a smaller answer.
 
     Raises:
         RequestError: the answer would be larger than `limit`.
@@ -86,15 +86,15 @@ def require_size(size: Callable[[int], int], reading: Reading, limit: int, param
     exact = estimated_size(size, reading, reading.longest_name())
     if exact > limit:
         message = (
-            f"the answer would have up to {exact} bytes; SCENE_MAX_ANSWER_BYTES leaves {limit} "
-            f"bytes for it. Lower `{parameter}`, send fewer objects, relations or scenes, or use "
+            f"the answer could have {exact} bytes, but SCENE_MAX_ANSWER_BYTES allows only {limit} "
+            f"bytes here. Lower `{parameter}`, send fewer objects, relations or scenes, or use "
             "shorter ids"
         )
         raise RequestError(Reason.ANSWER_TOO_LARGE, [Fault((parameter,), message)])
 
 
 def estimated_size(size: Callable[[int], int], reading: Reading, name: int) -> int:
-    """Bytes of a whole answer whose longest name has `name` bytes."""
+    """Return the size in bytes of a whole answer whose longest id or label has `name` bytes."""
     unknown = reading.unknown
     bare = _ENVELOPE_BYTES + size(name)
     if not (unknown.ignored or unknown.mapped or reading.observed or reading.warnings):
@@ -117,8 +117,8 @@ def written(answer: Any) -> bytes:
     body = orjson.dumps(answer, default=_fields)
     if b"null" not in body:
         return body
-    # `null` has three possible causes: NaN or infinity, a field without a value, or a name that
-    # contains the text "null".
+    # orjson writes NaN, infinity and fields without a value as `null`. A name may also contain the
+    # text "null". So convert the answer again, with a stricter function.
     body = to_json(answer, inf_nan_mode="constants", exclude_none=True)
     try:
         from_json(body, allow_inf_nan=False)

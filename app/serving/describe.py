@@ -39,19 +39,20 @@ def everything(models: ServedModels) -> ModelList:
 
 
 def model(models: ServedModels, reference: str) -> ModelSummary:
-    """Describe the model with this name or alias, even if its versions were refused.
+    """Describe the model with a name or an alias, even if the service refused all its versions.
 
     Raises:
-        UnknownModelError: no model or alias has this name.
+        UnknownModelError: no model or alias has the name ``reference``.
     """
     return _summary(models, _name(models, reference))
 
 
 def version(models: ServedModels, reference: str, number: str) -> VersionDetails:
-    """Describe one version of the model with this name or alias.
+    """Describe one version of the model with a name or an alias.
 
     Raises:
-        UnknownModelError: no model or alias has this name, or the model lacks this version.
+        UnknownModelError: no model or alias has the name ``reference``, or the model does not have
+            the version ``number``.
     """
     name = _name(models, reference)
     if number not in models.store.versions[name]:
@@ -74,7 +75,7 @@ def version(models: ServedModels, reference: str, number: str) -> VersionDetails
 
 
 def vocabulary(served: ServedModel) -> VocabularyAnswer:
-    """List object classes, relations and room types of a model."""
+    """List the object classes, relations and room types of a model."""
     canonical = served.artifact.manifest.vocabulary.relations
     names = (*canonical, *map(opposite, canonical))
     return VocabularyAnswer(
@@ -133,7 +134,7 @@ def _weighted(pairs: Sequence[tuple[str, float]]) -> list[WeightedLabel]:
 
 
 def _name(models: ServedModels, reference: str) -> str:
-    """Return the name of the model that a reference points to, even if its version was refused."""
+    """Return the model name of a reference, even if the service refused the version."""
     name = reference.partition("@")[0]
     target: AliasTarget | None = models.store.aliases.get(name)
     if target is not None:

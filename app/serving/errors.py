@@ -9,7 +9,7 @@ from enum import Enum
 from scene_client.schemas import Failure
 
 Location = tuple[str | int, ...]
-"""Path to a value in a request: its field names and list indices."""
+"""Path to a value in a request: field names and list indices, from the root of the request."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,9 +17,9 @@ class Fault:
     """One error in a request.
 
     Attributes:
-        location: path to the invalid value, from the root of the request.
+        location: path to the invalid value in the request.
         message: description of the error, without a copy of the input.
-        suggestions: known names that are most similar to an unknown name, best first.
+        suggestions: known names that are similar to an unknown name, most similar name first.
     """
 
     location: Location
@@ -28,7 +28,7 @@ class Fault:
 
 
 class Reason(Enum):
-    """The kind of a request error. Each kind has its own problem type."""
+    """The kind of a `RequestError`. Each kind has its own problem type."""
 
     INVALID = "invalid"
     UNKNOWN_LABELS = "unknown labels"
@@ -37,7 +37,7 @@ class Reason(Enum):
 
 
 class ServingError(Exception):
-    """Base class of the serving errors. The service may send their text to the client."""
+    """Base class of the errors of the serving layer. Clients may receive the message."""
 
 
 class RequestError(ServingError):
@@ -97,7 +97,7 @@ class RefreshRefusedError(ServingError):
     """The new state of the store would make a working version or alias unusable.
 
     Attributes:
-        failures: the refused versions and aliases with their reasons.
+        failures: for each refused version or alias, its name and the reason.
     """
 
     def __init__(self, failures: Sequence[Failure]) -> None:

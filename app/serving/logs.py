@@ -1,4 +1,4 @@
-"""Log records as JSON lines or plain text on standard error, without payloads or keys."""
+"""Log formats: JSON lines or plain text, on standard error. Keys are masked in every line."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ def _masked(line: str, secrets: Sequence[str]) -> str:
 class JSONFormatter(logging.Formatter):
     """Write one JSON object per line: time, level, process, logger, message and request fields.
 
-    Two attributes of a log record add fields. ``entry`` contains the fields of an access log line.
-    ``request_id`` is the id of the request that caused an internal error.
+    Two optional attributes of a log record add fields to the JSON object. The attribute ``entry``
+    contains the fields of an access log line. The attribute ``request_id`` is the id of the request
+    that caused an internal error.
 
     Args:
-        secrets: texts to mask in every line, because an exception message may contain them.
+        secrets: keys to mask in every line. An exception message may contain a key.
     """
 
     def __init__(self, secrets: Sequence[str] = ()) -> None:
         super().__init__()
-        # The lines are JSON, so they contain the secrets in escaped form.
+        # In a JSON line, a secret has the escaped form of a JSON string.
         self.secrets = [json.dumps(secret)[1:-1] for secret in secrets]
         self._second, self._text = -1, ""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the record as one line."""
+        """Return the log record as one line of JSON."""
         second = int(record.created)
         if second != self._second:
             self._second = second
@@ -62,15 +63,15 @@ class PlainFormatter(logging.Formatter):
         self.secrets = secrets
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the record as one or several lines."""
+        """Return the log record as one or several lines of text."""
         return _masked(super().format(record), self.secrets)
 
 
 class NoHandshakes(logging.Filter):
-    """Drop uvicorn's log lines about WebSocket handshakes, because they contain the path."""
+    """Drop uvicorn's log lines about WebSocket handshakes, because these contain raw paths."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether to write the record."""
+        """Return False for a log record about a WebSocket handshake, else True."""
         return not (record.name == "uvicorn.error" and '"WebSocket %s"' in str(record.msg))
 
 
@@ -80,13 +81,13 @@ def log_config(
     """Return the log configuration of the service and uvicorn for `logging.config.dictConfig`.
 
     The access log of uvicorn is off, because it would contain raw paths. The service writes its own
-    access log. Libraries log at `info` or above. At `debug`, uvicorn would log the headers of
-    WebSocket handshakes, including keys.
+    access log. The log level of libraries is at least `info`, because at `debug` uvicorn would log
+    the headers of WebSocket handshakes, including keys.
 
     Args:
         level: log level of the service.
         style: "json" for one JSON object per line, or "plain" for text.
-        secrets: texts to mask.
+        secrets: keys to mask in every line.
     """
     known = logging.getLevelNamesMapping()
     return {
@@ -108,7 +109,7 @@ def log_config(
         "loggers": {
             "app": {"level": level.upper()},
             "uvicorn.access": {"level": "CRITICAL"},
-            # At "info", this library would log each WebSocket that opens, fails or closes.
+            # At level "info", the library `websockets` would log each connection.
             "websockets": {"level": "WARNING"},
         },
     }

@@ -1,8 +1,8 @@
-"""Metrics for Prometheus. Requests update them, and `GET /metrics` formats them.
+"""Metrics for Prometheus. `GET /metrics` returns them as text.
 
-Clients cannot create new label values: the label of a route is its template, and only served models
-have labels. Each replica is one process and reports its own metrics; see
-docs/decisions/artifacts.md.
+Clients cannot create new label values of metrics, because the number of series must stay small. The
+label of a route is its template instead of the path, and only served models have labels. Each
+replica of the service is one process and reports its own metrics (docs/decisions/artifacts.md).
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ _ROWS: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 _MODEL: Final = ("model", "version")
 _INFO: Final = "scene_model_info"
 
-# By default, each counter has a second series with its creation time. Prometheus does not need it,
-# because it detects restarts itself.
+# By default, the library adds a second series to each counter, the creation time. Prometheus does
+# not need this series, because it detects restarts itself.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 
 class Metrics:
-    """The metrics of one application. Call its methods only on the thread of the event loop.
+    """The metrics of one application. Call the methods only on the thread of the event loop.
 
     Attributes:
-        registry: registry of this application. One process can have several applications.
+        registry: Prometheus registry of this application. A process can have several applications.
     """
 
     def __init__(self) -> None:
@@ -151,7 +151,7 @@ class Metrics:
         )
         self._infos: set[Info] = set()
         self._is_ready = False
-        # The look-up of a series by its labels is slower than the count, so these dicts cache it.
+        # These dictionaries cache the series, because the look-up of a series by labels is slow.
         self._of_request: dict[tuple[str, str, str], Counter] = {}
         self._of_route: dict[str, Histogram] = {}
         self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
@@ -166,7 +166,7 @@ class Metrics:
                 self._reloads.labels(change, outcome)
 
     def serving(self, models: ServedModels) -> None:
-        """Set the served models, and remove the series of all other models."""
+        """Report these models as served, and remove the series of all other models."""
         for key in self._of_model.keys() - models.served.keys():
             for question in self._of_model.pop(key):
                 self._compute.remove(*key, question)
@@ -188,7 +188,7 @@ class Metrics:
             self._ready.set(time.time())
 
     def reloaded(self, change: Change, outcome: Outcome) -> None:
-        """Count one attempt to change the served models."""
+        """Count one attempt to change the served models, with its outcome."""
         self._reloads.labels(change, outcome).inc()
 
     def answered(
@@ -204,11 +204,11 @@ class Metrics:
         Args:
             route: template of the route, or "-" if no route has the requested path.
             method: HTTP method, or "-" for a method that HTTP does not define.
-            outcome: "success" or the slug of the problem.
-            seconds: duration of the request, or None for a stream, whose duration the client
-                chooses.
-            serialised: seconds from the last answer of a model to the response, or None for a
-                request without an answer of a model.
+            outcome: "success" or the slug (short name) of the problem type.
+            seconds: duration of the request in seconds. It is None for a stream, because the client
+                chooses the duration of a stream.
+            serialised: time in seconds from the last answer of a model to the response. It is None
+                if no model has answered.
         """
         key = (route, method, outcome)
         counter = self._of_request.get(key)
@@ -224,7 +224,7 @@ class Metrics:
             self._serialisation.observe(serialised)
 
     def entry_answered(self, question: str, outcome: str) -> None:
-        """Count one scene of a batch. The outcome is "success" or the slug of the problem."""
+        """Count one scene of a batch. Its outcome is "success" or the slug of the problem type."""
         self._entries.labels(question, outcome).inc()
 
     def streams(self, count: int) -> None:
@@ -236,7 +236,7 @@ class Metrics:
 
         Args:
             kind: type of the message, or "-" for an unknown type.
-            outcome: "success" or the slug of the problem.
+            outcome: "success" or the slug (short name) of the problem type.
         """
         self._messages.labels(kind, outcome).inc()
 
@@ -244,25 +244,25 @@ class Metrics:
         """Count one answer on a stream.
 
         Args:
-            outcome: "success" or the slug of the problem.
-            superseded: number of older updates that the answer covers in addition to the newest
-                update.
+            outcome: "success" or the slug (short name) of the problem type.
+            superseded: number of older updates that have no answer of their own, because this
+                answer covers them.
         """
         self._answers.labels(outcome).inc()
         self._superseded.inc(superseded)
 
     def computed(self, key: Key, question: str, rows: int, waited: float, seconds: float) -> None:
-        """Record one computed question.
+        """Record one question that a model has computed.
 
-        The method does nothing if the model is no longer served. Otherwise the removed series of
-        the model would appear again.
+        The method does nothing for a model that is no longer served. Otherwise the removed series
+        of this model would appear again.
 
         Args:
             key: name and version of the model.
             question: name of the question.
-            rows: number of scenes of the question.
-            waited: seconds that the question waited before its computation.
-            seconds: duration of the computation.
+            rows: number of scenes of the question. It is 1, or the number of generated scenes.
+            waited: time in seconds that the question waited before its computation.
+            seconds: duration of the computation in seconds.
         """
         series = self._of_model.get(key)
         if series is None:
@@ -287,7 +287,7 @@ class Metrics:
 
 
 def _infos(models: ServedModels) -> Iterable[Info]:
-    """Yield the label values of each model once per alias. Without an alias, the value is ""."""
+    """Yield label values for each pair of model and alias. A model without alias has alias ""."""
     aliases: dict[Key, list[str]] = {key: [] for key in models.served}
     for alias in models.store.aliases:
         try:

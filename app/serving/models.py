@@ -1,7 +1,8 @@
-"""The served models. The registry verifies them, and the service warms them up.
+"""The served models: the registry has verified them, and the service has warmed them up.
 
 A snapshot of the models never changes, so a request uses the same models from beginning to end. The
-snapshot lists each refused version with its reason. An older version never replaces it.
+snapshot lists each refused version with the reason. An older version never replaces a refused
+version.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _UNKNOWN = {"unknown_model", "unknown_version", "invalid_reference"}
 
 @dataclass(frozen=True, eq=False)
 class ServedModel:
-    """A model that has passed its warm-up.
+    """A model that has passed its warm-up: it has answered each question once.
 
     Attributes:
         artifact: weights, vocabulary and calibration of the model.
@@ -42,7 +43,7 @@ class ServedModel:
 
     @cached_property
     def reference(self) -> ModelReference:
-        """The name, version, variant and digest of the model, as answers contain them."""
+        """Name, version, variant and digest of the model, in the form of the field `model`."""
         manifest = self.artifact.manifest
         return ModelReference(
             name=manifest.name,
@@ -63,15 +64,15 @@ class ServedModel:
 
     @cached_property
     def context_sizes(self) -> Mapping[str, int]:
-        """Number of units of each hidden layer."""
+        """Maps the name of each hidden layer to its number of units."""
         spec = self.artifact.spec
         return {"h1": spec.H1, "h2": spec.H2} if spec.H2 else {"h1": spec.H1}
 
     @cached_property
     def contexts(self) -> Mapping[str, tuple[questions.ContextUnit, ...]]:
-        """Hidden units of each layer, with the objects and relations of their largest weights.
+        """Maps each hidden layer to its units, with the objects and relations of largest weight.
 
-        The first access takes 0.2 s.
+        The first access computes the value, which takes 0.2 s.
         """
         return questions.contexts(self.artifact)
 
@@ -81,10 +82,11 @@ class ServedModels:
     """A snapshot of served models, refused versions and aliases.
 
     Attributes:
-        store: snapshot of the registry.
-        served: maps (name, version) to each model that has passed its warm-up.
-        warm_up_failures: maps (name, version) to the reason for each verified model that failed its
-            warm-up.
+        store: snapshot of the registry, with all versions and aliases.
+        served: dictionary from (name, version) to the served model. It contains the models that
+            have passed their warm-up.
+        warm_up_failures: dictionary from (name, version) to the failure. It contains the verified
+            models that failed their warm-up.
     """
 
     store: ModelSet
@@ -96,7 +98,8 @@ class ServedModels:
 
         Raises:
             UnknownModelError: the alias, model or version does not exist.
-            ModelUnavailableError: the version was refused, or the target of the alias is missing.
+            ModelUnavailableError: the service refused the version, or the store lacks the target of
+                the alias.
             NotReadyError: the default model is not usable.
         """
         found = self._resolved.get(reference)
@@ -121,15 +124,15 @@ class ServedModels:
 
     @cached_property
     def _resolved(self) -> dict[str, ServedModel]:
-        # The cache contains only valid references. The store limits their number, but clients can
-        # send any number of invalid references.
+        # The cache contains only valid references, because clients can send any number of invalid
+        # references. The contents of the store limit the number of valid references.
         return {}
 
     @cached_property
     def usable(self) -> frozenset[str]:
-        """The versions (``name@version``) and aliases without a failure.
+        """Names of the versions (``name@version``) and aliases that are usable.
 
-        It contains "store" if the store could be read.
+        The set also contains "store" if the service could read the store.
         """
         versions = {f"{name}@{version}" for name, version in self.served}
         subjects = versions | self.store.aliases.keys() | {DEFAULT, "store"}
@@ -137,7 +140,7 @@ class ServedModels:
 
     @cached_property
     def generation(self) -> str:
-        """Digest of the served versions and aliases. Replicas with the same state have the same."""
+        """Digest of the served versions and aliases. Equal digests mean equal states."""
         versions = {"@".join(key): model.artifact.digest for key, model in self.served.items()}
         aliases = {alias: str(target) for alias, target in self.store.aliases.items()}
         text = json.dumps([versions, aliases], sort_keys=True)
@@ -145,7 +148,7 @@ class ServedModels:
 
     @cached_property
     def failures(self) -> Mapping[str, Failure]:
-        """Maps each subject to its failure. A subject is ``name@version``, an alias or "store"."""
+        """Maps each unusable entry (``name@version``, an alias or "store") to its failure."""
         found = {
             f"{name}@{version}": Failure(
                 subject=f"{name}@{version}", reason=refused.code, detail=refused.reason

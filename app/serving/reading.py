@@ -1,7 +1,7 @@
-"""Conversion of a request to a scene: it finds ids, classes of labels, and relations from poses.
+"""Conversion of a request to a scene with ids, class indices and relations from poses.
 
-The module collects all errors of a request before it raises an exception. So a client can correct
-all errors at once.
+The functions collect all errors of a request before they raise an exception. So a client can
+correct all errors at once.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from scene_client.schemas import (
 )
 
 MAX_SUGGESTED: Final = 32
-"""Maximum number of look-ups of unknown labels per scene.
+"""Maximum number of searches for classes similar to an unknown label, per scene.
 
-It is also the maximum number of errors with suggestions per request.
+The same number limits the errors with suggestions per request.
 """
 MAX_MAPPED: Final = 256
 """Maximum number of unknown labels per request that the service maps to the nearest class."""
@@ -48,7 +48,7 @@ Triple = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits on one scene and its answer, from the settings.
+    """Limits on one scene and on its answer. The values come from the settings of the service.
 
     Attributes:
         objects: maximum number of objects in a scene.
@@ -66,7 +66,7 @@ class Faults:
     """The errors of a request found so far.
 
     Attributes:
-        found: maps each kind of error to its errors.
+        found: dictionary from each kind of error to the list of errors of this kind.
     """
 
     found: dict[Reason, list[Fault]] = field(default_factory=dict)
@@ -81,7 +81,8 @@ class Faults:
         """Raise an exception if the request has errors.
 
         Raises:
-            RequestError: all errors of one kind: the first kind in `Reason` that has errors.
+            RequestError: the request has errors. The exception contains all errors of one kind, the
+                first kind in `Reason` with errors.
         """
         if not self.found:
             return
@@ -92,13 +93,13 @@ class Faults:
 
 @dataclass(slots=True)
 class LookUps:
-    """The look-ups of unknown labels in all scenes of one request.
+    """Searches for classes similar to unknown labels, shared by all scenes of one request.
 
-    The object limits the number of look-ups, because a look-up takes 0.2 ms, and a batch may have
+    This class limits the number of searches, because a search takes 0.2 ms, and a batch may contain
     10,000 unknown labels.
 
     Attributes:
-        suggestions: number of errors that already have suggestions.
+        suggestions: number of errors of the request that already have suggestions.
     """
 
     suggestions: int = 0
@@ -107,8 +108,8 @@ class LookUps:
     def nearest(
         self, vocabulary: Vocabulary, label: str, *, is_room: bool, limit: int
     ) -> tuple[Match, ...] | None:
-        """Return the entries nearest to an unknown label, or None after ``limit`` look-ups."""
-        # id() stays unique, because the request keeps its models in memory.
+        """Return the names most similar to an unknown label, or None after ``limit`` searches."""
+        # id() stays unique, because the request keeps its models and their vocabularies in memory.
         key = id(vocabulary), label, is_room
         if key not in self._found:
             if len(self._found) >= limit:
@@ -124,10 +125,10 @@ class Unknown:
 
     Attributes:
         vocabulary: classes and room types of the model.
-        treatment: `SceneRequest.unknown_labels`.
-        look_ups: look-ups of the whole request.
+        treatment: value of the field `unknown_labels` of the request.
+        look_ups: searches for similar classes, shared by all scenes of the request.
         ignored: names of the ignored objects.
-        mapped: maps each unknown label to its nearest class.
+        mapped: dictionary from each unknown label to the class that replaces it.
     """
 
     vocabulary: Vocabulary
@@ -144,13 +145,14 @@ class Unknown:
 
         Args:
             label: the unknown label.
-            name: name of the object with this label, for the list of ignored names.
-            location: location of the label in the request, for an error.
-            faults: list of errors. The method adds an error if it refuses the label.
-            is_room: whether the label is a room type.
+            name: name of the object with this label. The list of ignored names contains it if the
+                label is ignored.
+            location: location of the label in the request, for an error message.
+            faults: list of errors. If the method refuses the label, it adds an error to this list.
+            is_room: whether the label is the name of a room type.
 
         Returns:
-            Index of the class or room type, or None if the label is ignored or refused.
+            Index of the class or room type. None means that the label is ignored or refused.
         """
         if self.treatment == "ignore":
             self.ignored.append(name)
@@ -181,7 +183,7 @@ class Unknown:
         return None
 
     def copy(self) -> Unknown:
-        """Return a copy for a question with more labels. The question changes only the copy."""
+        """Return a copy. A question with further labels changes only its own copy."""
         return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
 
     def _nearest(self, label: str, *, is_room: bool) -> tuple[Match, ...]:
@@ -199,15 +201,16 @@ class Unknown:
 
 @dataclass
 class Reading:
-    """The scene of a request, with the class indices of a model. Constant after `read_scene`.
+    """The scene of a request, with the class indices of a model. It is constant after `read_scene`.
 
     Attributes:
-        scene: objects with a known class, their relations and the room type.
-        ids: ids of the scene's objects.
-        unknown: unknown labels and their treatment.
+        scene: objects of known classes, their relations and the room type.
+        ids: ids of the objects in `scene`.
+        unknown: unknown labels of the request and their treatment.
         left_out: pairs (id, label) of the ignored objects.
-        observed: relations derived from poses, or None without poses.
-        flipped: canonical triples of `scene` that the request states by the opposite relation.
+        observed: relations that the service has derived from poses, or None without poses.
+        flipped: relations of `scene` that the request states by their opposite, for example right
+            instead of left. Each is a triple (relation, subject, object) of indices.
         warnings: warnings about probable mistakes in the scene.
     """
 
@@ -221,11 +224,11 @@ class Reading:
 
     @cached_property
     def names(self) -> Names:
-        """Look-up of objects by id or label. The first access builds it."""
+        """Look-up of objects by id or label. The first access builds the look-up tables."""
         return Names(self.scene.objects, self.left_out, self.unknown.vocabulary)
 
     def longest_name(self) -> int:
-        """Return the maximum size in bytes of an id or label in a JSON answer."""
+        """Return the maximum size in bytes of an id or label in the JSON text of the answer."""
         text = "".join(self.ids)
         if text.isascii() and '"' not in text and "\\" not in text:
             longest = max(map(len, self.ids), default=0) + 2
@@ -240,7 +243,7 @@ class Reading:
 
 
 class Names:
-    """Look-up of objects by id, or by a label that only one object has.
+    """Look-up of objects by id, or by label if only one object has the label.
 
     Args:
         objects: objects of the scene.
@@ -259,8 +262,8 @@ class Names:
         self._ignored_ids = {name for name, _ in ignored}
         self._ignored_labels = {label_key(label) for _, label in ignored}
 
-    # The first access builds each table. Most requests never need them, because they do not refer
-    # to their objects by name.
+    # The first access builds each table. Most requests never need the tables, because most requests
+    # do not refer to objects by name.
 
     @cached_property
     def _by_id(self) -> dict[str, int]:
@@ -282,9 +285,10 @@ class Names:
         return places
 
     def find(self, name: str, location: Location, faults: Faults) -> int | None:
-        """Return the index of the object with this name, or add an error and return None.
+        """Return the index of the object with a name. On failure, add an error and return None.
 
-        Ids take precedence over labels. The label may have any accepted spelling of its class.
+        The name is an id or a label. Ids take precedence over labels. A label may have any spelling
+        that the vocabulary accepts for its class.
         """
         if (place := self._by_id.get(name)) is not None:
             return place
@@ -302,7 +306,7 @@ class Names:
         return None
 
     def is_ignored(self, name: str) -> bool:
-        """Return whether the name belongs to an ignored object."""
+        """Return whether an ignored object has this id or label."""
         if name in self._by_id:
             return False
         return name in self._ignored_ids or label_key(name) in self._ignored_labels
@@ -323,10 +327,11 @@ def read_scene(
         request: the request.
         vocabulary: classes and room types of the model.
         limits: limits on the scene.
-        look_ups: look-ups of the whole request, for a scene of a batch.
-        may_be_empty: whether a scene without known objects is valid.
-        derive: whether to derive relations and warnings from poses. With False, the function only
-            checks the scene.
+        look_ups: searches for similar classes, shared by all scenes of a batch. None means that the
+            request has only this scene.
+        may_be_empty: whether a scene without objects of known classes is valid.
+        derive: whether to derive relations and warnings from poses. False means that the function
+            only checks the scene.
 
     Raises:
         RequestError: the scene is invalid; see `Faults.raise_any`.
@@ -376,13 +381,21 @@ def read_scene(
 
 def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
     if len(request.objects) > limits.objects:
-        faults.add(Reason.INVALID, ("objects",), f"must have at most {limits.objects} objects")
+        faults.add(
+            Reason.INVALID, ("objects",), f"the scene must have at most {limits.objects} objects"
+        )
     if request.relations is None:
         if request.relations_complete:
-            faults.add(Reason.INVALID, ("relations_complete",), "requires relations")
+            faults.add(
+                Reason.INVALID,
+                ("relations_complete",),
+                "`relations_complete` requires the field `relations`",
+            )
     elif len(request.relations) > limits.relations:
         faults.add(
-            Reason.INVALID, ("relations",), f"must have at most {limits.relations} relations"
+            Reason.INVALID,
+            ("relations",),
+            f"the scene must have at most {limits.relations} relations",
         )
     if faults.found:
         faults.raise_any()
@@ -391,7 +404,7 @@ def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
 def _derive(
     request: SceneRequest, reading: Reading, vocabulary: Vocabulary, *, has_poses: bool
 ) -> None:
-    """Add the relations and warnings that follow from the poses."""
+    """Add to ``reading`` the relations and warnings that follow from the poses of the objects."""
     given = reading.scene
     if has_poses and given.relations is None:
         view = request.viewpoint
@@ -410,9 +423,10 @@ def _derive(
 
 
 def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
-    """Return the ids of the objects.
+    """Return the ids of the objects in a request.
 
-    An object without an id has its label as id. Repeated labels have a number at the end.
+    An object without an id has its label as id. If several objects have this label, a number at the
+    end makes the id unique.
     """
     labels: list[str] = [entry for entry in entries if isinstance(entry, str)]
     if len(set(labels)) == len(entries):
@@ -481,7 +495,10 @@ def _room(name: str, unknown: Unknown, faults: Faults) -> int | None:
 def _triples(
     relations: Sequence[Relation], reading: Reading, faults: Faults
 ) -> tuple[tuple[Triple, ...], frozenset[Triple]]:
-    """Return the canonical triples, and those that the request states by the opposite relation."""
+    """Return the canonical triples of the stated relations.
+
+    The second value contains the triples that the request states by the opposite relation.
+    """
     names, some_ignored = reading.names, bool(reading.left_out)
     triples: dict[Triple, bool] = {}
     for place, relation in enumerate(relations):

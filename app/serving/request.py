@@ -1,4 +1,4 @@
-"""A request: its deadline, its snapshot of the models, and its record for log and metrics."""
+"""A request in the serving layer: its deadline, its models, and its record for log and metrics."""
 
 from __future__ import annotations
 
@@ -27,19 +27,21 @@ SUCCESS: Final = "success"
 
 @dataclass(slots=True)
 class Record:
-    """Values of a request for log and metrics. The gateway reads them after the response.
+    """Values of a request for log and metrics. The gateway reads these values after the response.
 
     Attributes:
-        outcome: `SUCCESS`, or the slug of the problem in the response.
+        outcome: `SUCCESS`, or the slug (short name) of the problem type in the response.
         status: HTTP status of the response, or 0 before the response starts.
-        models: (name, version) of the models that the request used. A batch may use several models.
-        queue_seconds: total time that the scenes of the request waited, or None if the request used
-            no model.
-        compute_seconds: total computation time of the models, or None if the request used no model.
-        answered_at: `time.perf_counter` at the last answer of a model.
+        models: pairs (name, version) of the models that the request used. A batch may use several
+            models.
+        queue_seconds: total time in seconds that the scenes of the request waited, or None if the
+            request used no model.
+        compute_seconds: total computation time of the models in seconds, or None if the request
+            used no model.
+        answered_at: time of the last answer of a model, as a value of `time.perf_counter`.
         serialise_seconds: time in seconds from the last answer of a model to the response.
-        stream: for a stream, the numbers of messages, answers and superseded updates, and the close
-            code. None for other requests.
+        stream: dictionary with the numbers of messages, answers and superseded updates of a stream,
+            and its close code. It is None for other requests.
     """
 
     outcome: str = SUCCESS
@@ -60,7 +62,7 @@ class Record:
     def known(self) -> dict[str, str | float]:
         """Return the fields for the access log line, with times in milliseconds.
 
-        The fields contain the model only if the request used exactly one model.
+        The dictionary contains the model only if the request used exactly one model.
         """
         entry: dict[str, str | float] = {"outcome": self.outcome, **(self.stream or {})}
         if len(self.models) == 1:
@@ -74,7 +76,7 @@ class Record:
 
 @dataclass(slots=True)
 class Request(Ticket):
-    """One request, with the same snapshot of the models from beginning to end.
+    """One request. It uses the same snapshot of the models from beginning to end.
 
     Attributes:
         id: request id. Every answer contains it.
@@ -82,10 +84,11 @@ class Request(Ticket):
         limits: limits on the scenes and answers of the request.
         metrics: metrics of the service.
         record: values for the log and the metrics.
-        holding: whether the request has already reserved its rows in the queues of the models.
+        holding: whether the request has already reserved rows (scenes) in the queues of the models.
         known: stored result of `read`, if several questions concern the same scene.
-        low_priority: whether the questions run after the questions of other requests.
-        look_ups: look-ups of unknown labels in all scenes of the request.
+        low_priority: whether other requests take precedence, because this one belongs to a stream.
+        look_ups: searches for classes similar to unknown labels, shared by all scenes of the
+            request.
     """
 
     id: str = ""
@@ -101,7 +104,7 @@ class Request(Ticket):
     def read(
         self, scene: SceneRequest, *, may_be_empty: bool = False
     ) -> tuple[ServedModel, Reading]:
-        """Return the model that a scene names, and the scene with the class indices of this model.
+        """Return the model in the field `model` of a scene, and the scene converted for this model.
 
         Raises:
             UnknownModelError: the model does not exist.
@@ -127,10 +130,10 @@ class Request(Ticket):
         """Ask a model one question about one scene.
 
         Args:
-            model: the model.
-            question: function of `app.questions`.
+            model: the model that computes the answer.
+            question: function of `app.questions` that computes the answer.
             scene: the scene with the class indices of the model.
-            *args, **kwargs: more arguments for ``question``.
+            *args, **kwargs: further arguments of ``question``.
 
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
@@ -144,7 +147,7 @@ class Request(Ticket):
                 call,
                 self,
                 kind=_kind_of_cost(name, scene, kwargs),
-                # The cost of relations grows with the number of pairs.
+                # The time for relations grows with the number of pairs of objects.
                 size=(1 + len(scene.objects)) ** 2,
                 low_priority=self.low_priority,
             )
@@ -158,11 +161,11 @@ class Request(Ticket):
         """Sample scenes from a model.
 
         Args:
-            rows: number of scenes.
-            model: the model.
-            name: name of the question.
+            rows: number of scenes to sample.
+            model: the model to sample from.
+            name: name of the question, for log and metrics.
             draw: function that samples the scenes. Its argument is a function that returns whether
-                the request has been abandoned.
+                the request has ended, because the sampling can then stop.
 
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
@@ -189,10 +192,14 @@ class Request(Ticket):
 
     @contextmanager
     def for_batch(self, references: Sequence[str]) -> Iterator[Request]:
-        """Reserve a row for each scene of a batch, and yield a copy of the request.
+        """Reserve one row in the model's queue for each scene of a batch.
 
         Args:
-            references: model of each scene. The method reserves no rows for an unusable model.
+            references: for each scene, the alias or name of its model. The method does not reserve
+                a row if the model is not usable.
+
+        Yields:
+            A copy of the request that does not reserve further rows.
 
         Raises:
             QueueFullError: the queue of a model is full.
@@ -209,11 +216,11 @@ class Request(Ticket):
 
 
 def _kind_of_cost(name: str, scene: Scene, parameters: Mapping[str, object]) -> str:
-    """Return a key for the expected computation time of a question.
+    """Return the kind of a question, which is the key for its expected computation time.
 
-    Questions with the same key and the same number of objects take a similar time. The time also
-    depends on the numbers of classes, related classes and related pairs. So the key contains the
-    order of magnitude of these numbers.
+    Questions of the same kind and with the same number of objects take a similar time. The time
+    also depends on the numbers of classes, related classes and related pairs in the scene. So the
+    key contains the orders of magnitude of these numbers.
     """
     of = [thing.class_index for thing in scene.objects]
     orders = [len(set(of)).bit_length(), 0, 0]

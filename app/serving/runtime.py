@@ -1,4 +1,4 @@
-"""The runtime of the process: it holds the current snapshot of models and replaces it."""
+"""The runtime of the process. It contains the current snapshot of the models."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import asyncio
 import ctypes
 import gc
 import logging
+import random
 import sys
 from collections.abc import Awaitable, Callable, Iterable
 from functools import wraps
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 from app.compiling import check_cache, progress
-from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
+from app.registry import AliasTarget, StoreError, StoreState, load_model_set, open_store
 from app.serving.admission import Backlog, Threads, WorkQueue
 from app.serving.errors import (
     AliasConflictError,
@@ -36,18 +37,21 @@ from app.serving.reading import Limits
 from app.serving.request import Record, Request
 from app.serving.warm_up import prepare
 from app.settings import Settings
-from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
+from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer, StoreHealth
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 _logger = logging.getLogger("app.serving")
 
-# Time in seconds that an administration request waits for another writer of the store.
+# Maximum time in seconds that an administration request waits for the lock of the store.
 _LOCK_TIMEOUT = 5.0
 
-# Time in seconds after which the interpreter switches from a worker thread to the event loop. The
-# default of 5 ms would delay answers by a quarter of a robot's control cycle.
+# While a remote store is unreachable, the time between two polls doubles up to so many times.
+_MAX_DOUBLINGS = 4
+
+# Time in seconds after which the interpreter switches from a worker thread to the event loop.
+# Python's default of 5 ms would delay answers by a quarter of a robot's control cycle (20 ms).
 _SWITCH_INTERVAL = 5e-4
 
 
@@ -57,7 +61,7 @@ def _counted(
     [Callable[Concatenate[Runtime, P], Awaitable[T]]],
     Callable[Concatenate[Runtime, P], Awaitable[T]],
 ]:
-    """Return a decorator for methods that change the served models. It counts their outcomes."""
+    """Return a decorator that counts the outcomes of a method that changes the served models."""
 
     def decorate(
         method: Callable[Concatenate[Runtime, P], Awaitable[T]],
@@ -81,7 +85,7 @@ def _counted(
 
 
 class Runtime:
-    """The runtime of the service, with the current snapshot of models.
+    """The runtime of the service. It contains the current snapshot of the models.
 
     Args:
         settings: settings of the service.
@@ -94,11 +98,15 @@ class Runtime:
     def __init__(self, settings: Settings) -> None:
         self.metrics = Metrics()
         self.backlog = Backlog(settings.queue_requests)
-        self._store = Store(
+        self._store = open_store(
             settings.store,
+            trusted=None if settings.unsigned_store else settings.trusted_keys,
+            cache=settings.store_cache,
             lock_timeout=_LOCK_TIMEOUT,
             max_weights_bytes=settings.max_weights_bytes,
+            max_cache_bytes=settings.store_cache_bytes,
         )
+        self._max_age = settings.store_max_age
         self._limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
@@ -109,13 +117,14 @@ class Runtime:
         self._changing = asyncio.Lock()
         self._models: ServedModels | None = None
         self._seen: StoreState | None = None
+        self._failed_polls = 0
 
     @property
     def models(self) -> ServedModels:
-        """The current snapshot.
+        """The current snapshot of the models.
 
         Raises:
-            NotReadyError: the models are not loaded yet.
+            NotReadyError: the service has not loaded the models yet.
         """
         if self._models is None:
             raise NotReadyError("The service is starting.")
@@ -128,12 +137,12 @@ class Runtime:
         record: Record | None = None,
         is_gone: Callable[[], Awaitable[bool]] | None = None,
     ) -> Request:
-        """Create a request that keeps the current snapshot until its end.
+        """Create a request that uses the current snapshot of the models until its end.
 
         Args:
-            deadline, is_gone: attributes of `Ticket`.
-            request_id: request id. Every answer contains it.
-            record: values for the log and the metrics.
+            deadline, is_gone: deadline and connection check of the request, as in `Ticket`.
+            request_id: id of the request. Every answer contains the id.
+            record: values of the request for the log and the metrics.
 
         Raises:
             NotReadyError: the models are not loaded yet.
@@ -154,15 +163,27 @@ class Runtime:
         return self.backlog.draining
 
     def check_ready(self) -> None:
-        """Check that the service accepts requests and its default model is usable.
+        """Check that the service accepts requests and that its default model is usable.
 
         Raises:
-            NotReadyError: the default model is not usable.
+            NotReadyError: the default model is not usable, or the local copy of a remote store is
+                too old.
             DrainingError: the service is shutting down.
         """
         if self.draining:
             raise DrainingError("The service finishes the requests in progress and then stops.")
+        age = self._store.age
+        if self._max_age and age is not None and age > self._max_age:
+            raise NotReadyError(f"The service has not reached the model store for {age:.0f} s.")
         self.models.resolve(DEFAULT)
+
+    @property
+    def store_health(self) -> StoreHealth | None:
+        """The state of the contact to a remote store, or None for a store in a folder."""
+        if (age := self._store.age) is None:
+            return None
+        error = self._store.error
+        return StoreHealth(age_s=round(age, 1), reason=None if error is None else error.code)
 
     def drain(self) -> None:
         """Refuse new requests, and answer readiness checks with 503."""
@@ -171,13 +192,13 @@ class Runtime:
     async def start(self) -> None:
         """Load, verify and warm up all versions in the store.
 
-        `models.failures` then contains the refused versions and aliases.
+        Afterwards, `models.failures` contains the refused versions and aliases.
         """
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.metrics.started()
         check_cache()
-        # The models load on this thread. The service has no requests yet, and another thread would
-        # cost time and memory.
+        # The models load on this thread, because the service has no requests yet. Another thread
+        # would cost time and memory.
         self._serve(self._load(None))
         for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
@@ -185,23 +206,24 @@ class Runtime:
             self._polling = asyncio.create_task(self._follow())
 
     def stop(self) -> None:
-        """Stop the worker threads. Work that has not started is dropped."""
+        """Stop the worker threads and drop the computations that have not started."""
         if self._polling is not None:
             self._polling.cancel()
         self._threads.stop()
 
     @_counted("refresh")
     async def refresh(self, request_id: str) -> RefreshAnswer:
-        """Serve the current state of the store, or keep the served models.
+        """Load the current state of the store and serve it, or keep the served models.
 
-        The service refuses a state with a new failure, and a state without a usable default model.
+        The service refuses a state of the store with a new failure or without a usable default
+        model.
 
         Raises:
             RefreshRefusedError: the service refused the new state. The served models are unchanged.
-            NotReadyError: the models are not loaded yet.
+            NotReadyError: the service has not loaded the models yet.
         """
         async with self._changing:
-            # These sets contain only names, so the memory of the old snapshot can be freed.
+            # These sets contain only names, so Python can free the memory of the old snapshot.
             failed, served = set(self.models.failures), set(self.models.served)
             new = await self._take_over(lambda subject: subject == DEFAULT or subject not in failed)
             return RefreshAnswer(
@@ -218,8 +240,8 @@ class Runtime:
 
         Raises:
             RequestError: the name is not valid for an alias.
-            UnknownModelError: the model or version is not served.
-            ModelUnusableError: the version was refused.
+            UnknownModelError: the service does not serve the model or version.
+            ModelUnusableError: the service refused the version.
             AliasConflictError: the alias has another target than expected, or a model has the name
                 of the alias.
             StoreNotWritableError: this process cannot write to the store.
@@ -243,13 +265,14 @@ class Runtime:
             )
 
     async def _follow(self) -> None:
-        """Check the store regularly for changes by other processes, and serve these changes."""
+        """Check the store regularly for changes by other processes, and serve the new state."""
         while True:
-            await asyncio.sleep(self._poll)
-            if await asyncio.to_thread(self._store.state) == self._seen:
-                continue
+            await asyncio.sleep(self._wait())
             try:
-                await self._take_over_changes()
+                async with self._changing:
+                    changed = await asyncio.to_thread(self._look)
+                if changed:
+                    await self._take_over_changes()
             except RefreshRefusedError as error:
                 for failure in error.failures:
                     _logger.error(
@@ -259,12 +282,26 @@ class Runtime:
             except Exception:
                 _logger.exception("the service could not load the changes in the store")
 
+    def _wait(self) -> float:
+        """Return the time in seconds until the next poll. It grows while the store is unreachable.
+
+        The time is random within 10 %, so that replicas do not poll a remote store all at once.
+        """
+        self._failed_polls = 0 if self._store.error is None else self._failed_polls + 1
+        longer = 1 << min(self._failed_polls, _MAX_DOUBLINGS)
+        return self._poll * longer * random.uniform(0.9, 1.1)  # noqa: S311 # nosec B311
+
+    def _look(self) -> bool:
+        """Bring the local copy of the store up to date. Return whether its state has changed."""
+        self._store.sync()
+        return self._store.state() != self._seen
+
     @_counted("poll")
     async def _take_over_changes(self) -> None:
         """Serve the changes in the store, if every usable version and alias stays usable.
 
-        If a new version fails, the service lists it as refused. The other changes still take
-        effect.
+        If a new version fails, the service lists this version as refused and serves the other
+        changes.
 
         Raises:
             RefreshRefusedError: a usable version or alias would become unusable. The served models
@@ -274,18 +311,22 @@ class Runtime:
             await self._take_over(self.models.usable.__contains__)
 
     async def _take_over(self, matters: Callable[[str], bool]) -> ServedModels:
-        """Load the store and serve it.
+        """Load the state of the store and serve it.
 
         Args:
-            matters: function that returns whether a failure of this subject makes the service
-                refuse the new state.
+            matters: function from the name of an unusable entry (``name@version``, an alias or
+                "store") to True, if this failure makes the service refuse the new state.
 
         Raises:
             RefreshRefusedError: the service refused the new state.
         """
-        # The load runs in a thread, so that the old snapshot answers in the meantime.
+        # `_load` runs in a thread, so that the event loop can answer from the old snapshot.
         new = await asyncio.to_thread(self._load, self.models)
-        worse = [failure for subject, failure in new.failures.items() if matters(subject)]
+        worse = [
+            failure
+            for subject, failure in new.failures.items()
+            if matters(subject) and failure.reason != "revoked"
+        ]
         if worse:
             raise RefreshRefusedError(worse)
         self._serve(new)
@@ -299,7 +340,9 @@ class Runtime:
             _settle_memory()
 
     def _load(self, previous: ServedModels | None) -> ServedModels:
-        # The state is read before the files. So the next poll finds changes made during the load.
+        self._store.sync()
+        # Read the state before the files. So the next check of the store finds changes that other
+        # processes make during the load.
         self._seen = self._store.state()
         known = None if previous is None else previous.store
         with progress():
@@ -312,8 +355,10 @@ class Runtime:
         try:
             found = self.models.resolve(reference).reference
         except (ModelUnavailableError, NotReadyError):
-            raise ModelUnusableError("The service refused to load this version.") from None
-        # If the reference is a name without version, the alias follows the newest version.
+            raise ModelUnusableError(
+                f"The service refused to load {reference}; GET /models gives the reason."
+            ) from None
+        # If the reference is a name without a version, the alias follows the newest version.
         newest = reference == found.name
         return AliasTarget(name=found.name, version=None if newest else found.version)
 
@@ -327,7 +372,7 @@ def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
     try:
         return AliasTarget(name=name, version=version if at else None)
     except ValueError:
-        raise AliasConflictError("The value of expected is not a model or version.") from None
+        raise AliasConflictError("`expected` is not the name of a model or version.") from None
 
 
 def _refusal(error: StoreError) -> Exception:
@@ -351,12 +396,13 @@ def _names(keys: Iterable[Key]) -> list[str]:
 
 
 def _settle_memory() -> None:
-    """Exclude long-lived objects from garbage collection.
+    """Exclude long-lived objects from garbage collection, and release unused memory.
 
-    A full collection stops every thread for tens of milliseconds. The function first unfreezes all
-    objects, because the collector never frees frozen reference cycles of a replaced snapshot. If
-    the C library supports it, the function returns unused memory (about 30 MB after the load) to
-    the operating system.
+    A full collection of all objects would stop every thread for tens of milliseconds. So the
+    function freezes the objects of the current snapshot. It first unfreezes all objects, because
+    the collector never frees frozen reference cycles of a replaced snapshot. At the end, the
+    function returns unused memory (about 30 MB after the load) to the operating system, if the C
+    library supports this.
     """
     gc.unfreeze()
     if gc.isenabled():

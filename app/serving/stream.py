@@ -1,8 +1,8 @@
 """The scene of a stream and its answers. docs/stream.md describes the protocol.
 
-The service merges a valid message into the scene when it arrives. It refuses an invalid message and
-leaves the scene unchanged. It computes answers only for the newest scene, so a superseded update
-costs no computation. This module does not use WebSockets.
+The service merges a valid message into the scene when the message arrives. An invalid message
+leaves the scene unchanged. The service computes answers only for the newest scene, so a superseded
+update costs no computation. This module does not use WebSockets.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from app.serving.request import Request
 from scene_client.schemas import MissingOptions, OutliersOptions, SceneRequest
 from scene_client.stream_messages import Ask, MergedScene, SceneMessage, Update, Whole, object_id
 
-# Fields of a message that do not belong to the scene.
+# Fields of a message that are not fields of a scene request.
 _NOT_REQUESTED: Final = frozenset({"ask", "timeout_ms"})
 _DEFAULT_ASK: Final = Ask(missing=MissingOptions(), outliers=OutliersOptions())
 _BY_NAME: Final = {question.name: question for question in QUESTIONS}
@@ -31,11 +31,12 @@ _ASKED: Final = [_BY_NAME[name] for name in Ask.model_fields]
 
 
 class StreamScene:
-    """The scene of one stream and the number of its unanswered messages.
+    """The scene of one stream and the number of unanswered messages.
 
     Attributes:
-        seq: sequence number of the newest message in the scene, or 0 if only `open` has arrived.
-        pending: number of messages since the last answer.
+        seq: sequence number of the newest message that has changed the scene. It is 0 if only the
+            message `open` has arrived.
+        pending: number of accepted messages since the last answer.
     """
 
     def __init__(self) -> None:
@@ -45,7 +46,7 @@ class StreamScene:
 
     @property
     def timeout_ms(self) -> int | None:
-        """Time limit for an answer in milliseconds, or None if the client chose none."""
+        """Time limit of each answer in milliseconds. None means that the client set no limit."""
         timeout: int | None = self._scene.fields.get("timeout_ms")
         return timeout
 
@@ -58,7 +59,7 @@ class StreamScene:
         """
         faults = Faults()
         if isinstance(message, Whole | Update) and message.seq <= self.seq:
-            text = "must be greater than the seq of the newest accepted message"
+            text = "`seq` must be greater than the `seq` of the newest accepted message"
             faults.add(Reason.INVALID, ("seq",), text)
         for place, name in enumerate(message.remove if isinstance(message, Update) else ()):
             if name not in self._scene.objects:
@@ -85,9 +86,9 @@ class StreamScene:
             self.pending += 1
 
     async def answer(self, request: Request) -> tuple[Answer, dict[str, ServingError]]:
-        """Return the answer message about the newest scene, and the error of each failed question.
+        """Return the answer message about the newest scene, and the errors of failed questions.
 
-        The errors are a mapping from the name of the question to its error.
+        The second value maps the name of each failed question to its error.
         """
         seq, covered = self.seq, self.pending
         found, errors = await _answers(self._scene, request)
@@ -97,7 +98,7 @@ class StreamScene:
 
 
 def _request(scene: MergedScene, form: type[SceneRequest] = SceneRequest, **given: Any) -> Any:
-    """Return the scene as a request."""
+    """Return the merged scene as a request of the schema ``form``."""
     fields = {name: value for name, value in scene.fields.items() if name not in _NOT_REQUESTED}
     return form(objects=list(scene.objects.values()), **fields, **given)
 
@@ -105,15 +106,15 @@ def _request(scene: MergedScene, form: type[SceneRequest] = SceneRequest, **give
 def _in_message(
     error: RequestError, scene: MergedScene, places: Mapping[str, int], given: Set[str]
 ) -> RequestError:
-    """Convert the locations of errors from the merged scene to the message.
+    """Convert error locations in the merged scene to locations in the newest message.
 
-    A location starts with ``scene`` if the message does not contain the value.
+    If the message does not contain the invalid value, the location starts with ``scene``.
 
     Args:
         error: the errors with locations in the merged scene.
         scene: the merged scene.
-        places: maps the id of each object in the message to its index in the message.
-        given: names of the message's fields.
+        places: dictionary from the id of each object in the message to the index of this object.
+        given: names of the fields that the message contains.
     """
     names = list(scene.objects)
 
@@ -132,9 +133,10 @@ def _in_message(
 async def _answers(
     scene: MergedScene, request: Request
 ) -> tuple[dict[str, Answer], dict[str, ServingError]]:
-    """Return the answer of each question, as its route returns it, and the errors.
+    """Return the answers and the errors of the questions.
 
-    Both are mappings from the name of the question.
+    Both values are dictionaries from the name of a question. An answer has the form that the route
+    of its question returns.
     """
     ask = scene.fields.get("ask") or _DEFAULT_ASK
     asked = [question for question in _ASKED if getattr(ask, question.name) is not None]
@@ -180,7 +182,7 @@ class TokenBucket:
         self._at = monotonic()
 
     def take(self, count: float) -> float:
-        """Take ``count`` tokens and return the seconds to wait until they are available."""
+        """Take ``count`` tokens. Return the time in seconds until these tokens are available."""
         now = monotonic()
         self._tokens = min(self._burst, self._tokens + (now - self._at) * self._rate) - count
         self._at = now
@@ -202,7 +204,7 @@ class Streams:
 
     @property
     def is_full(self) -> bool:
-        """Whether the maximum number of streams is open."""
+        """Whether the number of open streams has reached its maximum."""
         return len(self._open) >= self.limit
 
     @contextmanager
@@ -210,7 +212,7 @@ class Streams:
         """Count a stream as open within the ``with`` block.
 
         Args:
-            end: function that asks the stream to end. It is called at most once.
+            end: function that asks the stream to end. `drain` calls the function at most once.
         """
         self._open.add(end)
         self._metrics.streams(len(self._open))

@@ -1,4 +1,4 @@
-"""Warm up models: each verified model answers every question before it gets requests."""
+"""Warm-up of models: each verified model answers every question before the service uses it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ _logger = logging.getLogger("app.serving")
 def prepare(
     store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels | None = None
 ) -> ServedModels:
-    """Warm up every verified model, and collect the models that can be served.
+    """Warm up every verified model. Return the models that can be served, and the failures.
 
-    A model that ``previous`` serves from the same artifact is already warm, and keeps its queue.
+    If ``previous`` already serves a model from the same artifact, the function skips the warm-up of
+    this model and keeps its queue.
     """
     served: dict[Key, ServedModel] = {}
     failures: dict[Key, Failure] = {}
@@ -40,7 +41,7 @@ def prepare(
         try:
             warm_up(artifact)
         except Exception:
-            # A broken model may raise any exception; the other models must still be served.
+            # A broken model may raise any exception. The service must still serve other models.
             subject = f"{key[0]}@{key[1]}"
             _logger.exception("the warm-up of model %s failed", subject)
             failures[key] = Failure(
@@ -57,8 +58,8 @@ def warm_up(artifact: Artifact) -> None:
     """Ask each question about three scenes: with relations, without relations, and with poses.
 
     Raises:
-        ValueError: a number of an answer is not finite.
-        Exception: any error of the model.
+        ValueError: an answer contains a number that is not finite.
+        Exception: any other error of the model.
     """
     related = _scene(artifact.vocabulary)
     bare = replace(related, relations=None)
@@ -70,7 +71,7 @@ def warm_up(artifact: Artifact) -> None:
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:
-    """A row of up to three objects; the third one is on top of the second."""
+    """Return a scene of up to three objects in a row. The third object is on top of the second."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
         SceneObject(str(place), vocabulary.labels[index], index, position=(1.0, 0.5 * place, 0.5))

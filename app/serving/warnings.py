@@ -12,10 +12,10 @@ from app.scene.scene import Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import SceneRequest, SceneWarning
 
-MOST_DISTANT: Final = 100.0  # m from the viewer; detects positions in millimetres
-SMALLEST, LARGEST = 1e-3, 20.0  # m, plausible sides of a box
-_SAME_DEPTH: Final = 1e-3  # m, maximum difference of depths that count as equal
-_LEAST_FLAT: Final = 3  # minimum number of objects; two objects may really have the same depth
+MOST_DISTANT: Final = 100.0  # maximum distance from the viewer in m; detects positions in mm
+SMALLEST, LARGEST = 1e-3, 20.0  # shortest and longest plausible side of a box, in m
+_SAME_DEPTH: Final = 1e-3  # maximum difference in m of depths that count as equal
+_LEAST_FLAT: Final = 3  # minimum number of objects for the warning flat-scene
 
 Code = Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"]
 
@@ -26,10 +26,11 @@ def scene_warnings(
     """Return the warnings about a scene.
 
     Args:
-        given: the scene in body axes of the request's frame.
-        scene: the same scene after `observe`, in viewer axes if the request has a viewpoint.
+        given: the scene in the request's frame, in axes of REP-103 (x forward, y left, z up).
+        scene: the same scene after `observe`, in the axes of the viewer if the request has a
+            viewpoint.
         vocabulary: classes of the model, with their typical sizes.
-        request: the request with the scene.
+        request: the request that contains the scene.
     """
     found: list[SceneWarning] = []
     sized = [thing for thing in scene.objects if thing.size is not None]
@@ -80,8 +81,8 @@ def _add(
 def _distant(given: Scene, request: SceneRequest) -> list[SceneObject]:
     """Return the objects that are too far from the viewer.
 
-    In a world-fixed frame without a viewpoint, the viewer is unknown. The median position of the
-    objects then replaces the position of the viewer.
+    In a world-fixed frame without a viewpoint, the position of the viewer is unknown. The median
+    position of the objects then replaces the position of the viewer.
     """
     placed = [(thing, thing.position) for thing in given.objects if thing.position is not None]
     centre: Point = (0.0, 0.0, 0.0)

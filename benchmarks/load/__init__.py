@@ -1,1 +1,1 @@
-"""Throughput and latency of the running service under load, compared with a plain FastAPI app."""
+"""Load test: throughput and latency of the service, compared with a minimal FastAPI app."""

@@ -1,4 +1,7 @@
-"""``python -m benchmarks.load``: load test of the service, compared with a plain FastAPI app."""
+"""``python -m benchmarks.load``: load test of the service, compared with a minimal FastAPI app.
+
+The minimal ("plain") app validates the same requests and returns prepared answers (plain.py).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ from benchmarks.report import describe_machine
 _MANY = 32
 _DRAWN = 8
 _QUANTILES = (0.5, 0.9, 0.99, 0.999)
-# Offered rate as a fraction of the service's rate at 32 connections, so below saturation.
+# Requests per second at fixed rate, as a fraction of the service's throughput at 32 connections.
+# The service is therefore not saturated.
 _SHARE = 0.5
 
 
@@ -34,17 +38,23 @@ AIMS = {
     ("12 labels", "/outliers"): 0.35,
     ("12 labels", "/missing"): 0.18,
 }
-"""Target rate as a fraction of the plain app's rate, at 32 connections."""
+"""Target throughput by kind of request and route, as a fraction of the plain app's throughput.
+
+Both are measured with 32 connections.
+"""
 
 
 def main(
     store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
-    seconds: Annotated[float, typer.Option(min=0.1, help="length of one window")] = 1.5,
+    seconds: Annotated[float, typer.Option(min=0.1, help="seconds per measurement")] = 1.5,
     kind: Annotated[list[str] | None, typer.Option(help="only these kinds of request")] = None,
-    json_path: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
+    json_path: Annotated[Path | None, typer.Option("--json", help="JSON file of results")] = None,
     plot: Annotated[Path | None, typer.Option(help="image file of latency distributions")] = None,
 ) -> None:
-    """Send the same requests to the service and to a plain FastAPI app until both are steady."""
+    """Send the same requests to the service and to a plain FastAPI app, and compare their speed.
+
+    The measurements are repeated until the rate and the latency of both are steady.
+    """
     console = Console(width=140)
     for key, value in describe_machine().items():
         console.print(f"{key}: {value}", highlight=False)
@@ -112,7 +122,7 @@ def _all(
 
 
 def _prepare_answer(ports: tuple[int, int], route: str, request: bytes) -> None:
-    """Give the plain app the service's answer to one request as its fixed answer."""
+    """Send one request to the service, and store the answer in the plain app for this route."""
     service, plain = ports
     _, _, body = request.partition(b"\r\n\r\n")
     headers = {"Content-Type": "application/json"}
@@ -128,7 +138,7 @@ def _line(c: Comparison) -> str:
 
 def _table(found: Sequence[Comparison]) -> Table:
     table = Table(
-        title="The service beside a plain FastAPI app (service / plain app; milliseconds)"
+        title="The service compared with a plain FastAPI app (service / plain app; milliseconds)"
     )
     for column in ("request", "load", "req/s", "ratio", "p50", "p90", "p99", "p99.9", "errors"):
         table.add_column(column, justify="left" if column in ("request", "load") else "right")

@@ -1,4 +1,4 @@
-"""Fast HTTP/1.1 client connections: they send prepared bytes and read status and body."""
+"""Fast HTTP/1.1 client connections. They send prepared requests and parse only status and body."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ def prepared(path: str, body: Any, headers: dict[str, str] | None = None) -> byt
 
 
 class Connection(asyncio.Protocol):
-    """One connection with at most one pending request.
+    """A connection with at most one pending request.
 
     Attributes:
-        on_answer: called with (this connection, status, body) after each complete answer; status 0
-            means that the connection broke.
+        on_answer: function that is called after each complete answer, with the connection, the
+            status and the body. Status 0 means that the connection broke.
+        busy: True while a request is pending.
     """
 
     def __init__(self, on_answer: Callable[[Connection, int, bytes], None]) -> None:
@@ -39,7 +40,7 @@ class Connection(asyncio.Protocol):
         self._received = b""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        # The transports of uvloop are not subclasses of asyncio's classes.
+        # A cast is necessary: the transports of uvloop are not subclasses of asyncio.Transport.
         self._transport = cast("asyncio.Transport", transport)
 
     def send(self, request: bytes) -> None:
@@ -71,7 +72,7 @@ class Connection(asyncio.Protocol):
             self.on_answer(self, 0, b"")
 
     def close(self) -> None:
-        """Close the connection; a pending request is lost."""
+        """Close the connection. The answer to a pending request is lost."""
         self.busy = False
         if self._transport is not None:
             self._transport.close()
@@ -80,7 +81,7 @@ class Connection(asyncio.Protocol):
 async def connect(
     port: int, count: int, on_answer: Callable[[Connection, int, bytes], None]
 ) -> list[Connection]:
-    """Open ``count`` connections to a port of this machine.
+    """Open ``count`` connections to a port on this machine.
 
     Raises:
         OSError: the connection was refused.

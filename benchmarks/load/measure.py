@@ -1,4 +1,7 @@
-"""Compare the service with a plain FastAPI app in alternating windows until both are steady."""
+"""Compare the service with a plain FastAPI app.
+
+A window is a period of load on one of the two. Windows alternate until both are steady.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import uvloop
 from benchmarks.load.windows import Window, at_concurrency, at_rate, joined
 
 Load: TypeAlias = Callable[[int, Sequence[bytes], float], Coroutine[Any, Any, Window]]
-"""Function of (port, requests, seconds) that returns a window."""
+"""Function that sends requests to a port for some seconds and returns the measured window."""
 
 _STEADY = 0.1
 _FEWEST, _MOST = 3, 10
@@ -23,10 +26,13 @@ class Comparison:
     """Results of the same requests to the service and to the plain app.
 
     Attributes:
-        kind, route, load: kind of request, route and load.
-        service, plain: all windows of each, joined.
-        ratios: ratio of the rates, one per pair of windows.
-        steady: True if the last three windows of both were within 10 % of their mean.
+        kind: kind of request, for example "12 labels".
+        route: path of the requests.
+        load: description of the load, for example "32 connections".
+        service: all windows of the service, joined into one window.
+        plain: all windows of the plain app, joined into one window.
+        ratios: rate of the service divided by the rate of the plain app, for each pair of windows.
+        steady: True if the service and the plain app were steady at the end, see `is_steady`.
     """
 
     kind: str
@@ -39,22 +45,22 @@ class Comparison:
 
     @property
     def rate_ratio(self) -> float:
-        """Median over windows of the service's rate divided by the plain app's rate."""
+        """Rate of the service divided by the rate of the plain app, as median over windows."""
         return median(self.ratios)
 
     @property
     def p99_ratio(self) -> float:
-        """p99 of the service divided by p99 of the plain app."""
+        """99th percentile of the service's latency divided by that of the plain app."""
         return self.service.quantile(0.99) / self.plain.quantile(0.99)
 
     @property
     def extra_p50(self) -> float:
-        """p50 of the service minus p50 of the plain app, in seconds."""
+        """Median latency of the service minus median latency of the plain app, in seconds."""
         return self.service.quantile(0.5) - self.plain.quantile(0.5)
 
 
 def concurrency(connections: int) -> Load:
-    """Return a load of this number of connections, each without pauses."""
+    """Return a load function with this number of connections, which send without pauses."""
 
     async def load(port: int, requests: Sequence[bytes], seconds: float) -> Window:
         return await at_concurrency(port, requests, connections, seconds)
@@ -63,7 +69,7 @@ def concurrency(connections: int) -> Load:
 
 
 def rate(a_second: float) -> Load:
-    """Return a load of this number of requests per second, independent of the answers."""
+    """Return a load function that sends requests at a fixed rate, without waiting for answers."""
 
     async def load(port: int, requests: Sequence[bytes], seconds: float) -> Window:
         return await at_rate(port, requests, a_second, seconds)
@@ -79,11 +85,13 @@ def compare(
     *,
     seconds: float,
 ) -> Comparison:
-    """Alternate windows until both are steady, at most ten times.
+    """Load the service and the plain app alternately until both are steady, at most ten times each.
 
     Args:
         ports: port of the service and port of the plain app.
-        names: kind, route and load.
+        requests: requests as bytes, sent in turn.
+        load: function that runs one window of load.
+        names: kind of request, route, and description of the load.
         seconds: length of one window.
     """
     found: tuple[list[Window], list[Window]] = ([], [])
@@ -101,7 +109,10 @@ def compare(
 
 
 def is_steady(windows: Sequence[Window]) -> bool:
-    """Return True if rate and p50 of the last three windows are within 10 % of their mean."""
+    """Return True if the rate and the median latency vary little over the last three windows.
+
+    Each value must be within 10 % of the mean of the three windows.
+    """
     last = windows[-_FEWEST:]
     for values in ([w.rate for w in last], [w.quantile(0.5) for w in last]):
         mean = sum(values) / len(values)

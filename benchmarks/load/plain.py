@@ -1,7 +1,7 @@
-"""``python -m benchmarks.load.plain PORT``: the yardstick, a plain FastAPI app.
+"""``python -m benchmarks.load.plain PORT``: a minimal FastAPI app as reference for the load test.
 
-The app validates the same requests with the same models and sends a prepared answer. It has no
-model, middleware, metrics or log.
+The app validates requests with the request models of the service and returns a prepared answer. It
+computes no answers, and has no middleware, metrics or log.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _answers: dict[str, bytes] = {}
 
 @app.put("/answers/{question}")
 async def prepare(question: str, request: Request) -> None:
-    """Store the body as the answer to a question."""
+    """Store the body of the request as the answer to all later requests of a question."""
     _answers[question] = await request.body()
 
 

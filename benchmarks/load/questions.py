@@ -1,4 +1,4 @@
-"""Requests of the load test: scenes of a dozen objects, all different, as bytes ready to send."""
+"""Requests of the load test, as bytes ready to send. Each has another scene of twelve objects."""
 
 from __future__ import annotations
 
@@ -12,28 +12,33 @@ from benchmarks.load.connections import prepared
 ROUTES = ("/missing", "/relations", "/outliers")
 KINDS = ("12 labels", "12 poses", "20 relations")
 SCENES = 64
-"""Number of scenes of a kind: more than connections, so that all pending requests differ."""
+"""Number of scenes per kind of request. It exceeds the number of connections, so that all pending
+requests differ."""
 
 _OBJECTS, _RELATIONS = 12, 20
 
 
 def bodies(kind: str, labels: Sequence[str], seed: int = 0) -> list[dict[str, Any]]:
-    """Return request bodies of one kind.
+    """Return the request bodies of one kind.
+
+    Args:
+        kind: one of `KINDS`.
+        labels: object labels to draw from.
 
     Raises:
-        ValueError: unknown kind.
+        ValueError: `kind` is unknown.
     """
     rng = np.random.default_rng(seed)
     return [_body(kind, labels, rng) for _ in range(SCENES)]
 
 
 def requests(kind: str, route: str, labels: Sequence[str]) -> list[bytes]:
-    """Return the requests of one kind as bytes."""
+    """Return the requests of one kind to a route, as bytes."""
     return [prepared(route, body) for body in bodies(kind, labels)]
 
 
 def drawings(labels: Sequence[str], count: int, seed: int = 0) -> list[bytes]:
-    """Return requests to generate ``count`` scenes with three given objects each, as bytes."""
+    """Return requests to /generate as bytes. Each asks for ``count`` scenes with three objects."""
     rng = np.random.default_rng(seed)
     return [
         prepared(

@@ -1,4 +1,4 @@
-"""Start the service and the plain FastAPI app, each in a process pinned to one core."""
+"""Start the service or the plain FastAPI app, each as a process on a fixed processor core."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 class ServerError(RuntimeError):
-    """A server ended, or it was not ready in time."""
+    """A server process ended, or the server was not ready in time."""
 
 
 @dataclass(frozen=True)
 class Server:
-    """A server that is ready.
+    """A server that is ready to answer.
 
     Attributes:
         port: port on 127.0.0.1.
         pid: process id.
-        seconds: time from the start of the process to the first status 200 of /health/ready.
+        seconds: time from the start of the process until /health/ready returns status 200.
     """
 
     port: int
@@ -38,20 +38,28 @@ class Server:
 
     @property
     def memory(self) -> int:
-        """Resident memory in bytes."""
+        """Resident memory of the process in bytes."""
         pages = Path(f"/proc/{self.pid}/statm").read_text("ascii").split()[1]
         return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
 def cores() -> tuple[set[int], set[int]]:
-    """Return the cores for servers and for the client; disjoint if two cores are available."""
+    """Return the processor cores for the servers and the cores for the client.
+
+    The two sets are disjoint if at least two cores are available.
+    """
     every = sorted(os.sched_getaffinity(0))
     return ({every[0]}, set(every[1:])) if len(every) > 1 else (set(every), set(every))
 
 
 @contextmanager
 def service(store: Path, **settings: str) -> Iterator[Server]:
-    """Run ``python -m app``; settings by name become SCENE_* variables."""
+    """Run the service (``python -m app``).
+
+    Args:
+        store: folder of the model store.
+        settings: further settings of the service. `name` sets the variable SCENE_NAME.
+    """
     port = free_port()
     variables = {"SCENE_STORE": str(store.resolve()), "SCENE_PORT": str(port)}
     variables |= {f"SCENE_{name.upper()}": value for name, value in settings.items()}
@@ -61,7 +69,7 @@ def service(store: Path, **settings: str) -> Iterator[Server]:
 
 @contextmanager
 def plain() -> Iterator[Server]:
-    """Run ``python -m benchmarks.load.plain``."""
+    """Run the plain app (``python -m benchmarks.load.plain``)."""
     port = free_port()
     with _running(["-m", "benchmarks.load.plain", str(port)], port, {}) as server:
         yield server
@@ -103,11 +111,11 @@ def _wait(process: subprocess.Popen[bytes], port: int, start: float) -> None:
     with httpx.Client(timeout=_PATIENCE) as client:
         while time.perf_counter() - start < _PATIENCE:
             if process.poll() is not None:
-                raise ServerError(f"a server ended with status {process.returncode}")
+                raise ServerError(f"the server ended with status {process.returncode}")
             try:
                 if client.get(f"http://127.0.0.1:{port}/health/ready").is_success:
                     return
             except httpx.TransportError:
                 pass
             time.sleep(0.005)
-    raise ServerError(f"a server was not ready within {_PATIENCE:.0f} s")
+    raise ServerError(f"the server was not ready within {_PATIENCE:.0f} s")

@@ -1,7 +1,9 @@
-"""Windows of load: a number of connections without pauses, or a number of requests per second.
+"""Run load on a server for a period of time (a window), and measure rate and latency.
 
-At a fixed rate, the latency of a request runs from its scheduled time, not from its sending time.
-So the delays that a stalled server causes count as latency (no coordinated omission).
+The load is a number of connections that send without pauses, or a fixed number of requests per
+second. At a fixed rate, the latency of a request runs from its scheduled time, not from its sending
+time. If the server stalls, delayed requests therefore count with their whole delay (no coordinated
+omission).
 """
 
 from __future__ import annotations
@@ -24,8 +26,8 @@ class Window:
 
     Attributes:
         seconds: length of the window.
-        latency: (N,) latency of each answer in seconds.
-        statuses: number of answers by status; status 0 means a broken connection.
+        latency: (answers,) latency of each answer in seconds.
+        statuses: number of answers by HTTP status. Status 0 means a broken connection.
     """
 
     seconds: float
@@ -39,16 +41,16 @@ class Window:
 
     @property
     def errors(self) -> int:
-        """Number of answers with another status."""
+        """Number of answers with another status than 200, and of broken connections."""
         return sum(self.statuses.values()) - self.statuses[200]
 
     def quantile(self, q: float) -> float:
-        """Quantile of the latency in seconds."""
+        """Return a quantile of the latency in seconds. `q` is between 0 and 1."""
         return float(np.quantile(self.latency, q)) if len(self.latency) else float("nan")
 
 
 def joined(windows: Sequence[Window]) -> Window:
-    """Join several windows into one."""
+    """Join the answers of several windows into one window."""
     return Window(
         sum(window.seconds for window in windows),
         np.concatenate([window.latency for window in windows]),
@@ -59,7 +61,7 @@ def joined(windows: Sequence[Window]) -> Window:
 async def at_concurrency(
     port: int, requests: Sequence[bytes], connections: int, seconds: float
 ) -> Window:
-    """Run a window in which each connection sends its next request right after an answer."""
+    """Run a window in which each connection sends its next request directly after an answer."""
     latency: list[float] = []
     statuses: Counter[int] = Counter()
     began: dict[Connection, float] = {}
@@ -97,13 +99,32 @@ async def at_concurrency(
 async def at_rate(
     port: int, requests: Sequence[bytes], rate: float, seconds: float, connections: int = 64
 ) -> Window:
-    """Run a window with requests at regular times, independent of earlier answers."""
+    """Run a window with a fixed number of requests per second, without waiting for answers.
+
+    Args:
+        rate: requests per second.
+        seconds: length of the window.
+        connections: number of connections. Requests wait if all connections are busy.
+    """
+    count = max(1, round(rate * seconds))
+    return await at_times(port, requests, np.arange(count) / rate, connections)
+
+
+async def at_times(
+    port: int, requests: Sequence[bytes], times: NDArray[np.float64], connections: int = 64
+) -> Window:
+    """Run a window with requests at given times, without waiting for answers.
+
+    Args:
+        times: times in seconds from the start of the window, ascending.
+        connections: number of connections. Requests wait if all connections are busy.
+    """
     latency: list[float] = []
     statuses: Counter[int] = Counter()
     due: dict[Connection, float] = {}
     waiting: deque[float] = deque()
     finished = asyncio.Event()
-    count = max(1, round(rate * seconds))
+    count = len(times)
     sent = answers = 0
 
     def send(connection: Connection, when: float) -> None:
@@ -127,8 +148,8 @@ async def at_rate(
     pool = await connect(port, connections, answered)
     free = list(pool)
     start = perf_counter()
-    for number in range(count):
-        when = start + number / rate
+    for time in times.tolist():
+        when = start + time
         while (pause := when - perf_counter()) > 0:  # noqa: ASYNC110 - a clock, not an event
             await asyncio.sleep(pause if pause > 0.002 else 0)
         if free:

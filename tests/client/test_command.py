@@ -158,7 +158,7 @@ def test_a_refusal_is_1_and_says_what_was_meant(scene: Any) -> None:
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (("missing",), "name the objects: labels"),
+        (("missing",), "the objects are missing: give labels"),
         (("missing", "bed", "--at", "over bed"), "--at must be a relation and an object"),
         (("missing", "bed", "--at", "nightstand"), '"on-top desk"'),
         (("missing", "bed", "--relation", "bed over lamp"), "--relation"),

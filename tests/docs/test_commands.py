@@ -45,7 +45,8 @@ def test_commands_exist(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_settings_exist(page: Path) -> None:
     known = {f"SCENE_{name.upper()}" for name in Settings.model_fields}
-    for module in (REPOSITORY / "clients" / "python" / "scene_client").glob("*.py"):
+    clients, registry = REPOSITORY / "clients/python/scene_client", REPOSITORY / "app/registry"
+    for module in (*clients.glob("*.py"), *registry.glob("*.py")):
         known |= set(re.findall(r"\"(SCENE_[A-Z_]+)\"", module.read_text(encoding="utf-8")))
     assert set(re.findall(r"\bSCENE_[A-Z_]+\b", page.read_text(encoding="utf-8"))) <= known
 

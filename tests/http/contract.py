@@ -57,7 +57,14 @@ def documented(examples: int) -> Any:
                         "checks": {
                             "negative_data_rejection": {"expected-statuses": [*negative, "200"]}
                         },
-                    }
+                    },
+                    # The valid key that `call` sends suffices, even beside an invalid bearer token.
+                    {
+                        "include-path": "/models/refresh",
+                        "checks": {
+                            "negative_data_rejection": {"expected-statuses": [*negative, "200"]}
+                        },
+                    },
                 ],
             }
         ),

@@ -67,7 +67,7 @@ def test_gain_neither_overflows_nor_cancels_at_the_corners(V, H1, weight, logit,
 def test_weights_that_are_not_finite_are_refused(value):
     W = torch.zeros(2, 3)
     W[1, 2] = value
-    with pytest.raises(ValueError, match="W must be finite"):
+    with pytest.raises(ValueError, match="weights must be finite"):
         ContextScorer(W.numpy())
 
 

@@ -105,7 +105,7 @@ def test_what_was_loaded_before_is_verified_again(file: str, store: Store) -> No
     path.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
     broken = load_model_set(store, first)
     assert broken.entries["tiny", "2.0.0"] == ArtifactFailure(
-        "checksum_mismatch", f"{file} does not match its checksum"
+        "checksum_mismatch", f"{file} does not match its checksum: the file was altered"
     )
     path.write_bytes(good)
     assert load_model_set(store, broken).resolve("tiny").digest == first.resolve("tiny").digest
@@ -183,7 +183,9 @@ def test_one_unreadable_folder_does_not_take_the_others_down(
     monkeypatch.setattr(Path, "iterdir", deny)
     models = load_model_set(store)
     assert models.failure is not None
-    assert models.failure.reason == "model 'other': Permission denied"
+    assert models.failure.reason == (
+        "the folder of model 'other' cannot be read: Permission denied"
+    )
     assert models.ready
     with pytest.raises(StoreError) as refused:
         models.resolve("other")

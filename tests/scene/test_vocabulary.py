@@ -88,7 +88,7 @@ def test_two_classes_cannot_share_a_name() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({}, "list 'objects'"),
+        ({}, "the field 'objects'"),
         ({"objects": []}, "at least one object class"),
         ({"objects": ["bed"]}, "mapping with a string 'label'"),
         ({"objects": [{"label": ""}]}, "empty name"),

@@ -144,6 +144,7 @@ def test_the_store_is_one_volume_where_the_image_keeps_its_models(
     stages: dict[str, list[Instruction]], compose: dict[str, Any]
 ) -> None:
     store = compose["services"]["scene"]["environment"]["SCENE_STORE"]
+    store = store.removeprefix("${SCENE_STORE:-").removesuffix("}")
     assert f"SCENE_STORE={store}" in " ".join(arguments(stages["runtime"], "ENV"))
     for service in built(compose):
         assert f"models:{store}" in service["volumes"]

@@ -124,10 +124,10 @@ def test_from_rooms_to_answers(tmp_path, variant):
     ("arguments", "message"),
     [
         (("train", "nowhere.toml"), "no configuration"),
-        (("train", "indoor-triway", "--data", "nowhere"), "name its folder with --data"),
+        (("train", "indoor-triway", "--data", "nowhere"), "pass the folder of this file"),
         (("publish", "nowhere", "1.0.0"), "no finished run"),
         (("evaluate", "nowhere", "--store", "nowhere"), "error"),
-        (("compare", "nowhere"), "must be a finished run or a model"),
+        (("compare", "nowhere"), "names neither the folder of a finished run nor a model"),
         (("compare", "baselines"), "first model must be trained"),
     ],
 )

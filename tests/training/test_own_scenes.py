@@ -125,7 +125,7 @@ def test_the_same_again_is_not_worse_and_may_take_its_place(workplace) -> None:
     assert comparison["b"].startswith("my-lab@1.0.0")
     assert {row["verdict"] for row in comparison["differences"]} == {"undecided"}
     assert {row["figure"]["value"] for row in comparison["differences"]} == {0.0}
-    assert "Most different answers" not in output
+    assert "Questions with the most different answers" not in output
     output = workplace.publish(workplace.run, "1.0.1", "--promote")
     assert "promoted: default → my-lab@1.0.1, before my-lab@1.0.0" in output
 

@@ -1,9 +1,9 @@
 """Baselines that the benchmark trains on the same scenes as the models.
 
-The baselines treat a class that a source never mentions as absent from the scenes of this source.
-Our training objective does the same. If such classes are left out of the fit, the validation MRR of
-the baselines falls: EASE .398 to .381, denoising autoencoder .397 to .335, popularity .152 to .145.
-The reason is that a score does not know the source and has to rank all classes.
+A class that a data source never mentions counts as absent in all scenes of this source, as in our
+training objective. If the fit leaves such classes out, the validation MRR (mean reciprocal rank)
+falls: from .398 to .381 for EASE, from .397 to .335 for the denoising autoencoder, and from .152 to
+.145 for popularity. The reason is that a score must rank all classes without knowing the source.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from training.baselines.fitting import Baseline, Fitted, Trial
 from training.evaluation.missing import PlacedScore
 
 RELATIONS: Final = ("relations", "placement")
-"""Fields of `Contender` that hold a relation score without observed relations."""
+"""Fields of `Contender` for relation scores that use no observed relations."""
 
 _EVERY: tuple[Baseline[Any], ...] = (
     Baseline("popularity", objects.popularity),
@@ -61,13 +61,16 @@ _EVERY: tuple[Baseline[Any], ...] = (
 )
 
 BASELINES: Final[dict[str, Baseline[Any]]] = {entry.name: entry for entry in _EVERY}
-"""Baselines by row name."""
+"""Maps the row name of each baseline in the result tables to the baseline."""
 
 PLACED: Final = BASELINES["frequency table p(i | a, j)"]
 
 
 def placed_product(name: str, score: Any, table: Any) -> Baseline[PlacedScore]:
-    """Return a baseline of task T2-at: an object score times the table of `PLACED`, both fitted."""
+    """Return a baseline for task T2-at (objects at a place).
+
+    Its score is the product of a fitted object score and the fitted table of `PLACED`.
+    """
     propose = relations.times(score, table)
     return Baseline(f"{PLACED.name} × {name}", propose, fitting.placed_mrr, ("placed",))
 

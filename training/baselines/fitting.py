@@ -1,9 +1,10 @@
 """Common interface of all baselines: fit on training scenes, select on validation scenes.
 
-A baseline is a generator. It fits on the training part and yields (parameters, score) for each
-point of its hyperparameter grid. A network also yields a grid point for each candidate epoch.
-`Baseline.fit` evaluates each score on the validation part by the primary metric of its task, pooled
-over sources. The generator never sees the validation part. `Fitted` keeps all trials.
+A baseline is a generator function. It fits a model on the training scenes for each point of a
+hyperparameter grid, and yields pairs (parameters, score). A neural network yields a pair for each
+candidate number of epochs. `Baseline.fit` evaluates each score on the validation scenes of all data
+sources together, by the primary metric of the task. The generator function never sees the
+validation scenes. `Fitted` contains the results of all grid points.
 """
 
 from __future__ import annotations
@@ -35,12 +36,13 @@ Proposals: TypeAlias = Iterator[tuple[Parameters, Score]]
 
 @dataclass(frozen=True)
 class Trial:
-    """One point of a grid.
+    """The result of one point of a hyperparameter grid.
 
     Attributes:
-        parameters: the grid point.
-        validation: metric on the validation part.
-        seconds: wall time of fit and evaluation. Work done for earlier grid points is not included.
+        parameters: hyperparameters of the grid point.
+        validation: metric on the validation scenes.
+        seconds: wall time of fit and evaluation in seconds. Work that was already done for earlier
+            grid points is not included.
     """
 
     parameters: Parameters
@@ -50,53 +52,66 @@ class Trial:
 
 @dataclass(frozen=True)
 class Fitted(Generic[Score]):
-    """The score of the best trial, and all trials in order. On a tie, the first trial is best."""
+    """The score of the best grid point, and the trials of all grid points in order.
+
+    If two grid points have the same metric, the first is the best.
+    """
 
     score: Score
     trials: tuple[Trial, ...]
 
 
 def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """Return the mean reciprocal rank (MRR) of removed objects, task T2."""
+    """Return the mean reciprocal rank (MRR) of removed objects (task T2)."""
     return leave_one_out(scenes, structure, score).mrr().value
 
 
 def partial_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """Return the MRR of the hidden half of every scene, task T2 partial."""
+    """Return the mean reciprocal rank (MRR) of hidden objects (task T2 partial).
+
+    Half of the objects of each scene are hidden.
+    """
     return rank_hidden(hide(scenes, structure, 0.5), structure, score)[0].value
 
 
 def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
-    """Return the MRR of removed objects with one known relation, task T2-at."""
+    """Return the mean reciprocal rank (MRR) of removed objects at a known place (task T2-at).
+
+    The place is one relation of the removed object to another object.
+    """
     return leave_one_out_at(scenes, structure, score)[0].mrr().value
 
 
 def r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
-    """Return the R-precision of relations with known instance counts, task T1a."""
+    """Return the R-precision of relations, given the instance counts of classes (task T1a)."""
     return rank_relations(scenes, structure, score).pooled().value
 
 
 def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
-    """Return the R-precision on the half of the relations that is not given, task T1b."""
+    """Return the R-precision of half of the relations, given the other half (task T1b)."""
     return rank(complete_scenes(scenes, structure, score), len(scenes)).pooled().value
 
 
 def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDensity) -> float:
-    """Return the mean log-likelihood of the objects in nats, with the upper estimate of log Z."""
+    """Return the mean log-likelihood of the objects of a scene in nats.
+
+    The function uses the upper estimate of log Z, so the result is a lower estimate.
+    """
     return float(density.log_unnormalised(scenes.v).double().mean()) - density.upper
 
 
 @dataclass(frozen=True)
 class Baseline(Generic[Score]):
-    """One baseline, a row of a table.
+    """One baseline, shown as one row of a result table.
 
     Attributes:
         name: name of the row.
-        propose: generator function of (training scenes, structure classes (V,) bool, seed). It
-            yields (parameters, score) for each trial.
-        judge: function of (validation scenes, structure classes, score). It returns the metric;
-            higher is better.
-        scores: fields of `Contender` that the score fills.
+        propose: generator function that yields (parameters, score) for each grid point. Its
+            arguments are the training scenes, a mask of structure classes, (classes,) bool, and a
+            seed.
+        judge: function that returns the metric of a score; higher is better. Its arguments are the
+            validation scenes, the mask of structure classes and the score.
+        scores: fields of `Contender` for which the score is used.
         stochastic: True if the fit depends on the seed.
     """
 
@@ -120,23 +135,32 @@ class Baseline(Generic[Score]):
         seed: int = 0,
         progress: Callable[[str], None] = lambda _: None,
     ) -> Fitted[Score]:
-        """Fit on the training part and select on the validation part.
+        """Fit on training scenes, and select the best grid point on validation scenes.
 
         Args:
-            structure: (V,) bool; structure classes are evidence only, never candidates.
+            train: training scenes.
+            validation: validation scenes.
+            structure: True for structure classes such as walls, (classes,) bool. Structure classes
+                are evidence, and are never ranked.
+            seed: seed of the fit.
+            progress: function that is called with a message after each grid point.
 
         Raises:
-            ValueError: shapes disagree, or the training or validation scenes are unusable.
-            FloatingPointError: the metric of a trial is NaN.
+            ValueError: the numbers of classes differ, or scenes needed for fit or metric are
+                missing.
+            FloatingPointError: the metric of a grid point is NaN.
         """
         V = train.v.shape[1]
         if validation.v.shape[1] != V or structure.shape != (V,):
             raise ValueError(
-                f"training scenes have {V} classes, validation scenes {validation.v.shape[1]}, "
-                f"and structure has shape {tuple(structure.shape)}"
+                f"the numbers of classes differ: training scenes have {V} classes, validation "
+                f"scenes have {validation.v.shape[1]}, and structure has shape "
+                f"{tuple(structure.shape)}"
             )
         if not train.v.any():
-            raise ValueError(f"the {len(train)} training scenes contain no objects")
+            raise ValueError(
+                f"the {len(train)} training scenes contain no objects; a baseline needs objects"
+            )
         trials: list[Trial] = []
         chosen: list[Score] = []
         highest = -math.inf
@@ -144,7 +168,10 @@ class Baseline(Generic[Score]):
         for parameters, score in self.propose(train, structure, seed):
             figure = self.judge(validation, structure, score)
             if math.isnan(figure):
-                raise FloatingPointError(f"{self.name}: the metric of {dict(parameters)} is NaN")
+                raise FloatingPointError(
+                    f"{self.name}: the validation metric with {dict(parameters)} is NaN; leave "
+                    "this grid point out"
+                )
             if figure > highest:
                 highest, chosen = figure, [score]
             now = time.perf_counter()

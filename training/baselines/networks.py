@@ -17,14 +17,14 @@ from training.baselines.objects import frequency
 from training.batches import SceneTensors
 from training.evaluation.missing import ObjectScore
 
-# Training of both networks: predict a removed class among all absent classes.
+# Both networks learn to predict a removed class among all absent classes.
 #
-# One present class of each scene is removed as the target. Each other class is also hidden with a
-# probability that is drawn per scene (the noise). The loss is the cross-entropy of the target under
-# a softmax over the absent classes. This is a multinomial likelihood as in D. Liang et al.,
-# "Variational Autoencoders for Collaborative Filtering", WWW 2018. Optimiser: AdamW with one
+# One present class of each scene is removed as the target. Each other class is also hidden, with a
+# probability (the noise) that is drawn for each scene. The loss is the cross-entropy of the target
+# under a softmax over the absent classes. This is a multinomial likelihood as in D. Liang et al.,
+# "Variational Autoencoders for Collaborative Filtering", WWW 2018. The optimiser is AdamW with one
 # learning-rate cycle and an exponential moving average of the weights. Several late epochs are
-# candidates, so that selection on the validation part acts as early stopping.
+# candidates, so that selection on validation scenes has the effect of early stopping.
 
 
 _AVERAGING = 0.998
@@ -33,14 +33,15 @@ _WARM_UP = 0.1
 
 @dataclass(frozen=True)
 class Course:
-    """Training settings.
+    """Settings of the training of a network.
 
     Attributes:
-        epochs, batch_size: number of epochs, scenes per batch.
-        learning_rate: peak learning rate of the cycle.
+        epochs: number of epochs.
+        batch_size: number of scenes in a batch.
+        learning_rate: maximum learning rate of the cycle.
         weight_decay: weight decay of AdamW.
-        noise: maximum probability of hiding a class that is not the target.
-        offers: candidate epochs, as shares of the number of epochs.
+        noise: maximum probability with which a class other than the target is hidden.
+        offers: epochs at which the network becomes a candidate, as shares of `epochs`.
     """
 
     epochs: int
@@ -53,11 +54,11 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class NetworkScore:
-    """The score log p(i): a softmax over all absent classes except structure classes.
+    """The score log p(i) of each class i, from a softmax over absent non-structure classes.
 
     Attributes:
-        network: maps presence (B, V) to logits (B, V).
-        structure: (V,) bool, True for structure classes.
+        network: network from presence, (scenes, classes), to logits of the same shape.
+        structure: True for structure classes such as walls, (classes,) bool.
     """
 
     network: nn.Module
@@ -70,7 +71,13 @@ class NetworkScore:
 
     @torch.no_grad()
     def __call__(self, v: Tensor) -> Tensor:
-        """Return scores (B, V) for presence (B, V); -inf for present and structure classes."""
+        """Return the score of each class, (scenes, classes).
+
+        Present classes and structure classes have the score -inf.
+
+        Args:
+            v: presence of each class, (scenes, classes).
+        """
         values: Tensor = self.network(v)
         return values.masked_fill((v > 0) | self.structure, -torch.inf).log_softmax(1)
 
@@ -78,18 +85,25 @@ class NetworkScore:
 def train_network(
     network: nn.Module, v: Tensor, structure: Tensor, course: Course, seed: int
 ) -> Iterator[tuple[int, NetworkScore]]:
-    """Train a network; yield (epoch, score of the averaged network) at the candidate epochs.
+    """Train a network. At each candidate epoch, yield the epoch and the score of averaged weights.
 
     Args:
-        network: presence (B, V) -> unnormalised log-probabilities (B, V).
-        v: (N, V) presence; scenes with structure classes only are left out.
+        network: network from presence, (scenes, classes), to logits of the same shape.
+        v: presence in the training scenes, (scenes, classes). Scenes that contain only structure
+            classes are left out.
+        structure: True for structure classes such as walls, (classes,) bool.
+        course: settings of the training.
+        seed: seed of the random choices.
 
     Raises:
-        ValueError: every scene consists of structure classes only.
+        ValueError: every scene contains only structure classes.
     """
     v = v[(v * ~structure).any(1)]
     if not len(v):
-        raise ValueError("every scene consists of structure classes only: no class can be removed")
+        raise ValueError(
+            "every training scene contains only structure classes; training needs scenes with "
+            "other classes"
+        )
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=course.learning_rate, weight_decay=course.weight_decay
     )
@@ -100,7 +114,7 @@ def train_network(
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(_AVERAGING))
     offers = {max(1, round(share * course.epochs)) for share in course.offers}
     for epoch in range(1, course.epochs + 1):
-        # Dropout uses the global generator. The fork restores the generator's state afterwards.
+        # Dropout uses the global random generator. The fork restores its state after the block.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed * 1_000_003 + epoch)
             network.train()
@@ -115,9 +129,10 @@ def train_network(
 
 
 def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float) -> Tensor:
-    """Return the mean cross-entropy of one removed class per scene.
+    """Return the cross-entropy of a removed class, averaged over scenes.
 
-    The global random generator draws the removed and the hidden classes.
+    One class of each scene is removed. The global random generator draws the removed class and the
+    hidden classes.
     """
     target = torch.multinomial(v * ~structure, 1)
     left = v.scatter(1, target, 0.0)
@@ -140,7 +155,10 @@ _HEAVY = replace(_AUTOENCODER, noise=1.0)
 
 
 def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
-    """Build layers V -> width -> width -> V; log class frequencies initialise the output bias."""
+    """Return an untrained autoencoder with two hidden layers of `width` units.
+
+    The logs of the class frequencies in v, (scenes, classes), initialise the output bias.
+    """
     V = v.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -158,7 +176,7 @@ def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Se
 def autoencoder(
     train: SceneTensors, structure: Tensor, seed: int, course: Course = _AUTOENCODER
 ) -> Proposals[ObjectScore]:
-    """Yield a score for each dropout rate and number of epochs."""
+    """Yield the score of an autoencoder for each dropout rate and number of epochs."""
     for dropout in _HIDDEN_DROPOUT:
         network = build_autoencoder(train.v, _HIDDEN, dropout, seed)
         for epoch, score in train_network(network, train.v, structure, course, seed):
@@ -168,16 +186,19 @@ def autoencoder(
 def autoencoder_for_parts(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[ObjectScore]:
-    """Yield scores of autoencoders trained with up to all other classes hidden."""
+    """Yield scores of autoencoders that are trained with high noise.
+
+    In a training scene, up to all classes except the target can be hidden.
+    """
     return autoencoder(train, structure, seed, _HEAVY)
 
 
-# Masked transformer: the classes of a scene are tokens, and one query token predicts the removed
+# Masked transformer. The classes of a scene are tokens, and one query token predicts the removed
 # class.
 #
-# A. Vaswani et al., "Attention is all you need", NeurIPS 2017. Masking as in J. Devlin et al.,
-# "BERT", NAACL 2019. A set has no order, so there are no position embeddings. `train_network`
-# trains the network.
+# Sources: A. Vaswani et al., "Attention is all you need", NeurIPS 2017; J. Devlin et al., "BERT",
+# NAACL 2019, for masking. The classes of a scene have no order, so the network has no position
+# embeddings. `train_network` trains the network.
 
 
 _WIDTH, _HEADS, _LAYERS = 64, 4, 2
@@ -186,11 +207,14 @@ _TRANSFORMER = Course(epochs=20, learning_rate=5e-3, weight_decay=0.05, noise=0.
 
 
 class SetTransformer(nn.Module):
-    """Transformer: presence (B, V) -> unnormalised log-probabilities (B, V) of the removed class.
+    """A transformer that predicts the removed class of a scene.
 
     Args:
-        popularity: (V,) share of scenes with each class; its log initialises the output bias.
-        width, heads, layers: sizes of the encoder; its feed-forward part is twice as wide.
+        popularity: share of scenes with each class, (classes,). The log of this share initialises
+            the output bias.
+        width: width of the encoder. Its feed-forward part is twice as wide.
+        heads: number of attention heads.
+        layers: number of layers of the encoder.
         dropout: dropout rate of the encoder.
     """
 
@@ -200,7 +224,7 @@ class SetTransformer(nn.Module):
         super().__init__()
         V = len(popularity)
         self.classes = V
-        # Token V is the query, token V + 1 is padding.
+        # Token V is the query token. Token V + 1 is padding.
         self.embedding = nn.Embedding(V + 2, width)
         layer = nn.TransformerEncoderLayer(
             width, heads, 2 * width, dropout, activation="gelu", batch_first=True, norm_first=True
@@ -209,11 +233,14 @@ class SetTransformer(nn.Module):
             layer, layers, norm=nn.LayerNorm(width), enable_nested_tensor=False
         )
         self.bias = nn.Parameter(popularity.log())
-        # Small initial values, because the embeddings also give the output logits.
+        # The initial values are small, because the embeddings are also weights of the output.
         nn.init.normal_(self.embedding.weight, std=width**-0.5)
 
     def forward(self, v: Tensor) -> Tensor:
-        """Return the logits from the query token."""
+        """Return the logits of the removed class, (scenes, classes), for presence v.
+
+        The output of the query token determines the logits.
+        """
         most = int((v > 0).sum(1).max())
         present, token = v.topk(most, dim=1)
         token = torch.where(present > 0, token, self.classes + 1)
@@ -225,7 +252,7 @@ class SetTransformer(nn.Module):
 
 
 def transformer(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Yield a score for each dropout rate and number of epochs."""
+    """Yield the score of a transformer for each dropout rate and number of epochs."""
     for dropout in _DROPOUT:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)

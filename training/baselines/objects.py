@@ -1,4 +1,4 @@
-"""Object baselines: closed forms, counts, and the RBM of scikit-learn."""
+"""Baselines for objects: class counts, linear and pairwise models, and scikit-learn's RBM."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from training.evaluation.density import DensitySettings, ObjectDensity, ising_de
 from training.evaluation.missing import MachineScore, ObjectScore
 from training.machines import BoltzmannMachine, MachineSpec, build
 
-# Scores that are linear in the presence of the other classes.
+# Linear scores: the score of a class is linear in the presence of the other classes.
 
 
 @dataclass(frozen=True, eq=False)
 class LinearScore:
-    """The linear score bias + v · weights.
+    """The linear score bias + v · weights of each class.
 
     Attributes:
-        bias: (V,).
-        weights: (V, V), row = present class, column = scored class; the diagonal is zero.
+        bias: bias of each class, (classes,).
+        weights: weights from a present class (row) to the scored class (column), (classes,
+            classes). The diagonal is zero.
 
     Raises:
-        ValueError: shapes disagree, or the diagonal is not zero.
+        ValueError: the shapes of bias and weights do not match, or the diagonal is not zero.
     """
 
     bias: Tensor
@@ -37,43 +38,45 @@ class LinearScore:
     def __post_init__(self) -> None:
         V = len(self.bias)
         if self.weights.shape != (V, V):
-            raise ValueError(f"weights must be ({V}, {V}), not {tuple(self.weights.shape)}")
+            raise ValueError(
+                f"the shape of weights must be ({V}, {V}), not {tuple(self.weights.shape)}"
+            )
         if self.weights.diagonal().any():
             raise ValueError("the diagonal of the weights must be zero")
 
     @property
     def parameter_count(self) -> int:
-        """Number of weights that are not zero."""
+        """Number of biases and of weights that are not zero."""
         return len(self.bias) + int(self.weights.count_nonzero())
 
     def __call__(self, v: Tensor) -> Tensor:
-        """Return scores (B, V) for presence (B, V)."""
+        """Return the score of each class for presence v, both (scenes, classes)."""
         return self.bias + v @ self.weights
 
 
-# Frequency of each class.
+# Class frequencies.
 
 
 def frequency(v: Tensor) -> Tensor:
-    """Return the share of scenes with each class (V,).
+    """Return the share of scenes with each class, (classes,).
 
-    The share is smoothed: half a scene with the class and half a scene without it are added.
+    The share is smoothed: half a scene with the class and half a scene without the class are added.
     """
     return (v.sum(0) + 0.5) / (len(v) + 1.0)
 
 
 def popularity(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Yield the log-odds of the class frequencies, the only grid point."""
+    """Yield a single score: the log-odds of the class frequencies."""
     V = train.v.shape[1]
     yield {}, LinearScore(frequency(train.v).logit(), torch.zeros(V, V))
 
 
-# Co-occurrence: Bernoulli naive Bayes over the other classes that are present.
+# Co-occurrence: Bernoulli naive Bayes, with the present classes as evidence.
 #
 #     log-odds of i = logit p(i) + t · sum_{j present} log p(j | i) / p(j | not i)
 #
-# Only present classes are evidence, because annotators do not mention every object. The formula
-# counts classes that occur together as independent evidence. The exponent t < 1 corrects this.
+# Absent classes are no evidence, because annotators do not mention every object. The formula treats
+# classes that often occur together as independent evidence. A factor t < 1 corrects for this.
 
 
 _SMOOTHING = (10.0, 100.0, 300.0)
@@ -81,10 +84,14 @@ _EXPONENTS = (0.2, 0.3, 0.5, 1.0)
 
 
 def evidence(v: Tensor, smoothing: float) -> Tensor:
-    """Return log p(j | i) / p(j | not i) as (V, V) [j, i], with a zero diagonal.
+    """Return log p(j | i) / p(j | not i) for present class j and scored class i.
+
+    The result has j as row and i as column, (classes, classes). The diagonal is zero.
 
     Args:
-        smoothing: number of average scenes added to the scenes with i, and to the scenes without i.
+        v: presence in the training scenes, (scenes, classes).
+        smoothing: number of average scenes that are added to the scenes with i, and to the scenes
+            without i.
     """
     both, count, scenes = v.T @ v, v.sum(0), len(v)
     average = frequency(v).unsqueeze(1) * smoothing
@@ -94,7 +101,7 @@ def evidence(v: Tensor, smoothing: float) -> Tensor:
 
 
 def naive_bayes(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Yield a score for each smoothing and exponent."""
+    """Yield a score for each smoothing and each factor t."""
     bias = frequency(train.v).logit()
     for smoothing in _SMOOTHING:
         weights = evidence(train.v, smoothing)
@@ -103,12 +110,13 @@ def naive_bayes(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposal
             yield parameters, LinearScore(bias, exponent * weights)
 
 
-# kNN over scenes: the classes of the training scenes most similar to the query.
+# kNN over scenes. The neighbours are the k training scenes that are most similar to the query.
 #
 #     p(i) = (sum of the votes of the neighbours that have i + share of all scenes with i)
-#            / (sum of votes + 1),    scored as its logit
+#            / (sum of all votes + 1)
 #
-# The vote of a neighbour is (its cosine / cosine of the nearest scene) ** sharpness.
+# The score is the logit of p(i). The vote of a neighbour is (cosine similarity of the neighbour /
+# cosine similarity of the nearest neighbour) ** sharpness.
 
 
 _NEIGHBOURS = (100, 200)
@@ -116,12 +124,12 @@ _SHARPNESS = (2.0, 4.0, 8.0, 12.0)
 
 
 def nearest_score(v: Tensor, *, neighbours: int, sharpness: float) -> ObjectScore:
-    """Return a score: presence (B, V) -> log-odds (B, V).
+    """Return a score function from presence to log-odds, both (scenes, classes).
 
     Args:
-        v: (N, V) training scenes.
-        neighbours: k.
-        sharpness: exponent of the cosine ratio in a vote.
+        v: presence in the training scenes, (training scenes, classes).
+        neighbours: number k of neighbours.
+        sharpness: exponent of the ratio of cosine similarities in a vote.
     """
     popularity = frequency(v)
     index = normalize(v, dim=1).T.contiguous()
@@ -129,7 +137,7 @@ def nearest_score(v: Tensor, *, neighbours: int, sharpness: float) -> ObjectScor
     def score(query: Tensor) -> Tensor:
         cosine = normalize(query, dim=1) @ index
         near, place = cosine.topk(min(neighbours, len(v)), dim=1)
-        # The vote is 0 for a scene without common classes, and for an empty query.
+        # The vote of a training scene without a class of the query is 0.
         vote = (near / near[:, :1].clamp(min=1e-6)) ** sharpness
         share = embedding_bag(place, v, per_sample_weights=vote, mode="sum") + popularity
         return (share / (vote.sum(1, keepdim=True) + 1.0)).logit()
@@ -138,19 +146,19 @@ def nearest_score(v: Tensor, *, neighbours: int, sharpness: float) -> ObjectScor
 
 
 def nearest(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Yield a score for each number of neighbours and sharpness."""
+    """Yield a score for each number of neighbours and each sharpness."""
     for k in _NEIGHBOURS:
         for power in _SHARPNESS:
             score = nearest_score(train.v, neighbours=k, sharpness=power)
             yield {"neighbours": k, "sharpness": power}, score
 
 
-# EASE, the linear item model in closed form.
+# EASE, a linear model between classes with a closed form.
 #
-# H. Steck, "Embarrassingly Shallow Autoencoders for Sparse Data", WWW 2019, equation 8. With
-# P = (X'X + λI)⁻¹, the least-squares weights without a diagonal are -P[j,i] / P[i,i]. Here X is
-# centred, which is equivalent to a regression with a free intercept. Recommender libraries offer
-# EASE without the intercept and only with their own data sets and trainers.
+# Source: H. Steck, "Embarrassingly Shallow Autoencoders for Sparse Data", WWW 2019, equation 8. X
+# is the matrix of presence, (scenes, classes). With P = (X'X + λI)⁻¹, the least-squares weights
+# with zero diagonal are -P[j,i] / P[i,i]. Here X is centred, which is equivalent to a free
+# intercept. Recommender libraries implement EASE without an intercept.
 
 
 _EASE_L2 = (10.0, 30.0, 100.0, 300.0)
@@ -160,8 +168,8 @@ def fit_ease(v: Tensor, l2: float) -> LinearScore:
     """Fit a ridge regression of every class on all other classes.
 
     Args:
-        v: (N, V) presence.
-        l2: λ > 0.
+        v: presence in the training scenes, (scenes, classes).
+        l2: ridge penalty λ, above 0.
     """
     mean = v.double().mean(0)
     centred = v.double() - mean
@@ -173,38 +181,38 @@ def fit_ease(v: Tensor, l2: float) -> LinearScore:
 
 
 def ease(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Yield a score for each L2 penalty."""
+    """Yield a score for each ridge penalty."""
     for l2 in _EASE_L2:
         yield {"l2": l2}, fit_ease(train.v, l2)
 
 
 # Pairwise logistic model: an Ising model of classes, fitted by pseudo-likelihood.
 #
-# J. Besag, "Statistical analysis of non-lattice data", The Statistician 24 (1975). Maximise over
-# the training set
+# Source: J. Besag, "Statistical analysis of non-lattice data", The Statistician 24 (1975). The fit
+# maximises this function, with the sum over training scenes and classes i:
 #
 #     sum log p(v_i | others) - l2/2 · sum_{i<j} W[i,j]²,
 #     logit p(v_i = 1 | others) = b_i + sum_j W[i,j] v_j,    W symmetric with zero diagonal.
 #
-# The problem is convex; L-BFGS solves it.
+# The problem is convex. L-BFGS finds its optimum.
 
 
 _PAIRWISE_L2 = (30.0, 10.0, 3.0)
 _ITERATIONS = 40
-# A Gibbs sweep that updates one class at a time is slow, so these settings use fewer temperatures
-# than the default. They estimate log Z to about 0.01 nats.
+# Settings for the estimate of log Z. A Gibbs sweep of this model updates one class at a time and is
+# slow, so the number of temperatures is below the default. The error of log Z is about 0.01 nats.
 _EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)
 
 
 def fit_pairwise(
     v: Tensor, l2: float, *, start: LinearScore | None = None, iterations: int = _ITERATIONS
 ) -> LinearScore:
-    """Fit the weights by penalised pseudo-likelihood.
+    """Fit the pairwise model by penalised pseudo-likelihood.
 
     Args:
-        v: (N, V) presence.
-        l2: strength of the penalty, >= 0.
-        start: initial weights; by default independent classes.
+        v: presence in the training scenes, (scenes, classes).
+        l2: strength of the penalty on the weights, at least 0.
+        start: model from which the optimisation starts. The default has independent classes.
         iterations: maximum number of L-BFGS iterations.
     """
     V = v.shape[1]
@@ -233,7 +241,10 @@ def fit_pairwise(
 
 
 def pairwise(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[LinearScore]:
-    """Yield a score for each L2 penalty, largest first; each fit starts at the last solution."""
+    """Yield a score for each L2 penalty, largest penalty first.
+
+    Each fit starts at the solution of the previous penalty.
+    """
     score = None
     for l2 in _PAIRWISE_L2:
         score = fit_pairwise(train.v, l2, start=score)
@@ -243,24 +254,25 @@ def pairwise(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[L
 def pairwise_densities(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[ObjectDensity]:
-    """Yield the joint distributions of the pairwise models.
+    """Yield the joint distribution of a pairwise model for each L2 penalty.
 
-    The best penalty for the joint distribution is not the best penalty for the conditionals. With a
-    weak penalty, pseudo-likelihood gives the joint distribution a second mode: scenes with very
-    many classes. The conditionals of real scenes do not show this mode.
+    The best penalty for the joint distribution differs from the best penalty for the conditionals.
+    With a weak penalty, the fitted joint distribution has a second mode: scenes with very many
+    classes. This mode has no effect on the conditionals of real scenes.
     """
     for parameters, score in pairwise(train, structure, seed):
         yield parameters, ising_density(score.bias, score.weights, train, _EFFORT, seed)
 
 
-# `BernoulliRBM` of scikit-learn on objects only, scored by its exact log-odds.
+# `BernoulliRBM` of scikit-learn, trained on objects only. The score is the exact log-odds.
 #
-# The trained weights are copied into our own machine without relation units. Both models have the
-# same energy, so our code computes the log-odds.
+# The trained weights are copied into a machine of this project without relation units. Both models
+# have the same energy, so `training.machines` can compute the log-odds.
 
 
 _HIDDEN = 200
-# With higher learning rates, persistent CD learns only the class frequencies and raises no error.
+# Tested initial learning rates. With higher rates, persistent contrastive divergence learns only
+# the class frequencies, without an error.
 _LEARNING_RATES = (0.1, 0.2, 0.4)
 _EPOCHS = 60
 _BATCH = 32
@@ -269,17 +281,19 @@ _BATCH = 32
 def fit_annealed(
     v: Tensor, *, hidden: int, learning_rate: float, epochs: int, seed: int
 ) -> BoltzmannMachine:
-    """Train with scikit-learn's `partial_fit` while the learning rate falls linearly to 0.
+    """Train scikit-learn's `BernoulliRBM` with a learning rate that falls linearly to 0.
 
-    Persistent chains are accurate only if the model changes slowly at the end. MRR on the indoor
-    validation part: .411 after 40 passes with the falling rate, .377 after 10 passes and .378 after
-    20 passes at a constant rate. Each pass shuffles the scenes and skips an incomplete last batch.
+    Persistent chains are accurate only if the model changes slowly at the end. On the indoor
+    validation scenes, the MRR (mean reciprocal rank) is .411 after 40 epochs with the falling rate.
+    With a constant rate, the MRR is .377 after 10 epochs and .378 after 20 epochs. Each epoch
+    shuffles the scenes and skips an incomplete last batch.
 
     Args:
-        v: (N, V) binary presence.
-        hidden: H1.
+        v: binary presence in the training scenes, (scenes, classes).
+        hidden: number of hidden units.
         learning_rate: initial learning rate.
-        epochs: passes over the data.
+        epochs: number of passes over the scenes.
+        seed: seed of the random choices.
     """
     size = min(_BATCH, len(v))
     rbm = BernoulliRBM(n_components=hidden, batch_size=size, random_state=seed)
@@ -303,7 +317,7 @@ def _as_machine(rbm: BernoulliRBM) -> BoltzmannMachine:
 
 
 def bernoulli_rbm(train: SceneTensors, _structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Yield a score for each learning rate."""
+    """Yield the score of a trained RBM for each initial learning rate."""
     for rate in _LEARNING_RATES:
         machine = fit_annealed(
             train.v, hidden=_HIDDEN, learning_rate=rate, epochs=_EPOCHS, seed=seed

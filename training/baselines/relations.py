@@ -1,4 +1,4 @@
-"""Relation baselines, and baselines for objects at a place, from counts of triples."""
+"""Baselines for relations, and for objects at a place, from counts of triples."""
 
 from __future__ import annotations
 
@@ -16,40 +16,50 @@ from training.batches import Batch, SceneTensors
 from training.evaluation.missing import ObjectScore, PlacedScore, Places
 from training.evaluation.relations import RelationScore, transitive_closure
 
-# Counts of each relation per pair of classes, and score tables of that shape.
+# Counts of triples (relation a, subject class i, object class j), and score tables over triples.
 
 
 @dataclass(frozen=True, eq=False)
 class TripleCounts:
-    """Number of scenes per (a, i, j); structure classes and i = j are not counted.
+    """Numbers of scenes with each triple (relation a, subject class i, object class j).
+
+    Structure classes, and triples with i = j, have the count 0.
 
     Attributes:
-        held: (A, V, V) number of scenes in which the relation held.
-        together: (V, V) number of scenes with annotated relations that contain both classes.
+        held: number of scenes in which the relation holds, (relations, classes, classes).
+        together: number of scenes with annotated relations that contain both classes, (classes,
+            classes).
     """
 
     held: Tensor
     together: Tensor
 
     def overall(self) -> Tensor:
-        """Return p(r) over all pairs of classes, (A,), with add-one (Laplace) smoothing."""
+        """Return the probability of each relation over all pairs of classes, (relations,).
+
+        The counts have add-one (Laplace) smoothing.
+        """
         return (self.held.sum((1, 2)) + 1.0) / (self.together.sum() + 2.0)
 
 
 def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
     """Count triples over the scenes with annotated relations.
 
-    A relation that is not listed counts as false, as in task T1, even if the geometry left the pair
-    unobserved. Rates among observed pairs overrate relations that are annotated only where they
-    hold. They lower the validation R-precision: .343 to .323 on procthor, .34 to .10 on bedrooms.
+    An unlisted relation counts as false, as in task T1, even if the pair is unobserved. Some data
+    sources annotate a relation only where it holds, so rates among observed pairs would be too
+    high. With such rates, the validation R-precision falls from .343 to .323 on procthor, and from
+    .34 to .10 on bedrooms.
 
     Raises:
-        ValueError: all scenes lack observed relations.
+        ValueError: the scenes contain no observed relation.
     """
     V = scenes.v.shape[1]
     related = [scene.evidence for scene in scenes.scenes if scene.evidence.observed.any()]
     if not related:
-        raise ValueError(f"the {len(scenes)} training scenes contain no observed relation")
+        raise ValueError(
+            f"the {len(scenes)} training scenes contain no observed relation; this baseline needs "
+            "annotated relations"
+        )
     A = related[0].holds.shape[0]
     held = np.zeros((A, V, V), dtype=np.float32)
     together = np.zeros((V, V), dtype=np.float32)
@@ -63,20 +73,24 @@ def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
 
 @dataclass(frozen=True, eq=False)
 class TripleTable:
-    """A relation score from a table: table[a, i, j] + g · log(n_i n_j).
+    """The relation score log_odds[a, i, j] + g · log(n_i n_j) of relation a from class i to j.
 
-    The score uses the classes and instance counts of a batch. It ignores the relations.
+    n_i and n_j are the instance counts of the classes. The score ignores observed relations.
 
     Attributes:
-        log_odds: (A, V, V), by relation, subject class and object class.
-        multiplicity: g, weight of the instance counts; 0 ignores counts.
+        log_odds: table over relation, subject class and object class, (relations, classes,
+            classes).
+        multiplicity: weight g of the instance counts. 0 ignores the counts.
     """
 
     log_odds: Tensor
     multiplicity: float = 0.0
 
     def __call__(self, batch: Batch) -> Tensor:
-        """Return log-odds (B, A, n, n); padded entries are undefined."""
+        """Return the log-odds of the relations of a batch, (scenes, relations, n, n).
+
+        n is the number of classes in `batch.classes`. The log-odds of padding are arbitrary.
+        """
         index = batch.classes.clamp(min=0)
         values = self.log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
         if self.multiplicity:
@@ -91,7 +105,7 @@ class TripleTable:
 def relation_popularity(
     train: SceneTensors, structure: Tensor, _seed: int
 ) -> Proposals[RelationScore]:
-    """Yield the overall log-odds of each relation, the only grid point."""
+    """Yield a single score: the log-odds of each relation over all pairs of classes."""
     counts = count_triples(train, structure)
     overall = counts.overall().logit()[:, None, None]
     yield {}, TripleTable(overall.expand_as(counts.held))
@@ -100,8 +114,8 @@ def relation_popularity(
 # Smoothed frequency table p(r | i, j): a strong baseline for relations.
 #
 # R. Zellers et al., "Neural Motifs: Scene Graph Parsing with Global Context", CVPR 2018, show that
-# the labels of subject and object predict most relations. A rare pair backs off to its two classes,
-# and a rare class backs off to p(r):
+# the labels of subject and object predict most relations. The estimate for a rare pair depends
+# mainly on its two classes. The estimate for a rare class depends mainly on p(r):
 #
 #     p(r | i, j) = (held + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
 #     p(r | i)    = (held with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
@@ -113,11 +127,12 @@ _MULTIPLICITY = (0.0, 0.5, 1.0)
 
 
 def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
-    """Return logit p(r | i, j), (A, V, V).
+    """Return logit p(r | i, j) by the formula above, (relations, classes, classes).
 
     Args:
-        pair: s > 0, number of back-off cases added to a pair of classes.
-        end: m > 0, number of back-off cases, distributed as p(r), added to a class.
+        counts: counts of the training scenes.
+        pair: smoothing s of a pair of classes, above 0: number of added cases.
+        end: smoothing m of a single class, above 0: number of added cases.
     """
     overall = counts.overall()[:, None]
     subject = (counts.held.sum(2) + end * overall) / (counts.together.sum(1) + end)
@@ -127,9 +142,9 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
 
 
 def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RelationScore]:
-    """Yield a score for each pair smoothing, class smoothing and weight of the instance counts.
+    """Yield a score for each smoothing of pairs and of classes, and each weight of the counts.
 
-    The weight has no effect if all counts are set to 1.
+    The weight of the instance counts has no effect if all counts are 1.
     """
     counts = count_triples(train, structure)
     for pair in _PAIR:
@@ -140,12 +155,13 @@ def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Propo
                 yield parameters, TripleTable(table, weight)
 
 
-# ComplEx: complex class embeddings, which can give left(i, j) and left(j, i) different scores.
+# ComplEx: complex embeddings of classes. Complex numbers allow different scores for left(i, j) and
+# left(j, i).
 #
-# T. Trouillon et al., "Complex Embeddings for Simple Link Prediction", ICML 2016, equation 11:
-# logit p(a, i, j) = d_a + Re sum_k S[i,k] R[a,k] conj(S[j,k]). The model is fitted to all pairs of
-# classes that occur together. Each triple is a binomial: `held` successes in `together` trials. The
-# penalty is the nuclear 3-norm of T. Lacroix et al., ICML 2018.
+# Source: T. Trouillon et al., "Complex Embeddings for Simple Link Prediction", ICML 2016, equation
+# 11: logit p(a, i, j) = d_a + Re sum_k S[i,k] R[a,k] conj(S[j,k]). The fit uses all pairs of
+# classes that occur in the same scene. The likelihood of a triple is binomial, with `held`
+# successes in `together` trials. The penalty is the nuclear 3-norm of T. Lacroix et al., ICML 2018.
 
 
 _RANKS = (16, 64)
@@ -158,12 +174,14 @@ _LEARNING_RATE = 0.05
 def fit_complex(
     counts: TripleCounts, *, rank: int, penalty: float, seed: int, steps: int = _STEPS
 ) -> Tensor:
-    """Fit ComplEx and return its logits (A, V, V).
+    """Fit ComplEx, and return the logits of all triples, (relations, classes, classes).
 
     Args:
-        rank: number of complex dimensions.
-        penalty: weight of the mean cubed modulus of the factors of each pair.
-        steps: number of Adam steps over all pairs; the learning rate falls to 0.
+        counts: counts of the training scenes.
+        rank: number of complex dimensions of an embedding.
+        penalty: weight of the penalty, the mean cubed modulus of the factors of each pair.
+        seed: seed of the initial embeddings.
+        steps: number of Adam steps over all pairs. The learning rate falls to 0.
     """
     generator = torch.Generator().manual_seed(seed)
     A, V, _ = counts.held.shape
@@ -192,9 +210,15 @@ def fit_complex(
 
 
 def complex_logits(bias: Tensor, relations: Tensor, classes: Tensor) -> Tensor:
-    """Return d_a + Re <S_i, R_a, conj S_j>; bias (A,), relations (A, K), classes (V, K)."""
+    """Return the logits d_a + Re <S_i, R_a, conj S_j>, (relations, classes, classes).
+
+    Args:
+        bias: bias d_a of each relation, (relations,).
+        relations: complex embedding R_a of each relation, (relations, rank).
+        classes: complex embedding S_i of each class, (classes, rank).
+    """
     turned = classes * relations[:, None]
-    # Re(x conj(y)) = Re x Re y + Im x Im y. Two real products are faster than a complex one.
+    # Re(x conj(y)) = Re x Re y + Im x Im y. Two real products are faster than a complex product.
     real = turned.real @ classes.real.T + turned.imag @ classes.imag.T
     return bias[:, None, None] + real
 
@@ -202,7 +226,7 @@ def complex_logits(bias: Tensor, relations: Tensor, classes: Tensor) -> Tensor:
 def complex_embedding(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[RelationScore]:
-    """Yield a score for each rank, penalty and weight of the instance counts."""
+    """Yield a ComplEx score for each rank, penalty and weight of the instance counts."""
     counts = count_triples(train, structure)
     for rank in _RANKS:
         for penalty in _PENALTIES:
@@ -212,15 +236,15 @@ def complex_embedding(
                 yield parameters, TripleTable(table, weight)
 
 
-# Completion by logic: the frequency table, adjusted by consequences of the observed relations.
+# Frequency table with logical rules: the log-odds change by consequences of observed relations.
 #
 # The score adds a bonus to a relation a(i, k) that follows by transitivity from observed a(i, j)
-# and a(j, k). It subtracts a penalty from the reverse a(k, i) of each observed or implied relation.
-# The canonical relations store right as left with exchanged ends (inverse closure). Bonus and
-# penalty are finite for two reasons: classes may have several instances, and annotated on-top is
+# and a(j, k). The score subtracts a penalty from the reverse a(k, i) of each observed or implied
+# relation. Canonical relations represent right as left with exchanged subject and object. Bonus and
+# penalty are finite, because classes can have several instances, and because annotated on-top is
 # not always transitive.
 #
-# Task T1b marks only the evidence of a scene as observed, not the full annotation. This score
+# In the batches of task T1b, only the given relations of a scene are marked as observed. This score
 # needs such batches.
 
 
@@ -233,11 +257,13 @@ _PENALTY = (0.0, 1.0, 3.0)
 
 @dataclass(frozen=True, eq=False)
 class ClosureScore:
-    """table + bonus · [implied relation] - penalty · [reverse of an observed or implied relation].
+    """The score of a frequency table, changed by logical rules.
 
     Attributes:
-        table: log-odds without evidence.
-        bonus, penalty: changes of the log-odds, >= 0.
+        table: score without observed relations.
+        bonus: value that is added to the log-odds of an implied relation, at least 0.
+        penalty: value that is subtracted from the log-odds of the reverse of an observed or implied
+            relation, at least 0.
     """
 
     table: TripleTable
@@ -245,7 +271,7 @@ class ClosureScore:
     penalty: float
 
     def __call__(self, batch: Batch) -> Tensor:
-        """Return log-odds (B, A, n, n) given the observed relations of the batch."""
+        """Return log-odds given the observed relations of a batch, (scenes, relations, n, n)."""
         given = (batch.holds > 0) & batch.observed
         closed = transitive_closure(given)
         follows, mirror = closed & ~given, closed.mT & ~closed
@@ -255,7 +281,7 @@ class ClosureScore:
 def frequency_table_with_closure(
     train: SceneTensors, structure: Tensor, _seed: int
 ) -> Proposals[RelationScore]:
-    """Yield a score for each smoothing, weight of the counts, bonus and penalty."""
+    """Yield a score for each smoothing, weight of the instance counts, bonus and penalty."""
     counts = count_triples(train, structure)
     for pair in _CLOSURE_PAIR:
         log_odds = smoothed_log_odds(counts, pair, _CLOSURE_END)
@@ -267,17 +293,18 @@ def frequency_table_with_closure(
                     yield parameters | {"penalty": penalty}, ClosureScore(table, bonus, penalty)
 
 
-# Baselines for an object i at a place (a, j), such as "on-top of the desk": the frequency table
-# p(i | a, j), and the product of this table and an object score.
+# Baselines for an object of class i at a place (a, j), such as "on-top of the desk". They are the
+# frequency table p(i | a, j), and the product of this table and an object score.
 #
-#     p(i | a, j) = (held + s · p(i | a)) / (held by any + s)
+#     p(i | a, j) = (scenes with a(i, j) + s · p(i | a)) / (scenes with a of any class to j + s)
 #
-# p(i | a) is smoothed in the same way towards p(i), with weight m. There are separate tables for i
-# as subject and i as object. The product adds the log-odds given the other objects of the scene,
+# p(i | a) is smoothed in the same way towards p(i), with m in place of s. There are separate tables
+# for i as subject and for i as object. The score of the product is
 #
-#     score(i | rest) + w · log p(i | a, j) - u · log p(i),
+#     score(i | rest) + w · log p(i | a, j) - u · log p(i).
 #
-# where the last term corrects for the class frequency that both factors contain.
+# score(i | rest) is the log-odds of i given the other objects of the scene. Both factors depend on
+# the class frequency. The last term corrects for this.
 
 
 _PLACE = (0.3, 1.0, 3.0, 10.0)
@@ -288,22 +315,26 @@ _CORRECTIONS = (0.0, 0.5, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class PlacedTable:
-    """The score log p(i | a, j) from a table.
+    """The score log p(i | a, j) of class i at the place (a, j), from a frequency table.
 
     Attributes:
-        log_p: (2, A, V, V), by `Places.outgoing`, relation, anchor class and removed class.
+        log_p: table over direction, relation, class j of the place and class i, (2, relations,
+            classes, classes). The direction is `Places.outgoing`.
     """
 
     log_p: Tensor
 
     def __call__(self, places: Places) -> Tensor:
-        """Return log p(i | a, j), (B, V)."""
+        """Return log p(i | a, j) of each class i at each place, (places, classes)."""
         return self.log_p[places.outgoing.long(), places.relation, places.anchor]
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedProduct:
-    """Score: objects(v) + weight · table - correction · log popularity (V,)."""
+    """The product of an object score and a table, as a sum of logs.
+
+    The score is objects(v) + weight · table - correction · log popularity.
+    """
 
     objects: ObjectScore
     table: PlacedTable
@@ -312,7 +343,7 @@ class PlacedProduct:
     correction: float
 
     def __call__(self, places: Places) -> Tensor:
-        """Return scores (B, V)."""
+        """Return the score of each class at each place, (places, classes)."""
         added = self.weight * self.table(places) - self.correction * self.log_popularity
         return self.objects(places.v) + added
 
@@ -320,14 +351,16 @@ class PlacedProduct:
 def smoothed_log_p(
     counts: TripleCounts, popularity: Tensor, place: float, relation: float
 ) -> Tensor:
-    """Return log p(i | a, j), (2, A, V, V) as in `PlacedTable`.
+    """Return log p(i | a, j) in the layout of `PlacedTable.log_p`.
 
     Args:
-        popularity: p(i), (V,); the function normalises it.
-        place: s > 0, number of cases of p(i | a) added to each (a, j).
-        relation: m > 0, number of cases of p(i) added to each a.
+        counts: counts of the training scenes.
+        popularity: frequency of each class, (classes,). The function normalises the sum to 1.
+        place: smoothing s of a place (a, j), above 0: number of added cases.
+        relation: smoothing m of a relation a, above 0: number of added cases.
     """
-    # In the second table, the removed class is the subject. Its transpose puts the anchor first.
+    # In the second table, the removed class is the subject of the relation. The transpose puts the
+    # class j of the place first.
     held = torch.stack([counts.held, counts.held.mT])
     share = popularity / popularity.sum()
     any_anchor = held.sum(2)
@@ -338,7 +371,7 @@ def smoothed_log_p(
 
 
 def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
-    """Yield a score for each smoothing of places and of relations."""
+    """Yield a score for each smoothing s of places and each smoothing m of relations."""
     counts = count_triples(train, structure)
     for place in _PLACE:
         for relation in _RELATION:
@@ -349,7 +382,7 @@ def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposal
 def times(
     objects: ObjectScore, table: PlacedTable
 ) -> Callable[[SceneTensors, Tensor, int], Proposals[PlacedScore]]:
-    """Return a baseline: the product of a fitted object score and a fitted table."""
+    """Return a generator function for the product of a fitted object score and a fitted table."""
 
     def placed_table(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
         log_popularity = frequency(train.v).log()

@@ -1,4 +1,4 @@
-"""Scenes from files and from the room generator, and their encoding for the models."""
+"""Read scenes from files, generate rooms, and encode scenes for the models."""
 
 from training.datasets.encoding import EncodedScene, annotated_classes, encode
 from training.datasets.names import Names, curated_names

@@ -13,13 +13,14 @@ SOURCE = "coco"
 
 
 def read_coco(path: Path) -> list[AnnotatedScene]:
-    """Read each image with at least one object as a scene; boxes are in the image plane.
+    """Read the images of a file as scenes. Images without objects are skipped.
 
-    The reader skips boxes around crowds, because they hold several objects. The relations left and
-    above are derived from the boxes at encoding (`derive_from_boxes`).
+    Boxes around crowds are also skipped, because they contain several objects. Boxes are in the
+    image plane. Encoding later derives the relations left and above from boxes
+    (`derive_from_boxes`).
 
     Raises:
-        DatasetError: the file does not follow the COCO layout.
+        DatasetError: the file does not have the COCO format.
     """
     content = load_json(path)
     categories: dict[int, str] = {}
@@ -34,7 +35,7 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
         image = take(path, where, entry, "image_id", int)
         category = take(path, where, entry, "category_id", int)
         if image not in images:
-            raise DatasetError(path, where, f"image_id {image} is not among the images")
+            raise DatasetError(path, where, f"image_id {image} is not among the images of the file")
         if category not in categories:
             raise DatasetError(path, where, f"category_id {category} is not among the categories")
         if entry.get("iscrowd"):

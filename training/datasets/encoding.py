@@ -37,20 +37,25 @@ _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodedScene:
-    """One scene encoded with a vocabulary; N instances, A canonical relations.
+    """One scene, encoded with a vocabulary.
 
     Attributes:
-        scene_id, source, group: copied from the annotated scene.
-        room_type: index of the room type; -1 if the room type is unknown.
-        evidence: the classes of the scene and their relations.
-        instance_classes: (N,) int64, the class of each instance.
-        instance_holds: (A, N, N) bool, True where the relation between two instances holds.
-        instance_observed: (A, N, N) bool, True where the relation is known to hold or not to hold.
-        unknown: number of distinct labels outside the vocabulary; their objects are left out.
-        instance_positions: (N, 3) centres in metres, in the viewer axes used to derive the
-            relations; NaN for an unknown centre. None if relations do not come from positions.
-        weight: weight of the scene in object learning.
-        complete: True if the object list covers nearly the whole scene, see `Meaning`.
+        scene_id, source, group: id, data source and group of near-duplicates of the annotated
+            scene.
+        room_type: index of the room type. -1 means that the room type is unknown.
+        evidence: classes of the scene, and relations between classes.
+        instance_classes: class index of each object instance, (instances,) int64.
+        instance_holds: True where a relation between two instances holds, (relations, instances,
+            instances) bool.
+        instance_observed: True where the truth of the relation is known, shaped like
+            `instance_holds`.
+        unknown: number of distinct labels outside the vocabulary. Objects with such a label are
+            left out.
+        instance_positions: centres of the instances in metres, (instances, 3). The axes are the
+            viewer axes from which relations were derived. NaN means an unknown centre. None means
+            that the relations do not come from positions.
+        weight: weight of the scene in the training of objects.
+        complete: True if the object list of the scene is nearly complete; see `Meaning`.
     """
 
     scene_id: str
@@ -70,18 +75,18 @@ class EncodedScene:
 def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[EncodedScene]:
     """Encode scenes with a vocabulary.
 
-    An observed relation is known to hold or known not to hold. The relations come from the first of
-    these annotations that the scene has:
+    A relation is observed if its truth is known. Relations come from the first kind of annotation
+    in this list that a scene contains:
 
-    - Listed relations. A relation listed in both directions is unobserved.
-    - Positions, by the rules of `app.scene.geometry`. `room_viewpoint` supplies the viewpoint if
-      the positions are not in viewer axes. A support link means on-top, and all other relations of
-      the pair are false.
-    - Boxes in an image, by the rule of `scene_client.image_plane`: left and above.
-    - Support links only.
+    - Listed relations. A relation that is listed in both directions is unobserved.
+    - Positions, by the rules of `app.scene.geometry`. If positions are not in viewer axes,
+      `room_viewpoint` chooses a viewpoint. A support link means that the relation on-top holds and
+      all other relations of the pair are false.
+    - Boxes in an image, by the rule of `scene_client.image_plane`, for left and above only.
+    - Support links.
 
-    `training.datasets.sources` defines which relations are false if a scene does not list them. It
-    also defines which labels of a source are ignored.
+    The module `training.datasets.sources` defines for each data source which unlisted relations are
+    false, and which labels are ignored.
 
     Relations of structure classes are unobserved.
     """
@@ -94,12 +99,12 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
 def annotated_classes(
     scenes: Sequence[EncodedScene], vocabulary: Vocabulary
 ) -> dict[str, NDArray[np.bool_]]:
-    """Return, per source, a (V,) mask of the classes that the source annotates.
+    """Return the classes that each data source annotates, as masks (classes,) by source name.
 
-    If a scene does not list an annotated class, the class is absent. A source annotates the classes
-    that it mentions at least once. A source with an open vocabulary annotates all classes. Labels
-    in `Source.left_out` are excluded. The initial bias of a class is its frequency over the sources
-    that annotate it. Only annotated classes count in the evaluation of generated scenes.
+    If a scene does not list an annotated class, the class is absent. A data source annotates the
+    classes that it mentions at least once. A source with an open vocabulary annotates all classes.
+    Labels in `Source.left_out` are excluded. The initial bias of a class is its frequency in the
+    sources that annotate the class. The evaluation of generated scenes uses only annotated classes.
     """
     annotated: dict[str, NDArray[np.bool_]] = {}
     for scene in scenes:
@@ -134,7 +139,7 @@ class _Encoder:
         holds = relations.holds[:, kept][:, :, kept]
         observed = relations.observed[:, kept][:, :, kept]
         instance_classes = np.array([classes[i] for i in kept], dtype=np.int64)
-        # Relations of structure classes carry no information: every room has walls on all sides.
+        # Relations of structure classes are uninformative: every room has walls on all sides.
         structure = self.vocabulary.structure[instance_classes]
         for array in (holds, observed):
             array[:, structure] = False
@@ -176,7 +181,7 @@ class _Encoder:
 def _counts(
     evidence: ClassEvidence, classes: NDArray[np.int64], alike: Sequence[int]
 ) -> NDArray[np.int64]:
-    """Count the instances of each class; one entry may stand for several instances."""
+    """Return the number of instances of each class. One object entry can mean several instances."""
     counts = np.zeros_like(evidence.counts)
     np.add.at(counts, np.searchsorted(evidence.classes, classes), alike)
     return counts
@@ -185,10 +190,11 @@ def _counts(
 def _relations(
     scene: AnnotatedScene, meaning: Meaning
 ) -> tuple[PoseRelations, NDArray[np.float64] | None]:
-    """Derive the relations between all instances of a scene, see `encode`.
+    """Derive the relations between all instances of a scene; `encode` describes the rules.
 
     Returns:
-        The relations, and the positions (n, 3) used to derive them; None without positions.
+        The relations, and the positions from which they were derived, (instances, 3). The second
+        value is None if the relations do not come from positions.
     """
     positions = None
     if scene.relations is not None:
@@ -236,7 +242,7 @@ def _from_lists(
 def _close_poses(
     found: PoseRelations, objects: Sequence[AnnotatedObject], meaning: Meaning
 ) -> None:
-    """Apply the source's rule for unlisted relations to relations derived from positions."""
+    """Apply the data source's rule for unlisted relations to relations derived from positions."""
     located = np.array([thing.position is not None for thing in objects])
     sized = located & np.array([thing.size is not None for thing in objects])
     for relation, unlisted in enumerate(meaning.unlisted):
@@ -260,7 +266,7 @@ def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, NDArray[np.float6
 
 
 def _add_supports(found: PoseRelations, objects: Sequence[AnnotatedObject]) -> None:
-    """Set on-top for each support link; an object in a drawer is on-top of its dresser."""
+    """Set the relation on-top for each support link, also for an object inside its support."""
     place = {thing.id: index for index, thing in enumerate(objects)}
     for index, thing in enumerate(objects):
         if thing.supported_by is None or (support := place[thing.supported_by]) == index:
@@ -274,19 +280,21 @@ def _add_supports(found: PoseRelations, objects: Sequence[AnnotatedObject]) -> N
 def room_viewpoint(scene_id: str, positions: NDArray[np.float64]) -> Viewpoint:
     """Return a viewpoint at the middle of one side of the room, facing inwards.
 
-    The room is the bounding box of the object centres. A hash of the scene id selects the side.
-    So the viewpoint of a scene is fixed, and a collection of scenes covers all four sides.
+    The room is the bounding box of the object centres. A hash of the scene id selects the side, so
+    the viewpoint of a scene never changes. Over many scenes, all four sides occur.
 
     Args:
         scene_id: id of the scene.
-        positions: (n, 3) centres in metres; rows with NaN are ignored.
+        positions: centres of the objects in metres, (objects, 3). Rows with NaN are ignored.
 
     Raises:
         ValueError: no object has a position.
     """
     known = positions[np.isfinite(positions).all(axis=1), :2]
     if not len(known):
-        raise ValueError(f"scene {scene_id!r} has no object with a position")
+        raise ValueError(
+            f"scene {scene_id!r} has no object with a position; a viewpoint needs at least one"
+        )
     (x0, y0), (x1, y1) = known.min(axis=0).tolist(), known.max(axis=0).tolist()
     x, y = (x0 + x1) / 2, (y0 + y1) / 2
     return (
@@ -298,10 +306,11 @@ def room_viewpoint(scene_id: str, positions: NDArray[np.float64]) -> Viewpoint:
 
 
 def derive_from_boxes(boxes: ArrayLike) -> PoseRelations:
-    """Derive the relations left and above between n image boxes (`scene_client.image_plane`).
+    """Derive the relations left and above between image boxes (`scene_client.image_plane`).
 
     Args:
-        boxes: (n, 4) rows (xmin, ymin, xmax, ymax), y downwards; NaN marks an object without a box.
+        boxes: box (xmin, ymin, xmax, ymax) of each object, with y downwards, (objects, 4). NaN
+            means that the object has no box.
 
     Raises:
         ValueError: ``boxes`` has a wrong shape.

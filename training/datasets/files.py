@@ -16,10 +16,10 @@ MAX_DIGITS: Final = 30
 
 
 def read_lines(path: Path, limit: int) -> Iterator[bytes]:
-    """Iterate over the raw lines of a file; a file named ``*.gz`` is decompressed.
+    """Yield the lines of a file as bytes. A file named ``*.gz`` is decompressed.
 
-    Lines stay undecoded, so that invalid UTF-8 affects one line only. The limit keeps a small
-    compressed file from filling the memory.
+    The lines are not decoded, so that invalid UTF-8 affects one line only. Without the limit, a
+    small compressed file could fill the memory.
 
     Args:
         path: the file.
@@ -35,7 +35,9 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
             while line := file.readline(limit + 1):
                 number += 1
                 if len(line) > limit:
-                    raise DatasetError(path, f"line {number}", f"is longer than {limit} bytes")
+                    raise DatasetError(
+                        path, f"line {number}", f"the line is longer than {limit} bytes"
+                    )
                 yield line
     except (OSError, EOFError, zlib.error) as error:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
@@ -52,16 +54,17 @@ def load_json(path: Path) -> Any:
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
     except json.JSONDecodeError as error:
-        raise DatasetError(path, f"line {error.lineno}", f"not JSON: {error.msg}") from error
+        raise DatasetError(path, f"line {error.lineno}", f"is not JSON: {error.msg}") from error
     except (ValueError, RecursionError) as error:
-        raise DatasetError(path, "", f"not JSON: {error}") from error
+        raise DatasetError(path, "", f"is not JSON: {error}") from error
 
 
 def bounded_int(digits: str) -> int:
-    """Parse an integer of a JSON file, for ``parse_int``.
+    """Parse an integer of a JSON file, for the argument ``parse_int`` of `json.loads`.
 
     Raises:
-        ValueError: more than `MAX_DIGITS` digits; larger integers overflow on conversion to float.
+        ValueError: the integer has more than `MAX_DIGITS` digits. Such integers could overflow on
+            conversion to float.
     """
     if len(digits.lstrip("-")) > MAX_DIGITS:
         raise ValueError(f"an integer of {len(digits)} digits is too long: {digits[:10]}…")
@@ -70,7 +73,10 @@ def bounded_int(digits: str) -> int:
 
 @contextmanager
 def located(path: Path, where: str) -> Iterator[None]:
-    """Turn a TypeError or ValueError of the block into a DatasetError with path and position."""
+    """Convert a TypeError or ValueError in the `with` block to a DatasetError.
+
+    The DatasetError contains the path and the position in the file.
+    """
     try:
         yield
     except DatasetError:
@@ -80,7 +86,14 @@ def located(path: Path, where: str) -> Iterator[None]:
 
 
 def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return the field ``name`` of the JSON object at ``where`` after a check of its type.
+    """Check the type of the field ``name`` of a JSON object, and return its value.
+
+    Args:
+        path: the file.
+        where: position of the JSON object in the file.
+        values: the JSON object.
+        name: name of the field.
+        kind: accepted types.
 
     Raises:
         DatasetError: the field is missing or has another type.

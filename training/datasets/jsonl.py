@@ -1,14 +1,15 @@
-"""Scenes as JSON lines, plain or gzipped: the native format of this project.
+"""Read and write scenes as JSON lines, plain or gzipped, the native format of this project.
 
-Each line holds one scene, a JSON object with these fields ("?" marks an optional field):
+Each line contains one scene, a JSON object with these fields ("?" marks an optional field):
 
 - ``scene_id``, ``source``, ``group``, ``room_type`` (may be null);
 - ``objects``: [{``id``, ``label``, ``position``?, ``size``?, ``yaw``?, ``supported_by``?,
   ``box2d``?}];
 - ``relations``: [[subject id, predicate, object id]], or null if relations were not annotated;
 - ``false_relations``?: relations that do not hold, in the same form;
-- ``counts``?: {label: number of instances} where one object stands for all instances of a label;
-- ``viewer_frame``?: true if positions are in viewer axes (x away, y left, z up).
+- ``counts``?: {label: number of instances} for labels of which all instances share one entry in
+  ``objects``;
+- ``viewer_frame``?: true if positions are in viewer axes (x away from the viewer, y left, z up).
 
 A line has at most `MAX_LINE` bytes.
 """
@@ -35,15 +36,16 @@ _SCENE_FIELDS = {
 }
 _OBJECT_FIELDS = {"id", "label", "position", "size", "yaw", "supported_by", "box2d"}
 
-# These sources are in viewer axes; their files predate the field ``viewer_frame``.
+# Data sources with positions in viewer axes whose files were written before the field
+# ``viewer_frame`` existed.
 _VIEWER_SOURCES = frozenset({"sunrgbd-bedroom-3d"})
 
 
 def read_jsonl(path: Path) -> list[AnnotatedScene]:
-    """Read every scene of a ``.jsonl`` or ``.jsonl.gz`` file.
+    """Read all scenes of a ``.jsonl`` or ``.jsonl.gz`` file.
 
     Raises:
-        DatasetError: the file cannot be read, or a line is not a scene.
+        DatasetError: the file cannot be read, or a line is not a valid scene.
     """
     scenes: list[AnnotatedScene] = []
     for found in scan_jsonl(path):
@@ -54,7 +56,7 @@ def read_jsonl(path: Path) -> list[AnnotatedScene]:
 
 
 def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
-    """Yield a scene for each valid line, and an error for each invalid line. Skip blank lines.
+    """Yield a scene for each valid line and an error for each invalid line. Skip blank lines.
 
     Raises:
         DatasetError: the file cannot be read.
@@ -67,7 +69,7 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
         try:
             scene = _scene(json.loads(line, parse_int=bounded_int))
         except json.JSONDecodeError as error:
-            yield DatasetError(path, where, f"not JSON: {error}")
+            yield DatasetError(path, where, f"the line is not JSON: {error}")
         except (ValueError, RecursionError) as error:
             yield DatasetError(path, where, str(error))
         else:
@@ -80,7 +82,7 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
 
 
 def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
-    """Write scenes in the format of `read_jsonl`; gzip a file named ``*.gz``."""
+    """Write scenes in the format of `read_jsonl`. A file named ``*.gz`` is compressed by gzip."""
     opener = gzip.open if path.suffix == ".gz" else open
     with opener(path, "wt", encoding="utf-8") as file:
         for scene in scenes:
@@ -96,7 +98,7 @@ def _values(scene: AnnotatedScene) -> dict[str, Any]:
         "group": scene.group,
         "room_type": scene.room_type,
         "objects": [
-            # Unknown values are left out.
+            # Fields with an unknown value are left out.
             {
                 name: value
                 for name, value in asdict(thing).items()
@@ -143,13 +145,16 @@ def _counted(objects: tuple[AnnotatedObject, ...], counts: Any) -> tuple[Annotat
     if counts is None:
         return objects
     if not isinstance(counts, Mapping):
-        raise ValueError("counts must be a mapping of labels to numbers, or null")
+        raise ValueError("counts must be null, or an object that maps labels to numbers")
     listed = Counter(thing.label for thing in objects)
     for label, count in counts.items():
         if isinstance(count, bool) or not isinstance(count, int):
             raise ValueError(f"the count of {label!r} must be an integer, not {count!r}")
         if listed[label] != 1:
-            raise ValueError(f"counts needs exactly one object {label!r}, found {listed[label]}")
+            raise ValueError(
+                f"counts contains the label {label!r}, which needs exactly one object, but the "
+                f"scene has {listed[label]}"
+            )
     return tuple(replace(thing, count=counts.get(thing.label, 1)) for thing in objects)
 
 
@@ -181,12 +186,14 @@ def _relations(
     found: dict[tuple[int, str, int], None] = {}
     for entry in values:
         if not isinstance(entry, list) or len(entry) != 3:
-            raise ValueError(f"a relation is [subject id, predicate, object id], not {entry!r}")
+            raise ValueError(
+                f"a relation is a list [subject id, predicate, object id], not {entry!r}"
+            )
         subject, anchor = place.get(_id(entry[0])), place.get(_id(entry[2]))
         if subject is None or anchor is None:
             raise ValueError(f"relation {entry!r} names an object that is not in the scene")
         relation = relation_of(source, _text("predicate", entry[1]))
-        # Some image annotators relate a thing to itself; such a relation has no meaning.
+        # Some image annotators relate an object to itself. Such relations are skipped.
         if relation is not None and subject != anchor:
             found[subject, relation, anchor] = None
     return tuple(found)

@@ -1,4 +1,4 @@
-"""Curated names: synonyms of classes and rooms, and labels that are not objects."""
+"""Hand-curated names: synonyms of object classes and room types, and labels to exclude."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ NAMES_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "names.to
 
 @dataclass(frozen=True)
 class Names:
-    """The content of `vocabularies/names.toml`; each attribute is a table or list of the file.
+    """The content of `vocabularies/names.toml`. Each attribute is a table or list of the file.
 
     Attributes:
-        base: classes of every indoor vocabulary.
-        household: rare household objects, which are also classes of every indoor vocabulary.
-        structure: classes that the service accepts in requests but never proposes.
+        base: common classes, which every indoor vocabulary contains.
+        household: rare household objects, which every indoor vocabulary also contains.
+        structure: classes such as walls. The service accepts these classes in requests but never
+            proposes them.
         not_objects: labels that never become a class.
-        surroundings: outdoor structure; excluded from indoor vocabularies.
-        outdoor: outdoor objects; excluded from indoor vocabularies.
-        aliases: other names of each class.
-        kinds: narrower kinds of each class. A kind outside a vocabulary can become an alias.
-        rooms: other names of each room type; the key "" lists names that mean no room type.
+        surroundings: outdoor structures such as buildings. Indoor vocabularies exclude them.
+        outdoor: outdoor objects. Indoor vocabularies exclude them.
+        aliases: maps each class to its other names.
+        kinds: maps each class to more specific names. If a vocabulary lacks a specific name, the
+            name can become an alias of the class.
+        rooms: maps each room type to its other names. The key "" lists names that mean no room
+            type.
     """
 
     base: tuple[str, ...] = ()
@@ -50,7 +53,9 @@ class Names:
                         raise ValueError(f"{title}: {other!r} names both {first!r} and {name!r}")
         for name in (*self.base, *self.household):
             if (other := self.canonical(name)) != name:
-                raise ValueError(f"the base class {name!r} is an alias of {other!r}")
+                raise ValueError(
+                    f"the base class {name!r} is an alias of {other!r}: remove it from `base`"
+                )
         for name, kinds in self.kinds.items():
             for kind in (name, *kinds):
                 if (other := self.canonical(kind)) != kind:
@@ -59,7 +64,7 @@ class Names:
     def canonical(self, label: str) -> str:
         """Return the curated name of a label.
 
-        Without a curated name, return the label in lower case with single spaces.
+        A label without a curated name is returned in lower case with single spaces.
         """
         found = self._by_key.get(label_key(label))
         if found is not None:
@@ -100,10 +105,10 @@ class Names:
 
 @cache
 def curated_names() -> Names:
-    """Read the curated names.
+    """Read the curated names of `vocabularies/names.toml`.
 
     Raises:
-        ValueError: one name has two meanings.
+        ValueError: the file gives two meanings to one name.
     """
     values: dict[str, Any] = tomllib.loads(NAMES_FILE.read_text(encoding="utf-8"))
     found: dict[str, Any] = {

@@ -1,8 +1,8 @@
-"""Read placing priors: a table that gives the usual relation of two objects, without scenes.
+"""Read placing priors: tables of the usual relations between pairs of objects, without scenes.
 
-The table has tab-separated columns and may be gzipped. Its first line names the columns:
-``source``, ``subject``, ``relation``, ``object``, ``count``, ``room`` (empty = any room).
-The reader skips relations outside the eight of the service, such as ``inside`` and ``next to``.
+The table has tab-separated columns and can be gzipped. Its first line contains the column names:
+``source``, ``subject``, ``relation``, ``object``, ``count`` and ``room``. An empty ``room`` means
+any room. The reader skips relations that the service does not have, such as ``inside``.
 """
 
 from __future__ import annotations
@@ -20,29 +20,30 @@ COLUMNS: Final = ("source", "subject", "relation", "object", "count", "room")
 MAX_LINE: Final = 4096
 MAX_ROWS: Final = 2_000_000
 
-# Prefixes that one source puts before a name: "food bread", "clothes skirt".
+# Prefixes of names in one of the sources, for example "food bread" and "clothes skirt".
 _KINDS: Final = ("food ", "clothes ")
 
 SOURCE: Final = "placing_priors"
-"""Source name of the scenes made from the rows."""
+"""Source name of all scenes that the reader makes from rows of the table."""
 
-# Sources that list where objects are placed: VirtualHome, AI2-THOR, TidyBot.
+# Names of sources that list places of objects: VirtualHome, AI2-THOR and TidyBot.
 PLACES: Final = frozenset({"virtualhome_placing", "ithor_receptacles", "tidybot"})
-# The other sources give locations (ConceptNet's ``at``), votes, or counts of parts.
+# Accepted values of the column ``source``. The three values after `PLACES` mean tables of
+# locations, of votes and of part counts.
 _SOURCES: Final = PLACES | {"conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts"}
 
 
 def read_prior_scenes(path: Path, *, sources: Collection[str] = PLACES) -> list[AnnotatedScene]:
     """Read each row of a table as a scene of two objects and their relation.
 
-    All scenes have the source name `SOURCE`. Rows about the same pair of objects share a group.
+    All scenes have the source name `SOURCE`. Rows about the same pair of objects are in one group.
 
     Args:
-        path: the table.
-        sources: the sources to read; by default the sources that list placements.
+        path: file of the table.
+        sources: values of the column ``source`` to read. The default is `PLACES`.
 
     Raises:
-        DatasetError: the file is missing, malformed or too large.
+        DatasetError: the file is missing, invalid or too large.
     """
     scenes = []
     for where, (source, subject, relation, anchor, _, _) in _rows(path):
@@ -67,19 +68,21 @@ def _plain(label: str) -> str:
 
 
 def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Iterate over the rows: position in the file, and the column values."""
+    """Yield the position in the file and the column values of each row."""
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         where = f"line {number}"
         if number > MAX_ROWS:
-            raise DatasetError(path, where, f"has more than {MAX_ROWS} lines")
+            raise DatasetError(path, where, f"the file has more than {MAX_ROWS} lines")
         try:
             values = line.decode("utf-8").rstrip("\r\n").split("\t")
         except UnicodeDecodeError as error:
-            raise DatasetError(path, where, f"not UTF-8: {error}") from error
+            raise DatasetError(path, where, f"is not UTF-8: {error}") from error
         if number == 1:
             if tuple(values) != COLUMNS:
                 raise DatasetError(path, where, f"must name the columns {', '.join(COLUMNS)}")
         elif len(values) != len(COLUMNS):
-            raise DatasetError(path, where, f"has {len(values)} columns, not {len(COLUMNS)}")
+            raise DatasetError(
+                path, where, f"the row has {len(values)} columns, not {len(COLUMNS)}"
+            )
         else:
             yield where, values

@@ -1,4 +1,4 @@
-"""The dataset readers, by format name."""
+"""The readers of scene files, by the name of the file format."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ READERS: Final[dict[str, Callable[[Path], list[AnnotatedScene]]]] = {
 
 
 def guess_format(path: Path) -> str:
-    """Return the format that the name of a file implies.
+    """Return the name of a file's format, derived from the file name.
 
     Raises:
         DatasetError: the name matches no known format.
@@ -38,15 +38,15 @@ def guess_format(path: Path) -> str:
     raise DatasetError(
         path,
         "",
-        "the name fits no known format: *.jsonl, *.jsonl.gz, *.mat, relationships*.json or "
-        "instances*.json",
+        "the file name fits no known format; rename the file to *.jsonl, *.jsonl.gz, *.mat, "
+        "relationships*.json or instances*.json",
     )
 
 
 def read_scenes(path: Path) -> list[AnnotatedScene]:
-    """Read a file in the format that its name implies.
+    """Read the scenes of a file. The file name determines the format.
 
     Raises:
-        DatasetError: the name matches no known format, or the file is malformed.
+        DatasetError: the name matches no known format, or the file is invalid.
     """
     return READERS[guess_format(path)](path)

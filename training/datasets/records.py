@@ -1,4 +1,4 @@
-"""Annotated scenes: the common output of all readers."""
+"""Annotated scenes, the common result of all readers of scene files."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Box2d = tuple[float, float, float, float]
 
 MAX_COUNT: Final = 1_000_000
 MAX_PROBLEM: Final = 500
-"""Maximum length of an error text, in characters."""
+"""Maximum length of the text of a `DatasetError`, in characters."""
 
 
 class DatasetError(ValueError):
-    """A data file cannot be read or is malformed.
+    """A data file cannot be read or has invalid content.
 
     Args:
         path: the file.
@@ -28,7 +28,7 @@ class DatasetError(ValueError):
     """
 
     def __init__(self, path: Path, where: str, problem: str) -> None:
-        if len(problem) > MAX_PROBLEM:  # the text may quote a value of several megabytes
+        if len(problem) > MAX_PROBLEM:  # the text can contain a value of several megabytes
             problem = problem[:MAX_PROBLEM] + "…"
         super().__init__(f"{path}, {where}: {problem}" if where else f"{path}: {problem}")
         self.path = path
@@ -38,20 +38,20 @@ class DatasetError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedObject:
-    """One annotated object.
+    """One annotated object. None means that a value is unknown.
 
     Attributes:
         id: id of the object, distinct within the scene.
-        label: label as annotated.
-        position: centre (x, y, z) in metres, or None.
-        size: extents (x, y, z) in metres before rotation by the yaw, or None.
-        yaw: rotation about z in radians.
-        supported_by: id of the supporting object, or None.
-        box2d: (xmin, ymin, xmax, ymax) in the image, y downwards, or None.
+        label: label of the object in the data set.
+        position: centre (x, y, z) of the object in metres.
+        size: extents (x, y, z) of the object in metres, before rotation by the yaw.
+        yaw: rotation of the object about the z axis in radians.
+        supported_by: id of the object that supports this object.
+        box2d: box (xmin, ymin, xmax, ymax) in the image, with y downwards.
         count: number of instances that this entry represents.
 
     Raises:
-        ValueError: numbers are not finite, or extents or the count are not positive.
+        ValueError: the label is empty, or a number is not finite or out of range.
     """
 
     id: str
@@ -88,19 +88,20 @@ class AnnotatedScene:
     """One annotated scene.
 
     Attributes:
-        scene_id: id of the scene, distinct within its source.
-        source: name of the data set.
-        group: group of near-duplicates, such as frames of one place or scans of one room.
-        room_type: room type as annotated, or None.
-        objects: the objects of the scene.
-        relations: (subject index, relation, object index) with one of the eight relations; the
-            indices refer to ``objects``. None if relations were not annotated.
+        scene_id: id of the scene, distinct within its data source.
+        source: name of the data source.
+        group: name of a group of near-duplicate scenes, such as frames of one place.
+        room_type: room type in the data set. None means unknown.
+        objects: objects of the scene.
+        relations: triples (subject index, relation, object index). The indices refer to
+            ``objects``. None means that relations were not annotated.
         viewer_frame: True if positions are in viewer axes. Otherwise left and front are undefined
             until a viewpoint is chosen.
-        false_relations: relations that an annotator denied, in the form of ``relations``.
+        false_relations: triples that an annotator marked as false, in the form of ``relations``.
 
     Raises:
-        ValueError: ids are not distinct, or a support or relation names an unknown object.
+        ValueError: two objects have the same id, or a support link or relation refers to an
+            unknown object.
     """
 
     scene_id: str
@@ -119,7 +120,8 @@ class AnnotatedScene:
         for thing in self.objects:
             if thing.supported_by is not None and thing.supported_by not in ids:
                 raise ValueError(
-                    f"supported_by of {thing.id!r} is {thing.supported_by!r}, which is no object"
+                    f"supported_by of {thing.id!r} is {thing.supported_by!r}, which is no object "
+                    "of the scene"
                 )
         for subject, relation, anchor in (*(self.relations or ()), *self.false_relations):
             if relation not in RELATIONS:

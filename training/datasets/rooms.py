@@ -1,10 +1,9 @@
-"""A small procedural generator of furnished rooms, for tests, examples and machines without data.
+"""A generator of random furnished rooms, for tests, for examples and for training without data.
 
 The tables of `vocabularies/rooms.toml` define the rooms. Furniture stands at walls without overlap,
-and small objects stand on the furniture. The relations follow from the boxes by the rules of
-`app.scene.geometry`. The generator creates one to three views of each room from different sides. A
-view omits 10 % of the small objects at random. The views of a room share a group, like the frames
-of one real place.
+and small objects stand on the furniture. Encoding derives the relations from the boxes by the rules
+of `app.scene.geometry`. The generator creates one to three views of each room from different sides.
+A view omits 10 % of the small objects at random. All views of a room are in one group.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ from training.datasets.vocabulary import source_vocabulary
 SOURCE = "rooms"
 
 _HEIGHT = 2.6  # height of a room in metres
-_ATTEMPTS = 20  # maximum number of random positions for one object; then it is left out
+_ATTEMPTS = 20  # maximum number of random positions that are tried for one object
 _GONE = 0.1  # probability that a view omits a small object
 _CLEARANCE = 0.02  # minimum distance in metres between pieces of furniture
 
 
-# Extents in metres: along the wall, away from the wall, upwards.
+# Extents of an object in metres, in the order: along the wall, away from the wall, upwards.
 Size = tuple[float, float, float]
 Where = Literal["wall", "centre", "hung", "ceiling"]
 Side = Literal["left", "right", "front", "around"]
@@ -43,9 +42,9 @@ class Small:
 
     Attributes:
         label: class of the object.
-        size: mean extents.
-        chance: probability of adding the object, in each of ``most`` attempts.
-        most: maximum number of these objects.
+        size: mean extents of the object.
+        chance: probability that an object is added in each of ``most`` attempts.
+        most: maximum number of objects of this kind on the piece.
     """
 
     label: str
@@ -59,8 +58,9 @@ class Beside:
     """A piece of furniture beside a main piece, such as a nightstand left of a bed.
 
     Attributes:
-        piece: the adjacent piece with the objects on it; its ``chance`` applies to each side.
-        side: side of the main piece, as seen from its wall; ``around`` means all four sides.
+        piece: adjacent piece with the objects on it. Its ``chance`` applies to each side.
+        side: side of the main piece, as seen from the wall behind it. ``around`` means all four
+            sides.
     """
 
     piece: Piece
@@ -73,12 +73,12 @@ class Piece:
 
     Attributes:
         label: class of the piece.
-        size: mean extents.
-        chance: probability of adding the piece to the room, in each of ``most`` attempts.
+        size: mean extents of the piece.
+        chance: probability that a piece is added to the room in each of ``most`` attempts.
         where: place of the piece: at a wall, in the centre, hung on a wall, or under the ceiling.
-        most: maximum number of these pieces.
-        carries: small objects on the piece.
-        beside: adjacent pieces.
+        most: maximum number of pieces of this kind in the room.
+        carries: small objects that can stand on the piece.
+        beside: pieces that can stand beside the piece.
     """
 
     label: str
@@ -91,11 +91,14 @@ class Piece:
 
 
 Rooms = Mapping[str, tuple[Piece, ...]]
-"""The pieces that each room type may contain."""
+"""Maps each room type to the pieces of furniture that it can contain."""
 
 
 class _Tables:
-    """The rooms of each domain. An entry of the file is a table or the name of an earlier table."""
+    """The tables of `vocabularies/rooms.toml`.
+
+    An entry is a table, or the name of an earlier table.
+    """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.smalls: dict[str, Small] = {}
@@ -128,7 +131,7 @@ class _Tables:
 
 _FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "rooms.toml"
 DOMAINS: Final = _Tables(tomllib.loads(_FILE.read_text(encoding="utf-8"))).rooms
-"""``homes`` and ``workplaces``; workplaces are laboratories, workshops and storerooms."""
+"""Rooms of each domain: ``homes``, or ``workplaces`` (laboratories, workshops, storerooms)."""
 
 ROOMS: Final = DOMAINS["homes"]
 WORKPLACES: Final = DOMAINS["workplaces"]
@@ -150,14 +153,17 @@ class _Box:
 
 
 def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[AnnotatedScene]:
-    """Generate ``count`` scenes; the same seed gives the same scenes.
+    """Generate scenes. The same seed gives the same scenes.
+
+    Positions are in viewer axes. Objects have sizes and yaws. The field ``supported_by`` of an
+    object on furniture is the id of the furniture. ``relations`` is None, because encoding derives
+    the relations.
 
     Args:
-        rooms: maps each room type to the pieces it may contain. Pass an entry of `DOMAINS` to
-            generate scenes of another domain.
-
-    Positions are in viewer axes. Boxes have sizes and yaws. An object on furniture names the
-    furniture as its support. ``relations`` is None, because encoding derives the relations.
+        count: number of scenes.
+        seed: seed of the random choices.
+        rooms: maps each room type to the pieces of furniture that it can contain. `DOMAINS`
+            contains the rooms of other domains.
 
     Raises:
         ValueError: ``count`` is negative.
@@ -177,7 +183,7 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
 
 
 def rooms_vocabulary() -> Vocabulary:
-    """Return the vocabulary of the generator: all classes in its tables of rooms."""
+    """Return the vocabulary of the generator, with all classes in its tables of rooms."""
     labels = sorted({label for pieces in ROOMS.values() for label in _labels(pieces)})
     things = tuple(AnnotatedObject(str(i), label) for i, label in enumerate(labels))
     scenes = [AnnotatedScene(room, SOURCE, room, room, things) for room in ROOMS]
@@ -206,7 +212,7 @@ class _Layout:
                     self._furnish(piece)
 
     def seen(self, group: str, view: int) -> AnnotatedScene:
-        """Return the room as seen from the middle of a random wall."""
+        """Return a view of the room from the middle of a random wall."""
         viewpoint = (
             Viewpoint(0.0, self.depth / 2, 0.0),
             Viewpoint(self.width / 2, 0.0, math.pi / 2),
@@ -258,7 +264,7 @@ class _Layout:
                 return
 
     def _propose(self, piece: Piece, size: Size) -> _Box | None:
-        """Return a piece's box at a random place, or None if the room is too small."""
+        """Return the box of a piece at a random place, or None if the room is too small."""
         if piece.where in ("centre", "ceiling"):
             margin = math.hypot(size[0], size[1]) / 2
             if 2 * margin > min(self.width, self.depth):
@@ -268,7 +274,7 @@ class _Layout:
             turned = self.rng.choice([0.0, math.pi / 2]) + self.rng.normal(0.0, 0.05)
             z = size[2] / 2 if piece.where == "centre" else _HEIGHT - size[2] / 2
             return _Box(piece.label, x, y, z, size, float(turned))
-        # The back of the piece is its -y side and touches the wall.
+        # The back of a piece is its -y side. The back touches the wall.
         side = int(self.rng.integers(4))
         length = self.width if side % 2 == 0 else self.depth
         if size[0] > length:
@@ -319,7 +325,7 @@ class _Layout:
             away = self.rng.uniform(0.03, 0.15)
             if side in ("left", "right"):
                 u = (anchor.size[0] + size[0]) / 2 + away
-                # At a wall, the backs of both pieces touch the wall.
+                # Unless the side is "around", the backs of both pieces touch the same wall.
                 v = 0.0 if beside.side == "around" else (size[1] - anchor.size[1]) / 2
                 x, y = _offset(anchor, -u if side == "left" else u, v)
             else:
@@ -354,7 +360,10 @@ class _Layout:
 
 
 def _offset(box: _Box, u: float, v: float) -> tuple[float, float]:
-    """Return a point in room axes: u along the front of a box, v away from its back."""
+    """Return the room coordinates of a point near a box.
+
+    The point is u metres along the front of the box and v metres away from its back.
+    """
     cos, sin = math.cos(box.yaw), math.sin(box.yaw)
     return box.x + cos * u - sin * v, box.y + sin * u + cos * v
 

@@ -1,10 +1,10 @@
-"""Permute objects between scenes; a model trained on the result learns class frequencies only.
+"""Permute objects between scenes. A model trained on permuted scenes learns only class frequencies.
 
-Each class of a scene occupies a slot. A step exchanges the classes of two random slots, unless a
-scene would then contain a class twice. Counts and relations stay with their slots. The exchange
-preserves the number of classes per scene and the number of scenes per class. An exchange is as
-likely as its reversal, so all tables with these two margins become equally likely. This holds only
-if a rejected exchange also counts as a step.
+A slot is the place of one class in one scene. A step exchanges the classes of two random slots,
+unless a scene would then contain a class twice. Counts and relations stay with their slots. The
+exchange preserves the number of classes of each scene and the number of scenes of each class. An
+exchange is as likely as its reversal. All tables with the same two margins therefore become equally
+likely, provided that a rejected exchange also counts as a step.
 
 Source: Gionis, Mannila, Mielikäinen and Tsaparas, "Assessing data mining results via swap
 randomization" (ACM TKDD, 2007).
@@ -22,30 +22,34 @@ from numpy.typing import NDArray
 from app.scene import ClassEvidence
 from training.datasets.encoding import EncodedScene
 
-# Attempted exchanges per slot. Each exchange draws two slots, so a slot is drawn about 20 times.
+# Number of attempted exchanges, divided by the number of slots. An exchange draws two slots, so
+# each slot is drawn about 20 times.
 _STEPS_PER_MENTION: Final = 10
 
 
 def shuffle_objects(
     scenes: Sequence[EncodedScene], structure: NDArray[np.bool_], seed: int
 ) -> list[EncodedScene]:
-    """Permute classes between scenes of all sources, and room types between scenes.
+    """Permute classes between scenes of all data sources, and room types between scenes.
 
-    Structure classes are exchanged with structure classes only, because their relations are
-    unobserved. Counts, confidences and relations stay on their slots. Room types are permuted
+    Structure classes are exchanged only with structure classes, because their relations are
+    unobserved. Counts, confidences and relations stay with their slots. Room types are permuted
     among the scenes with a room type. Scene ids, sources, groups and the number of unknown labels
     stay unchanged.
 
     Args:
-        structure: (V,) bool, True for structure classes.
+        scenes: the scenes.
+        structure: True for structure classes such as walls, (classes,) bool.
+        seed: seed of the random exchanges.
 
     Raises:
-        ValueError: a scene has a class index of V or more.
+        ValueError: a class index of a scene exceeds the length of `structure`.
     """
     for scene in scenes:
         if len(scene.evidence.classes) and scene.evidence.classes[-1] >= len(structure):
             raise ValueError(
-                f"scene {scene.scene_id} has a class index of {len(structure)} or more"
+                f"scene {scene.scene_id} has a class index of {len(structure)} or more; pass "
+                "`structure` with one value for each class"
             )
     rng = np.random.default_rng(seed)
     sizes = [len(scene.evidence.classes) for scene in scenes]
@@ -66,10 +70,11 @@ def shuffle_objects(
 def _exchange(
     owner: NDArray[np.int64], classes: NDArray[np.int64], rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Return the classes (n,) of n slots after random exchanges.
+    """Return the class of each slot, (slots,), after random exchanges.
 
     Args:
-        owner: (n,) index of the scene of each slot.
+        owner: index of the scene of each slot, (slots,).
+        classes: class of each slot before the exchanges, (slots,).
     """
     if not len(classes):
         return classes
@@ -78,7 +83,7 @@ def _exchange(
     for s, c in zip(scene, label, strict=True):
         there.setdefault(s, set()).add(c)
     drawn = rng.integers(len(label), size=(2, _STEPS_PER_MENTION * len(label)))
-    # Each step depends on the earlier steps. Lists and sets are faster than array operations here.
+    # Each exchange depends on the earlier exchanges, so lists and sets are faster than arrays.
     for i, j in zip(*drawn.tolist(), strict=True):
         c, d = label[i], label[j]
         first, second = there[scene[i]], there[scene[j]]
@@ -94,7 +99,11 @@ def _exchange(
 
 
 def _relabelled(scene: EncodedScene, labels: NDArray[np.int64], room: int) -> EncodedScene:
-    """Return the scene with new classes (n,) on its slots, sorted by class."""
+    """Return the scene with a new class in each slot, sorted by class.
+
+    Args:
+        labels: new class of each slot, (slots,).
+    """
     before = scene.evidence
     order = np.argsort(labels)
     evidence = ClassEvidence(

@@ -1,7 +1,7 @@
-"""Known data sets: terms of use, predicates, and the meaning of relations that a scene omits.
+"""Known data sources: terms of use, predicates, and the meaning of relations that are not listed.
 
-A listed relation holds. For relations that a scene does not list, the source decides: they are
-false ("off"), false only between neighbours ("off for neighbours"), or unobserved:
+A listed relation holds. An unlisted relation is false ("off"), false only between neighbours ("off
+for neighbours"), or unobserved. The meaning depends on the data source and on the relation:
 
 | source | on-top | above | left, front |
 |---|---|---|---|
@@ -9,14 +9,14 @@ false ("off"), false only between neighbours ("off for neighbours"), or unobserv
 | centres only (bedrooms) | unobserved | unobserved | off |
 | 3dssg | off | unobserved | off for neighbours |
 | pictures and sentences | unobserved | unobserved | unobserved |
-| lists of the user's own | off | off | off |
+| scenes of the user with listed relations | off | off | off |
 
-Two rules hold in every source. First, a listed on-top or above makes all other relations of the
-pair false, in both directions, unless they are listed too. (1 to 10 % of the pairs with a listed
-on-top or above also have a left or front.) Second, a relation that an annotator denied is false.
+Two rules apply to every data source. First, if on-top or above is listed for a pair of objects, all
+unlisted relations of the pair are false in both directions. (1 to 10 % of such pairs also have a
+listed left or front.) Second, a relation that an annotator marked as false is false.
 
-With poses, neighbours are two objects that are near each other by the rule of `app.scene.geometry`.
-Without poses, neighbours are two objects with at least one listed relation. 3DSSG compares heights
+With poses, two objects are neighbours if they are close by the rule of `app.scene.geometry`.
+Without poses, two objects with at least one listed relation are neighbours. 3DSSG compares heights
 only within a class, so an unlisted above is unobserved. 3DSSG lists left and front only between
 objects on the same support, so left and front of distant pairs are unobserved.
 """
@@ -34,14 +34,15 @@ Unlisted = Literal["off", "off for neighbours", "unobserved"]
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """The meaning of an unlisted relation in a source.
+    """The meaning of relations and objects that the scenes of a data source do not list.
 
     Attributes:
-        on_top, above, lateral: state of an unlisted relation; lateral means left and front.
-        complete_objects: True if the object list covers nearly the whole scene. Then absent
-            objects are evidence in object learning.
-        scenes_per_group: maximum total weight of a group in object learning, in scenes. None if
-            each scene has weight 1.
+        on_top, above, lateral: meaning of an unlisted relation of this kind. lateral means left and
+            front.
+        complete_objects: True if object lists are nearly complete. The training of objects then
+            uses unlisted objects as absent objects.
+        scenes_per_group: maximum total weight of a group of near-duplicates in the training of
+            objects, in scenes. None means that each scene has weight 1.
     """
 
     on_top: Unlisted = "off"
@@ -52,16 +53,16 @@ class Meaning:
 
     @property
     def unlisted(self) -> tuple[Unlisted, ...]:
-        """The state of an unlisted relation, for each canonical relation."""
+        """Meaning of an unlisted relation, for each canonical relation in order."""
         own = {"on-top": self.on_top, "above": self.above}
         return tuple(own.get(name, self.lateral) for name in CANONICAL)
 
 
 LISTS: Final = Meaning()
-"""Relations that a user listed: an unlisted relation is false."""
+"""Meaning for scenes of the user with listed relations: an unlisted relation is false."""
 
 BOXES: Final = Meaning(lateral="off for neighbours")
-"""Relations derived from boxes. Without sizes, on-top and above are unobserved."""
+"""Meaning for relations derived from boxes. Without sizes, on-top and above are unobserved."""
 
 _CENTRES: Final = Meaning(on_top="unobserved", above="unobserved")
 _MENTIONS: Final = Meaning(
@@ -69,7 +70,7 @@ _MENTIONS: Final = Meaning(
 )
 
 _THE_EIGHT: Final = {name: name for name in RELATIONS}
-# All kinds of support in 3DSSG map to on-top.
+# Relation of each predicate of 3DSSG. All kinds of support become on-top.
 _3DSSG: Final = {
     "left": "left",
     "right": "right",
@@ -98,18 +99,19 @@ _VRD: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A known data set.
+    """A known data source.
 
     Attributes:
-        terms: provenance and licence, for the model card.
+        terms: origin and licence of the data, for the model card.
         research_only: True if the licence excludes commercial use.
-        meaning: meaning of an unlisted relation. None selects `LISTS` for scenes that list
-            relations and `BOXES` for other scenes.
-        predicates: maps predicates to relations. The reader skips predicates outside this mapping,
-            such as "inside" and "wear". If the mapping is None, an unknown predicate is an error.
-        left_out: labels whose annotation is too incomplete for use.
-        open_vocabulary: True if annotators used free words. A class that a scene does not mention
-            is then absent. Otherwise annotators chose from a list, and a class outside the list is
+        meaning: meaning of unlisted relations. None means `LISTS` for scenes with listed relations
+            and `BOXES` for other scenes.
+        predicates: maps predicates of the data source to relations of the service. The reader skips
+            other predicates, such as "inside" and "wear". None means that predicates are names of
+            relations, and another predicate is an error.
+        left_out: labels that are ignored because their annotation is too incomplete.
+        open_vocabulary: True if annotators used free words. An unlisted class is then absent.
+            Otherwise annotators chose labels from a list, and a class outside the list is
             unobserved.
     """
 
@@ -177,7 +179,8 @@ SOURCES: Final[dict[str, Source]] = {
     ),
     "alfred": Source(
         "ALFRED (Shridhar et al., CVPR 2020): AI2-THOR rooms and triples from instructions; MIT",
-        # Thousands of episodes show about a hundred rooms: each room has the weight of 3 scenes.
+        # Thousands of episodes show only about a hundred rooms, so all episodes of a room together
+        # have the weight of three scenes.
         meaning=Meaning(
             on_top="unobserved", above="unobserved", lateral="unobserved", scenes_per_group=3.0
         ),
@@ -209,10 +212,12 @@ SOURCES: Final[dict[str, Source]] = {
 
 
 def meaning_of(source: str, *, listed: bool = True) -> Meaning:
-    """Return the meaning of unlisted relations in a source.
+    """Return the meaning of relations and objects that a data source does not list.
 
     Args:
-        listed: whether the scene lists relations; used for sources without a fixed meaning.
+        source: name of the data source.
+        listed: True if the scene lists relations. Only unknown sources, and sources without a fixed
+            meaning, depend on this argument.
     """
     known = SOURCES.get(source)
     if known is not None and known.meaning is not None:
@@ -221,10 +226,10 @@ def meaning_of(source: str, *, listed: bool = True) -> Meaning:
 
 
 def relation_of(source: str, predicate: str) -> str | None:
-    """Map a predicate of a source to one of the eight relations, or None if no relation matches.
+    """Return the relation that a predicate of a data source means, or None if no relation matches.
 
     Raises:
-        ValueError: the source lacks a predicate table, and the predicate is not a relation name.
+        ValueError: the predicate is unknown, and the data source has no table of predicates.
     """
     known = SOURCES.get(source)
     if known is not None and known.predicates is not None:

@@ -1,18 +1,21 @@
 """Split scenes into training, test and validation parts by one of four protocols.
 
-- ``group`` (75 / 15 / 10 %) keeps near-duplicates together: each group goes to one part. A group
-  may occur in several sources, such as a frame and the 3D boxes of the same frame. The group then
-  goes to the same part in all these sources.
-- ``stable`` (75 / 15 / 10 %) derives the part of a group from the seed and the group name only.
-  When a data set grows, all groups keep their parts. So a later model version never trains on
-  the test scenes of an earlier version. This protocol does not stratify.
-- ``final`` (90 / 0 / 10 %) works like ``group`` without a test part. The 10 % are for calibration.
-  The shipped weights are trained on the 90 %.
-- ``random`` (60 / 30 / 10 %) is the protocol of the seed paper and assigns each scene separately.
+The percentages are the shares of the training, test and validation part.
+
+- ``group`` (75 / 15 / 10 %) puts all scenes of a group of near-duplicates into one part. A group
+  can occur in several data sources, for example as a camera frame and as 3D boxes of the same
+  frame. The group then has the same part in all these sources.
+- ``stable`` (75 / 15 / 10 %) derives the part of a group only from the seed and the group name.
+  All groups keep their parts when a data set grows. A later model version is therefore never
+  trained on the test scenes of an earlier version. This protocol does not stratify.
+- ``final`` (90 / 0 / 10 %) is ``group`` without a test part. The shipped weights are trained on the
+  90 % and calibrated on the 10 %.
+- ``random`` (60 / 30 / 10 %) is the protocol of Bozcan et al. (ICRA 2018). Each scene is assigned
+  separately.
 
 All protocols except ``stable`` stratify by room type. Their parts depend on the seed and on the set
-of scenes, but not on the order of scenes. Sources without a common group do not affect each other:
-splitting one of them alone gives the same parts. Sources with common groups must be split together.
+of scenes, but not on the order of scenes. Data sources without a common group do not affect each
+other's parts. Data sources with common groups must be split together.
 """
 
 from __future__ import annotations
@@ -39,20 +42,22 @@ FRACTIONS: Final[dict[Protocol, dict[Part, float]]] = {
 def split(
     scenes: Sequence[AnnotatedScene], *, seed: int, protocol: Protocol = "group"
 ) -> dict[Part, list[AnnotatedScene]]:
-    """Assign each scene to a part; the order of scenes is kept.
+    """Return the scenes of each part, in their original order.
 
     Args:
-        scenes: the scenes of all sources.
-        seed: random seed of the split.
+        scenes: scenes of all data sources.
+        seed: seed of the split.
         protocol: ``group``, ``stable``, ``random`` or ``final``.
 
     Raises:
-        ValueError: an unknown protocol, or two scenes of one source with one id.
+        ValueError: the protocol is unknown, or two scenes of a data source have the same id.
     """
     if protocol not in FRACTIONS:
         raise ValueError(f"protocol must be one of {', '.join(FRACTIONS)}, not {protocol!r}")
     if len({(scene.source, scene.scene_id) for scene in scenes}) < len(scenes):
-        raise ValueError("two scenes of one source have the same scene_id")
+        raise ValueError(
+            "two scenes of one source have the same scene_id; give each scene a distinct id"
+        )
     units = [_unit(scene, protocol) for scene in scenes]
     part_of: dict[str, Part] = {}
     if protocol == "stable":
@@ -67,12 +72,15 @@ def split(
 
 
 def _unit(scene: AnnotatedScene, protocol: Protocol) -> str:
-    """Return the name of a scene's unit. All scenes of a unit go to the same part."""
+    """Return the name of the unit of a scene: a group, or a single scene with ``random``.
+
+    All scenes of a unit have the same part.
+    """
     return f"{scene.source}/{scene.scene_id}" if protocol == "random" else scene.group
 
 
 def stable_part(group: str, seed: int) -> Part:
-    """Return the part of a group under the ``stable`` protocol, independent of other scenes."""
+    """Return the part of a group in the ``stable`` protocol. It depends on no other scenes."""
     place = int.from_bytes(_rank(seed, group)[:8], "big") / 2**64
     for part, share in FRACTIONS["stable"].items():
         if place < share:
@@ -84,10 +92,11 @@ def stable_part(group: str, seed: int) -> Part:
 def _families(
     scenes: Sequence[AnnotatedScene], units: Sequence[str]
 ) -> list[dict[str, Counter[str]]]:
-    """Count room types by unit, for each set of sources with common units.
+    """Count the room types of each unit (group or scene), for each set of connected data sources.
 
-    A unit is counted only in the largest source that contains it. So a small source with the same
-    groups does not change the parts of a large source.
+    Data sources are connected if they have common units. A unit is counted only in the largest
+    source that contains the unit. A small source therefore cannot change the parts of a large
+    source.
     """
     sources_of: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter()
@@ -110,7 +119,7 @@ def _families(
 
 
 def _connected(sources: Iterable[str], shared: Iterable[set[str]]) -> dict[str, str]:
-    """Map each source to the alphabetically first source of its connected component."""
+    """Map each data source to the alphabetically first source of its connected component."""
     family = {source: source for source in sources}
     for linked in shared:
         if len(linked) > 1:
@@ -123,11 +132,12 @@ def _connected(sources: Iterable[str], shared: Iterable[set[str]]) -> dict[str, 
 def _assign(
     rooms_of: Mapping[str, Counter[str]], shares: Mapping[Part, float], seed: int
 ) -> dict[str, Part]:
-    """Assign each unit to the part furthest below its target share, one stratum at a time.
+    """Assign each unit to the part that is furthest below its target share of scenes.
 
-    The stratum of a unit is its most common room type. Large strata come first, and a hash orders
-    the units within a stratum. The distance from the target is the sum of the distance within the
-    stratum and the distance over all scenes. So units of small strata do not all go to training.
+    The stratum of a unit is its most common room type. Large strata are assigned first, and a hash
+    orders the units within a stratum. The distance from the target is the sum of two distances:
+    within the stratum and over all scenes. Otherwise, all units of small strata would become
+    training scenes.
     """
     strata: dict[str, list[str]] = defaultdict(list)
     for unit, rooms in rooms_of.items():
@@ -152,7 +162,7 @@ def _assign(
 
 
 def _lack(share: float, given: int, total: int) -> float:
-    """Return the number of scenes that a part lacks to reach its target share."""
+    """Return the number of additional scenes with which a part reaches its target share."""
     return share * total - given
 
 

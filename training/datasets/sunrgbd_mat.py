@@ -1,9 +1,10 @@
 """SUN RGB-D 3D boxes (Song, Lichtenberg & Xiao, CVPR 2015): ``SUNRGBDMeta3DBB_v2.mat``.
 
-The file holds a struct array ``SUNRGBDMeta`` with one element per frame. ``groundtruth3DBB`` is a
-struct array of boxes with the fields ``basis`` (rows are the box axes), ``coeffs`` (half extents
-along these axes), ``centroid`` and ``classname``. Coordinates are in metres: x right, y away from
-the camera, z up. They are already corrected for the tilt of the camera.
+The file contains a struct array ``SUNRGBDMeta`` with one element for each camera frame. Its field
+``groundtruth3DBB`` is a struct array of boxes with the fields ``basis`` (rows are the box axes),
+``coeffs`` (half extents along these axes), ``centroid`` and ``classname``. Coordinates are in
+metres, with x to the right, y away from the camera and z up. The coordinates are already corrected
+for the tilt of the camera.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetEr
 
 SOURCE = "sunrgbd-mat"
 
-# Number of frames in a group. Consecutive frames in the file often show the same place.
+# Number of consecutive frames in a group. Consecutive frames often show the same place.
 _BLOCK = 20
 
 
 def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
-    """Read the frames that have boxes.
+    """Read all camera frames with boxes as scenes.
 
-    The room type comes from ``<sequenceName>/scene.txt`` if the image folders are next to the file.
-    Frames of one SUN3D place share a group. Other frames form groups of 20 consecutive frames of
-    one sensor and collection.
+    The file ``<sequenceName>/scene.txt`` gives the room type, if the image folders are in the same
+    folder as the MATLAB file. Frames of one SUN3D place are in one group. Other frames form groups
+    of 20 consecutive frames from one sensor and collection.
 
     Raises:
-        DatasetError: the file does not follow the official layout.
+        DatasetError: the file does not have the official format.
     """
     scenes: list[AnnotatedScene] = []
     taken: Counter[str] = Counter()
@@ -72,12 +73,15 @@ def _load(path: Path) -> Any:
     except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
         raise DatasetError(path, "", f"is not a MATLAB 5 file: {error}") from error
     if "SUNRGBDMeta" not in content:
-        raise DatasetError(path, "", "lacks the variable SUNRGBDMeta")
+        raise DatasetError(path, "", "the file lacks the variable SUNRGBDMeta of SUN RGB-D")
     return content["SUNRGBDMeta"]
 
 
 def _structs(value: Any) -> list[Any]:
-    """Convert a struct array to a list; MATLAB returns one struct, several or an empty matrix."""
+    """Convert a MATLAB struct array to a list.
+
+    The value is a single struct, several structs, or an empty matrix for an empty array.
+    """
     if isinstance(value, dict):
         return [value]
     return list(value) if isinstance(value, list) else list(np.atleast_1d(value))
@@ -103,7 +107,7 @@ def _array(path: Path, where: str, struct: Any, name: str, shape: tuple[int, ...
 
 def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
     basis = _array(path, where, struct, "basis", (3, 3))
-    # Some boxes have negative half extents in the file.
+    # Some boxes in the file have negative half extents, so use the absolute values.
     half = np.abs(_array(path, where, struct, "coeffs", (3,)))
     x, y, z = _array(path, where, struct, "centroid", (3,)).tolist()
     upright = int(np.abs(basis[:, 2]).argmax())
@@ -112,7 +116,8 @@ def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
         return AnnotatedObject(
             id=str(number),
             label=_text(path, where, struct, "classname"),
-            # In the file, x points right and y away. In viewer axes, x points away and y left.
+            # In the file, x points right and y away from the camera. In viewer axes, x points away
+            # from the viewer and y left.
             position=(y, -x, z),
             size=(2 * float(half[ahead]), 2 * float(half[aside]), 2 * float(half[upright])),
             yaw=math.atan2(-float(basis[ahead, 0]), float(basis[ahead, 1])),

@@ -1,8 +1,8 @@
-"""3DSSG scene graphs (Wald et al., CVPR 2020) in their official layout.
+"""Reader for 3DSSG scene graphs (Wald et al., CVPR 2020) in their official format.
 
-The whole data set has ``relationships.json``, with the labels in ``objects.json`` in the same
-folder. The subset has ``relationships_train.json`` and ``relationships_validation.json``. The files
-of the subset include the labels and divide scans into splits of at most nine objects.
+The whole data set consists of ``relationships.json`` and of ``objects.json``, which contains the
+labels. The subset consists of ``relationships_train.json`` and ``relationships_validation.json``.
+The files of the subset include the labels and divide scans into splits of at most nine objects.
 ``3RScan.json`` in the same folder lists the scans of each room.
 """
 
@@ -19,12 +19,12 @@ SOURCE = "3dssg"
 
 
 def read_3dssg(path: Path) -> list[AnnotatedScene]:
-    """Read the scans (or splits of scans) of a relationships file.
+    """Read the scans, or splits of scans, in a relationships file as scenes.
 
     All scans of a room are in one group. The official files contain no room types and no poses.
 
     Raises:
-        DatasetError: a file is missing or does not follow the official layout.
+        DatasetError: a file is missing or does not have the official format.
     """
     scans = take(path, "", load_json(path), "scans", list)
     rooms = _rooms(path.with_name("3RScan.json"))
@@ -83,7 +83,7 @@ def _relations(
 
 
 def _labels(path: Path) -> dict[str, dict[str, str]]:
-    """Read the labels from ``objects.json``, by scan id and object id."""
+    """Read ``objects.json``. Return a mapping from scan id to object id to label."""
     labels: dict[str, dict[str, str]] = {}
     for number, scan in enumerate(take(path, "", load_json(path), "scans", list)):
         where = f"scans[{number}]"
@@ -96,11 +96,11 @@ def _labels(path: Path) -> dict[str, dict[str, str]]:
 
 
 def _rooms(path: Path) -> dict[str, str]:
-    """Return the reference scan of the same room for each scan id, from ``3RScan.json``."""
+    """Read ``3RScan.json``. Map each scan id to the id of the reference scan of the same room."""
     rooms: dict[str, str] = {}
     entries = load_json(path)
     if not isinstance(entries, list):
-        raise DatasetError(path, "", "must be a list of reference scans")
+        raise DatasetError(path, "", "the file must contain a list of reference scans")
     for number, entry in enumerate(entries):
         where = f"[{number}]"
         reference = take(path, where, entry, "reference", str)

@@ -16,11 +16,11 @@ from training.datasets.records import AnnotatedScene
 
 INDOOR_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "indoor.json"
 
-# Minimum number of mentions of a class in the training scenes. Indoor classes also have word
-# vectors, so a smaller minimum suffices for them.
+# Minimum number of objects of a class in the scenes. Classes of indoor vocabularies also have word
+# vectors, so a smaller minimum is enough for these vocabularies.
 MINIMUM_MENTIONS = 8
 INDOOR_MINIMUM_MENTIONS = 5
-# Minimum number of boxes for a typical size.
+# Minimum number of boxes of a class from which a typical size is computed.
 MINIMUM_BOXES = 5
 
 
@@ -32,20 +32,20 @@ def build_vocabulary(
     minimum_rooms: int | None = None,
     outdoor: bool = False,
 ) -> Vocabulary:
-    """Collect the frequent classes of scenes and their aliases, most frequent first.
+    """Collect the frequent classes of scenes with their aliases, most frequent class first.
 
-    Labels are pooled under their curated names before counting. The base and household classes of
-    ``names`` are always included. Labels of ``not_objects`` are always excluded.
+    A label counts for its curated name. The base and household classes of ``names`` are always
+    included. Labels in ``names.not_objects`` are always excluded.
 
     Args:
         scenes: the annotated scenes.
         names: the curated names.
-        minimum: minimum number of mentions of a class.
-        minimum_rooms: minimum number of scenes of a room type; by default ``minimum``.
-        outdoor: include labels of ``outdoor`` and ``surroundings``.
+        minimum: minimum number of objects of a class.
+        minimum_rooms: minimum number of scenes of a room type. The default is ``minimum``.
+        outdoor: True includes the labels in ``names.outdoor`` and ``names.surroundings``.
 
     Raises:
-        ValueError: every class has fewer mentions than the minimum.
+        ValueError: every class has fewer objects than the minimum.
     """
     spellings: dict[str, Counter[str]] = {}
     rooms: Counter[str] = Counter()
@@ -55,7 +55,7 @@ def build_vocabulary(
             spellings.setdefault(label_key(label), Counter())[label] += 1
         if room := names.canonical_room(scene.room_type):
             rooms[room] += 1
-    # Spellings with the same key are one label; the most common spelling represents it.
+    # Spellings with the same key count as one label, under the most common spelling.
     mentions = Counter(
         {
             min(found, key=lambda label: (-found[label], label)): found.total()
@@ -86,9 +86,10 @@ def build_vocabulary(
 def write_indoor_vocabulary(
     scenes: Iterable[AnnotatedScene], path: Path = INDOOR_FILE
 ) -> Vocabulary:
-    """Build the indoor vocabulary from the scenes of all sources; write one class per line.
+    """Build the indoor vocabulary from the scenes of all data sources, and write it to a file.
 
-    Photographs relate indoor objects to outdoor surroundings, so surroundings are ordinary classes.
+    Photographs contain relations between indoor objects and outdoor surroundings. Surroundings are
+    therefore ordinary classes.
     """
     names = replace(curated_names(), surroundings=())
     vocabulary = build_vocabulary(
@@ -103,9 +104,9 @@ def write_indoor_vocabulary(
 
 
 def vocabulary_json(vocabulary: Vocabulary) -> str:
-    """Format a vocabulary as JSON that people can edit, one class per line.
+    """Return a vocabulary as JSON text that people can edit, with one class on each line.
 
-    The file omits sizes: `with_typical_sizes` computes them from the training data.
+    The text contains no typical sizes, because `with_typical_sizes` computes them from scenes.
     """
     values = vocabulary.to_dict()
     for entry in values["objects"]:
@@ -116,27 +117,28 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
-    """Read a vocabulary file, written by `vocabulary_json` or by hand.
+    """Read a vocabulary from a JSON file. `vocabulary_json` returns the format.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the content is not JSON or not a vocabulary.
+        ValueError: the content of the file is not JSON or not a vocabulary.
     """
     return Vocabulary.from_dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def indoor_vocabulary(path: Path = INDOOR_FILE) -> Vocabulary:
-    """Read the committed indoor vocabulary."""
+    """Read the indoor vocabulary from the repository."""
     return read_vocabulary(path)
 
 
 def source_vocabulary(
     scenes: Iterable[AnnotatedScene], *, minimum: int = MINIMUM_MENTIONS
 ) -> Vocabulary:
-    """Build a vocabulary of the mentioned classes only, without the base classes.
+    """Build a vocabulary that contains only classes of the scenes, without the base classes.
 
-    The vocabulary is for models trained on one source, such as ProcTHOR or VRD. It has few classes,
-    so names of narrower kinds become aliases: "dining table" becomes an alias of "table".
+    The vocabulary is for models trained on one data source, such as ProcTHOR or VRD. Because it has
+    few classes, more specific names become aliases. For example, "dining table" becomes an alias of
+    "table".
     """
     names = curated_names()
     mentioned_only = Names(
@@ -152,26 +154,30 @@ def source_vocabulary(
 
 
 def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> ObjectClass:
-    """Add names of narrower kinds as aliases if the vocabulary does not contain them."""
+    """Add more specific names of a class as aliases, if the vocabulary does not contain them."""
     unknown = [kind for kind in names.kinds.get(entry.label, ()) if vocabulary.index(kind) is None]
     more = [name for kind in unknown for name in (kind, *names.aliases.get(kind, ()))]
     return replace(entry, aliases=(*entry.aliases, *more))
 
 
 def _reachable(names: Names) -> dict[str, tuple[str, ...]]:
-    """Return the aliases by class; an entry for every curated class keeps the curated spelling."""
+    """Return the aliases of each curated class. A class without aliases has an empty entry.
+
+    The empty entry preserves the curated spelling of the class.
+    """
     return dict.fromkeys((*names.base, *names.household, *names.structure), ()) | names.aliases
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
-    """Add a typical size to each class: the median of its boxes.
+    """Add the typical size of each class, the median size of its boxes.
 
-    The yaw of an object is unknown if only its typical size is used, so the typical footprint is a
-    square. Its side is the median of sqrt(dx * dy), which preserves the area.
+    The service uses the typical size for objects without a size, whose yaw is also unknown. The
+    typical footprint is therefore a square. The side of the square is the median of sqrt(dx * dy),
+    which preserves the area.
 
     Args:
-        vocabulary: the classes; a class with fewer than `MINIMUM_BOXES` boxes keeps its size.
-        scenes: the scenes; objects without a size are skipped.
+        vocabulary: the classes. A class with fewer than `MINIMUM_BOXES` boxes stays unchanged.
+        scenes: the scenes. Objects without a size are skipped.
     """
     boxes: dict[int, list[tuple[float, float]]] = {}
     found: dict[str, int | None] = {}
@@ -200,15 +206,15 @@ def _sized(entry: ObjectClass, boxes: Sequence[tuple[float, float]]) -> ObjectCl
 def coverage(
     vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene], *, structure: bool = True
 ) -> float:
-    """Return the share of object mentions in scenes that a vocabulary covers.
+    """Return the share of the objects in scenes whose label is in a vocabulary.
 
     Args:
         vocabulary: the vocabulary.
         scenes: the scenes.
-        structure: include mentions of structure classes.
+        structure: True also counts objects of structure classes such as walls.
 
     Raises:
-        ValueError: the scenes mention no object.
+        ValueError: the scenes contain no objects.
     """
     known = total = 0
     mentions = Counter(thing.label for scene in scenes for thing in scene.objects)

@@ -1,7 +1,7 @@
 """Word vectors for the classes of a vocabulary.
 
-The ``.npz`` file contains ``words`` (n,) strings, ``vectors`` (n, d) int8 and the scalar ``scale``.
-The vector of a word is its row of ``vectors`` times ``scale``.
+The ``.npz`` file contains three arrays: ``words`` (words,) strings, ``vectors`` (words, dimensions)
+int8 and the scalar ``scale``. The vector of a word is its row of ``vectors`` times ``scale``.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ MAX_WORDS: Final = 1_000_000
 MAX_BYTES: Final = 512 * 2**20
 
 _MEMBERS: Final = ("words", "vectors", "scale")
-# `zipfile` raises RuntimeError for an encrypted archive and for an unknown compression.
+# Errors of an unreadable archive. `zipfile` raises RuntimeError for an encrypted archive and for an
+# unknown compression.
 _UNREADABLE: Final = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
 _SEPARATORS: Final = re.compile(r"[\s_\-./]+")
-# Filler words, which do not describe the object.
+# Words in a label that do not describe the object. They are ignored.
 _FILLERS: Final = frozenset({"a", "an", "and", "for", "in", "no", "of", "on", "or", "the", "with"})
 
 Vectors = NDArray[np.float32]
@@ -36,12 +37,12 @@ Vectors = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class WordVectors:
-    """Vectors of words.
+    """Word vectors, stored as 8-bit integers.
 
     Attributes:
-        words: (n,) distinct words in lower case.
-        vectors: (n, d) int8; multiply by ``scale``.
-        scale: positive factor.
+        words: distinct words in lower case, (words,).
+        vectors: integer vector of each word, (words, dimensions) int8.
+        scale: positive factor. The word vectors are ``vectors`` times ``scale``.
     """
 
     words: tuple[str, ...]
@@ -53,10 +54,10 @@ class WordVectors:
         return int(self.vectors.shape[1])
 
     def of(self, text: str) -> Vectors | None:
-        """Return the mean vector (d,) of the words of a text, with unit length.
+        """Return the mean vector of the words of a text, scaled to length 1, (dimensions,).
 
-        An unknown plural is looked up in the singular. Fillers such as "of" are ignored. The result
-        is None if less than half of the words are known.
+        An unknown plural is looked up in the singular. Words such as "of" are ignored. The result
+        is None if less than half of the words have a vector.
         """
         words = [word for word in _SEPARATORS.split(text.casefold()) if word]
         words = [word for word in words if word not in _FILLERS] or words
@@ -78,11 +79,12 @@ class WordVectors:
 def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, NDArray[np.bool_]]:
     """Return the word vectors of the classes of a vocabulary.
 
-    The vector of a class comes from its label, or else from its first alias with a vector.
+    The vector of a class is the vector of its label. If the label has no vector, the vector of the
+    first alias with a vector is used.
 
     Returns:
-        Vectors (V, d) float32 of unit length, zero for a class without a vector.
-        Mask (V,) bool, True for a class with a vector.
+        Vectors of length 1, (classes, dimensions) float32, and a mask (classes,) bool. The mask is
+        True for classes with a vector. The vector of any other class is zero.
     """
     vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
     found = np.zeros(len(vocabulary), dtype=np.bool_)
@@ -96,7 +98,7 @@ def read_word_vectors(path: Path) -> WordVectors:
     """Read a file of word vectors.
 
     Raises:
-        DatasetError: the file is missing, malformed or too large.
+        DatasetError: the file is missing, invalid or too large.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -107,27 +109,30 @@ def read_word_vectors(path: Path) -> WordVectors:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
     words, vectors, scale = (arrays[name] for name in _MEMBERS)
     if words.ndim != 1 or words.dtype.kind != "U" or not 0 < len(words) <= MAX_WORDS:
-        raise DatasetError(path, "words", f"must be 1 to {MAX_WORDS} strings")
+        raise DatasetError(path, "words", f"must be 1 to {MAX_WORDS} strings in one dimension")
     if vectors.dtype != np.int8 or vectors.ndim != 2 or len(vectors) != len(words):
-        raise DatasetError(path, "vectors", f"must be {len(words)} rows of int8")
+        raise DatasetError(path, "vectors", f"must be {len(words)} rows of int8, one per word")
     if not vectors.shape[1]:
         raise DatasetError(path, "vectors", "must have at least one column")
     if scale.shape != () or scale.dtype.kind != "f" or not 0 < float(scale) < np.inf:
         raise DatasetError(path, "scale", "must be one positive number")
     names = tuple(word.casefold() for word in words.tolist())
     if len(set(names)) < len(names):
-        raise DatasetError(path, "words", "contains a word twice")
+        raise DatasetError(path, "words", "contains a word twice; words must be distinct")
     return WordVectors(names, vectors, float(scale))
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """Read one array without unpickling, after a check of its declared size."""
+    """Read one array of the archive, after a check of its declared size.
+
+    Pickled arrays are refused, because unpickling can run code of the file.
+    """
     if f"{name}.npy" not in archive.namelist():
         raise DatasetError(path, name, "is missing")
     with archive.open(f"{name}.npy") as file:
         version = npy.read_magic(file)
         if version not in ((1, 0), (2, 0)):
-            raise DatasetError(path, name, f"has the unsupported format version {version}")
+            raise DatasetError(path, name, f"has the unsupported .npy version {version}")
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, _, dtype = read(file)
         size = dtype.itemsize

@@ -1,4 +1,4 @@
-"""Commands about scenes: `init` proposes a configuration for them, `example` generates some."""
+"""Two commands: `init` proposes a configuration for your scenes, `example` generates scenes."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from training.datasets.rooms import DOMAINS
 from training.domain.proposal import Proposal, propose
 from training.domain.report import as_dict, show
 
-# Number of bad lines to print; the others are counted.
+# Maximum number of invalid lines that are printed. Further invalid lines are only counted.
 BAD_LINES = 20
 
 console = Console()
 
 
 class BadLinesError(ValueError):
-    """Some lines are not scenes; `errors` holds one error per bad line."""
+    """Some lines of a file are not valid scenes. `errors` contains the error of each line."""
 
     def __init__(self, errors: list[DatasetError]) -> None:
         super().__init__(f"{len(errors)} lines are not scenes")
@@ -41,17 +41,17 @@ class BadLinesError(ValueError):
 
 def init(
     name: Annotated[str, typer.Argument(help="name of the model: lower case, digits and hyphens")],
-    files: Annotated[list[Path], typer.Argument(help="scene files of one domain")],
+    files: Annotated[list[Path], typer.Argument(help="files with the scenes of one domain")],
     output: Annotated[
-        Path | None, typer.Option(help="output folder; by default the name of the model")
+        Path | None, typer.Option(help="output folder; default: a folder named like the model")
     ] = None,
     format_: Annotated[
         str | None,
-        typer.Option("--format", help=f"{', '.join(READERS)}; by default from the file name"),
+        typer.Option("--format", help=f"{', '.join(READERS)}; default: derived from file names"),
     ] = None,
-    terms: Annotated[str, typer.Option(help="terms of use of the scenes, for the card")] = "",
-    report: Annotated[Path | None, typer.Option("--json", help="write the report here")] = None,
-    force: Annotated[bool, typer.Option("--force", help="overwrite an earlier proposal")] = False,
+    terms: Annotated[str, typer.Option(help="terms of use of the scenes (model card)")] = "",
+    report: Annotated[Path | None, typer.Option("--json", help="file for a JSON report")] = None,
+    force: Annotated[bool, typer.Option("--force", help="overwrite existing files")] = False,
 ) -> None:
     """Analyse your scenes, and propose a vocabulary and a training configuration.
 
@@ -64,8 +64,8 @@ def init(
         targets = [folder / f"{name}.toml", folder / "vocabulary.json"]
         if not force and (there := [path for path in targets if path.exists()]):
             raise ConfigError(
-                f"{' and '.join(map(str, there))} would be overwritten: use --force or another "
-                "--output"
+                f"{' and '.join(map(str, there))} would be overwritten: use --force, or choose "
+                "another folder with --output"
             )
         with console.status("reading scenes"):
             found = {file: _read(file, format_) for file in files}
@@ -94,20 +94,22 @@ def init(
 
 def _check_name(name: str) -> None:
     if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
-        raise ConfigError(f"a model name is lower-case words joined by hyphens, not {name!r}")
+        raise ConfigError(
+            f"the model name is {name!r}; use lower-case words and digits, joined by hyphens"
+        )
     if name in shipped_configs():
-        raise ConfigError(f"{name} is the name of a shipped configuration: use another name")
+        raise ConfigError(f"{name} is the name of a shipped configuration; choose another name")
 
 
 def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
     """Read the scenes of a file.
 
     Raises:
-        BadLinesError: some lines are not scenes.
+        BadLinesError: some lines of the file are not valid scenes.
         DatasetError: the file cannot be read.
     """
     if format_ is not None and format_ not in READERS:
-        raise ConfigError(f"unknown format {format_!r}: {', '.join(READERS)}")
+        raise ConfigError(f"unknown format {format_!r}: use one of {', '.join(READERS)}")
     if (format_ or guess_format(path)) != "jsonl":
         return READERS[format_ or guess_format(path)](path)
     scenes: list[AnnotatedScene] = []
@@ -125,9 +127,10 @@ def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
 def _sources(
     folder: Path, found: dict[Path, list[AnnotatedScene]]
 ) -> tuple[list[str], dict[Path, list[AnnotatedScene]]]:
-    """Return the source paths relative to the folder, and the scenes of each copy to write.
+    """Return the paths of the scene files relative to the folder, and the files to copy.
 
-    A file is copied if its name implies no format.
+    A file is copied under a new name if its own name does not determine the format. The second
+    result maps the path of each copy to its scenes.
     """
     sources: list[str] = []
     copies: dict[Path, list[AnnotatedScene]] = {}
@@ -143,7 +146,7 @@ def _sources(
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file atomically."""
+    """Write a text file atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".part")
     draft.write_text(text, encoding="utf-8")
@@ -165,7 +168,7 @@ def _next(
 
 
 def _fail_lines(error: BadLinesError) -> NoReturn:
-    console.print(f"[red]error:[/red] {error}; nothing was written", soft_wrap=True)
+    console.print(f"[red]error:[/red] {error}; no file was written", soft_wrap=True)
     for line in error.errors[:BAD_LINES]:
         console.print(f"  {line.path.name}, {line.where}: {line.problem}", markup=False)
     if (more := len(error.errors) - BAD_LINES) > 0:
@@ -190,12 +193,12 @@ def example(
     scenes: Annotated[int, typer.Option(min=1, help="number of scenes")] = 300,
     seed: Annotated[int, typer.Option(min=0, help="random seed")] = 0,
 ) -> None:
-    """Generate example scenes of a domain and write them as JSON lines.
+    """Generate example scenes of a domain, and write them as JSON lines.
 
-    With the same seed, a larger number of scenes keeps the earlier scenes and adds new ones.
+    With the same seed, a larger number of scenes only adds scenes after the existing scenes.
     """
     if file.exists():
-        fail(ConfigError(f"{file} already exists"))
+        fail(ConfigError(f"{file} already exists; choose another output file"))
     file.parent.mkdir(parents=True, exist_ok=True)
     write_jsonl(generate_rooms(scenes, seed, DOMAINS[domain]), file)
     console.print(f"{scenes} generated scenes of {domain}: {file}", soft_wrap=True)

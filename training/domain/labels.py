@@ -1,4 +1,4 @@
-"""The labels of scenes: their frequencies, their spellings, and pairs of similar labels."""
+"""Analyse the labels of scenes: frequencies, spellings, and pairs of similar labels."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from rapidfuzz.distance import OSA
 from app.scene import label_key
 from training.datasets import AnnotatedScene, Names
 
-# Only this number of the most frequent names are compared with each other.
+# Maximum number of names that are compared with each other, most frequent names first.
 _COMPARED = 2000
-# Lookalikes of at least 5 letters differ by one edit; of at least 10 letters, by at most two edits.
+# Minimum number of letters of two similar names that differ by one edit, or by two edits.
 _ONE_SLIP, _TWO_SLIPS = 5, 10
-# A merged name has at least 6 letters. It has at most two mentions, or at most 10 % of the mentions
-# of the other name.
+# A name is merged into a similar name if it has at least `_MERGED_LENGTH` letters and is rare. A
+# rare name has at most two objects, or at most the share `_RARE` of the objects of the other name.
 _RARE, _MERGED_LENGTH = 0.1, 6
 
 
 @dataclass(frozen=True)
 class Label:
-    """One name with all its spellings.
+    """One name of objects, with all its spellings.
 
     Attributes:
-        name: spelling for the vocabulary.
+        name: spelling in the vocabulary.
         mentions: number of objects with this name.
         scenes: number of scenes with this name.
-        spellings: spellings as annotated, most frequent first.
+        spellings: spellings in the scenes, most frequent first.
     """
 
     name: str
@@ -45,9 +45,10 @@ class Lookalike:
     Attributes:
         name: the rarer name.
         like: the more frequent name.
-        mentions: number of mentions of both names.
-        merged: True if the rarer name is proposed as an alias. Otherwise the user has to decide.
-        why: short reason.
+        mentions: number of objects with each of the two names.
+        merged: True if the rarer name becomes an alias of the other name. If False, the user has to
+            decide.
+        why: short reason for the value of `merged`.
     """
 
     name: str
@@ -58,7 +59,7 @@ class Lookalike:
 
 
 def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
-    """Count all names, most frequent first; spellings with the same key count as one name."""
+    """Count all names, most frequent first. Spellings with the same key count as one name."""
     spellings: dict[str, Counter[str]] = {}
     shown: dict[str, Counter[str]] = {}
     seen: Counter[str] = Counter()
@@ -93,10 +94,10 @@ def _first(counts: Counter[str]) -> str:
 def lookalikes(
     labels: Sequence[Label], scenes: Sequence[AnnotatedScene], names: Names
 ) -> list[Lookalike]:
-    """Find pairs of names that differ by one or two letters, and merge clear misspellings.
+    """Find pairs of names that differ by one or two letters, and mark clear misspellings as merged.
 
-    Pairs of curated names and pairs that differ in digits are left out, because they are different
-    objects. Names that occur in the same scene are reported as a pair and not merged.
+    Two curated names, or two names with different digits, are different objects and form no pair.
+    Two names that occur in the same scene form a pair that is not merged.
     """
     compared = [label for label in labels[:_COMPARED] if len(label_key(label.name)) >= _ONE_SLIP]
     curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}
@@ -104,7 +105,7 @@ def lookalikes(
     together = _together({compared[k].name for pair in pairs for k in pair}, scenes, names)
     found = []
     for i, j in pairs:
-        # Labels are sorted by frequency, so the second name is the rarer one.
+        # Labels are sorted by frequency, so the second name of a pair is rarer.
         like, rare = compared[i], compared[j]
         keys = label_key(like.name), label_key(rare.name)
         if set(keys) <= curated or _digits(keys[0]) != _digits(keys[1]):
@@ -138,7 +139,7 @@ def _digits(key: str) -> str:
 def _together(
     wanted: set[str], scenes: Sequence[AnnotatedScene], names: Names
 ) -> set[frozenset[str]]:
-    """Return the pairs of wanted names that occur in the same scene."""
+    """Return the pairs of names in `wanted` that occur in the same scene."""
     by_key = {label_key(name): name for name in wanted}
     known: dict[str, str | None] = {}
     found: set[frozenset[str]] = set()
@@ -154,7 +155,10 @@ def _together(
 
 
 def _once(found: list[Lookalike]) -> list[Lookalike]:
-    """Merge each name at most once, and never into a name that is itself merged."""
+    """Return the pairs such that each name is merged at most once.
+
+    A name is never merged into another merged name.
+    """
     merged: set[str] = set()
     kept = []
     for pair in found:

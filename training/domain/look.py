@@ -1,4 +1,4 @@
-"""Statistics of a set of scenes, and findings: contradictions and data that cannot be learnt."""
+"""Compute statistics of scenes, and find contradictions and data that training cannot use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from training.datasets import AnnotatedScene, Names
 
 _ON_TOP, _ABOVE = CANONICAL.index("on-top"), CANONICAL.index("above")
 
-# Maximum number of examples per finding; all cases are counted.
+# Maximum number of examples in a finding. Further cases are only counted.
 SHOWN = 5
 
 # Maximum length of a label in a request, as in `scene_client.schemas.Label`.
@@ -23,10 +23,10 @@ class Finding:
     """A property of the scenes that the user should check.
 
     Attributes:
-        what: one sentence.
+        what: description of the property, in one sentence.
         count: number of cases.
-        examples: the first few cases.
-        advice: recommended action.
+        examples: the first `SHOWN` cases.
+        advice: recommended action of the user.
     """
 
     what: str
@@ -35,7 +35,7 @@ class Finding:
     examples: list[str] = field(default_factory=list)
 
     def add(self, example: str) -> None:
-        """Add one case."""
+        """Add one case, and keep it as an example if there is space."""
         self.count += 1
         if len(self.examples) < SHOWN:
             self.examples.append(example)
@@ -43,16 +43,16 @@ class Finding:
 
 @dataclass(frozen=True)
 class Facts:
-    """Counts over a set of scenes; shares are of all scenes.
+    """Statistics of a set of scenes.
 
     Attributes:
-        scenes, groups, objects: number of scenes, groups and objects.
-        objects_per_scene: minimum, mean and maximum.
-        rooms: number of scenes by canonical room type.
-        shares: share of scenes with a room type, with relations, with positions, with sizes, with
-            supports, with boxes in an image, and in viewer axes.
-        relations: number of annotated triples by relation.
-        findings: the findings with at least one case.
+        scenes, groups, objects: number of scenes, of groups of near-duplicates, and of objects.
+        objects_per_scene: minimum, mean and maximum number of objects in a scene.
+        rooms: maps each canonical room type to its number of scenes.
+        shares: maps a kind of annotation, such as "positions" or "sizes", to the share of all
+            scenes with this annotation.
+        relations: maps each relation to its number of annotated triples.
+        findings: findings with at least one case.
     """
 
     scenes: int
@@ -66,7 +66,7 @@ class Facts:
 
     @property
     def related(self) -> bool:
-        """True if the scenes contain data to learn relations from."""
+        """True if a model can learn relations from the scenes."""
         sources = ("relations", "positions", "supports", "boxes in an image")
         return any(self.shares[name] > 0 for name in sources)
 
@@ -78,7 +78,7 @@ def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
         ValueError: the list of scenes is empty.
     """
     if not scenes:
-        raise ValueError("there are no scenes")
+        raise ValueError("there are no scenes to analyse; pass at least one scene")
     sizes = [len(scene.objects) for scene in scenes]
     rooms = Counter(
         room for scene in scenes if (room := names.canonical_room(scene.room_type)) is not None
@@ -184,17 +184,17 @@ def _pair(scene: AnnotatedScene, i: int, j: int) -> str:
 
 
 def _circle(scene: AnnotatedScene, held: set[tuple[int, int, int]]) -> list[str] | None:
-    """Return the labels of a support cycle, or None."""
+    """Return the labels of objects that support each other in a cycle, or None without a cycle."""
     place = {thing.id: index for index, thing in enumerate(scene.objects)}
     below: dict[int, set[int]] = {}
     for a, i, j in held:
-        # Another finding reports pairs of objects that are on top of each other.
+        # Skip pairs of objects that are on top of each other. Another finding reports such pairs.
         if a == _ON_TOP and (a, j, i) not in held:
             below.setdefault(i, set()).add(j)
     for index, thing in enumerate(scene.objects):
         if thing.supported_by is not None:
             below.setdefault(index, set()).add(place[thing.supported_by])
-    # Remove objects without a remaining support until only cycles are left.
+    # Repeatedly remove objects whose supports were all removed. Then only cycles remain.
     while free := [i for i, under in below.items() if not under & set(below)]:
         for i in free:
             del below[i]
@@ -219,7 +219,7 @@ def _duplicates(scenes: Sequence[AnnotatedScene]) -> Finding:
         ]
         telling = scene.relations or any(place or box for _, place, box in things)
         if not telling:
-            continue  # two small scenes may well have the same objects by chance
+            continue  # two small scenes often have the same objects by chance
         content = (tuple(sorted(things, key=repr)), tuple(sorted(scene.relations or ())))
         other = first.setdefault(content, scene)
         if other.group != scene.group:
@@ -234,8 +234,8 @@ def _rounded(position: tuple[float, float, float] | None) -> tuple[float, ...] |
 def _alone(scenes: Sequence[AnnotatedScene]) -> Finding:
     found = Finding(
         "Every scene has its own group.",
-        "If several scenes are frames or scans of one place, put these into one group. "
-        "Near-duplicates on both sides of the split make the test results too good.",
+        "If several scenes are frames or scans of one place, put these scenes into one group. "
+        "Near-duplicates in training and test scenes make the test results too good.",
     )
     if len({scene.group for scene in scenes}) == len(scenes):
         found.count = len(scenes)

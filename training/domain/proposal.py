@@ -1,7 +1,8 @@
-"""Propose a vocabulary and a configuration for scenes, with reasons.
+"""Propose a vocabulary and a training configuration for scenes, with a reason for each entry.
 
-The rules interpolate between configurations found by search (docs/decisions/objective.md,
-docs/decisions/own-scenes.md). `training tune` searches for better configurations.
+The rules interpolate between configurations that a search found for data sets of different sizes
+(docs/decisions/objective.md, docs/decisions/own-scenes.md). The command `training tune` searches
+for a better configuration.
 """
 
 from __future__ import annotations
@@ -25,31 +26,33 @@ from training.datasets import (
 from training.domain.labels import Label, Lookalike, count_labels, lookalikes
 from training.domain.look import Facts, look
 
-# Minimum mentions per class, by preference. Few mentions hardly train a class, but a small data
-# set needs a small minimum for enough coverage.
+# Possible minimum numbers of objects of a class, in order of preference. A class with few objects
+# is hardly trained. A small data set needs a small minimum, so that the vocabulary covers enough
+# objects.
 MINIMA: Final = (8, 5, 3, 2)
 COVERED: Final = 0.97
 _TABLE: Final = (2, 3, 5, 8, 16, 30)
-# Maximum number of classes; docs/benchmarks.md gives the cost of larger vocabularies.
+# Maximum number of classes. docs/benchmarks.md gives the cost of larger vocabularies.
 _MOST_CLASSES: Final = 2000
 _SPLIT_SEEDS: Final = 50
-# Accepted relative deviation of a part from its target share.
+# Accepted relative deviation of a part of the split from its target share of scenes.
 _TOLERANCE: Final = 0.2
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """Files and report of `init`.
+    """The files and the report that `init` writes.
 
     Attributes:
         name: name of the configuration and of the model.
-        facts, labels, lookalikes: results of the analysis.
-        minimum: minimum number of mentions of a class.
-        covered: maps each minimum to the number of classes and the covered share of the mentions.
-        vocabulary: the vocabulary; merged lookalikes are aliases.
-        dropped: (name, mentions, reason) of each name without a class.
-        values: entries of the configuration, by section.
-        reasons: reason for each value, by "section.entry".
+        facts, labels, lookalikes: results of the analysis: statistics, labels and similar labels.
+        minimum: minimum number of objects of a class.
+        covered: maps each possible minimum to the number of classes and the share of all objects
+            that these classes cover.
+        vocabulary: the proposed vocabulary. Merged similar labels are aliases.
+        dropped: tuple (name, number of objects, reason) of each name that is not a class.
+        values: maps each section of the configuration to its entries.
+        reasons: maps "section.entry" to the reason for the value.
         parts: number of scenes in each part of the proposed split.
     """
 
@@ -67,11 +70,11 @@ class Proposal:
 
     @property
     def config(self) -> Config:
-        """Return the validated configuration."""
+        """Return the proposed configuration after validation."""
         return Config.model_validate(self.values)
 
     def toml(self) -> str:
-        """Return the configuration as TOML; a comment above each entry gives the reason."""
+        """Return the configuration as TOML text. A comment above each entry gives the reason."""
         return (
             f"# Proposed by `python -m training init {self.name}`; you can change every entry.\n"
             "# `python -m training tune` searches for better values on the validation scenes.\n\n"
@@ -86,14 +89,17 @@ def propose(
     *,
     terms: str = "",
 ) -> Proposal:
-    """Analyse the scenes and propose a configuration.
+    """Analyse the scenes, and propose a vocabulary and a configuration.
 
     Args:
-        sources: file names for the configuration.
+        name: name of the configuration.
+        scenes: the scenes of all files.
+        sources: file names for the entry `data.sources` of the configuration.
+        terms: terms of use of the scenes.
 
     Raises:
-        ConfigError: too few scenes for training and testing.
-        ValueError: the list of scenes is empty, or the scenes mention no object.
+        ConfigError: the scenes are too few for training and testing.
+        ValueError: the list of scenes is empty, or the scenes contain no objects.
     """
     names = curated_names()
     facts = look(scenes, names)
@@ -144,7 +150,11 @@ def propose(
 def _minimum(
     scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike]
 ) -> tuple[int, dict[int, tuple[int, float]]]:
-    """Return the largest minimum with enough coverage, and the coverage of each minimum."""
+    """Return the largest minimum with enough coverage, and the coverage of each minimum.
+
+    The minimum is the minimum number of objects of a class. The coverage is the number of classes,
+    and the share of all objects that these classes cover.
+    """
     covered: dict[int, tuple[int, float]] = {}
     for minimum in sorted({*_TABLE, *MINIMA}):
         try:
@@ -153,7 +163,7 @@ def _minimum(
             continue  # no label has so many mentions
         covered[minimum] = (len(found), coverage(found, scenes))
     if not covered:
-        raise ConfigError("every label is mentioned only once: too few mentions for training")
+        raise ConfigError("every label occurs only once: training needs labels with more objects")
     enough = [
         minimum for minimum in covered if covered[minimum][1] >= COVERED and minimum <= MINIMA[0]
     ]
@@ -203,7 +213,11 @@ def _dropped(
 
 
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int]]:
-    """Return a seed and its parts: the first with parts near their targets, or the best tried."""
+    """Return a seed of the split, and the number of scenes in each part of the split.
+
+    The function returns the first seed whose parts are near their target shares. If there is no
+    such seed, it returns the best of the tested seeds.
+    """
     best: tuple[float, int, dict[str, int]] | None = None
     for seed in range(_SPLIT_SEEDS):
         found = split(scenes, seed=seed, protocol="stable")
@@ -280,7 +294,10 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
 
 
 def _between(n: int, low: tuple[int, int], high: tuple[int, int]) -> int:
-    """Interpolate linearly in log(n) between two points; constant outside."""
+    """Interpolate linearly in log(n) between two points (n, value).
+
+    Outside the two points, the value is constant.
+    """
     (n0, x0), (n1, x1) = low, high
     share = math.log(max(n, 1) / n0) / math.log(n1 / n0)
     return round((x0 + min(max(share, 0.0), 1.0) * (x1 - x0)) / 10) * 10

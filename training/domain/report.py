@@ -1,4 +1,4 @@
-"""The report of `init`: tables for people and one JSON value for programs."""
+"""The report of the command `init`: tables for people, and one JSON value for programs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.table import Table
 
 from training.domain.proposal import Proposal
 
-# Maximum rows of a table; the JSON report has all rows.
+# Maximum number of rows of a printed table. The JSON report contains all rows.
 ROWS = 12
 
 
@@ -38,7 +38,7 @@ def as_dict(proposal: Proposal) -> dict[str, Any]:
 
 
 def show(proposal: Proposal, console: Console) -> None:
-    """Print the report."""
+    """Print the report of a proposal as tables."""
     _facts(proposal, console)
     _labels(proposal, console)
     _lookalikes(proposal, console)

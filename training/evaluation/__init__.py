@@ -1,3 +1,3 @@
-"""Leak-free evaluation of a machine on encoded scenes; each module documents its task."""
+"""Evaluation tasks for models. Each module measures one task and documents its protocol."""
 
 from __future__ import annotations

@@ -1,18 +1,21 @@
 """Calibration: compare the probabilities of the service with the truth.
 
-An answer is true if:
+An answer has a probability and a truth value. The answer to each question is true if:
 
-    relations    the relation holds between the two objects. Variants: the relations of half of the
-                 pairs are evidence, or one object was removed. Relations with unknown truth are
-                 left out (see `training.cases.known_relations`)
-    missing      the class is in the scene and was hidden. Each scene shows 25, 50 or 75 % of its
-                 classes, or all but one, at random
-    at a place   the class is in the scene at the given place; one occupied place is drawn at random
-    outliers     the object is an intruder; half of the scenes have one
-    misplaced    the relation is false; one relation was altered in half of the scenes
+    relations    the relation holds between the two objects. In one variant, the relations of half
+                 of the pairs are evidence. In another variant, one object was removed. Relations
+                 with unknown truth are left out (see `training.cases.known_relations`)
+    missing      the class is in the scene and was hidden. A request lists 25, 50 or 75 % of the
+                 classes of the scene, or all classes but one. The share is drawn at random
+    at a place   the class is in the scene at the place of the request. A place is a relation to an
+                 object. The place is drawn from the places that hold an object
+    outliers     the object is an intruder, a random object added for the test. Half of the scenes
+                 contain one intruder
+    misplaced    the listed relation is false. Half of the scenes contain one altered relation
 
 The questions about hidden classes and intruders use scenes with complete object lists. Requests
-contain no room type and use default parameters. Only the returned answers count.
+contain no room type and use default parameters. Candidates that the service does not return are
+left out.
 """
 
 from __future__ import annotations
@@ -43,8 +46,9 @@ from training.evaluation.metrics import Flags, Ints, Items, Metric
 from training.evaluation.missing import SHARES, shown_classes
 from training.evaluation.setting import Contender, Outcome, Setting
 
-# Number of removed objects per scene for placements. A removed object gives only 3 answers, while a
-# scene has about 20 relations. With one object per scene, chance alone gives an ECE of .02 to .03.
+# Number of removed objects per scene in `ask_placements`. A removed object gives only 3 answers,
+# while a scene has about 20 relations. With one removed object per scene, chance alone gives an
+# expected calibration error (ECE) of .02 to .03.
 _REMOVALS = 4
 # (probability, truth) of each answer about one scene.
 Answered = list[tuple[float, bool]]
@@ -52,7 +56,11 @@ Ask = Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]
 
 
 def uncalibrated(artifact: Artifact) -> Artifact:
-    """Return the artifact without calibration; a slope of -1 only changes the sign of log-odds."""
+    """Return the artifact with raw log-odds in place of calibrated log-odds.
+
+    Calibration multiplies log-odds by a slope. The slope -1 turns the log-odds of an object or
+    relation into the log-odds that the object or relation is wrong.
+    """
     plain = Calibration.neutral(artifact.spec.A).model_copy(
         update={"outlier": CountSlope(slope=-1.0), "misplaced": Slope(slope=-1.0)}
     )
@@ -60,7 +68,7 @@ def uncalibrated(artifact: Artifact) -> Artifact:
 
 
 def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
-    """Ask one of `QUESTIONS` about every scene."""
+    """Ask one of `QUESTIONS` about every scene, and collect the answers with their truth."""
     answers: list[tuple[int, float, bool]] = []
     skipped = 0
     for k, scene in enumerate(scenes.scenes):
@@ -76,7 +84,7 @@ def ask_relations(
     encoded: EncodedScene,
     rng: np.random.Generator,  # noqa: ARG001
 ) -> Answered | None:
-    """Ask for the relations of a scene, given its labels."""
+    """Ask for all relations of a scene. The request contains only the labels of the objects."""
     known = known_relations(encoded)
     if not known.any():
         return None
@@ -86,7 +94,7 @@ def ask_relations(
 def ask_given(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Ask for the relations of some pairs of a scene, given the relations of the other pairs."""
+    """Ask for the relations of half of the pairs. The relations of the other half are evidence."""
     asked, given = told_pairs(encoded, artifact.vocabulary.structure, rng)
     if not given:
         return None
@@ -95,7 +103,10 @@ def ask_given(
 
 
 def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Flags) -> Answered:
-    """Return the answers about the relations marked in ``judged`` (A, N, N)."""
+    """Return the answers about the relations that are True in ``judged``.
+
+    The shape of ``judged`` is (relations, objects, objects).
+    """
     found: Answered = []
     for answer in relations(artifact, scene)[0]:
         triple = CANONICAL.index(answer.relation), answer.subject, answer.object
@@ -107,7 +118,7 @@ def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Fla
 def ask_placements(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Ask for the placement of one instance of a removed class, for several classes."""
+    """Ask where a removed object belongs. Up to `_REMOVALS` objects are removed one at a time."""
     found: Answered = []
     if known_relations(encoded).any():
         for _ in range(_REMOVALS):
@@ -134,7 +145,7 @@ def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: np.random.Gen
 def ask_missing(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Ask for missing classes; a random share of the classes, or one class, is hidden."""
+    """Ask for missing classes. A random share of the classes, or one class, is hidden."""
     hidden = _hidden(artifact, encoded, rng)
     if hidden is None:
         return None
@@ -147,9 +158,9 @@ def ask_missing(
 def ask_placed(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Ask for the hidden classes at one place.
+    """Ask for the hidden classes at one place, which is a relation to an object.
 
-    Classes are left out if the truth of their relation to the place is unknown.
+    A class is left out if it is unknown whether the class has this relation to the object.
     """
     hidden = _hidden(artifact, encoded, rng)
     if hidden is None:
@@ -169,7 +180,7 @@ def ask_placed(
 
 
 def _hidden(artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator) -> Ints | None:
-    """Return the hidden classes of a scene; the shown share is drawn per scene."""
+    """Draw the classes of a scene to hide. The share of hidden classes is drawn for each scene."""
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
     classes = classes[~structure[classes]]
@@ -186,11 +197,11 @@ def ask_outliers(
     rng: np.random.Generator,
     intruders: Mapping[tuple[str, str], Ints] | None = None,
 ) -> Answered | None:
-    """Ask for outliers; half of the scenes contain an added intruder.
+    """Ask for outliers. An intruder (an object of an absent class) is added to half of the scenes.
 
     Args:
-        intruders: candidate intruders by source and scene id, see `kinds_of_intruders`. None means
-            any absent class.
+        intruders: maps (source, scene id) to the classes from which the intruder is drawn, see
+            `kinds_of_intruders`. None means any absent class.
     """
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
@@ -213,7 +224,7 @@ def ask_outliers(
 def ask_misplaced(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Ask for misplaced relations; half of the scenes have one altered relation."""
+    """Ask for misplaced relations. One relation is altered in half of the scenes."""
     case = altered_case(encoded, artifact.vocabulary.structure, rng)
     if case is None:
         return None
@@ -236,7 +247,7 @@ QUESTIONS: dict[str, Ask] = {
 
 
 def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure every probability of the service, with and without calibration."""
+    """Measure the calibration of each `QUESTIONS` entry, with and without the calibration maps."""
     if contender.artifact is None:
         return None
     related = setting.some(related=True, share=3)
@@ -255,13 +266,13 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
             for figure in ("ECE", "Brier skill"):
                 metrics[f"{figure}, {name}"] = found.metric(figure)
                 metrics[f"{figure}, {name}, uncalibrated"] = before.metric(figure)
-    # Skill is undefined if all answers are true or all are false.
+    # Brier skill is undefined if all answers are true or all answers are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None
 
 
 def _questions(complete: SceneTensors, setting: Setting) -> dict[str, Ask]:
-    """Return `QUESTIONS` with intruders of every kind for these scenes."""
+    """Return `QUESTIONS`, where `ask_outliers` draws from the intruders in `kinds_of_intruders`."""
     intruders = kinds_of_intruders(
         complete, setting.structure, setting.complete.train, setting.seed
     )

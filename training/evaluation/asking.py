@@ -1,4 +1,4 @@
-"""Query a score or `app.questions` with requests like those of a robot, and return arrays.
+"""Query a score function or `app.questions` with test scenes, and return the answers as arrays.
 
 Some cases are queried a second time in another order. If an answer changes with the order, the
 score uses information outside the scene, and the evaluation stops. This check does not detect
@@ -39,10 +39,10 @@ class LeakError(ValueError):
 
 
 def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floats]:
-    """Return the answers to all cases in order.
+    """Return the answers to all cases, in the order of the cases.
 
     Raises:
-        LeakError: a second query of a case in another order gives another answer.
+        LeakError: a case gets another answer when the cases are queried in another order.
         FloatingPointError: an answer is NaN.
     """
     answers = [ask(case) for case in cases]
@@ -56,14 +56,14 @@ def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floa
 
 @torch.no_grad()
 def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -> Tensor:
-    """Return the scores (N, ...) of N rows, computed in blocks.
+    """Return the scores (N, ...) of N cases. The scores are computed in blocks of cases.
 
     Args:
-        score: function of the rows of each column.
-        columns: tensors (N, ...).
+        score: function with one argument per column. It returns the scores of a block of cases.
+        columns: tensors (N, ...). Entry k of each tensor belongs to case k.
 
     Raises:
-        LeakError: a second query of some rows, in another block, gives other scores.
+        LeakError: a case gets another score when it is queried in another block.
     """
     count = len(columns[0])
     blocks = [
@@ -82,7 +82,11 @@ def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -
 
 
 def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Scene:
-    """Return a scene of the instances at the indices `kept` (default: all), with labels only."""
+    """Return a scene that contains only labels, without relations and poses.
+
+    Args:
+        kept: indices of the instances in the returned scene. None means all instances.
+    """
     places = range(len(encoded.instance_classes)) if kept is None else kept
     return replace(scene_of(encoded, places, ()), room_type=None)
 
@@ -93,13 +97,13 @@ def of_classes(classes: Sequence[int]) -> Scene:
 
 
 def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
-    """Return the scene with one more object, of an absent class."""
+    """Return the scene with one more object, of the class `intruder`."""
     thing = SceneObject("intruder", artifact.vocabulary.labels[intruder], intruder)
     return replace(scene, objects=(*scene.objects, thing))
 
 
 def things(scene: Scene, structure: Flags) -> Flags:
-    """Return a mask (n,) of the objects that are not structure."""
+    """Return a mask (n,) that is False for structure, such as walls and floors."""
     classes = [-1 if thing.class_index is None else thing.class_index for thing in scene.objects]
     found: Flags = ~structure[classes]
     return found
@@ -111,11 +115,14 @@ def missing_probabilities(
     coverage: float | None = None,
     at: tuple[str, int] | None = None,
 ) -> Floats:
-    """Return the probability of every class that `/missing` may propose, (V,); -inf elsewhere.
+    """Return the probability that each class is missing, (V,).
+
+    The value is -inf for classes that `/missing` cannot propose.
 
     Args:
-        coverage: coverage of the request; None means the default of the model.
-        at: the place in question: a relation and the index of its anchor object.
+        coverage: share of the objects that the scene lists. None means the default of the model.
+        at: place of the missing object: a relation, and the index of the object to which the
+            missing object has this relation. None means the whole scene.
     """
     vocabulary = artifact.vocabulary
     found = np.full(len(vocabulary), -np.inf)
@@ -131,8 +138,9 @@ class Verdict:
     """Answers of `/outliers` about the n objects of a scene, in the order of the objects.
 
     Attributes:
-        probability, log_odds: (n,).
-        is_outlier: (n,) bool.
+        probability: (n,) probability that the object is an outlier.
+        log_odds: (n,) log-odds of the object given the rest of the scene.
+        is_outlier: (n,) bool, True if the service reports the object as an outlier.
     """
 
     probability: Floats
@@ -141,7 +149,7 @@ class Verdict:
 
 
 def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Verdict:
-    """Query `/outliers` for a scene at one of `SENSITIVITIES`."""
+    """Return the answers of `/outliers` for a scene at one of the `SENSITIVITIES`."""
     n = len(scene.objects)
     probability, log_odds, flagged = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.bool_)
     found = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False).outliers
@@ -155,10 +163,12 @@ def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium")
 def relation_probabilities(
     artifact: Artifact, scene: Scene, pairs: Sequence[tuple[int, int]] | None = None
 ) -> Floats:
-    """Return probabilities (A, n, n) of the canonical relations of n objects; 0 if not answered.
+    """Return the probability of each canonical relation, (relations, objects, objects).
+
+    The value is 0 for pairs that were not queried.
 
     Args:
-        pairs: ordered pairs of object indices to query; all pairs by default.
+        pairs: ordered pairs of object indices to query. None means all pairs.
     """
     n = len(scene.objects)
     found = np.zeros((len(CANONICAL), n, n))

@@ -1,4 +1,7 @@
-"""Build contenders: a model with the scores of the service, and two reference rows."""
+"""Build contenders, the models that an evaluation compares.
+
+A contender is a trained model or one of two references: held-out scenes and independent classes.
+"""
 
 from __future__ import annotations
 
@@ -35,12 +38,12 @@ def artifact_contender(
     *,
     calibrated: bool = True,
 ) -> Contender:
-    """Build the contender of a model, published or in memory.
+    """Build the contender of a model.
 
     Args:
-        train: training scenes; annealing in the density task starts at their class frequencies.
-        calibrated: include the calibrated probabilities and the alarm. Otherwise include only the
-            scores of the machine.
+        train: training scenes. Annealing in the density task starts at their class frequencies.
+        calibrated: True includes the calibrated probabilities and the outlier alarm. False includes
+            only the uncalibrated scores of the machine.
     """
     machine = machine_of(artifact.weights)
     objects, completion = MachineScore(machine), relation_score(artifact, given=True)
@@ -64,12 +67,13 @@ def artifact_contender(
 
 
 def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
-    """Return a score: log-odds of every relation between the classes of a batch.
+    """Return a function that computes the log-odds of each relation between two present classes.
 
-    The evidence of a relation excludes the relation itself.
+    The log-odds of a relation do not use the observed value of this relation.
 
     Args:
-        given: use the observed relations that hold as evidence; otherwise use no relations.
+        given: True uses the other observed relations that hold as evidence. False uses no
+            relations.
     """
 
     def score(batch: Batch) -> Tensor:
@@ -94,7 +98,10 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
 
 
 def placed_score(artifact: Artifact) -> PlacedScore:
-    """Return a score: log-probabilities of `/missing` at a place; -inf for other classes."""
+    """Return a function that computes the log-probability of each class at a place.
+
+    `/missing` computes these probabilities. The value is -inf for classes it cannot propose.
+    """
 
     def score(places: Places) -> Tensor:
         rows = []
@@ -114,13 +121,16 @@ def placed_score(artifact: Artifact) -> PlacedScore:
 
 
 def _instances(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
-    """Return a scene with the given instance counts, and the first object index of each class."""
+    """Return a scene with `counts` objects of each class, and the first object index per class."""
     each = counts.clamp(min=1).long()
     return of_classes(classes.repeat_interleave(each).tolist()), each.cumsum(0) - each
 
 
 def floor_contender(setting: Setting) -> Contender:
-    """Return a contender whose samples are held-out scenes: it estimates the best value of T4."""
+    """Return a contender whose samples are held-out scenes.
+
+    Its result estimates the best possible value of task T4 (generation).
+    """
     _, second = held_out_halves(setting.complete)
     return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
 

@@ -7,14 +7,15 @@ machine without relation units. With h1 drawn from its mean field q given the sc
 
     log p(v) = log mean_h [ exp(b·v + h·(c1 + v'W)) prod_l (1 + exp(c2 + h'J)_l) / q(h) ] - log Z
 
-The mean is unbiased, so its log is too low in expectation. The upper estimate of log Z lowers the
-log-likelihood further, so the result is conservative.
+The estimate of the mean is unbiased, so the log of this estimate is too low in expectation. The
+upper estimate of log Z lowers the log-likelihood further. The reported log-likelihood is therefore
+conservative.
 
 The pairwise model is the fully visible Boltzmann machine (Ising model) of classes:
 p(v) = exp(b·v + v'Wv / 2) / Z with symmetric W and zero diagonal. The annealing path starts at
 beta = 0 with independent classes of log-odds a, where log Z has a closed form. The path ends at
-beta = 1 with the model. At other beta, the log-odds are (1 - beta) a + beta b, and the edges are
-beta W. One sweep updates each class once.
+beta = 1 with the model. At any other beta, the biases are (1 - beta) a + beta b, and the pairwise
+weights are beta W. One Gibbs sweep updates each class once.
 
 Source: Neal, "Annealed importance sampling" (2001), run in both directions as in
 `training.machines.partition`.
@@ -49,12 +50,13 @@ _BLOCK = 16
 
 @dataclass(frozen=True)
 class DensitySettings:
-    """Effort of the estimates.
+    """Number of samples and sweeps of the density estimates.
 
     Attributes:
-        chains, temperatures: number of chains and temperatures of each AIS run.
-        burn_in: number of Gibbs sweeps from training scenes before the reverse run.
-        draws: number of samples of h1 per scene.
+        chains: number of Gibbs chains of each AIS run.
+        temperatures: number of inverse temperatures of each AIS run.
+        burn_in: number of Gibbs sweeps from training scenes before the reverse AIS run.
+        draws: number of samples of the hidden units h1 per scene.
     """
 
     chains: int = 128
@@ -69,12 +71,14 @@ class DensitySettings:
 
 @dataclass(frozen=True, eq=False)
 class ObjectDensity:
-    """A density over presence vectors.
+    """A probability distribution over presence vectors, which list the classes of a scene.
 
     Attributes:
-        log_unnormalised: function of presence (B, V); returns log-likelihood + log Z, (B,).
-        lower, upper: lower and upper estimate of log Z; equal if log Z is exact.
-        notes: details of the two estimates.
+        log_unnormalised: function that takes presence vectors (B, V) and returns their
+            log-likelihood + log Z, (B,).
+        lower: lower estimate of log Z.
+        upper: upper estimate of log Z. It equals `lower` if log Z is exact.
+        notes: estimates of log Z and their standard errors, by name.
     """
 
     log_unnormalised: Callable[[Tensor], Tensor]
@@ -84,7 +88,7 @@ class ObjectDensity:
 
 
 def independent_density(train: SceneTensors) -> ObjectDensity:
-    """Return the density of independent classes at their smoothed frequencies."""
+    """Return the density of independent classes at their smoothed training frequencies."""
     logits = _log_odds(train)
 
     def log_p(v: Tensor) -> Tensor:
@@ -100,10 +104,10 @@ def ising_density(
     settings: DensitySettings = DensitySettings(),
     seed: int = 0,
 ) -> ObjectDensity:
-    """Return the density of a pairwise model with biases b (V,) and edges W (V, V).
+    """Return the density of a pairwise model with biases b (V,) and pairwise weights W (V, V).
 
     Raises:
-        ValueError: invalid shapes or edges, see `Ising`.
+        ValueError: b or W is invalid, see `Ising`.
     """
     model = Ising(b.double().numpy(), W.double().numpy())
     generator = torch.Generator().manual_seed(seed)
@@ -121,11 +125,11 @@ def machine_density(
     settings: DensitySettings = DensitySettings(),
     seed: int = 0,
 ) -> ObjectDensity:
-    """Return the density of a machine of the local form.
+    """Return the density of a machine of the local form, in which relations do not affect p(v).
 
     Args:
         train: training scenes. Annealing starts at independent classes with the frequencies of
-            these scenes. The reverse run starts its Gibbs chains at these scenes.
+            these scenes. The reverse AIS run starts its Gibbs chains at these scenes.
 
     Raises:
         ValueError: the machine has the seed form, in which relations affect p(v).
@@ -155,7 +159,7 @@ def _density(
 
 
 def object_part(machine: BoltzmannMachine) -> BoltzmannMachine:
-    """Return the machine without relation units; in the local form p(v) is the same."""
+    """Return the machine without relation units. A machine of the local form keeps its p(v)."""
     spec = machine.spec
     part = build(MachineSpec("gbm", V=spec.V, A=1, H1=spec.H1, H2=spec.H2, form="local"))
     with torch.no_grad():
@@ -181,7 +185,10 @@ def log_partition(
 
 @torch.no_grad()
 def _log_sum(machine: BoltzmannMachine, v: Tensor, draws: int) -> Tensor:
-    """Return the log of the sum over h1 and h2, (B,)."""
+    """Return log p(v) + log Z for each presence vector, (B,).
+
+    The value is the log of a sum over the hidden units h1 and h2, estimated with samples of h1.
+    """
     if not machine.spec.H2:
         return -machine.free_energy(v)
     y = mean_field(machine, Evidence(v)).y
@@ -197,7 +204,7 @@ def _log_odds(train: SceneTensors) -> Tensor:
 
 
 def density_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure the log-likelihood of the objects in nats, with both estimates of log Z."""
+    """Measure the log-likelihood of the objects in nats, with the lower and upper log Z."""
     if contender.density is None or setting.train is None:
         return None
     scenes = setting.some()
@@ -221,14 +228,14 @@ def density_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 @dataclass(frozen=True, eq=False)
 class Ising:
-    """A pairwise density over presence vectors.
+    """A fully visible Boltzmann machine over presence vectors of V classes.
 
     Attributes:
-        b: (V,).
-        W: (V, V).
+        b: (V,) biases of the classes.
+        W: (V, V) pairwise weights of the classes.
 
     Raises:
-        ValueError: shapes disagree, or W is not symmetric with a zero diagonal.
+        ValueError: the shapes of b and W disagree, or W is not symmetric with a zero diagonal.
     """
 
     b: Floats
@@ -279,7 +286,7 @@ class Ising:
 
 
 class State:
-    """The states of all chains, (V, chains).
+    """The states of all Gibbs chains, (classes, chains).
 
     The class axis comes first, so that the values of one class are contiguous in memory.
     """
@@ -290,12 +297,15 @@ class State:
         self.field = model.W @ v
 
     def gain(self, a: Floats) -> Floats:
-        """Return log(density of the model / density of independent classes), unnormalised."""
+        """Return the log ratio of the unnormalised densities of each chain state, (chains,).
+
+        The numerator is the pairwise model. The denominator is independent classes with log-odds a.
+        """
         linear = (self.model.b - a) @ self.v
         return np.asarray(linear + (self.field * self.v).sum(0) / 2)
 
     def sweep(self, a: Floats, beta: float, rng: np.random.Generator) -> None:
-        """Sample every class once, given the others, at `beta`."""
+        """Sample each class once given the other classes, at the inverse temperature `beta`."""
         uniform = rng.random(self.v.shape)
         logits = np.log(uniform) - np.log1p(-uniform)
         bias = (1 - beta) * a + beta * self.model.b

@@ -1,8 +1,8 @@
 """Everyday facts: questions with answers that people agree on, for acceptance tests only.
 
 People wrote the facts by hand before any model was evaluated. Training and tuning must never use
-the facts, so no other module of this package reads them. The questions use the defaults of the
-service and ignore labels outside the vocabulary.
+the facts, so only this module of the package reads the facts file. The requests use the default
+parameters of the service. Labels outside the vocabulary are ignored.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ LINES = (
     "generate: the scene has what never belongs",
     "generate: scenes of fewer than three classes",
 )
-"""Names of the counts. Lower is better for alarms in plain scenes and for the last two."""
+"""Names of the eleven counts of the report.
+
+Lower is better for the alarms in plain scenes (scenes without intruder) and for the last two names.
+"""
 
 _VERTICAL = ("on-top", "under", "above", "below")
 _RELATIONS = 50
@@ -49,24 +52,24 @@ _LISTED = 5
 _DRAWN = 8
 _FEW = 3
 
-# Maps each name in `LINES` to a list of (hits, questions), one pair per fact.
+# Maps each name in `LINES` to a list of (number of hits, number of questions), one pair per fact.
 Lines = dict[str, list[tuple[int, int]]]
 
 
 def facts_file(folder: Path = EVERYDAY) -> Path | None:
-    """Return the path of the facts in a folder, or None without such a file."""
+    """Return the path of the facts file in a folder, or None if the file does not exist."""
     path = folder / "facts.json"
     return path if path.is_file() else None
 
 
 def facts_digest(folder: Path) -> str:
-    """Return the sha256 of the facts, or an empty string without facts."""
+    """Return the SHA-256 of the facts file, or an empty string if the file does not exist."""
     path = facts_file(folder)
     return "" if path is None else sha256(path.read_bytes()).hexdigest()
 
 
 def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> dict[str, tuple[int, int]]:
-    """Return the total (hits, questions) for each of the eleven counts.
+    """Return the total (number of hits, number of questions) for each name in `LINES`.
 
     Raises:
         FileNotFoundError: the folder contains no facts.
@@ -78,7 +81,7 @@ def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> dict[str, tuple
 
 
 def everyday_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Ask the everyday facts once, independent of the scenes; each fact counts as one scene."""
+    """Measure the everyday facts. Each fact counts as one scene. `setting.scenes` is not used."""
     artifact, folder = contender.artifact, setting.everyday
     if artifact is None or folder is None or facts_file(folder) is None:
         return None
@@ -107,7 +110,10 @@ def _lines(artifact: Artifact, folder: Path) -> Lines:
 
 
 def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
-    """Build a scene of known objects with ids as in the service: the label, or label_number."""
+    """Build a scene of the labels in the vocabulary.
+
+    The id of an object is its label, or label_number if several objects have the label.
+    """
     objects = []
     taken: set[str] = set()
     for label in labels:
@@ -136,7 +142,7 @@ def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
 
 
 def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
-    """Return the probability of each relation of the subject to the other object."""
+    """Return the probability of each of the eight relations of the subject to the other object."""
     scene = _scene(artifact, [subject, other])
     names = [thing.id for thing in scene.objects]
     if not names:
@@ -159,7 +165,7 @@ def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Line
 
 
 def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[questions.MissingAnswer, ...]:
-    """Return the first five answers, or none if the service would reject the question."""
+    """Return the first five answers, or an empty tuple if the service would reject the request."""
     scene = _scene(artifact, fact["objects"])
     at = None
     if "at" in fact:
@@ -172,7 +178,7 @@ def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[questions.MissingAn
 
 
 def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
-    """Return the index of the object with that id, or of the only object of that class."""
+    """Return the index of the object with the id `name`, or of the only object of class `name`."""
     index = artifact.vocabulary.index(name)
     named = [k for k, thing in enumerate(scene.objects) if thing.id == name]
     places = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]

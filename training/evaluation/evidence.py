@@ -1,17 +1,20 @@
-"""The effect of additional evidence (relations, poses, room type) compared with labels only.
+"""Measure how additional evidence changes the answers: relations, poses or the room type.
 
-Each question is asked twice about the same scene: with labels only, and with one additional kind of
-evidence. The result is the paired change of a metric, with a confidence interval over scenes.
+Each question is asked twice about the same scene: with the object labels only, and with labels and
+one kind of evidence. The result is the paired change of a metric, with an interval over scenes.
 
-    T2   one class is removed with all its instances. The evidence is the relations (or poses) of
-         the remaining instances, or the room type. Metric: change of MRR over absent classes
-    T3   a uniformly drawn intruder is added; its relations are unknown. Metric: change of hit@1
-    T1   the evidence is the relations (or poses) between the instances of half of the classes.
-         Metric: change of R-precision on all other ordered pairs, with as many predictions as
-         listed relations; an unlisted relation counts as wrong
+    T2   (missing objects) One class is removed with all its instances. The evidence is the
+         relations or poses of the remaining instances, or the room type. Metric: change of the
+         mean reciprocal rank (MRR) of the removed class among absent classes
+    T3   (outliers) A uniformly drawn absent class is added as an intruder. The relations of the
+         intruder are unknown. Metric: change of the share of scenes whose intruder ranks first
+    T1   (relations) The evidence is the relations or poses between the instances of half of the
+         classes. Metric: change of R-precision on all other ordered pairs. The number of
+         predictions is the number of listed relations. An unlisted relation counts as wrong
 
-Poses also show which relations do not hold; only sources with positions have poses. Scenes without
-a relation among the remaining instances are left out. The answer is never part of the evidence.
+Poses also show which relations do not hold. Only data sources with positions have poses. Scenes
+without a relation between the remaining instances are left out. The evidence never contains the
+answer.
 """
 
 from __future__ import annotations
@@ -44,22 +47,23 @@ from training.evaluation.setting import Contender, Outcome, Setting
 
 KINDS = ("relations", "poses", "room type")
 
-# Number of removed classes per scene. With one class, chance varies the change of a small source by
-# .01.
+# Number of questions per scene in T2, each with another removed class. With one question per scene,
+# the random choice of the class changes the result of a small data source by about 0.01.
 _REMOVALS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One question, asked with and without additional evidence.
+    """One question about a scene, asked with labels only and with additional evidence.
 
     Attributes:
         place: index of the scene.
-        scenes: the scene with labels only, and with evidence.
-        target: the removed class in T2, the object index of the intruder in T3.
-        truth, asked: (A, n, n) bool in T1: relations that hold, and queried relations. Empty in T2
-            and T3.
-        items: number of listed relations in T1; 1 in T2 and T3.
+        scenes: the scene with labels only, and the scene with evidence.
+        target: index of the removed class in T2, or index of the intruding object in T3. Unused in
+            T1.
+        truth: (relations, objects, objects) bool, the relations that hold. Empty in T2 and T3.
+        asked: (relations, objects, objects) bool, the queried relations. Empty in T2 and T3.
+        items: number of relations to find in T1; 1 in T2 and T3.
     """
 
     place: int
@@ -73,13 +77,15 @@ class Case:
 def told(
     encoded: EncodedScene, kept: list[int], kind: str, between: Flags | None = None
 ) -> tuple[Scene, Scene] | None:
-    """Return a scene twice: with labels only, and with evidence of one of `KINDS`.
+    """Return a scene twice: with labels only, and with evidence.
 
-    The result is None if the scene lacks such evidence.
+    The result is None if the scene lacks this kind of evidence.
 
     Args:
-        kept: indices of the remaining instances.
-        between: (n, n) mask of the pairs with evidence; all pairs by default.
+        kept: indices of the remaining object instances.
+        kind: kind of evidence, one of `KINDS`.
+        between: (instances, instances) bool, the pairs of instances with evidence. None means all
+            pairs.
     """
     bare = replace(scene_of(encoded, kept, ()), room_type=None)
     if kind == "room type":
@@ -99,7 +105,7 @@ def told(
 def removals(
     scenes: SceneTensors, structure: NDArray[np.bool_], kind: str, seed: int = 0
 ) -> Iterator[Case]:
-    """Generate T2 cases: up to two classes of every scene are removed, one at a time."""
+    """Generate the T2 questions: up to two questions per scene, each with one removed class."""
     for place, encoded in enumerate(scenes.scenes):
         classes = encoded.evidence.classes
         removable = classes[~structure[classes]]
@@ -117,10 +123,11 @@ def intrusions(
     intruders: NDArray[np.int64],
     kind: str,
 ) -> Iterator[Case]:
-    """Generate T3 cases: every scene with its intruder.
+    """Generate the T3 questions: each scene with one intruder.
 
     Args:
-        intruders: (N,) class of the intruder of each scene; -1 skips the scene.
+        intruders: (scenes,) class of the intruder in each scene; -1 skips the scene.
+        kind: kind of evidence, one of `KINDS`.
     """
     for place, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
         both = told(encoded, list(range(len(encoded.instance_classes))), kind)
@@ -131,7 +138,7 @@ def intrusions(
 
 
 def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
-    """Return the scene with one more object; only the label of the object is known."""
+    """Return the scene with an intruder, of which only the label is known."""
     if scene.poses is not None:
         pad = ((0, 0), (0, 1), (0, 1))
         poses = PoseRelations(np.pad(scene.poses.holds, pad), np.pad(scene.poses.observed, pad))
@@ -143,7 +150,10 @@ def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
 def halves(
     scenes: SceneTensors, structure: NDArray[np.bool_], kind: str, seed: int = 0
 ) -> Iterator[Case]:
-    """Generate T1 cases: half of the classes (at least two) have evidence; others are queried."""
+    """Generate the T1 questions: the evidence is about half of the classes, at least two.
+
+    All pairs of instances without evidence are queried.
+    """
     for place, encoded in enumerate(scenes.scenes):
         own, classes = encoded.instance_classes, encoded.evidence.classes
         usable = classes[~structure[classes]]
@@ -161,14 +171,17 @@ def halves(
 
 
 def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
-    """Return the reciprocal rank of a removed class among absent ones; expectation over ties."""
+    """Return the reciprocal rank of a removed class among all absent classes.
+
+    For ties, the result is the expectation under random order.
+    """
     p = missing_probabilities(artifact, scene)
     above, ties = int((p > p[target]).sum()), int((p == p[target]).sum())
     return float((1.0 / np.arange(above + 1, above + ties + 1)).mean())
 
 
 def missing_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T2 with additional evidence."""
+    """Measure T2 (missing objects) with labels only and with additional evidence."""
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
         return reciprocal_rank(artifact, scene, case.target)
@@ -183,7 +196,7 @@ def missing_evidence_task(contender: Contender, setting: Setting) -> Outcome | N
 
 
 def outliers_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T3 with additional evidence."""
+    """Measure T3 (outliers) with labels only and with additional evidence."""
     structure = setting.structure.numpy()
 
     def cases(artifact: Artifact, scenes: SceneTensors, kind: str) -> Iterator[Case]:
@@ -198,7 +211,7 @@ def outliers_evidence_task(contender: Contender, setting: Setting) -> Outcome | 
 
 
 def relations_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T1 with additional evidence."""
+    """Measure T1 (relations) with labels only and with additional evidence."""
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
         p, truth = relation_probabilities(artifact, scene)[case.asked], case.truth[case.asked]
@@ -222,11 +235,14 @@ def _changes(
     value: Callable[[Artifact, Scene, Case], float],
     kinds: tuple[str, ...] = KINDS,
 ) -> Outcome | None:
-    """Return the metric with and without each kind of evidence, and its change, over all items.
+    """Return the metric without and with each kind of evidence, and the change of the metric.
 
     Args:
-        cases_of: function of the artifact, scenes and a kind of evidence; yields the cases.
-        value: function that returns the metric of one scene of a case, summed over its items.
+        metric: name of the metric.
+        cases_of: function that takes a model, scenes and a kind of evidence, and yields questions.
+        value: function that takes a model, one of the two scenes of a question, and the question.
+            It returns the metric of the answer, summed over the items of the question.
+        kinds: kinds of evidence.
     """
     artifact = contender.artifact
     if artifact is None:

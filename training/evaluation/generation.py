@@ -1,17 +1,20 @@
 """Task T4: compare generated scenes with held-out scenes.
 
-The metrics use only annotated classes without structure. Intervals resample the held-out scenes and
-keep the generated scenes fixed.
+The metrics use only annotated classes, without structure classes such as walls. For intervals, the
+held-out scenes are resampled and the generated scenes are fixed.
 
-    MMD²        squared maximum mean discrepancy, unbiased, kernel exp(-Hamming distance/bandwidth);
-                by default the bandwidth is the median distance of the held-out scenes
-    marginals   sum_i |p_i - q_i| / sum_i q_i over classes; p generated, q held-out frequency
-    pairs       Pearson r over pairs of classes of cov(v_i, v_j), generated against held-out
+    MMD²        squared maximum mean discrepancy, unbiased. The kernel is
+                exp(-Hamming distance / bandwidth). The bandwidth is the median distance between
+                two held-out scenes
+    marginals   sum_i |p_i - q_i| / sum_i q_i over classes i. p_i is the share of generated scenes
+                with class i, and q_i is the share of held-out scenes
+    pairs       correlation (Pearson r) between the class covariances cov(v_i, v_j) of generated
+                scenes and of held-out scenes, over pairs of classes
     copies      share of generated scenes with the same set of classes as a training scene
-    mirrored    share of related pairs with both a(x, y) and a(y, x). Several instances of a class
-                can make both true, so held-out scenes have a share above 0 too
-    cycles      share of scenes with an on-top cycle, among scenes with on-top relations. Several
-                instances of a class can form a true cycle of classes
+    mirrored    share of related pairs of classes with both a(x, y) and a(y, x), for a relation a.
+                Both can be true if a class has several instances, also in held-out scenes
+    cycles      share of scenes with a cycle of on-top relations, among scenes with on-top
+                relations. A cycle of classes can be true if a class has several instances
 
 Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
 """
@@ -40,7 +43,7 @@ from training.machines.edges import present_classes
 from training.machines.gibbs import Clamp, State, gibbs_step, run
 
 _RESAMPLES = 200
-# Number of held-out scenes for the bandwidth, and number of classes for covariances.
+# Maximum number of held-out scenes for the bandwidth, and of classes for the covariances.
 _BANDWIDTH_SCENES = 1000
 _COMMON_CLASSES = 200
 _CHAINS = 256
@@ -49,14 +52,15 @@ _ON_TOP = CANONICAL.index("on-top")
 
 @dataclass(frozen=True, eq=False)
 class Contradictions:
-    """Contradictory relations in B scenes, between different classes.
+    """Counts of contradictory relations between different classes.
 
     Attributes:
-        related: (B,) number of pairs with a canonical relation in at least one direction, summed
-            over the relations.
-        mirrored: (B,) number of pairs with the relation in both directions, summed likewise.
-        stacked: (B,) bool, the scene has an on-top relation.
-        cyclic: (B,) bool, the scene has an on-top cycle.
+        related: (scenes,) number of pairs of classes with a relation in at least one direction,
+            summed over the canonical relations.
+        mirrored: (scenes,) number of pairs of classes with a relation in both directions, summed
+            over the canonical relations.
+        stacked: (scenes,) bool, True if the scene has an on-top relation.
+        cyclic: (scenes,) bool, True if the on-top relations of the scene form a cycle.
     """
 
     related: Tensor
@@ -66,7 +70,7 @@ class Contradictions:
 
     @classmethod
     def of(cls, holds: Tensor) -> Contradictions:
-        """Count the contradictions of relations (B, A, n, n)."""
+        """Count the contradictions of relations (scenes, relations, classes, classes)."""
         n = holds.shape[-1]
         on = (holds > 0) & ~torch.eye(n, dtype=torch.bool)
         upper = torch.ones(n, n, dtype=torch.bool).triu(1)
@@ -92,7 +96,10 @@ class Contradictions:
         return Contradictions(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def metrics(self) -> dict[str, Metric]:
-        """Return the shares of mirrored relations and on-top cycles that are defined."""
+        """Return the share of mirrored relations and the share of scenes with an on-top cycle.
+
+        A share is left out if no scene has a relation for it.
+        """
         shares = {
             "mirrored relations": (self.mirrored, self.related),
             "on-top cycles": (self.cyclic, self.stacked),
@@ -106,11 +113,12 @@ class Contradictions:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """B generated scenes.
+    """Generated scenes.
 
     Attributes:
-        v: (B, V) presence.
-        contradictions: contradictions of the relations; None if relations were not generated.
+        v: (scenes, classes) presence.
+        contradictions: contradictions of the generated relations. None if the sampler generates no
+            relations.
     """
 
     v: Tensor
@@ -118,11 +126,11 @@ class Drawn:
 
 
 class Sampler(Protocol):
-    """Generate one scene per row.
+    """Function that generates scenes, one for each row of `given`.
 
     Args:
-        given: (B, V) bool, classes that the scene must contain.
-        room: (B,) int64 room types; -1 if the room type is not given.
+        given: (scenes, classes) bool, the classes that each scene must contain.
+        room: (scenes,) int64 room type of each scene; -1 if the room type is free.
         seed: seed of the random numbers.
     """
 
@@ -130,7 +138,7 @@ class Sampler(Protocol):
 
 
 def drawn_of(scenes: SceneTensors, block: int = 64) -> Drawn:
-    """Return held-out scenes in the form of generated scenes."""
+    """Return held-out scenes in the format of generated scenes."""
     parts = [
         Contradictions.of(scenes.batch(index).holds)
         for index in torch.arange(len(scenes)).split(block)
@@ -139,7 +147,7 @@ def drawn_of(scenes: SceneTensors, block: int = 64) -> Drawn:
 
 
 def independent_sampler(train: SceneTensors) -> Sampler:
-    """Return a sampler of independent classes at training frequencies, without relations."""
+    """Return a sampler that draws each class independently, with its frequency in training."""
     frequency = train.v.mean(0)
 
     def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
@@ -151,13 +159,13 @@ def independent_sampler(train: SceneTensors) -> Sampler:
 
 
 def scene_sampler(scenes: SceneTensors) -> Sampler:
-    """Return a sampler of real scenes, which estimates the best possible value of a metric.
+    """Return a sampler that returns real scenes, to estimate the best possible value of a metric.
 
-    Without given classes, row k returns scene k if its room type fits. Otherwise the sampler
-    returns a random scene that satisfies the row.
+    Without given classes, the sample with index k is scene k if its room type fits. Otherwise the
+    sample is a random scene with the given classes and room type.
 
     Raises:
-        ValueError: no scene satisfies a row.
+        ValueError: no scene has the given classes and room type (raised by the sampler).
     """
     real = drawn_of(scenes)
 
@@ -171,7 +179,9 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
                 fits &= scenes.room == room[row]
             places = fits.nonzero().squeeze(1).numpy()
             if not len(places):
-                raise ValueError(f"no scene satisfies the conditions of row {row}")
+                raise ValueError(
+                    f"no real scene has the observed classes and the room type of test scene {row}"
+                )
             own = free and row in places
             chosen.append(row if own else int(rng.choice(places)))
         index = torch.tensor(chosen)
@@ -182,12 +192,13 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
 
 
 def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler:
-    """Return a sampler with the Gibbs chains of the service and the relations of the machine.
+    """Return a sampler that runs the Gibbs chains of the service, and also samples relations.
 
-    The service keeps only one of a(x, y) and a(y, x); here both may hold.
+    Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
+    keeps both.
 
     Args:
-        steps: number of sweeps of a chain.
+        steps: number of Gibbs sweeps per scene.
     """
     samples = ChainSamples(machine)
 
@@ -208,22 +219,23 @@ def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler
 def _sweep(
     machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp, steps: int
 ) -> State:
-    """Run Gibbs sweeps; in the local form only the last sweep samples relations."""
+    """Run Gibbs sweeps. If relations do not affect objects, only the last sweep samples them."""
     always = machine.relations_act
     state = run(machine, state, generator, steps - 1, clamp, relations=always)
     return gibbs_step(machine, state, generator, clamp)
 
 
 def _grid(machine: BoltzmannMachine, state: State) -> Tensor:
-    """Return the relations between present classes, (B, A, n, n)."""
+    """Return the relations between present classes, (scenes, relations, classes, classes)."""
     r = state.r * state.edges.ends_present(state.v)
     return machine.between(state.edges, r, present_classes(state.v)).clamp(min=0)
 
 
 def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
-    """Split held-out scenes into reference scenes and scenes that serve as the best sample.
+    """Split held-out scenes into two halves: reference scenes, and scenes of an ideal sampler.
 
-    A group stays in one half. The limit of the setting applies to each half.
+    A group of near-duplicate scenes stays in one half. The limit of the setting applies to each
+    half.
     """
     scenes = setting.scenes
     odd = torch.tensor([crc32(scene.group.encode()) % 2 for scene in scenes.scenes]).bool()
@@ -235,7 +247,7 @@ def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
 
 
 def hamming(x: Tensor, y: Tensor) -> Tensor:
-    """Return Hamming distances (N, M) of binary rows (N, V) and (M, V)."""
+    """Return the Hamming distances (N, M) between the binary rows of `x` (N, V) and `y` (M, V)."""
     return (x.sum(1, keepdim=True) + y.sum(1) - 2 * x @ y.T).clamp(min=0)
 
 
@@ -247,9 +259,13 @@ def median_distance(v: Tensor) -> float:
 
 
 def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[Floats], float]:
-    """Return MMD² as a function of the weights of the held-out scenes.
+    """Return a function that takes weights of the held-out scenes and returns MMD².
 
-    The statistic excludes pairs of a scene with itself or with its copy in a resample.
+    The statistic excludes pairs of a scene with itself, or with a copy of itself in a resample.
+
+    Args:
+        held_out: (held-out scenes, classes) presence.
+        drawn: (generated scenes, classes) presence.
     """
 
     def kernel(x: Tensor, y: Tensor) -> Floats:
@@ -272,7 +288,10 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
 
 
 def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return sum |p - q| / sum q as a function of the weights of the held-out scenes."""
+    """Return a function that takes weights of the held-out scenes and returns sum |p - q| / sum q.
+
+    p and q are the frequencies of a class in generated and in held-out scenes.
+    """
     p = drawn.mean(0)
 
     def at(weight: Floats) -> float:
@@ -285,7 +304,11 @@ def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]
 
 
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return Pearson r of the covariances of all pairs of the most common held-out classes."""
+    """Return a function that takes weights of the held-out scenes and returns Pearson r.
+
+    r correlates the class covariances of generated scenes with those of held-out scenes, over all
+    pairs of the most common held-out classes.
+    """
     common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
     common = common[held_out[:, common].any(0)]
     x, y = drawn[:, common], held_out[:, common]
@@ -310,7 +333,10 @@ def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], floa
 
 
 def copies(drawn: Tensor, train: Tensor) -> Floats:
-    """Return (B,) 1 where a generated scene has the same set of classes as a training scene."""
+    """Return 1 for each generated scene with the same set of classes as a training scene, else 0.
+
+    The result has the shape (generated scenes,).
+    """
     known = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
     rows = np.packbits(drawn.numpy() > 0, axis=1)
     return np.array([row.tobytes() in known for row in rows], dtype=np.float64)
@@ -328,10 +354,11 @@ def generation_metrics(
 
     Args:
         drawn: at least two generated scenes.
-        held_out: (N, V) presence.
-        train: (T, V) presence.
-        asked: (V,) bool, the classes that the metrics use.
-        emphasis: (N,) weights of the held-out scenes; 1 by default.
+        held_out: (held-out scenes, classes) presence.
+        train: (training scenes, classes) presence.
+        asked: (classes,) bool, the classes that the metrics use.
+        bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
+        emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
     """
     x, y, known = drawn.v[:, asked], held_out[:, asked], train[:, asked]
     ours, theirs = x.double().numpy(), y.double().numpy()
@@ -357,11 +384,12 @@ def generation_metrics(
 def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
     """Measure T4: compare generated scenes with the first half of the held-out scenes.
 
-    The number of generated scenes is the size of the second half. There are three conditions:
-    without evidence, with the room types of the second half, and with one given class. The given
-    class is drawn from all class mentions of the second half. So the probability of a scene is
-    proportional to its number of classes. In this condition the first half has the same weights, so
-    that a perfect sampler has no discrepancy.
+    The number of generated scenes is the number of scenes in the second half. The scenes are
+    generated under three conditions: without evidence, with the room types of the second half, and
+    with one given class. The given classes are drawn from all (scene, class) pairs of the second
+    half, so scenes with many classes are drawn more often. With a given class, each scene of the
+    first half is therefore weighted by its number of classes. A perfect sampler then has no
+    discrepancy.
     """
     if contender.sampler is None or setting.train is None:
         return None

@@ -1,21 +1,24 @@
-"""Intruders: one absent class is added to a scene, drawn from one of four distributions.
+"""Intruders: add one absent class to a scene, to test the detection of outliers.
 
-    uniform     uniform over the absent, non-structure classes
-    popularity  proportional to the number of training scenes with the class
-    room        uniform over the classes seen in training in the same room type
-    signature   a class typical of another room type
+The class is drawn from one of four distributions over absent classes:
 
-Scenes with fewer than three classes are skipped.
+    uniform     all classes have the same probability
+    popularity  the probability is proportional to the number of training scenes with the class
+    room        uniform over the classes that training scenes of the same room type contain
+    signature   a class that is typical of another room type
+
+Structure classes such as walls are never intruders. Scenes with fewer than three other classes are
+skipped.
 
 The lift of a class in a room type is p(class | room type) / p(class), over training scenes with a
-known room type. The signature of a room type has at most ten classes, those with the highest lift.
-A signature class has a lift of at least 5 and occurs in at least 20 % of the scenes of the room
-type. Room types with fewer than 20 training scenes are left out.
+known room type. The signature of a room type contains the ten classes with the highest lift, or
+fewer. A signature class has a lift of at least 5 and occurs in at least 20 % of the scenes of the
+room type. Room types with fewer than 20 training scenes are left out.
 
-For a scene of room type r, a suitable class is a signature class of another room type. It is absent
-from the scene, is not structure, and occurs in less than 1 % of the training scenes of type r. The
-intruder is drawn in two steps: uniformly one of the room types with a suitable class, then
-uniformly one of its suitable classes.
+In a scene of room type r, a signature intruder must be a signature class of another room type. It
+must also occur in less than 1 % of the training scenes of room type r. The intruder is drawn in two
+steps. The first step draws one of the room types that have such a class. The second step draws one
+of these classes. Both draws are uniform.
 """
 
 from __future__ import annotations
@@ -40,17 +43,20 @@ _LIFT = 5.0
 _OFTEN = 0.2
 _FOREIGN = 0.01
 
-# Function of scenes and training scenes that returns sampling weights (N, V).
+# Function that takes scenes and training scenes, and returns sampling weights (scenes, classes).
 Law = Callable[[SceneTensors, SceneTensors], Tensor]
 
 
 def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return weights (N, V): the number of training scenes with each class."""
+    """Return weights (scenes, classes): the number of training scenes with each class."""
     return train.v.sum(0).expand(len(scenes), -1)
 
 
 def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return weights (N, V): 1 if training has the class in the scene's room type, else 0."""
+    """Return weights (scenes, classes) of 1 or 0.
+
+    A weight is 1 if a training scene of the scene's room type contains the class.
+    """
     weights = torch.zeros_like(scenes.v)
     for room in scenes.room.unique().tolist():
         if room >= 0:
@@ -62,11 +68,11 @@ def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 def draw_intruders(
     scenes: SceneTensors, structure: Tensor, weights: Tensor | None = None, seed: int = 0
 ) -> Tensor:
-    """Draw an intruder for each scene, (N,) int64; -1 means the scene is skipped.
+    """Draw an intruder for each scene. Return its class, (scenes,) int64; -1 skips the scene.
 
     Args:
-        structure: (V,) bool, True for structure classes.
-        weights: (N, V) sampling weights of absent classes; None means uniform.
+        structure: (classes,) bool, True for structure classes.
+        weights: (scenes, classes) sampling weights. None means equal weights.
     """
     present = scenes.v > 0
     absent = (~present & ~structure).double()
@@ -83,11 +89,11 @@ def draw_intruders(
 
 @dataclass(frozen=True, eq=False)
 class Signatures:
-    """Statistics of training scenes for R room types.
+    """Signatures of the room types, from training scenes.
 
     Attributes:
-        typical: (R, V) bool, the signature classes of each room type.
-        share: (R, V) p(class | room type); NaN for a room type with too few scenes.
+        typical: (room types, classes) bool, True for the signature classes of each room type.
+        share: (room types, classes) p(class | room type). NaN for a room type with too few scenes.
     """
 
     typical: Flags
@@ -115,7 +121,10 @@ def signatures(train: SceneTensors) -> Signatures:
 
 
 def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return weights (N, V): the sampling probability of each class; all 0 for no intruder."""
+    """Return the sampling probability of each class in each scene, (scenes, classes).
+
+    All probabilities of a scene are 0 if it can have no signature intruder.
+    """
     found = signatures(train)
     weights = np.zeros(scenes.v.shape)
     absent = scenes.v.numpy() == 0
@@ -134,15 +143,15 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 def kinds_of_intruders(
     scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Ints]:
-    """Draw one intruder of each kind for every scene.
+    """Draw three intruders for every scene: uniform, by popularity and by signature.
 
-    The kinds are those of the calibration: uniform, by popularity and by signature. The keys of the
-    result are (source, scene id).
+    Returns:
+        The classes of the intruders, by (data source, scene id).
     """
     laws: list[Tensor | None] = [None]
     if train is not None:
         laws += [by_popularity(scenes, train), by_signature(scenes, train)]
-    # `answers.ask_outliers` draws with `seed`; another seed here keeps the draws independent.
+    # `answers.ask_outliers` uses `seed` itself. Another seed keeps the draws independent.
     drawn = [draw_intruders(scenes, structure, weights, seed + 1) for weights in laws]
     each = torch.stack(drawn, 1).numpy()
     names = [(scene.source, scene.scene_id) for scene in scenes.scenes]
@@ -151,17 +160,20 @@ def kinds_of_intruders(
 
 @dataclass(frozen=True, eq=False)
 class IntruderScores:
-    """Log-odds of each object given the rest, for scenes with and without an intruder.
+    """Log-odds of each object given the other objects, for scenes without and with an intruder.
+
+    A scene is scored twice: once as it is (clean), and once with its intruder. The arrays have one
+    entry for each object of each scored scene.
 
     Attributes:
-        scene: (N,) index of the scene.
-        thing: (N,) class of the object.
-        log_odds: (N,) log-odds of the object.
-        intruder: (N,) bool, the object is the intruder.
-        size: (N,) number of distinct classes in the scored scene.
-        clean: (N,) bool, the scored scene has no intruder.
+        scene: (objects,) index of the scene.
+        thing: (objects,) class of the object.
+        log_odds: (objects,) log-odds of the object.
+        intruder: (objects,) bool, True if the object is the intruder.
+        size: (objects,) number of distinct classes in the scored scene.
+        clean: (objects,) bool, True if the scored scene has no intruder.
         scenes: number of scenes.
-        skipped: number of scenes that are too small or lack a class to add.
+        skipped: number of scenes that are too small or have no possible intruder.
     """
 
     scene: Ints
@@ -175,35 +187,47 @@ class IntruderScores:
 
     @property
     def listed(self) -> Ints:
-        """(N,) number of distinct classes in the scored scene, without structure."""
+        """(objects,) number of distinct classes in the scored scene, without structure classes."""
         as_scored = 2 * self.scene + self.clean
         counts: Ints = np.bincount(as_scored)[as_scored]
         return counts
 
     def with_prior(self, prior: Floats) -> IntruderScores:
-        """Subtract the prior log-odds of being an intruder, by class (V,)."""
+        """Subtract `prior` (classes,) from the log-odds of the objects.
+
+        `prior` is the prior log-odds that an object of the class is an intruder.
+        """
         return replace(self, log_odds=self.log_odds - prior[self.thing])
 
     @property
     def dirty(self) -> Items:
-        """Return the objects of scenes with an intruder, with scores -log-odds.
+        """Return the objects of scenes with an intruder as items for ranking metrics.
 
-        Only the intruder counts as true.
+        The score of an object is its negated log-odds. Only the intruder counts as true.
         """
         rows = ~self.clean
         score, truth = -self.log_odds[rows], self.intruder[rows]
         return Items(self.scene[rows], score, truth, self.scenes, self.skipped)
 
     def hit_at_1(self) -> Ratio:
-        """Return the share of scenes whose intruder has the lowest log-odds; expected over ties."""
+        """Return the share of scenes whose intruder has the lowest log-odds.
+
+        For ties, the result is the expectation under random order.
+        """
         return self.dirty.hit_at_1()
 
     def false_alarms(self, loud: Flags) -> Ratio:
-        """Return the share of clean scenes with an alarm; loud (N,) marks objects with an alarm."""
+        """Return the share of clean scenes with an alarm.
+
+        `loud` (objects,) is True for objects with an alarm.
+        """
         return self._alarms(loud, self.clean)
 
     def caught(self, loud: Flags) -> Ratio:
-        """Return the share of intruders with an alarm; loud (N,) marks objects with an alarm."""
+        """Return the share of intruders with an alarm.
+
+        `loud` (objects,) is True for objects with an alarm.
+        """
         return self._alarms(loud, self.intruder)
 
     def _alarms(self, loud: Flags, judged: Flags) -> Ratio:
@@ -221,9 +245,14 @@ def intruder_scores(
     weights: Tensor | None = None,
     seed: int = 0,
 ) -> IntruderScores:
-    """Score every object of every scene without and with an intruder; see `draw_intruders`.
+    """Score every object of every scene, without an intruder and with an intruder.
 
     All relations are unobserved.
+
+    Args:
+        structure: (classes,) bool, True for structure classes.
+        score: function that takes presence (rows, classes) and returns log-odds (rows, classes).
+        weights: sampling weights of the intruders, see `draw_intruders`.
     """
     added = draw_intruders(scenes, structure, weights, seed)
     kept = (added >= 0).nonzero().squeeze(1)
@@ -238,7 +267,7 @@ def intruder_scores(
 
 @torch.no_grad()
 def clean_scores(v: Tensor, structure: Tensor, score: Callable[[Tensor], Tensor]) -> IntruderScores:
-    """Score every object of every scene (N, V) without intruders."""
+    """Score every object of the scenes `v` (scenes, classes), without intruders."""
     parts = [
         _scored(v[index], index, torch.full_like(index, -1), structure, score)
         for index in torch.arange(len(v)).split(64)
@@ -253,7 +282,13 @@ def _scored(
     structure: Tensor,
     score: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, ...]:
-    """Return the columns of `IntruderScores` for some scenes; `added` is -1 for clean scenes."""
+    """Return the arrays of `IntruderScores` for a block of scenes.
+
+    Args:
+        v: (scenes, classes) presence, with intruders.
+        index: (scenes,) index of each scene.
+        added: (scenes,) class of the intruder; -1 for a clean scene.
+    """
     row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
     odds = torch.zeros(0)
     if len(row):

@@ -1,9 +1,9 @@
-"""Statistics of scored items that are not sums over scenes.
+"""Statistics of scored items, for statistics that are not sums over scenes.
 
-Each function takes the scores (N,) and truth values (N,) of items. It returns the statistic as a
-function of the item weights (N,). A weight is the number of times that an item counts; resampling
-gives whole numbers. For items of equal score, the statistic is the expectation under random order.
-An undefined statistic is NaN.
+An item is an answer with a score and a truth value. Each function takes the scores (items,) and
+truth values (items,). It returns a function that takes item weights (items,) and returns the
+statistic. A weight is the number of times that a bootstrap resample contains the item. For items of
+equal score, the statistic is the expectation under random order. An undefined statistic is NaN.
 """
 
 from __future__ import annotations
@@ -22,14 +22,20 @@ BINS = 10
 
 @dataclass(frozen=True, eq=False)
 class _Levels:
-    """Items grouped by equal score, in ascending order."""
+    """Items grouped by score. A level is the set of items with the same score.
+
+    Attributes:
+        level: (items,) index of the level of each item. Levels are sorted by score, lowest first.
+        scores: (levels,) score of each level.
+        truth: (items,) bool, True for true items.
+    """
 
     level: NDArray[np.int64]
     scores: Floats
     truth: NDArray[np.bool_]
 
     def count(self, weight: Floats) -> tuple[Floats, Floats]:
-        """Return the weight of all items and of the true items at each level."""
+        """Return the total weight of all items and of the true items, each (levels,)."""
         size = len(self.scores)
         every = np.bincount(self.level, weights=weight, minlength=size).astype(np.float64)
         true = np.bincount(self.level, weights=weight * self.truth, minlength=size)
@@ -42,7 +48,10 @@ def _levels(score: Floats, truth: NDArray[np.bool_]) -> _Levels:
 
 
 def auroc(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """Return the probability that a true item scores above a false item; ties count half."""
+    """Return the probability that a true item has a higher score than a false item.
+
+    A pair of items with equal scores counts half.
+    """
     levels = _levels(score, truth)
 
     def at(weight: Floats) -> float:
@@ -56,11 +65,11 @@ def auroc(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 
 
 def average_precision(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """Return the mean precision at the true items.
+    """Return the mean precision at the ranks of the true items.
 
-    Suppose that N items (P of them true) score higher than n items of equal score (p of them true).
-    If a true item has rank N + k, the expected number of true items among the first N + k items is
-    P + 1 + (k - 1)(p - 1)/(n - 1).
+    Suppose that n items have the same score and that p of them are true. Suppose also that N items
+    have a higher score and that P of them are true. If a true item has rank N + k, the expected
+    number of true items among the first N + k items is P + 1 + (k - 1)(p - 1)/(n - 1).
     """
     levels = _levels(score, truth)
 
@@ -80,9 +89,10 @@ def average_precision(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 
 
 def calibration_error(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """Return the expected calibration error (ECE) of probabilities in `BINS` bins of equal mass.
+    """Return the expected calibration error (ECE) of probabilities.
 
-    The ECE is the mean over bins of |mean probability - share of true items|.
+    The items are sorted by probability and divided into `BINS` bins of equal weight. The ECE is the
+    mean over bins of |mean probability - share of true items|.
     """
     levels = _levels(score, truth)
 
@@ -97,7 +107,10 @@ def calibration_error(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 
 
 def brier_skill(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """Return 1 - Brier score / Brier score of the base rate; 0 means as good as the base rate."""
+    """Return the Brier skill: 1 - Brier score / Brier score of the base rate.
+
+    The base rate is the share of true items. The skill is 0 if all probabilities are the base rate.
+    """
     levels = _levels(score, truth)
 
     def at(weight: Floats) -> float:
@@ -114,7 +127,13 @@ def brier_skill(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Data of a reliability plot by bin of equal mass: mean probability and share of true items."""
+    """Bins of a reliability plot. All bins have the same weight of items.
+
+    Attributes:
+        probability: (bins,) mean probability of the items in each bin.
+        frequency: (bins,) share of true items in each bin.
+        mass: (bins,) share of all items in each bin.
+    """
 
     probability: Floats
     frequency: Floats
@@ -122,16 +141,17 @@ class Reliability:
 
 
 def reliability(score: Floats, truth: NDArray[np.bool_]) -> Reliability:
-    """Return the bins of `calibration_error`."""
+    """Return the bins that `calibration_error` uses."""
     levels = _levels(score, truth)
     mass, p, y = _bins(levels.scores, *levels.count(np.ones(len(score))))
     return Reliability(p, y, mass)
 
 
 def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the mass, mean score and share of true items of each bin.
+    """Return the share of items, the mean score and the share of true items of each bin.
 
-    If items of equal score cross a bin border, both bins get a proportional part of true items.
+    If a bin border divides items of equal score, each bin gets a proportional part of the true
+    items among them.
     """
     total = every.sum()
     edges = np.linspace(0.0, total, BINS + 1)

@@ -169,7 +169,8 @@ class Ratio(Metric):
     """Micro-average: sum(numerators) / sum(denominators) over scenes.
 
     Attributes:
-        numerators, denominators: (scenes,); the denominator of a skipped scene is 0.
+        numerators: (scenes,) numerator of each scene.
+        denominators: (scenes,) denominator of each scene. A skipped scene has denominator 0.
 
     Raises:
         ValueError: all denominators are 0.
@@ -356,7 +357,8 @@ class Items:
         scene: (N,) scene of each item.
         score: (N,) score of each item.
         truth: (N,) bool, the item is true.
-        scenes, skipped: number of scenes, and number of scenes that could not be scored.
+        scenes: number of scenes.
+        skipped: number of scenes that could not be scored.
     """
 
     scene: Ints

@@ -40,16 +40,18 @@ from training.machines import BoltzmannMachine
 from training.machines.log_odds import object_log_odds
 from training.machines.mean_field import Evidence
 
-# Function of presence (B, V) that returns log-odds (B, V) of every class.
+# Function that takes presence (scenes, classes) and returns log-odds (scenes, classes).
 ObjectScore = Callable[[Tensor], Tensor]
-# Function of presence (B, V) and room types (B,), -1 if unknown; returns log-odds (B, V).
+# Function that takes presence (scenes, classes) and room types (scenes,), with -1 for an unknown
+# room type. It returns log-odds (scenes, classes).
 RoomScore = Callable[[Tensor, Tensor], Tensor]
 
 TOP = (1, 2, 3, 5, 10, 20, 50)
 """Values of k for top-k accuracy."""
 
 SHARES: dict[str, float | None] = {"50 %": 0.5, "25 %": 0.25, "75 %": 0.75, "all but one": None}
-"""Share of classes that T2 partial shows; the primary share comes first."""
+"""Share of the classes that stay listed in T2 partial. None hides one class. The first share gives
+the primary metric."""
 
 _FIRST = 5
 # Coverage 1: the object list is complete, so unlisted objects are absent.
@@ -58,9 +60,10 @@ _CLOSED = 1.0
 
 @dataclass(frozen=True, eq=False)
 class MachineScore:
-    """The score of a machine: log-odds with all relations unobserved.
+    """The score of a machine: log-odds of each class with all relations unobserved.
 
-    A seed-form machine sums relations out at the mean-field fixed point.
+    In a seed-form machine, relations affect objects. Such a machine sums the relations out at the
+    mean-field fixed point.
     """
 
     machine: BoltzmannMachine
@@ -85,7 +88,8 @@ class Ranking:
         target: (N,) the hidden class.
         above: (N,) number of candidates with a higher score.
         ties: (N,) number of other candidates with the same score.
-        scenes, skipped: number of scenes, and number of scenes with too few classes.
+        scenes: number of scenes in the set.
+        skipped: number of scenes with too few classes.
     """
 
     scene: Ints
@@ -136,12 +140,10 @@ class Ranking:
         return metrics | {"MRR, macro by class": macro}
 
     def with_unknown(self, unknown: Ints) -> Ratio:
-        """Return the MRR with each label outside the vocabulary counted as a removed object.
-
-        Such a label scores 0.
+        """Return the MRR, where each label outside the vocabulary is a removed object of score 0.
 
         Args:
-            unknown: (scenes,) number of such labels per scene; skipped scenes stay skipped.
+            unknown: (scenes,) number of labels outside the vocabulary. Skipped scenes are ignored.
         """
         known = self.mrr()
         scored = known.denominators > 0
@@ -158,9 +160,9 @@ def leave_one_out(
     """Remove each class of each scene in turn, and rank the removed class.
 
     Args:
-        structure: (V,) bool.
+        structure: (V,) bool, True for structure classes, such as walls.
         score: a higher score of a class means that the class is more likely missing.
-        told_room: pass the room type of each scene to the score.
+        told_room: True passes the room type of each scene to the score.
 
     Raises:
         LeakError: the score depends on more than the shown evidence.
@@ -198,8 +200,8 @@ def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int
     """Hide classes of every scene with at least two classes.
 
     Args:
-        structure: (V,) bool.
-        share: share of shown classes; None shows all but one.
+        structure: (V,) bool, True for structure classes, such as walls.
+        share: share of the classes that stay listed. None hides one class.
     """
     plain = ~structure.numpy()
     places: list[int] = []
@@ -232,7 +234,7 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
         ValueError: all scenes have fewer than two classes.
     """
     if not len(partial.v):
-        raise ValueError("no scene has two classes: one to show and one to hide")
+        raise ValueError("the task T2 partial needs a scene with at least two classes")
     values = ask_rows(score, partial.v)
     # -inf marks classes that are no candidates. So a candidate of probability 0 gets the smallest
     # finite score.
@@ -252,10 +254,11 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
 
 
 def partial_score(artifact: Artifact, coverage: float | None = None) -> ObjectScore:
-    """Return a score: log-probabilities of `/missing`, given labels only.
+    """Return a function that computes the log-probabilities of `/missing` from labels only.
 
     Args:
-        coverage: None means the default of the model; 1 means unlisted = absent.
+        coverage: share of the objects that the scene lists. None means the default of the model.
+            With 1, unlisted objects are absent.
     """
 
     def log_p(row: NDArray[np.float32]) -> Floats:
@@ -288,7 +291,7 @@ class Places:
     outgoing: Tensor
 
     def rows(self, index: Tensor) -> Places:
-        """Select rows."""
+        """Select the scenes at the given indices."""
         return Places(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
@@ -378,7 +381,7 @@ def missing_in_room_task(contender: Contender, setting: Setting) -> Outcome | No
 
 
 def partial_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T2 partial; a published model is also measured with unlisted = absent."""
+    """Measure T2 partial. A published model is also measured with unlisted objects as absent."""
     artifact = contender.artifact
     score = contender.objects if artifact is None else partial_score(artifact)
     if score is None:
@@ -405,7 +408,7 @@ def partial_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 
 def placed_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T2-at, and the same questions without the place."""
+    """Measure T2-at. Also measure the same removed classes in requests without the place."""
     if contender.placed is None:
         return None
     scenes, structure = setting.some(related=True, share=3), setting.structure

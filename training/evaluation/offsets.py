@@ -1,9 +1,11 @@
-"""Coverage of the placement offsets on held-out scenes.
+"""Test the placement offsets of a model on held-out scenes.
 
-The task takes every related pair of objects with known poses. It looks up the offset distribution
-of their classes. In the plane, an offset is covered if it lies in the ellipse that should contain
-80 % of offsets; in space, the region is an ellipsoid. The task also measures the distance of the
-offset from two means: the mean for the relation and classes, and the mean for the relation alone.
+An offset is the position of a relation's subject minus the position of its object, in metres. The
+model has a distribution of offsets for each relation and pair of classes. The distribution gives an
+ellipse in the horizontal plane and an ellipsoid in space. Each of these regions should contain 80 %
+of the offsets. The task measures the share of held-out offsets in these regions. It also measures
+the distance from an offset to two means of the model: the mean for the relation and classes, and
+the mean for the relation alone.
 """
 
 from __future__ import annotations
@@ -19,10 +21,10 @@ from training.evaluation.setting import Contender, Outcome, Setting
 from training.offsets import seen_offsets
 
 SHARE: Final = 0.8
-"""Share of the offsets that each region should contain."""
+"""Share of the offsets that each ellipse or ellipsoid should contain."""
 
 _REGIONS: Final = {"the ellipse": 2, "the ellipsoid": 3}
-"""Number of axes of each region: x and y, or x, y and z."""
+"""Number of axes of each region: two axes are x and y, three axes are x, y and z."""
 
 METRICS: Final = (
     *(f"in {region}, {name}" for name in CANONICAL for region in _REGIONS),
@@ -32,7 +34,10 @@ METRICS: Final = (
 
 
 def offsets_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure coverage by relation, and distances over all relations."""
+    """Measure the share of covered offsets for each relation, and the distances for all relations.
+
+    Return None if the model has no offsets, or if no scene has related objects with poses.
+    """
     if contender.artifact is None or (offsets := contender.artifact.offsets) is None:
         return None
     scenes = setting.scenes.scenes

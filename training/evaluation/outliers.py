@@ -82,7 +82,7 @@ class Alarm:
 
 
 def calibrated_alarm(calibration: Calibration) -> Alarm:
-    """Return the alarm of the service: its intruder probability and its default threshold."""
+    """Return the alarm rule of the service, with the default sensitivity."""
     entry = calibration.outlier
     popularity = np.array(calibration.popularity)
 
@@ -102,7 +102,7 @@ def fitted_alarm(
 
     Args:
         validation: at most 1,500 scenes with complete object lists are used.
-        structure: (V,) bool.
+        structure: (V,) bool, True for structure classes, such as walls.
     """
     complete = subset(validation, validation.complete.nonzero().squeeze(1))
     scenes = some_scenes(complete, _SCENES, seed)
@@ -159,7 +159,7 @@ def kept_in_each_source(
     Args:
         worst: (N,) highest suspicion of each clean scene.
         group: (N,) group of each scene.
-        source: (N,) index of the source.
+        source: (N,) index of the source of each scene.
     """
     kinds, sizes = np.unique(source, return_counts=True)
     large = [source == kind for kind in kinds[sizes >= _SOURCE_SCENES]]
@@ -194,7 +194,11 @@ _SHORT_LISTS = (1, 2, 4)
 
 
 def outliers_task(contender: Contender, setting: Setting, law: Law | None = None) -> Outcome | None:
-    """Measure T3 with a score; uniform intruders by default."""
+    """Measure T3 with the object score of a contender.
+
+    Args:
+        law: distribution of the intruders. None means uniform.
+    """
     if contender.objects is None or (law is not None and setting.train is None):
         return None
     scenes = setting.some()
@@ -280,7 +284,7 @@ def judge_intruders(
     """Return hit@1 by probability and by log-odds, and the detected share at each sensitivity.
 
     Args:
-        intruders: (N,) classes; -1 for scenes without an intruder.
+        intruders: (N,) class of the intruder of each scene, or -1 for a scene without intruder.
         law: suffix of the metric names, for the distribution of the intruders.
 
     Raises:

@@ -5,7 +5,7 @@ A question is a pair of different classes of a scene for which the scene lists a
 relations. The eight relations are the four canonical relations in both directions. A pair may have
 several listed relations; each of them is correct.
 
-    accuracy   the most probable of the eight is listed (expectation over ties)
+    accuracy   share of pairs whose most probable relation is listed (expectation over ties)
     log-loss   -log of the listed relations' share of the eight probabilities, in nats
 
 Pairs with structure classes are excluded. Scenes without such a pair are skipped.
@@ -116,14 +116,14 @@ def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
 
 @dataclass(frozen=True, eq=False)
 class PairAnswers:
-    """Answers about all pairs.
+    """Answers about all N pairs of a set of scenes.
 
     Attributes:
         scene: (N,) index of the scene of each pair.
-        classes: (N, 2) class indices.
-        p: (N, 8) probabilities.
-        listed: (N, 8) bool, listed relations.
-        scenes: number of scenes.
+        classes: (N, 2) indices of the two classes of each pair.
+        p: (N, 8) probability of each of the eight relations.
+        listed: (N, 8) bool, True for relations that the scene lists.
+        scenes: number of scenes in the set.
     """
 
     scene: NDArray[np.int64]
@@ -133,13 +133,13 @@ class PairAnswers:
     scenes: int
 
     def where(self, mask: NDArray[np.bool_]) -> PairAnswers:
-        """Select pairs."""
+        """Select the pairs with a True value in `mask` (N,)."""
         return PairAnswers(
             self.scene[mask], self.classes[mask], self.p[mask], self.listed[mask], self.scenes
         )
 
     def accuracy(self) -> Ratio:
-        """Return the share of pairs whose most probable relation of the eight is listed."""
+        """Return the share of pairs whose most probable relation is listed in the scene."""
         best = self.p == self.p.max(1, keepdims=True)
         right = (best & self.listed).sum(1) / best.sum(1)
         return Ratio.of_items(self.scene, right, self.scenes)
@@ -159,7 +159,7 @@ class PairAnswers:
 
 
 def answer_pairs(asked: list[ScenePairs], score: PairScore, scenes: int) -> PairAnswers:
-    """Query the score for the pairs of all scenes.
+    """Compute the probabilities of the eight relations for all pairs of all scenes.
 
     Raises:
         LeakError: see `ask_every`.

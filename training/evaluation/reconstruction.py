@@ -1,9 +1,9 @@
-"""Reconstruction error of objects and of relations: the training curve of the seed paper.
+"""Reconstruction error of objects and relations, as in the training curves of Bozcan et al. (2018).
 
-The error uses one deterministic up–down pass. The up pass computes the mean of the hidden layer
-given the scene, with annotated relations observed. The down pass computes p(v | h1) and
-p(r | v, h1). The object error is the mean absolute difference over classes. The relation error is
-the mean absolute difference over observed relation units between present objects.
+The error uses one deterministic up–down pass. The up pass computes the mean of the hidden layer h1
+given the scene, with the annotated relations observed. The down pass computes p(v | h1) for objects
+v and p(r | v, h1) for relations r. The object error is the mean of |v - p(v | h1)| over classes.
+The relation error is the mean of |r - p(r | v, h1)| over observed relations of present objects.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from training.machines.mean_field import Evidence, mean_field
 def reconstruction_error(
     machine: BoltzmannMachine, scenes: SceneTensors, *, limit: int = 512, block: int = 64
 ) -> tuple[float, float]:
-    """Return (object error, relation error) over `limit` random scenes; NaN without relations."""
+    """Return (object error, relation error) over at most `limit` random scenes.
+
+    The relation error is NaN if the scenes have no observed relations.
+    """
     object_sum = relation_sum = 0.0
     objects = relations = 0
     chosen = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:limit]

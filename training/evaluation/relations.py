@@ -74,9 +74,9 @@ class Candidates:
 
     Attributes:
         scene: index of the scene among the scored scenes.
-        relation: (k,) int64.
-        key: (k,) int64, see `triple_keys`.
-        score: (k,).
+        relation: (k,) int64, index of the canonical relation.
+        key: (k,) int64, number of the triple (relation, class, class), see `triple_keys`.
+        score: (k,) score of each triple. A higher score means more likely true.
         truth: (k,) bool, the triple is annotated.
     """
 
@@ -87,7 +87,7 @@ class Candidates:
     truth: Flags
 
     def where(self, mask: Flags) -> Candidates:
-        """Select triples."""
+        """Select the triples with a True value in `mask` (k,)."""
         return Candidates(
             self.scene, self.relation[mask], self.key[mask], self.score[mask], self.truth[mask]
         )
@@ -147,8 +147,8 @@ def score_scenes(
     """Score the T1a candidates of the scenes with annotated triples.
 
     Args:
-        structure: (V,) bool.
-        counts: pass the instance counts to the score. Otherwise all counts are 0 (unknown).
+        structure: (V,) bool, True for structure classes, such as walls.
+        counts: True passes the instance counts to the score. False sets all counts to 0 (unknown).
     """
 
     def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
@@ -200,7 +200,7 @@ class RelationRanking:
 
     Attributes:
         annotated: (scenes,) int64, 0 for a skipped scene.
-        hits: (scenes,).
+        hits: (scenes,) expected number of annotated triples among the predictions.
     """
 
     annotated: Ints
@@ -248,7 +248,7 @@ def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Can
 
     Args:
         seen: (T, 3) triples (a, i, j) of training; see `training.batches.seen_triples`.
-        classes: V.
+        classes: number of classes in the vocabulary, V.
     """
     relation, subject, object_ = seen.long().unbind(1)
     keys = triple_keys(relation, subject, object_, classes).numpy()
@@ -356,7 +356,7 @@ def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 
 def completion_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T1b, and the same candidates without given triples."""
+    """Measure T1b. Also score the same candidates without given triples."""
     if contender.completion is None:
         return None
     scenes, structure, seed = setting.scenes, setting.structure, setting.seed

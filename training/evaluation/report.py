@@ -1,8 +1,9 @@
-"""Metrics of one contender by source and pooled, stored in files that a later run can continue.
+"""Reports: the metrics of a model or baseline on one data source, or pooled over data sources.
 
-A `SourceReport` holds the results of one model, training seed and source. `measure` fills its file
-task by task and skips stored tasks. Metrics are stored with their values per scene. So reports can
-be pooled over sources, and compared by paired resampling, without the models.
+A `SourceReport` holds the results of one model, training seed and data source. `measure` writes the
+report into a file after each task. A later run skips the tasks in the file. The report stores the
+values of each scene. Reports can therefore be pooled over data sources, and compared by paired
+resampling, without the models.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from training.evaluation.metrics import Figure, Macro, Metric, Ratio, Resampled,
 from training.evaluation.setting import Contender, Outcome, Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
-# Maximum scenes of a source for slow tasks; the second limit is for machines that sample answers.
+# Maximum number of scenes per data source in slow tasks. The second limit is for machines that
+# compute their answers by sampling.
 _LIMIT = 200
 _LIMIT_OF_DRAWS = 20
 
@@ -40,7 +42,7 @@ def silent(_: str) -> None:
 
 @dataclass(frozen=True)
 class Row:
-    """One table entry with its interval."""
+    """One metric of a task on a data source, with its interval."""
 
     task: str
     source: str
@@ -50,13 +52,13 @@ class Row:
 
 @dataclass
 class SourceReport:
-    """Results of one contender on one source.
+    """Results of one model or baseline on one data source.
 
     Attributes:
-        source: name of the source or of the pool.
-        scenes: digest of the scenes, the question seed and the limit.
-        outcomes: outcome by task; None if the contender does not support the task.
-        seconds: wall time by task.
+        source: name of the data source, or "pooled".
+        scenes: digest of the questions, see `digest`.
+        outcomes: metrics of each task, by task name. None if the model does not support the task.
+        seconds: wall time of each task in seconds, by task name.
     """
 
     source: str
@@ -65,7 +67,10 @@ class SourceReport:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-serialisable dictionary; it contains intervals for human readers too."""
+        """Return a JSON-serialisable dictionary.
+
+        The dictionary also contains intervals, which are for human readers only.
+        """
         return {
             "source": self.source,
             "scenes": self.scenes,
@@ -88,7 +93,7 @@ class SourceReport:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Replace a file atomically; an interrupted run keeps the earlier file."""
+    """Replace a file atomically. If the process is interrupted, the earlier file is kept."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".part")
     draft.write_text(text, encoding="utf-8")
@@ -96,7 +101,7 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
-    """Iterate over the sources and their scenes."""
+    """Iterate over the data sources, by name, and their scenes."""
     for source in sorted({scene.source for scene in scenes.scenes}):
         index = [k for k, scene in enumerate(scenes.scenes) if scene.source == source]
         yield source, subset(scenes, torch.tensor(index))
@@ -111,14 +116,26 @@ def settings_by_source(
     limit: int | None = 600,
     seed: int = 0,
 ) -> Iterator[tuple[str, Setting]]:
-    """Iterate over the sources and their settings, with training scenes of the same source."""
+    """Iterate over the data sources, by name, and their evaluation settings.
+
+    Each setting has only the scenes and the training scenes of its data source.
+
+    Args:
+        structure: (classes,) bool, True for structure classes such as walls.
+        seen: triples that the model may have learnt from, see `Setting`.
+        limit: maximum number of scenes per data source in slow tasks.
+        seed: random seed of the questions.
+    """
     training = dict(by_source(train))
     for source, some in by_source(scenes):
         yield source, Setting(some, structure, training.get(source), seen, limit, seed)
 
 
 def digest(setting: Setting) -> str:
-    """Return the sha256 of the questions: scene ids, limit, seed and facts."""
+    """Return the sha256 of all values that determine the questions.
+
+    These values are the scene ids, the limit, the seed and the everyday facts.
+    """
     names = [f"{scene.source} {scene.scene_id}" for scene in setting.scenes.scenes]
     facts = [] if setting.everyday is None else [f"facts {facts_digest(setting.everyday)}"]
     asked = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
@@ -133,16 +150,18 @@ def run(
     tasks: Iterable[str] = tuple(TASKS),
     progress: Progress = silent,
 ) -> Iterator[str]:
-    """Measure the tasks that a report lacks; yield the name of each finished task.
+    """Measure the tasks that the report lacks. Yield the name of each task after measuring it.
 
     Raises:
         ValueError: a task is unknown, or the report belongs to other scenes or questions.
     """
     if report.scenes != digest(setting):
-        raise ValueError(f"the report on {report.source} belongs to other scenes or questions")
+        raise ValueError(
+            f"the file of the report on {report.source} is from other scenes or tasks: delete it"
+        )
     wanted = list(tasks)
     if unknown := sorted(set(wanted) - set(EVERY_TASK)):
-        raise ValueError(f"unknown tasks {unknown}: must be among {list(EVERY_TASK)}")
+        raise ValueError(f"unknown tasks {unknown}: choose from {list(EVERY_TASK)}")
     for task in wanted:
         if task in report.outcomes:
             continue
@@ -162,10 +181,12 @@ def measure(
     tasks: Iterable[str] = tuple(TASKS),
     progress: Progress = silent,
 ) -> SourceReport:
-    """Create or continue the report in the file at `path`; write it after every task.
+    """Measure tasks, and write the report to the file at `path` after every task.
+
+    Tasks that the file already contains are skipped.
 
     Raises:
-        ValueError: see `run`.
+        ValueError: a task is unknown, or the file belongs to other scenes or questions.
     """
     report = SourceReport(source, digest(setting))
     if path.exists():
@@ -176,9 +197,10 @@ def measure(
 
 
 def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceReport:
-    """Pool the reports of several sources into one report.
+    """Pool the reports on several data sources into one report.
 
-    Metrics of whole sets (T4) cannot be pooled: `measure` them on the union of the scenes.
+    Metrics of a whole set of scenes (task T4, generated scenes) cannot be pooled and are left out.
+    Use `measure` on the union of the scenes for these metrics.
     """
     together = sha256("\n".join(report.scenes for report in reports).encode()).hexdigest()
     joined = SourceReport(source, together)
@@ -208,17 +230,18 @@ def evaluate(
     everyday: Path | None = None,
     progress: Progress = silent,
 ) -> list[Row]:
-    """Measure the published metrics of a model for every source of a set of scenes.
+    """Measure the metrics of a model card on every data source.
 
-    Generation has metrics of whole sets and is measured on all sources together.
+    Generated scenes are compared with the scenes of all data sources together.
 
     Args:
         artifact: the model as published, with its calibration.
-        structure: (V,) bool.
+        scenes: held-out scenes.
+        structure: (classes,) bool, True for structure classes such as walls.
         train: training scenes. They show which generated scenes are copies, and which classes are
             typical of a room type.
-        limit: maximum number of scenes of a source for slow tasks, see `Setting`. The default is
-            lower for a machine with sampled answers.
+        limit: maximum number of scenes per data source in slow tasks, see `Setting`. None means 200
+            scenes, or 20 scenes for a machine that computes its answers by sampling.
         everyday: folder of the everyday facts, see `Setting`.
     """
     if limit is None:
@@ -254,7 +277,7 @@ def _published(
         for task, outcome in report.outcomes.items()
         if outcome is not None
         for name in EVERY_TASK[task].card
-        # Some sources lack the data for a question, such as listed relations.
+        # A metric is missing if the data source lacks data for it, such as listed relations.
         if name in outcome.metrics
     ]
 
@@ -289,14 +312,17 @@ def _from_dict(values: dict[str, Any] | None) -> Outcome | None:
 
 
 def pool(parts: Sequence[Metric]) -> Metric | None:
-    """Pool metrics of the same kind over all scenes; None for metrics of whole sets.
+    """Pool a metric over the scenes of all parts. Return None for a metric of a whole set.
+
+    Args:
+        parts: the metric on each data source.
 
     Raises:
-        ValueError: there are no parts, or the parts have different kinds.
+        ValueError: `parts` is empty or contains metrics of different types.
     """
     kinds = {(type(part), getattr(part, "statistic", "")) for part in parts}
     if len(kinds) != 1:
-        raise ValueError(f"cannot pool metrics of {len(kinds)} kinds")
+        raise ValueError(f"metrics to pool must have one type, not {len(kinds)} types")
     return type(parts[0]).join(parts)
 
 
@@ -310,7 +336,7 @@ _TYPES: dict[str, type] = {"scene": np.int64, "group": np.int64, "truth": np.boo
 
 
 def metric_to_dict(metric: Metric) -> dict[str, Any]:
-    """Return JSON-serialisable values; floats have nine significant digits."""
+    """Return the values of a metric for JSON. Floats are rounded to nine significant digits."""
     kind = next(name for name, cls in _KINDS.items() if type(metric) is cls)
     names = [field.name for field in fields(_KINDS[kind])]
     return {"kind": kind} | {name: _plain(getattr(metric, name)) for name in names}
@@ -320,12 +346,12 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
     """Create a metric from the output of `metric_to_dict`.
 
     Raises:
-        ValueError: unknown kind of metric.
+        ValueError: the kind of metric is unknown.
     """
     rest = dict(values)
     kind = rest.pop("kind", None)
     if kind not in _KINDS:
-        raise ValueError(f"kind must be one of {sorted(_KINDS)}, not {kind!r}")
+        raise ValueError(f"metric kind must be one of {sorted(_KINDS)}, not {kind!r}")
     found: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in rest.items()})
     return found
 
@@ -333,7 +359,7 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
 def _array(name: str, value: Any) -> Any:
     if not isinstance(value, list):
         return value
-    # JSON has no NaN: null marks an undefined resample.
+    # JSON has no NaN, so null marks a resample in which the metric is undefined.
     values = [float("nan") if x is None else x for x in value]
     return np.array(values, dtype=_TYPES.get(name, np.float64))
 

@@ -1,20 +1,22 @@
-"""Protocol of the seed paper: one stochastic reconstruction answers each question.
+"""Seed protocol: the evaluation protocol of Bozcan et al. (2018), the paper behind this project.
 
-The hidden layers are sampled once. h1 is drawn from its mean field, which is exact with one layer.
-Then the queried units are sampled once given h1. The protocol uses no ranking or threshold; a
-random sample is the answer. The metrics serve comparison with the paper only, because they leak
-information and reward switching many units on:
+One random reconstruction of a scene answers each question. First the hidden layer h1 is sampled
+once from its mean field, which is exact for a machine with one hidden layer. Then the queried units
+are sampled once given h1. The sample is the answer, without any ranking or threshold.
 
-    T1  share of labelled relations that are switched on, given all objects. Other switched-on
-        units cost nothing, so their number is reported too
-    T2  share of removed objects that are switched on again. In the published protocol, the
-        relations of the object stay on. In a gated machine, these relations force the object on. In
-        other machines, they inform the hidden layer, and the two-way weights of the GBM also raise
-        the object. A second variant deletes these relations
+    T1  share of labelled relations that the sample switches on, given all objects. Switching on
+        other relations costs nothing, so the number of all relations switched on is also reported
+    T2  share of removed objects that the sample switches on again. In the published protocol, the
+        relations of the removed object stay on. In a gated machine, these relations force the
+        object on. In other machines, these relations affect the hidden layer. In the GBM, two-way
+        weights between relations and objects also raise the object. A second variant of T2 deletes
+        these relations
     T3  mean over classes of |reconstruction - scene| after a class was added. A model that returns
         its input is wrong in one of V classes and scores 1/V
 
-The split is random by scene, so near-duplicates of test scenes are in the training part.
+Use these metrics only for comparison with the paper. They leak information and reward machines that
+switch on many units. The split is random by scene, so the training part contains near-duplicates of
+test scenes.
 
 Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
 """
@@ -46,13 +48,13 @@ PAPER: dict[str, dict[str, float]] = {
     },
     "T3 error measure": {"RBM": 0.6446, "GBM": 0.1404, "Triway": 0.0789, "doing nothing": 1 / 417},
 }
-"""Results of the paper on its own data."""
+"""Results of Bozcan et al. (2018) on their own data, by metric and machine."""
 
 _BLOCK = 32
 
 
 def relations_switched_on(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T1: relations are unobserved and sampled once."""
+    """Measure T1: all relations are unobserved, and each relation is sampled once."""
     if contender.machine is None:
         return None
     scenes = setting.some(related=True)
@@ -74,7 +76,7 @@ def relations_switched_on(contender: Contender, setting: Setting) -> Outcome | N
 
 
 def removed_switched_on(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T2: remove one random class of each scene and sample its unit again."""
+    """Measure T2: remove one random class from each scene, and sample the unit of this class."""
     if contender.machine is None:
         return None
     scenes = setting.some(related=True)
@@ -100,7 +102,10 @@ def removed_switched_on(contender: Contender, setting: Setting) -> Outcome | Non
 
 
 def reconstruction_after_addition(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T3: add an absent class and sample all objects again, relations unobserved."""
+    """Measure T3: add an absent class to each scene, and sample all objects once.
+
+    All relations are unobserved.
+    """
     if contender.machine is None:
         return None
     machine, scenes = contender.machine, setting.some()
@@ -133,12 +138,12 @@ def reconstruction_after_addition(contender: Contender, setting: Setting) -> Out
 def draw_relations(
     machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Sample all relations once given the objects.
+    """Sample all relations once, given the objects.
 
     Returns:
-        The number of units that are on (B,), and the relations between present classes
-        (B, A, n, n). Machines without gates also switch on units of absent objects; only the first
-        value counts these.
+        The number of relation units that are on (scenes,), and the sampled relations between
+        present classes (scenes, relations, classes, classes). Machines without gates also switch on
+        relations of absent objects. Only the number of units includes these relations.
     """
     h1 = _draw_h1(machine, Evidence(batch.v), generator)
     edges = machine.edges(batch.classes, batch.counts)
@@ -155,11 +160,15 @@ def switch_on_probability(
     left_on: bool,
     generator: torch.Generator,
 ) -> Tensor:
-    """Return p(v_i = 1 | one sample of h1, relations), (B,), for the removed class i of each scene.
+    """Return the probability (scenes,) that the removed class i of each scene is switched on.
+
+    The probability is p(v_i = 1 | h1, relations), with one sample of the hidden layer h1.
 
     Args:
-        target: (B,) int64, the removed classes.
-        left_on: keep the relations of i as annotated; otherwise they are unobserved.
+        batch: the complete scenes.
+        target: (scenes,) int64, the removed class of each scene.
+        left_on: True keeps the relations of the removed class as annotated. False makes these
+            relations unobserved.
     """
     place = target.unsqueeze(1)
     absent, there = batch.v.scatter(1, place, 0.0), batch.v.scatter(1, place, 1.0)
@@ -172,7 +181,8 @@ def switch_on_probability(
     for v, sign in ((there, 1.0), (absent, -1.0)):
         logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
         logit = logit + sign * machine.relation_term(logits, gate, r, observed).sum(-1)
-    # If a relation is on and its gate would be closed without object i, object i must be present.
+    # The gate of a relation is closed if one of its objects is absent. So a relation that is on
+    # forces object i on.
     held = (observed * r > machine.gate(edges, absent)).any(-1)
     return torch.where(held, torch.inf, logit).sigmoid()
 
@@ -183,13 +193,16 @@ def _draw_h1(machine: BoltzmannMachine, evidence: Evidence, generator: torch.Gen
 
 
 def _touches(edges: Edges, target: Tensor) -> Tensor:
-    """Return a mask (B, E) of the relation units of the class."""
+    """Return a mask (scenes, units) of the relation units that contain the class `target`."""
     i = target.unsqueeze(1)
     return ((edges.subject == i) | (edges.object == i)) & edges.valid
 
 
 def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
-    """Draw a class to remove from each scene, (N,); -1 for scenes with fewer than two classes."""
+    """Draw a class to remove from each scene, (scenes,).
+
+    The result is -1 for scenes with fewer than two classes that are not structure.
+    """
     found = torch.full((len(scenes),), -1, dtype=torch.int64)
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
@@ -200,7 +213,7 @@ def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
 
 
 def _blocks(scenes: SceneTensors, seed: int) -> Iterator[tuple[Tensor, Batch, torch.Generator]]:
-    """Yield (scene indices, batch, random generator) for blocks of scenes."""
+    """Iterate over blocks of scenes: yield (scene indices, batch, random generator)."""
     generator = torch.Generator().manual_seed(seed)
     for index in torch.arange(len(scenes)).split(_BLOCK):
         yield index, scenes.batch(index), generator

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """One row of the tables.
+    """A model or baseline that the evaluation compares; it fills one row of the result tables.
 
-    The attribute of a task is None if the row does not support the task.
+    The attribute of a task is None if the model or baseline does not support the task.
 
     Attributes:
         objects: score of T2 and T3.
@@ -72,7 +72,7 @@ class Setting:
         limit: maximum number of scenes for slow tasks, which are all but T1a, T1b and T2. The
             slowest tasks, T2-at and Calibration, use a third of the limit.
         seed: random seed of the questions.
-        everyday: folder of the everyday facts; None leaves them out.
+        everyday: folder of the everyday facts. None skips the task.
     """
 
     scenes: SceneTensors
@@ -115,7 +115,8 @@ class Outcome:
 
     Attributes:
         metrics: metrics by name; the primary metric comes first.
-        scenes, skipped: number of scenes, and number of scenes that could not be scored.
+        scenes: number of scenes.
+        skipped: number of scenes that could not be scored.
         notes: additional values, such as a bandwidth.
     """
 

@@ -1,6 +1,6 @@
-"""The tasks of the evaluation: functions from a contender and a setting to metrics.
+"""The tasks of the evaluation. A task asks a model questions about scenes and returns metrics.
 
-A task returns None if the contender does not support it or the scenes lack the required data.
+A task returns None if the model does not support it, or if the scenes lack the required data.
 """
 
 from __future__ import annotations
@@ -45,10 +45,11 @@ class Task:
     """One task.
 
     Attributes:
-        ask: function that measures the task.
-        shown: metrics of the Markdown tables; the JSON file holds all metrics.
-        card: metrics of a model card.
-        of_objects: use only scenes with complete object lists.
+        ask: function that takes the model (`Contender`) and the questions (`Setting`), and returns
+            the metrics.
+        shown: names of the metrics in Markdown tables. JSON files contain all metrics.
+        card: names of the metrics in a model card.
+        of_objects: True if the task uses only scenes with complete object lists.
     """
 
     ask: Callable[[Contender, Setting], Outcome | None]
@@ -57,7 +58,7 @@ class Task:
     of_objects: bool = False
 
     def __call__(self, contender: Contender, setting: Setting) -> Outcome | None:
-        """Return the outcome, or None if the task has no scenes."""
+        """Return the metrics, or None if the task cannot be measured."""
         if self.of_objects:
             setting = setting.complete
             if not len(setting.scenes):
@@ -74,7 +75,7 @@ def _objects(
 
 
 def _each(names: tuple[str, ...], kinds: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the metric names "name, kind" for all names and kinds."""
+    """Return the metric names "name, kind" for all pairs of a name and a kind."""
     return tuple(f"{name}, {kind}" for name in names for kind in kinds)
 
 
@@ -175,16 +176,17 @@ SEED_TASKS: dict[str, Task] = {
         reconstruction_after_addition, shown=("error measure", "error measure, doing nothing")
     ),
 }
-"""The protocol of the seed paper; it has separate tables."""
+"""Tasks of the seed protocol (Bozcan et al., 2018). Their results have separate tables."""
 
-# Machines trained on the same scenes have the same offsets, so no table compares the offsets.
+# The offsets depend only on the training scenes, not on the machine. They appear in model cards,
+# but not in tables that compare machines.
 EVERY_TASK = TASKS | SEED_TASKS | {"Offsets": Task(offsets_task, card=METRICS)}
 
 ONCE = ("Everyday",)
-"""Tasks that do not depend on the scenes; they are measured once, on the set of all sources."""
+"""Tasks that do not depend on the held-out scenes. They are measured once, not per data source."""
 
 WHOLE_SET = ("T4 generate", *ONCE)
-"""Tasks with metrics of a whole set of scenes: they are measured again on all sources together.
+"""Tasks that are measured on the scenes of all data sources together.
 
-Other tasks are pooled from the results of each source.
+For all other tasks, the results on the data sources are pooled.
 """

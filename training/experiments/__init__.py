@@ -1,18 +1,19 @@
 """Experiments: the commands `benchmark`, `ablate`, `compare` and `tune` of `python -m training`.
 
-A row is a contender of `training.evaluation`: a trained machine, a baseline, or one of two compared
-models. Each command measures rows (measure.py) and summarises them with bootstrap intervals and
-paired differences to one row. All commands write the same format (results.py).
+A row of a result table is a trained machine, a baseline, or one of two compared models. The first
+three commands measure all rows on the same scenes. They report bootstrap intervals, and the paired
+difference between each row and one reference row. Their JSON files have the same format
+(results.py).
 
-rows.py         rows and their training
-measure.py      reports on disk, resumption, several processes
-results.py      means over seeds, paired differences, JSON and Markdown
-plots.py        plots for the tables
-benchmark.py    all baselines and machines on the same scenes; the seed protocol; shuffled scenes
-ablate.py       a configuration and variants with one change
-compare.py      two models on scenes held out from both
-tune.py         search for settings on validation scenes
-sides.py        the two models of a comparison, and their common held-out scenes
-translation.py  a model queried with the classes of another model
-gate.py         decision whether a version may replace the served version
+rows.py         the rows of a result table, and the training of their models
+measure.py      evaluation of rows in several processes, with reports on disk
+results.py      means over training seeds, paired differences, output as JSON and Markdown
+plots.py        plots of the results
+benchmark.py    comparison of machines and baselines, and two further experiments with them
+ablate.py       comparison of a configuration with variants of it
+compare.py      comparison of two models on scenes held out from both
+tune.py         search for better settings on validation scenes
+sides.py        the two models of `compare`, and the scenes held out from both
+translation.py  questions to a model about the classes of another model
+gate.py         decision whether a new model version may replace the served version
 """

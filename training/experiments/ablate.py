@@ -1,4 +1,4 @@
-"""`python -m training ablate`: compare a configuration with variants that change one thing."""
+"""`python -m training ablate`: compare a full model with ablations, its variants."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PRIMARY: dict[str, tuple[str, ...]] = {
     "T2-at missing at a place": ("MRR",),
     "T3 outliers, uniform": ("hit@1", "AUROC"),
 }
-"""Metrics to compare; the reports hold all metrics of these tasks."""
+"""Metrics in the result tables, by task. The report files hold all metrics of these tasks."""
 
 console = Console()
 
@@ -45,18 +45,18 @@ console = Console()
 def ablate(
     configuration: Annotated[str, typer.Argument(help="configuration of the full model")],
     rows: Annotated[
-        Path | None, typer.Option(help="TOML file of the rows; by default the shipped file")
+        Path | None, typer.Option(help="TOML file of the ablations; by default the shipped file")
     ] = None,
     row: Annotated[
-        list[str] | None, typer.Option(help="train only these rows and the full model")
+        list[str] | None, typer.Option(help="train only these ablations and the full model")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="number of training seeds per row")] = 1,
-    limit: Annotated[int | None, typer.Option(min=10, help="maximum scenes of a source")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="number of training seeds per model")] = 1,
+    limit: Annotated[int | None, typer.Option(min=10, help="maximum scenes per source")] = None,
     asked: Annotated[
-        int, typer.Option(min=1, help="maximum scenes of a source for slow tasks")
+        int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")
     ] = 300,
-    epochs: Annotated[int | None, typer.Option(min=1, help="maximum epochs of a row")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="processes with one thread each")] = 2,
+    epochs: Annotated[int | None, typer.Option(min=1, help="maximum epochs per model")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="number of single-threaded processes")] = 2,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="folder for runs and results")] = Path(
         "runs/ablation"
@@ -65,9 +65,9 @@ def ablate(
 ) -> None:
     """Train the full model and each of its ablations, and compare them on the same scenes.
 
-    The command writes results.json and results.md into <folder>/<configuration>. A row that
-    diverges is reported and left out. After Ctrl-C, the same command continues; at most one epoch
-    or task is lost.
+    The command writes results.json and results.md into <folder>/<configuration>. If the training of
+    an ablation diverges, the results contain the error in place of its metrics. After Ctrl-C, run
+    the same command again: it continues from the last finished epoch or task.
     """
     with resumable(console):
         configs = _configs(configuration, rows, row, limit, epochs)
@@ -117,11 +117,15 @@ def _configs(
     limit: int | None,
     epochs: int | None,
 ) -> list[Config]:
-    """Return the full model and the selected rows, with the given limits.
+    """Return the configurations of the full model and of the selected ablations.
+
+    Args:
+        limit: maximum number of scenes per data source.
+        epochs: maximum number of training epochs.
 
     Raises:
-        ConfigError: the rows are invalid (see `load_rows`), the configuration has no shipped rows,
-            or a selected row is unknown.
+        ConfigError: an ablation is invalid (see `load_rows`), the configuration has no shipped
+            ablations, or a selected ablation is unknown.
     """
     full = load_config(reference)
     if limit is not None:
@@ -129,12 +133,12 @@ def _configs(
     shipped = shipped_ablations()
     if path is None and full.name not in shipped:
         raise ConfigError(
-            f"no shipped ablation of {full.name}, only of {', '.join(shipped)}: name a TOML file "
-            "with --rows"
+            f"{full.name} has no shipped ablations (available for: {', '.join(shipped)}). Pass a "
+            "TOML file of ablations with --rows"
         )
     found = load_rows(path or shipped[full.name], full)
     if unknown := sorted(set(names or ()) - {config.name for config in found}):
-        raise ConfigError(f"unknown rows {unknown}: must be {', '.join(c.name for c in found)}")
+        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(c.name for c in found)}")
     chosen = [full, *(config for config in found if not names or config.name in names)]
     if epochs is None:
         return chosen
@@ -145,7 +149,10 @@ def _configs(
 
 
 def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
-    """Return the settings of each source and part; `limit` bounds the scenes of slow tasks."""
+    """Return the evaluation settings, for the validation and test part of each data source.
+
+    `limit` is the maximum number of scenes in slow tasks.
+    """
     seen = seen_triples(scenes.train.scenes, scenes.train.v.shape[1])
     parts = {"validation": scenes.validation, "test": scenes.test}
     return {
@@ -158,7 +165,10 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
 
 
 def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
-    """Return the metrics of `PRIMARY`, pooled reports first."""
+    """Return the reports with only the metrics of `PRIMARY`.
+
+    The first two reports are new: they pool the data sources of the validation and test part.
+    """
     pools = {
         f"{part} pooled": pooled(
             [report for name, report in reports.items() if name.startswith(part)], f"{part} pooled"
@@ -171,9 +181,9 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
 def _costs(
     folder: Path, configs: Sequence[Config], seeds: int
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Return, by row, the number of trained weights and the mean training time in seconds.
+    """Return the number of trained weights and the mean training time in seconds, by model name.
 
-    Weights fixed at zero do not count as trained.
+    Weights that stay at zero do not count as trained.
     """
     weights, seconds = {}, {}
     for config in configs:
@@ -214,13 +224,14 @@ def shipped_ablations() -> dict[str, Path]:
 
 
 def load_rows(path: Path, full: Config) -> list[Config]:
-    """Read the ablation configurations of a file; they use the scenes of the full model.
+    """Read the ablations in a TOML file: one configuration for each `[[row]]` of the file.
 
-    A configuration has the name of its row; its description states the change.
+    All ablations use the scenes of the full model. The description of an ablation states how it
+    differs from the full model.
 
     Raises:
-        ConfigError: the file is missing or not TOML, a setting is unknown or invalid, a name occurs
-            twice, or a row has no effect.
+        ConfigError: the file is missing or not TOML, a setting is unknown or invalid, two ablations
+            have the same name, or an ablation has the same settings as the full model.
     """
     try:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
@@ -235,7 +246,7 @@ def load_rows(path: Path, full: Config) -> list[Config]:
     configs: dict[str, Config] = {}
     for row in file.row:
         if row.name in configs or row.name == full.name:
-            raise ConfigError(f"{path.name}: two rows have the name {row.name}")
+            raise ConfigError(f"{path.name}: the name {row.name} occurs twice: rename one row")
         configs[row.name] = _config(row, full, path.name)
     return list(configs.values())
 
@@ -245,7 +256,7 @@ def _config(row: _Change, full: Config, file: str) -> Config:
         start = load_config(row.start) if row.start else full
         changed = with_settings(start, row.changes).model_copy(update={"data": full.data})
         if changed == full:
-            raise ConfigError(f"the row does not change {full.name}")
+            raise ConfigError(f"the row has the same settings as {full.name}: change a setting")
         values = changed.model_dump() | {"name": row.name, "description": row.what}
         return Config.model_validate(values)
     except ConfigError as error:

@@ -1,8 +1,11 @@
-"""`python -m training benchmark`: compare baselines and machines on the same scenes, resumable.
+"""`python -m training benchmark`: compare machines and baselines on the same scenes.
 
-<folder>/<domain>/results.*                  the tables
-<folder>/<domain>/seed-protocol/results.*    the protocol of the seed paper
-<folder>/<domain>/shuffled/<task>/results.*  rows trained on shuffled scenes, tested on real scenes
+Each machine or baseline is one row of the result tables. An interrupted run can be continued. The
+command writes these files:
+
+<folder>/<domain>/results.*                  results of the comparison
+<folder>/<domain>/seed-protocol/results.*    results by the protocol of Bozcan et al. (2018)
+<folder>/<domain>/shuffled/<task>/results.*  results after training on shuffled scenes
 """
 
 from __future__ import annotations
@@ -59,7 +62,7 @@ from training.experiments.rows import (
 from training.pipeline import SplitScenes, prepare
 
 DOMAINS = ("indoor", "everyday")
-"""Domains to measure without given configurations."""
+"""Domains that the command measures if it is called without configurations."""
 
 YARDSTICKS = {
     "T1a relations": ("relation popularity", "R-precision, distinct classes"),
@@ -68,12 +71,16 @@ YARDSTICKS = {
     "T2 partial": ("popularity", "MRR, 50 %"),
     "T3 signature": ("popularity", "hit@1"),
 }
-"""By task on shuffled scenes: the baseline that no other row should exceed, and the metric."""
+"""Reference baseline and metric of each task, for training on shuffled scenes.
+
+After training on shuffled scenes, no other model should exceed this baseline.
+"""
 
 _RELATION_TASKS = ("T1a relations", "T1 pairs")
-# Tasks that a quick run leaves out: annealing for log Z is slow for any number of scenes.
+# Tasks that a quick run leaves out. The annealing that estimates log Z (the log of the partition
+# function) is slow even for a few scenes.
 _SLOW_TASKS = ("Density",)
-# Settings of a quick run, which only tests the command; its results are meaningless.
+# Settings of a quick run. A quick run only tests the command, so its results are meaningless.
 _QUICK_SCENES = 150
 _QUICK_EPOCHS = 2
 _QUICK_LIMIT = 30
@@ -90,11 +97,12 @@ console = Console()
 
 @dataclass(frozen=True)
 class Domain:
-    """Configurations with the same data section.
+    """Configurations with the same data section, for one comparison.
 
     Attributes:
-        name: name of the first configuration without its last word.
-        configs: the configurations; all rows are compared with the first.
+        name: name of the first configuration without its last word: "indoor" for "indoor-triway".
+        configs: the configurations. The machine of the first one is the reference of all paired
+            differences.
     """
 
     name: str
@@ -102,21 +110,21 @@ class Domain:
 
     @property
     def leaks(self) -> bool:
-        """True if a group may be in several parts, so near-duplicates of test scenes are learnt."""
+        """True if the training part may contain near-duplicates of test scenes."""
         return self.configs[0].data.split == "random"
 
     def require_groups(self) -> None:
-        """Check that each group is in one part, as tables that rank rows require.
+        """Check that the split keeps near-duplicates of test scenes out of the training part.
 
         Raises:
-            ConfigError: the domain uses a random split.
+            ConfigError: the domain uses a random split, which separates near-duplicates.
         """
         if self.leaks:
             names = ", ".join(config.name for config in self.configs)
             raise ConfigError(
                 f'{names}: data.split = "random" leaves near-duplicates of test scenes in the '
-                'training part; tables and shuffled scenes need "group". Use --seed-protocol for '
-                "such a configuration"
+                'training part. Set data.split = "group", or run only --seed-protocol, which uses '
+                "a random split"
             )
 
 
@@ -126,11 +134,12 @@ class Options:
 
     Attributes:
         root: folder with the scene files.
-        tasks: names in `TASKS`.
-        seeds: number of training seeds for rows with random training.
-        baselines: baselines to measure; None means all.
-        limit: maximum scenes of a source for slow tasks.
+        tasks: names of the tasks to measure, see `TASKS`.
+        seeds: number of training seeds. Deterministic baselines are trained only once.
+        baselines: names of the baselines to measure. None means all baselines.
+        limit: maximum number of scenes per data source in slow tasks.
         workers: number of processes.
+        ray: address of a Ray cluster; empty measures in local processes.
         quick: use few scenes, epochs and baselines.
         fresh: delete earlier reports.
     """
@@ -141,11 +150,12 @@ class Options:
     baselines: tuple[str, ...] | None = None
     limit: int = 300
     workers: int = 1
+    ray: str = ""
     quick: bool = False
     fresh: bool = False
 
     def configs(self, domain: Domain, seed: int) -> list[Config]:
-        """Return the configurations of the domain for one training seed."""
+        """Return the configurations of the domain with the given training seed."""
         most = _QUICK_EPOCHS if self.quick else None
         return [
             with_settings(
@@ -159,7 +169,7 @@ class Options:
         ]
 
     def scenes(self, domain: Domain, **changes: Any) -> SplitScenes:
-        """Return the scenes of the domain."""
+        """Read and split the scenes of the domain. `changes` replace values of its data section."""
         data: DataConfig = domain.configs[0].data.model_copy(update=changes)
         if self.quick:
             few = min(data.limit or _QUICK_SCENES, _QUICK_SCENES)
@@ -171,8 +181,8 @@ def benchmark(
     machines: Annotated[
         list[str] | None,
         typer.Argument(
-            help="configurations; those with the same data section are measured together, and all "
-            "rows are compared with the first. Default: the indoor and everyday machines."
+            help="configurations; those with the same data section are compared with each other, "
+            "and the first is the reference. Default: the indoor and everyday machines."
         ),
     ] = None,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
@@ -180,32 +190,35 @@ def benchmark(
         "runs/benchmark"
     ),
     seeds: Annotated[
-        int, typer.Option(min=1, help="training seeds, for rows with random training")
+        int, typer.Option(min=1, help="training seeds, for models with random training")
     ] = 3,
     baseline: Annotated[
-        list[str] | None, typer.Option(help="measure only these baselines; 'none' for no baseline")
+        list[str] | None, typer.Option(help="measure only these baselines; 'none' leaves out all")
     ] = None,
     task: Annotated[
         list[str] | None, typer.Option(help="measure only these tasks, by name or prefix: T2, T3")
     ] = None,
     limit: Annotated[
-        int, typer.Option(min=1, help="maximum scenes of a source for slow tasks")
+        int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")
     ] = 300,
     workers: Annotated[int, typer.Option(min=1, help="processes with one thread each")] = 2,
+    ray: Annotated[
+        str, typer.Option(help="address of a Ray cluster that measures the rows; local: a new one")
+    ] = "",
     seed_protocol: Annotated[
-        bool, typer.Option("--seed-protocol", help="also run the protocol of the seed paper")
+        bool, typer.Option("--seed-protocol", help="also use the protocol of Bozcan et al. (2018)")
     ] = False,
     shuffled: Annotated[
-        bool, typer.Option("--shuffled", help="also train the rows on shuffled scenes")
+        bool, typer.Option("--shuffled", help="also train all models on shuffled scenes")
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="small run to test the command")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="delete earlier reports")] = False,
 ) -> None:
-    """Train every baseline and machine on the same groups and evaluate all on the same scenes.
+    """Train machines and baselines on the same scenes, and evaluate all on the same test scenes.
 
-    The command writes results.json, results.md and plots into one folder per domain. The seed
-    protocol and the shuffled scenes have subfolders there. After Ctrl-C, the same command
-    continues; at most the current task is lost.
+    The command writes results.json, results.md and plots into one folder per domain. The options
+    --seed-protocol and --shuffled write into subfolders. After Ctrl-C, run the same command again:
+    it continues and skips finished tasks.
     """
     with resumable(console, ValueError, FloatingPointError):
         wanted = None if baseline is None else tuple(b for b in baseline if b != "none")
@@ -218,6 +231,7 @@ def benchmark(
             baselines=QUICK_BASELINES if quick and wanted is None else wanted,
             limit=_QUICK_LIMIT if quick else limit,
             workers=workers,
+            ray=ray,
             quick=quick,
             fresh=fresh,
         )
@@ -228,7 +242,7 @@ def benchmark(
                 domain.require_groups()
         for domain in domains:
             place = folder / domain.name
-            # A random split allows the seed protocol only.
+            # With a random split, only the seed protocol (Bozcan et al., 2018) is valid.
             if not domain.leaks:
                 compare_domain(domain, place, options)
             if seed_protocol:
@@ -239,23 +253,23 @@ def benchmark(
 
 
 def default_configs() -> list[str]:
-    """Return the shipped configurations of `DOMAINS`; the Triway machine of each comes first."""
+    """Return the shipped configurations of `DOMAINS`, the Triway machine of a domain first."""
     names = [f"{domain}-{variant}" for domain in DOMAINS for variant in ("triway", "gbm", "rbm")]
     return [name for name in names if name in shipped_configs()]
 
 
 def read_domains(references: Sequence[str]) -> list[Domain]:
-    """Group configurations into domains, in the order of the first configuration of each.
+    """Read configurations, and group them by data section into domains.
 
     Raises:
-        ConfigError: a configuration cannot be read, or two configurations or domains have the same
-            name.
+        ConfigError: a configuration cannot be read, or two configurations or two domains have the
+            same name.
     """
     groups: dict[DataConfig, list[Config]] = {}
     for reference in references:
         config = load_config(reference)
         if any(config.name == other.name for group in groups.values() for other in group):
-            raise ConfigError(f"two configurations have the name {config.name}")
+            raise ConfigError(f"two configurations have the name {config.name}: rename one of them")
         groups.setdefault(config.data, []).append(config)
     domains: dict[str, Domain] = {}
     for configs in groups.values():
@@ -263,14 +277,18 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
         if name in domains:
             raise ConfigError(
                 f"{configs[0].name} and {domains[name].configs[0].name} have different data "
-                f"sections, but the same domain name {name!r}: rename one of them"
+                f"sections, but their results have the same folder {name!r}: rename one of them"
             )
         domains[name] = Domain(name, tuple(configs))
     return list(domains.values())
 
 
 def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
-    """Return names in `TASKS` that match a wanted name or prefix; by default all.
+    """Return the names of the wanted tasks. Without `wanted`, return all tasks.
+
+    Args:
+        wanted: task names, or prefixes of task names.
+        quick: True leaves out slow tasks, unless they are wanted.
 
     Raises:
         ValueError: a wanted name matches no task.
@@ -282,31 +300,31 @@ def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
         # A full name selects only that task, even if it is a prefix of other names.
         named = {part} & set(TASKS) or {name for name in TASKS if name.startswith(part)}
         if not named:
-            raise ValueError(f"unknown task {part!r}: must match one of {list(TASKS)}")
+            raise ValueError(f"unknown task {part!r}: use a name, or the start, of {list(TASKS)}")
         found |= named
     return tuple(name for name in TASKS if name in found)
 
 
 def shuffled_tasks(tasks: Sequence[str]) -> tuple[str, ...]:
-    """Select the tasks of `YARDSTICKS`.
+    """Return the tasks that training on shuffled scenes supports, see `YARDSTICKS`.
 
     Raises:
-        ValueError: all tasks are outside `YARDSTICKS`.
+        ValueError: no task is supported.
     """
     found = tuple(task for task in YARDSTICKS if task in tasks)
     if not found:
-        raise ValueError(f"shuffled scenes support only the tasks {', '.join(YARDSTICKS)}")
+        raise ValueError(f"--shuffled needs at least one of the tasks {', '.join(YARDSTICKS)}")
     return found
 
 
 def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
-    """Measure every row of a domain on its test scenes; write tables and plots.
+    """Measure the machines and baselines of a domain on its test scenes; write tables and plots.
 
     Raises:
-        ConfigError: the split is random, or the scenes cannot be found.
-        DatasetError: the scenes cannot be read.
-        BenchmarkError: the folder holds other reports, see `Plan.known`.
-        ValueError: an unknown baseline.
+        ConfigError: the split is random, or the scene files are missing.
+        DatasetError: the scene files cannot be read.
+        BenchmarkError: the folder holds reports of another experiment, see `Plan.known`.
+        ValueError: a baseline in `options` is unknown.
     """
     domain.require_groups()
     scenes = options.scenes(domain)
@@ -325,7 +343,10 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
 
 
 def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> Results:
-    """Measure the machines of a domain by the seed protocol, trained once on a random split."""
+    """Measure the machines of a domain by the seed protocol (Bozcan et al., 2018).
+
+    Each machine is trained once, on a random split of the scenes.
+    """
     scenes = options.scenes(domain, split="random")
     plan = _plan(folder, scenes, options, tuple(SEED_TASKS))
     rows = [
@@ -334,21 +355,23 @@ def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> 
     ]
     reports = _measured(plan, rows, options, f"{domain.name}, seed protocol")
     found = summarise(reports, domain.configs[0].name, parameters(folder, rows))
-    # The seed protocol does not rank rows.
+    # The seed protocol does not rank the machines, so the results contain no paired differences.
     results = replace(found, differences=())
     _write(folder, scenes, results.to_dict() | {"paper": PAPER}, _protocol_text(results))
     return results
 
 
 def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[str, Results]:
-    """Run the control experiment: train rows on shuffled scenes, and test them on real scenes.
+    """Run the control experiment: train models on shuffled scenes, and test them on real scenes.
 
-    Baselines and epochs are also selected on shuffled validation scenes. Each row has one seed. The
-    reference of each task is its baseline in `YARDSTICKS`, which is always measured.
+    Baseline settings and training epochs are selected on shuffled validation scenes. Each model is
+    trained with one seed. The reference of a task is its baseline in `YARDSTICKS`. These baselines
+    are always measured.
 
     Raises:
         ConfigError: the split is random, see `Domain.require_groups`.
-        ValueError: invalid tasks, see `shuffled_tasks`, or the scenes lack the relations for them.
+        ValueError: no task is supported (see `shuffled_tasks`), or all supported tasks need
+            relations and the scenes contain none.
     """
     domain.require_groups()
     real = options.scenes(domain)
@@ -359,11 +382,12 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
         asked = tuple(task for task in asked if task not in _RELATION_TASKS)
         if not asked:
             raise ValueError(
-                f"the selected tasks need relations, but the scenes of {domain.name} contain none"
+                f"the scenes of {domain.name} contain no relations, but the selected tasks need "
+                "relations: select other tasks"
             )
         plan = replace(plan, tasks=asked)
     rows = [machine_row(config, calibrated=False) for config in options.configs(domain, 0)]
-    # One fit of a baseline serves all its tasks.
+    # A baseline that supports several of the tasks is fitted once.
     names = [name for name, one in BASELINES.items() if one.scores in (("objects",), RELATIONS)]
     if options.baselines is not None:
         yardsticks = {YARDSTICKS[task][0] for task in asked}
@@ -378,7 +402,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
             row: {source: only(report, {task: (metric,)}) for source, report in by_source.items()}
             for row, by_source in reports.items()
         }
-        # Some sets of scenes lack the data for a task.
+        # A task without metrics needs data that these scenes lack, for example room types.
         if any(report.outcomes[task] for report in some[yardstick, 0].values()):
             results[task] = summarise(some, yardstick, weights)
             text = shuffled_text(task, results[task])
@@ -393,10 +417,11 @@ def _plan(
     tasks: tuple[str, ...],
     asked_by: SplitScenes | None = None,
 ) -> Plan:
-    """Plan the measurement of rows that learn from the given scenes.
+    """Plan the measurement of models that learn from the given scenes.
 
     Args:
-        asked_by: scenes whose training part defines the questions; by default the same scenes.
+        asked_by: scenes whose training part determines the questions, for example the classes that
+            are typical of a room type. None means `scenes`.
     """
     material = Material.of(scenes)
     data = material.data
@@ -412,13 +437,16 @@ def _plan(
 def _measured(plan: Plan, rows: Sequence[Row], options: Options, title: str) -> Reports:
     with shown(console, title, len(rows) * len(plan.settings)) as progress:
         reports, _ = measure_rows(
-            plan, rows, progress, workers=options.workers, fresh=options.fresh
+            *(plan, rows, progress),
+            workers=options.workers,
+            ray=options.ray,
+            fresh=options.fresh,
         )
     return reports
 
 
 def _write(folder: Path, scenes: SplitScenes, values: dict[str, Any], text: str) -> None:
-    """Write the results with the sha256 of each source."""
+    """Write the results and the sha256 of each data source."""
     write(folder, {"contents": dict(scenes.digests)} | values, text)
     console.print(text, markup=False)
 
@@ -434,10 +462,14 @@ def _protocol_text(results: Results) -> str:
     )
     return f"""# Seed protocol
 
-One stochastic reconstruction gives each answer, and scenes are split at random (60 / 30 / 10 %).
-These figures are not comparable with other tables, and they leak information. Near-duplicates of
-test scenes are in the training part. Relations that are left on force or reveal the removed object.
-Switching on more relations can only improve T1. Returning the input scene scores 1/V in T3.
+This is the protocol of Bozcan et al. (2018). One random reconstruction of a scene gives each
+answer. Scenes are split at random into training, test and validation scenes (60 / 30 / 10 %). The
+figures cannot be compared with other tables:
+
+- The training part contains near-duplicates of test scenes.
+- Some T2 questions contain relations of the removed object, which force or reveal the object.
+- Switching on more relations can only improve T1.
+- A model of V classes that returns its input scores 1/V in T3.
 
 {results.markdown({name: task.shown for name, task in SEED_TASKS.items()})}
 Results of the paper on its own data:
@@ -456,11 +488,12 @@ def shuffled_text(task: str, results: Results) -> str:
     ]
     return f"""# Shuffled scenes, {task}
 
-The rows are trained on scenes with objects permuted between scenes. Each scene keeps its number of
-classes, and each class keeps its number of scenes, but co-occurrence is random. Test scenes are
-real. No row should exceed {results.ours}; a row above it uses information from outside the training
-scenes. A star marks a row that is worse than the bold row over the whole interval.
+All models are trained on shuffled scenes: the objects are permuted between scenes. Each scene keeps
+its number of classes, and each class keeps its number of scenes, but co-occurrence is random. Test
+scenes are real. No model should exceed {results.ours}. A model above it uses information from
+outside the training scenes. A star marks a model that is worse than the bold model: the whole
+interval of the paired difference is on one side of zero.
 
 {results.markdown({task: (metric,)})}
-Rows above {results.ours} over the whole interval: {", ".join(above) or "none"}.
+Models above {results.ours} over the whole interval: {", ".join(above) or "none"}.
 """

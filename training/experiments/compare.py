@@ -16,6 +16,7 @@ from rich.table import Table
 from torch import Tensor
 
 from app.registry import RegistryError, Store
+from app.registry.location import open_for_publisher
 from app.scene import Vocabulary
 from training.batches import SceneTensors, scene_tensors
 from training.cases import some_scenes
@@ -46,16 +47,17 @@ COMPARED: dict[str, tuple[str, ...]] = {
     "T1b completion": ("R-precision",),
     "T3b placement": ("hit@1",),
 }
-"""Metrics to compare by task, the primary metric first; higher is better for all."""
+"""Metrics to compare, by task. The first metric of a task is its primary metric. For all metrics,
+higher is better."""
 
 RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
 """Tasks that need scenes with relations."""
 
-# Tasks that skip scenes without relations.
+# Tasks that leave out scenes without relations.
 _RELATED = ("T2-at missing at a place", "T3b placement")
-# With fewer groups, intervals are rough.
+# With fewer groups of near-duplicate scenes, the bootstrap intervals are inaccurate.
 _ENOUGH_GROUPS = 15
-# Number of answers to show per model.
+# Number of answers per model in an example.
 _FIRST = 3
 _COLOURS = {"better": "green", "worse": "red"}
 
@@ -68,11 +70,12 @@ class Example:
 
     Attributes:
         scene: scene id.
-        room_type: room type, or "".
+        room_type: room type of the scene, or "" if unknown.
         shown: labels of the remaining objects.
         removed: label of the removed object.
-        ranks: rank of the removed object by each model; a tie counts as the best rank.
-        answers: the first few answers of each model.
+        ranks: rank that each model gives to the removed object, first model first. Objects with
+            equal scores share the best rank.
+        answers: labels of the most probable missing objects by each model, first model first.
     """
 
     scene: str
@@ -88,14 +91,15 @@ class Comparison:
     """Comparison of two models.
 
     Attributes:
-        results: results with the first model as `ours`.
+        results: metrics of both models. The first model is the reference `ours`.
         b: title of the second model.
-        scenes, groups: number of scenes and groups.
-        certain: True if the scenes are certainly held out from both models.
+        scenes: number of compared scenes.
+        groups: number of groups of near-duplicates among the compared scenes.
+        certain: False if a model may have learnt from some of the scenes.
         notes: remarks on the results.
-        examples: questions with the most different answers.
-        unmeasured: relation tasks of the second model's card that this comparison cannot measure,
-            because its scenes contain no relations.
+        examples: questions for which the answers of the models differ most.
+        unmeasured: relation tasks that were measured for the second model before its publication,
+            but not in this comparison. Empty if this comparison measures any relation task.
     """
 
     results: Results
@@ -113,50 +117,57 @@ class Comparison:
         return self.results.ours
 
     def worse_by(self, margin: float) -> list[Difference]:
-        """Return the primary metrics whose whole interval is below -margin."""
+        """Return the primary metrics in which the first model is worse by more than `margin`.
+
+        In these metrics, the whole interval of the paired difference is below -margin.
+        """
         return [
             row for row in self.results.differences if is_primary(row) and row.figure.high < -margin
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-serialisable dictionary: `Results.to_dict` and the other attributes."""
+        """Return a JSON-serialisable dictionary with the results and all other attributes."""
         own = asdict(self)
         own.pop("results")
         return self.results.to_dict() | {"a": self.a} | own
 
 
 def is_primary(row: Difference) -> bool:
-    """Return True for the primary metric of the task."""
+    """Return True if the metric of a row is the primary metric of its task."""
     return row.metric == COMPARED[row.task][0]
 
 
 def compare_command(
-    new: Annotated[str, typer.Argument(help="folder of a finished run, or a model of the store")],
+    new: Annotated[str, typer.Argument(help="first model: folder of a run, or a stored model")],
     old: Annotated[
         str | None,
         typer.Argument(
-            help=f"the other model, or {BASELINE_SIDE}; by default the model served as `default`, "
-            f"or {BASELINE_SIDE} without such a model"
+            help=f"second model, or {BASELINE_SIDE}. By default the model with the alias "
+            f"`default`; if the store has no such alias, {BASELINE_SIDE}"
         ),
     ] = None,
     data: Annotated[
         Path | None, typer.Option("--data", help="folder with the scenes of the first model")
     ] = None,
-    store: Annotated[Path, typer.Option("--store", help="the model store")] = Path("model_store"),
+    store: Annotated[
+        str, typer.Option("--store", help="the model store: a folder or a URL")
+    ] = "model_store",
     limit: Annotated[int, typer.Option(min=2, help="maximum number of scenes")] = 300,
-    examples: Annotated[int, typer.Option(min=0, help="number of changed answers to show")] = 3,
+    examples: Annotated[int, typer.Option(min=0, help="number of example questions to show")] = 3,
     output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
 ) -> None:
     """Compare two models on scenes held out from both.
 
-    The scenes are the test part of the first model's configuration, without scenes that the second
-    model learnt from. Intervals are 95 % and paired, over groups of scenes.
+    The scenes are the test scenes of the first model, without scenes that the second model learnt
+    from. The table shows the difference of each metric with its paired 95 % interval. The bootstrap
+    resamples groups of near-duplicate scenes.
     """
     try:
         with console.status("reading") as status:
             say: Say = status.update
-            a = find(new, Store(store), data, say)
-            b = find(old or _served(store), Store(store), data, say)
+            models = open_for_publisher(store)
+            a = find(new, models, data, say)
+            b = find(old or _served(models), models, data, say)
             comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         console.print(f"[red]error:[/red] {error}", soft_wrap=True)
@@ -167,9 +178,9 @@ def compare_command(
     show(comparison, console)
 
 
-def _served(store: Path) -> str:
-    """Return `default`, or the name of the baselines if the store has no such alias."""
-    return "default" if "default" in Store(store).aliases() else BASELINE_SIDE
+def _served(store: Store) -> str:
+    """Return the alias `default`. If the store has no such alias, return `BASELINE_SIDE`."""
+    return "default" if "default" in store.aliases() else BASELINE_SIDE
 
 
 def _root(given: Path | None, *sides: Side) -> Path:
@@ -178,7 +189,7 @@ def _root(given: Path | None, *sides: Side) -> Path:
 
 
 def show(comparison: Comparison, console: Console) -> None:
-    """Print the table, the notes and the examples."""
+    """Print the metrics of a comparison as a table, with its notes and examples."""
     title = f"{comparison.scenes} held-out scenes of {comparison.groups} groups"
     table = Table(title=title, title_justify="left")
     for name in ("task", "metric", comparison.a, comparison.b, "difference", ""):
@@ -198,12 +209,12 @@ def show(comparison: Comparison, console: Console) -> None:
     notes = list(comparison.notes)
     if comparison.unmeasured:
         names = ", ".join(comparison.unmeasured)
-        notes.append(f"the scenes do not measure {comparison.a} in {names}")
+        notes.append(f"{comparison.a} was not measured in {names}: the scenes contain no relations")
     for note in notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     if not comparison.examples:
         return
-    console.print("Most different answers, each with one object removed from a scene:")
+    console.print("Questions with the most different answers (one object removed from each scene):")
     for example in comparison.examples:
         room = f" ({example.room_type})" if example.room_type else ""
         lines = [f"  {example.scene}{room}: {', '.join(example.shown)}"]
@@ -218,21 +229,23 @@ def show(comparison: Comparison, console: Console) -> None:
 def compare(
     a: Side, b: Side, root: Path, *, limit: int | None, examples: int, say: Say
 ) -> Comparison:
-    """Measure both models on the tasks of `COMPARED`, in the classes of the first model.
+    """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
 
     Args:
-        root: folder with the scenes of the first model's configuration.
+        root: folder with the scene files of the first model's configuration.
         limit: maximum number of scenes.
+        examples: maximum number of examples.
+        say: function that shows the current step to the user.
 
     Raises:
-        ConfigError: the first model lacks its configuration, its scenes cannot be found, or too few
-            scenes are held out from both models.
-        DatasetError: the scenes cannot be read.
+        ConfigError: the first model lacks its training configuration, its scene files are missing,
+            or too few scenes are held out from both models.
+        DatasetError: the scene files cannot be read.
     """
     if a.config is None or a.vocabulary is None:
         raise ConfigError(
-            f"{a.title} does not state its held-out scenes: the first model must be trained with "
-            "this project"
+            f"{a.title} does not record its training configuration, so its held-out scenes are "
+            "unknown: choose a first model that was trained with this project"
         )
     say("reading scenes")
     sources = read_sources(a.config.data, root)
@@ -246,7 +259,10 @@ def compare(
     except ValueError as error:
         raise ConfigError(f"{a.title} and {b.title} cannot be compared: {error}") from error
     if not results.differences:
-        raise ConfigError(f"the {len(scenes)} held-out scenes are unsuitable for all tasks")
+        raise ConfigError(
+            f"the {len(scenes)} held-out scenes are unsuitable for all compared tasks: provide "
+            "scenes with at least two object classes"
+        )
     groups = len({scene.group for scene in scenes.scenes})
     say("looking for examples")
     first, second = (rival("T2 missing").objects for rival in rivals)
@@ -273,13 +289,17 @@ def side_by_side(
     *,
     progress: Progress = silent,
 ) -> Results:
-    """Measure every metric that both models support, with differences paired over groups.
+    """Measure every metric that both models support, and the paired differences.
+
+    The bootstrap resamples groups of near-duplicate scenes.
 
     Args:
-        structure: (V,) bool.
+        titles: titles of the two models.
+        rivals: function of each model that returns its scores for a task.
+        structure: (classes,) bool, True for structure classes such as walls.
 
     Raises:
-        ValueError: fewer than two groups, so intervals are impossible.
+        ValueError: the scenes belong to fewer than two groups, so intervals are undefined.
     """
     setting = Setting(scenes, structure, limit=None)
     groups = {
@@ -287,7 +307,7 @@ def side_by_side(
         for related in (False, True)
     }
     if len(set(groups[False])) < 2:
-        raise ValueError("a comparison with intervals needs scenes of at least two groups")
+        raise ValueError("the scenes belong to one group, but intervals need at least two groups")
     reports = {}
     for title, rival in zip(titles, rivals, strict=True):
         report = SourceReport("held out", digest(setting))
@@ -300,7 +320,10 @@ def side_by_side(
 
 
 def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
-    """Return the relation tasks of the other model's card if no row measures relations."""
+    """Return the relation tasks that only the other model's card measures.
+
+    The result is empty if any of `rows` measures a relation task.
+    """
     if other.artifact is None or any(row.task in RELATIONAL for row in rows):
         return ()
     measured = {metric.task for metric in other.artifact.manifest.metrics}
@@ -313,27 +336,28 @@ def _tensors(scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary) -> SceneT
 
 
 def _notes(a: Side, b: Side, held: HeldOut, limit: int | None, groups: int) -> Iterator[str]:
-    """Return remarks on the results."""
+    """Generate remarks on the results, for the user."""
     yield from held.notes
     asked, other = a.vocabulary, b.vocabulary
     if asked is not None and other is not None and not same_classes(asked, other):
         yield _classes_note(a, b, asked, other, held)
     if limit is not None and len(held.scenes) > limit:
-        yield f"--limit selects {limit} of {len(held.scenes)} held-out scenes"
+        yield f"only {limit} of {len(held.scenes)} held-out scenes are compared, because of --limit"
     if groups < _ENOUGH_GROUPS:
-        yield f"{groups} groups are few: the intervals are rough and too narrow"
+        yield f"the scenes belong to only {groups} groups: the intervals are inaccurate and narrow"
 
 
 def _classes_note(a: Side, b: Side, asked: Vocabulary, other: Vocabulary, held: HeldOut) -> str:
-    """Describe which classes of the first model the second model lacks."""
+    """Return a note on the classes of the first model that the second model lacks."""
     own = Translation.between(asked, other).own
     labels = [thing.label for scene in held.scenes for thing in scene.objects]
     mentions = [index for label in labels if (index := asked.index(label)) is not None]
     lost = sum(int(own[index]) < 0 for index in mentions)
     return (
-        f"questions use the {len(asked)} classes of {a.title}; {b.title} lacks "
-        f"{int((own < 0).sum())} of them ({lost / max(len(mentions), 1):.0%} of the mentions). It "
-        "does not see these objects, and it ranks these classes last as a tie"
+        f"the questions use the {len(asked)} classes of {a.title}. {b.title} lacks "
+        f"{int((own < 0).sum())} of these classes ({lost / max(len(mentions), 1):.0%} of the "
+        "objects in the scenes). Objects of these classes are not part of its input, and it ranks "
+        "these classes last"
     )
 
 
@@ -345,7 +369,11 @@ def changed_most(
     vocabulary: Vocabulary,
     count: int,
 ) -> list[Example]:
-    """Return the removed objects whose reciprocal rank differs most, at most one per group."""
+    """Return the questions for which the two models' reciprocal ranks differ most.
+
+    Each question removes one object from a scene. The result has at most `count` examples, and at
+    most one example per group of near-duplicate scenes.
+    """
     first, second = (leave_one_out(scenes, structure, score) for score in (a, b))
     change = np.abs(first.reciprocal_rank() - second.reciprocal_rank())
     chosen: dict[str, int] = {}
@@ -382,5 +410,5 @@ def _answers(
     """Return the labels of the most probable missing objects, best first."""
     values = score(v.unsqueeze(0))[0].masked_fill((v > 0) | structure, -torch.inf)
     order = values.argsort(descending=True, stable=True)[:_FIRST].tolist()
-    # Classes that the model lacks have the lowest score and are left out.
+    # The score -BEYOND marks classes that the model lacks.
     return tuple(vocabulary.labels[index] for index in order if values[index] > -BEYOND)

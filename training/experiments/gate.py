@@ -1,8 +1,9 @@
 """Decide whether a new version may replace the version that an alias serves.
 
-The new version is refused if the whole interval of a paired difference shows a loss larger than the
-margin in a primary metric. Smaller or uncertain losses are accepted. If the served version was
-measured on relations, the comparison must measure relations too.
+Both versions are compared on common held-out scenes (see compare.py). The new version is refused if
+a primary metric is lower by more than the margin, over the whole interval of the paired difference.
+Smaller or uncertain losses are accepted. The new version is also refused if the served version was
+measured on relation tasks and the comparison contains none.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ from training.experiments.sides import Say, Side, stored_side
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
 
-# Accepted loss of a primary metric at a promotion.
+# Accepted loss of a primary metric when a new version replaces the served version.
 MARGIN = 0.02
 
 
 class WorseError(RuntimeError):
-    """The new version is worse, or it is not measured on relations; see `comparison`."""
+    """The new version is refused: it is worse than the served version, or lacks relation metrics.
+
+    Attributes:
+        comparison: comparison of the new version with the served version.
+    """
 
     def __init__(self, comparison: Comparison, margin: float) -> None:
         a, b, reasons = comparison.a, comparison.b, []
@@ -32,8 +37,8 @@ class WorseError(RuntimeError):
         if comparison.unmeasured:
             names = ", ".join(comparison.unmeasured)
             reasons.append(
-                f"the compared scenes contain no relations: {b} was measured in {names}, but {a} "
-                "was not"
+                f"{b} was measured in {names}, but {a} was not, because the compared scenes "
+                "contain no relations"
             )
         super().__init__("; ".join(reasons))
         self.comparison = comparison
@@ -41,13 +46,13 @@ class WorseError(RuntimeError):
 
 @dataclass(frozen=True)
 class Seat:
-    """Current target of an alias.
+    """An alias of the model store, and the model that it serves now.
 
     Attributes:
         alias: name of the alias.
-        target: target of the alias; None for a new alias.
-        holder: the served model; None if the alias is new or the model cannot be read.
-        note: reason why a comparison is impossible, or "".
+        target: model version that the alias names now. None if the alias is new.
+        holder: the served model. None if the alias is new or the model cannot be read.
+        note: reason why a comparison with the served model is impossible, or "".
     """
 
     alias: str
@@ -57,18 +62,18 @@ class Seat:
 
 
 def seat(store: Store, alias: str) -> Seat:
-    """Look up an alias.
+    """Look up an alias in the store and load the model that it serves.
 
     Raises:
         StoreError: the aliases of the store cannot be read.
     """
     target = store.aliases().get(alias)
     if target is None:
-        return Seat(alias, None, None, f"{alias} is a new alias: no model to compare with")
+        return Seat(alias, None, None, f"no comparison: {alias} is a new alias and serves no model")
     try:
         return Seat(alias, target, stored_side(alias, store), "")
     except (ArtifactError, StoreError) as error:
-        note = f"the model served as {alias} cannot be read ({error}): no model to compare with"
+        note = f"no comparison: the model served as {alias} cannot be read ({error})"
         return Seat(alias, target, None, note)
 
 
@@ -87,9 +92,13 @@ def judge(
 
     Args:
         artifact: the new version.
+        holder: the served version.
+        root: folder with the scene files of the run.
+        margin: accepted loss of a primary metric.
+        limit: maximum number of scenes.
 
     Raises:
-        WorseError: the version is worse, or it is not measured on relations.
+        WorseError: the new version is worse, or it is not measured on relation tasks.
         ConfigError: the comparison is impossible, see `compare`.
     """
     new = Side("the new version", run.config, scenes.digests, artifact, root)

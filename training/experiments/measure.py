@@ -1,10 +1,12 @@
-"""Measure rows on every source, and reuse finished reports on disk.
+"""Measure models on every data source, and reuse finished reports on disk.
 
-<folder>/<row>/seed-<n>/row.json          identity, digest of the training scenes, trained weights
-                        trials.jsonl      all trials of the tuning
+A row is one model of an experiment: a machine, a baseline or a reference.
+
+<folder>/<row>/seed-<n>/row.json          settings, training scenes (as digest), number of weights
+                        trials.jsonl      all settings that the tuning of a baseline tried
                         run/              training run of a machine, and its calibration
-                        <source>.json     report on a source
-                        pooled.json       report of the tasks in `WHOLE_SET`
+                        <source>.json     report on one data source
+                        pooled.json       report on all data sources together (tasks of `WHOLE_SET`)
 
 Several processes fill these files in parallel. One process with one thread measures each row.
 """
@@ -12,22 +14,15 @@ Several processes fill these files in parallel. One process with one thread meas
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
-import pickle  # nosec B403
 import re
 import shutil
-import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
-import torch
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
@@ -39,25 +34,28 @@ from training.evaluation.report import SourceReport, digest, measure, pooled, wr
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import ONCE, WHOLE_SET
 from training.experiments.rows import Material, Rival, Row
+from training.experiments.workers import Progress, measure_in_workers
 from training.runs import RunError
 
-# A progress function receives the row, the source, and a note on the current step.
-Progress = Callable[[str, str, str], None]
 # The last note on a row and source tells whether the report was measured now or read from a file.
 DONE, KNOWN = "done", "known"
 Reports = dict[tuple[str, int], dict[str, SourceReport]]
 
 POOLED = "pooled"
-"""Name of the union of all sources."""
+"""Name of the union of all data sources."""
 
 
 class BenchmarkError(RuntimeError):
-    """The folder contains files of another experiment; the message names them."""
+    """A folder or report belongs to another experiment. The message names the folder or file."""
 
 
 @contextmanager
 def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
-    """Handle errors of a resumable command: print the error, or how to continue, and exit."""
+    """Print expected errors and exit; after Ctrl-C, print how to continue.
+
+    Args:
+        others: further exception types that are printed without a traceback.
+    """
     expected: tuple[type[Exception], ...] = (
         *(ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool),
         *others,
@@ -74,13 +72,13 @@ def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Questions for every row.
+    """The questions of an experiment. All rows get the same questions.
 
     Attributes:
         folder: folder of the reports.
-        material: training and validation scenes of the rows.
-        settings: setting by source; `POOLED` is the union of all sources.
-        tasks: names in `TASKS` or `SEED_TASKS`.
+        material: scenes for training, validation and test.
+        settings: evaluation setting by data source. The key `POOLED` is the union of all sources.
+        tasks: names of the tasks to measure, see `TASKS` and `SEED_TASKS`.
     """
 
     folder: Path
@@ -89,21 +87,21 @@ class Plan:
     tasks: Sequence[str]
 
     def place(self, row: Row) -> Path:
-        """Return the folder of a row and seed."""
+        """Return the folder of a row and its training seed."""
         return place_of(self.folder, row.name, row.seed)
 
     def asked(self, source: str) -> list[str]:
-        """Return the tasks to measure on a source."""
+        """Return the names of the tasks to measure on a data source, or on `POOLED`."""
         if source == POOLED:
             return [task for task in self.tasks if task in WHOLE_SET]
         return [task for task in self.tasks if task not in ONCE]
 
     def known(self, row: Row) -> dict[str, SourceReport]:
-        """Return the finished reports of a row, by source.
+        """Return the finished reports of a row, by data source.
 
         Raises:
-            BenchmarkError: the folder holds reports of other scenes, of another configuration of
-                the row, or of other training scenes.
+            BenchmarkError: the folder holds reports of other test scenes, other training scenes, or
+                another configuration of the row.
         """
         claim(self.place(row), row, self.material.digest)
         found = {}
@@ -118,12 +116,13 @@ class Plan:
         return found
 
     def measure(self, row: Row, progress: Progress) -> None:
-        """Complete the reports of a row on all sources; train only if a report is incomplete.
+        """Measure a row on every data source that lacks a finished report.
 
-        On KeyboardInterrupt, the results of finished tasks are already on disk.
+        The model is trained only if a report is missing. On KeyboardInterrupt, the results of
+        finished tasks are already on disk.
 
         Raises:
-            BenchmarkError: the folder holds other reports, see `known`.
+            BenchmarkError: the folder holds reports of another experiment, see `known`.
         """
         known = self.known(row)
         rival: Rival | None = None
@@ -143,7 +142,7 @@ class Plan:
             say(DONE)
 
     def report(self, row: Row) -> dict[str, SourceReport]:
-        """Return the reports of a measured row; the pooled report holds all tasks."""
+        """Return the reports of a measured row, by data source. The pooled report has all tasks."""
         found = self.known(row)
         sources = [found[source] for source in self.settings if source != POOLED]
         if POOLED in self.settings:
@@ -160,19 +159,25 @@ def measure_rows(
     progress: Progress,
     *,
     workers: int = 1,
+    ray: str = "",
     fresh: bool = False,
     failures: tuple[type[Exception], ...] = (),
 ) -> tuple[Reports, dict[str, str]]:
-    """Measure all rows; return reports by (name, seed), and the error of each failed row by name.
+    """Measure all rows, and skip finished reports.
 
-    KeyboardInterrupt stops the workers. The results of finished tasks are already on disk.
+    KeyboardInterrupt stops the worker processes. The results of finished tasks are then already on
+    disk.
 
     Args:
+        workers, ray: see `measure_in_workers`.
         fresh: delete earlier reports of these rows.
         failures: exception types that end only the row in which they occur.
 
+    Returns:
+        The reports by (row name, seed), and the error messages of failed rows by row name.
+
     Raises:
-        BenchmarkError: a folder holds other reports, see `Plan.known`.
+        BenchmarkError: a folder holds reports of another experiment, see `Plan.known`.
         BrokenProcessPool: a worker process died.
     """
     if fresh:
@@ -183,12 +188,14 @@ def measure_rows(
     for row in rows:
         if row not in missing:
             plan.measure(row, progress)
-    if workers > 1 and missing:
-        count = min(workers, len(missing))
-        failed = _in_workers(plan, missing, progress, count, failures)
+    if ray:  # tasks may start in another folder
+        plan = replace(plan, folder=plan.folder.resolve())
+    work = partial(_failure, plan, failures)
+    if missing and (ray or workers > 1):
+        failed = measure_in_workers(work, missing, progress, min(workers, len(missing)), ray)
     else:
         for row in missing:
-            if error := _failure(plan, row, progress, failures):
+            if error := work(row, progress):
                 failed[row.name, row.seed] = error
     reasons = {name: f"seed {seed}: {error}" for (name, seed), error in failed.items()}
     kept = [row for row in rows if row.name not in reasons]
@@ -196,7 +203,7 @@ def measure_rows(
 
 
 def _failure(
-    plan: Plan, row: Row, progress: Progress, failures: tuple[type[Exception], ...]
+    plan: Plan, failures: tuple[type[Exception], ...], row: Row, progress: Progress
 ) -> Exception | None:
     try:
         plan.measure(row, progress)
@@ -207,7 +214,7 @@ def _failure(
 
 @contextmanager
 def shown(console: Console, title: str, total: int) -> Iterator[Progress]:
-    """Show a progress bar over (row, source) pairs."""
+    """Show a progress bar for finished pairs (row, data source). `total` is the number of pairs."""
     columns = (
         "[progress.description]{task.description}",
         BarColumn(),
@@ -227,7 +234,7 @@ def shown(console: Console, title: str, total: int) -> Iterator[Progress]:
 
 
 def place_of(folder: Path, name: str, seed: int) -> Path:
-    """Return the folder of a row and seed."""
+    """Return the folder of a row and its training seed."""
     return folder / slug(name) / f"seed-{seed}"
 
 
@@ -237,7 +244,7 @@ def slug(name: str) -> str:
 
 
 def parameters(folder: Path, rows: Sequence[Row]) -> dict[str, int]:
-    """Return the number of trained weights by row, for rows with a meaningful number."""
+    """Return the number of trained weights by row name, for rows that record this number."""
     found = {}
     for row in rows:
         path = place_of(folder, row.name, row.seed) / "row.json"
@@ -248,25 +255,28 @@ def parameters(folder: Path, rows: Sequence[Row]) -> dict[str, int]:
 
 
 def claim(place: Path, row: Row, material: str) -> None:
-    """Write the identity of a row into its folder, or check it.
+    """Reserve a folder for a row, or check that the folder already belongs to the row.
 
     Args:
-        material: digest of the training scenes.
+        place: folder of the row.
+        material: digest of the scenes and their split.
 
     Raises:
-        BenchmarkError: the folder belongs to another row or to other scenes.
+        BenchmarkError: the folder belongs to a row with other settings or other scenes.
     """
     path = place / "row.json"
     if path.exists():
         known = json.loads(path.read_text(encoding="utf-8"))
         if known["identity"] != row.identity:
             raise BenchmarkError(
-                f"{place} holds another configuration of {row.name}; use --fresh or another folder"
+                f"{place} holds reports of another configuration of {row.name}: use --fresh or "
+                "another folder"
             )
         if known.get("material") != material:
             raise BenchmarkError(
-                f"the reports in {place} belong to other training scenes: the file, source, limit, "
-                "split or vocabulary differs, or is not recorded; use --fresh or another folder"
+                f"the reports in {place} belong to other training scenes, or do not record their "
+                "scenes (files, sources, limit, split and vocabulary must be equal): use --fresh "
+                "or another folder"
             )
         return
     values = {"name": row.name, "seed": row.seed, "identity": row.identity}
@@ -274,7 +284,7 @@ def claim(place: Path, row: Row, material: str) -> None:
 
 
 def read_report(path: Path, setting: Setting) -> SourceReport:
-    """Read the report in a file.
+    """Read a report from a file, and check that it belongs to `setting`.
 
     Raises:
         BenchmarkError: the report belongs to other scenes or questions.
@@ -282,7 +292,7 @@ def read_report(path: Path, setting: Setting) -> SourceReport:
     report = SourceReport.from_dict(json.loads(path.read_text(encoding="utf-8")))
     if report.scenes != digest(setting):
         raise BenchmarkError(
-            f"{path} belongs to other scenes or questions; use --fresh or another folder"
+            f"the report {path} belongs to other scenes or questions: use --fresh or another folder"
         )
     return report
 
@@ -292,78 +302,3 @@ def _note_parameters(place: Path, count: int | None) -> None:
     values = json.loads(path.read_text(encoding="utf-8"))
     if values.get("parameters") != count:
         write_whole(path, json.dumps(values | {"parameters": count}))
-
-
-# ------------------------------------------------------------------------------------- processes
-
-_Message = tuple[str, str, str]
-# Seconds between two checks for messages.
-_TICK = 0.2
-# Linear algebra libraries read these variables when a process loads them.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-_plan: Plan
-_messages: SimpleQueue[_Message]
-
-
-def _in_workers(
-    plan: Plan,
-    rows: Sequence[Row],
-    progress: Progress,
-    workers: int,
-    failures: tuple[type[Exception], ...],
-) -> dict[tuple[str, int], Exception]:
-    """Measure rows in worker processes; return the `failures` by (name, seed)."""
-    # Pickling avoids the shared memory of torch, which is small in containers.
-    material = pickle.dumps(plan)
-    context = multiprocessing.get_context("spawn")
-    # SimpleQueue has no sending thread, so all messages of a finished row are already in the queue.
-    messages: SimpleQueue[_Message] = context.SimpleQueue()
-    with (
-        _one_thread(),
-        ProcessPoolExecutor(
-            workers, context, initializer=_begin, initargs=(material, messages)
-        ) as pool,
-    ):
-        futures = {pool.submit(_work, row, failures): (row.name, row.seed) for row in rows}
-        try:
-            while True:
-                done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
-                while not messages.empty():
-                    progress(*messages.get())
-                failed = {futures[future]: error for future in done if (error := future.result())}
-                if not waiting:
-                    return failed
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _begin(material: bytes, messages: SimpleQueue[_Message]) -> None:
-    global _plan, _messages  # set once in each worker
-    # Ctrl-C reaches every process of the terminal; only the main process handles it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
-    # The main process wrote these bytes and passed them on in memory.
-    _plan = pickle.loads(material)  # noqa: S301  # nosec B301
-    _messages = messages
-
-
-def _work(row: Row, failures: tuple[type[Exception], ...]) -> Exception | None:
-    return _failure(_plan, row, lambda *message: _messages.put(message), failures)

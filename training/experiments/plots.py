@@ -1,8 +1,8 @@
-"""Plots for the tables.
+"""Plots of the results of `benchmark`.
 
-learning-curves.png   metrics of every machine and seed by epoch
+learning-curves.png   validation metrics by epoch, for every machine and training seed
 reliability-*.png     predicted probability against observed frequency, one file per machine
-recall.png            recall at k of relations and of removed objects
+recall.png            recall among the first k predictions, for relations and for removed objects
 """
 
 from __future__ import annotations
@@ -41,10 +41,12 @@ _RECALL = {
 def write_plots(
     plan: Plan, machines: Sequence[Row], reports: Reports, results: Results
 ) -> list[Path]:
-    """Write all plots with data; return the written files.
+    """Write all plots that have data, and return the paths of the files.
 
     Args:
-        machines: rows with a run and a calibration; the first row is the reference.
+        machines: trained and calibrated machines, one per training seed. The reliability plots use
+            the seed of the first machine.
+        reports: reports of all machines and baselines, by (name, seed) and data source.
     """
     matplotlib.use("Agg")
     runs: dict[str, list[Path]] = {}
@@ -68,7 +70,11 @@ def write_plots(
 
 
 def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
-    """Plot validation metrics by epoch, with one colour per machine and one line per seed."""
+    """Plot validation metrics by epoch, with one colour per machine and one line per seed.
+
+    Args:
+        runs: curve files of each machine, one file per training seed.
+    """
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     axes = figure.subplots(2, 2).flat
     for axis, (column, title) in zip(axes, _CURVES.items(), strict=True):
@@ -83,16 +89,17 @@ def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
 
 
 def read_curve(path: Path, column: str) -> tuple[list[int], list[float]]:
-    """Return the epochs, counted from 1, and one column of a run's curve file."""
+    """Return the epochs (counted from 1) and the values of one column of a curve file."""
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     return [int(row["epoch"]) + 1 for row in rows], [float(row[column]) for row in rows]
 
 
 def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
-    """Plot one diagram per question, with and without calibration, over bins of equal mass.
+    """Plot reliability diagrams, one per question, with and without calibration.
 
-    Most probabilities are small, so the axes are logarithmic.
+    Each bin holds the same number of answers. The axes are logarithmic because most probabilities
+    are small.
     """
     asked = [name for name in QUESTIONS if f"ECE, {name}" in outcome.metrics]
     figure = Figure(figsize=(3.2 * max(len(asked), 1), 3.6), layout="constrained")
@@ -102,7 +109,7 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
         for suffix, marker in ((", uncalibrated", "x"), ("", "o")):
             metric = outcome.metrics[f"ECE, {name}{suffix}"]
             if not isinstance(metric, Scored):
-                raise TypeError(f"the metric ECE of {name} lacks its answers")
+                raise TypeError(f"the metric ECE of {name} does not store its answers")
             bins = reliability(metric.score, metric.truth)
             label = f"{suffix[2:] or 'as published'}, ECE {metric.value:.3f}"
             axis.plot(bins.probability, bins.frequency, marker=marker, linewidth=1, label=label)
@@ -114,7 +121,7 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
 
 
 def recall_curves(results: Results, source: str) -> Figure:
-    """Plot recall by number of predictions for every measured row."""
+    """Plot recall by number of predictions, one line per model, for one data source."""
     figure = Figure(figsize=(12, 5), layout="constrained")
     for axis, (task, (prefix, title)) in zip(
         _axes(figure, 1, len(_RECALL)), _RECALL.items(), strict=True
@@ -134,7 +141,10 @@ def recall_curves(results: Results, source: str) -> Figure:
 def recall_points(
     results: Results, task: str, prefix: str, source: str
 ) -> dict[str, list[tuple[int, float]]]:
-    """Return points (k, value) by row, for metrics named prefix + k."""
+    """Return the points (k, recall at k) of one task, by model name.
+
+    The name of each metric is `prefix` followed by k, for example "R@10".
+    """
     found: dict[str, list[tuple[int, float]]] = {}
     for cell in results.cells:
         k = cell.metric.removeprefix(prefix)

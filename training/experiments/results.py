@@ -1,4 +1,7 @@
-"""Results of rows × tasks: means over training seeds, paired differences, JSON and Markdown."""
+"""Results of an experiment: means over training seeds, paired differences, JSON and Markdown.
+
+A row of a result table is a model: a machine, a baseline or a reference.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +40,15 @@ _LOWER_IS_BETTER = (
 
 @dataclass(frozen=True)
 class Cell:
-    """One table entry.
+    """One metric of one row on one data source.
 
     Attributes:
-        row, task, source, metric: names that locate the entry.
-        figure: mean over seeds with the interval over scenes.
-        seeds: the value of each seed.
+        row: name of the row.
+        task: name of the task.
+        source: name of the data source, or "pooled".
+        metric: name of the metric.
+        figure: mean over training seeds, with the bootstrap interval over scenes.
+        seeds: value of the metric for each training seed.
     """
 
     row: str
@@ -55,7 +61,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Difference:
-    """Reference row minus another row in one metric, with the paired interval."""
+    """Difference in one metric: the reference row minus another row, with its paired interval."""
 
     row: str
     task: str
@@ -65,9 +71,9 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """Return `better` or `worse` if the whole interval agrees, else `undecided`.
+        """Return whether the reference row is `better` or `worse` than the other row.
 
-        The verdict is about the reference row.
+        If the interval contains zero, the verdict is `undecided`.
         """
         low, high = self.figure.low, self.figure.high
         if self.metric.startswith(_LOWER_IS_BETTER):
@@ -77,12 +83,16 @@ class Difference:
 
 @dataclass(frozen=True)
 class Asked:
-    """Number of scored and skipped scenes of one task, for one row and seed.
+    """Number of scenes of one task, for one row, training seed and data source.
 
     Attributes:
-        row, seed, task, source: names that locate the entry.
-        scenes, skipped: number of scenes, and number of scenes that could not be scored.
-        notes: additional values, such as a bandwidth, or log Z with its standard errors.
+        row: name of the row.
+        seed: training seed.
+        task: name of the task.
+        source: name of the data source, or "pooled".
+        scenes: number of scenes.
+        skipped: number of scenes that could not be scored.
+        notes: additional values, such as a kernel bandwidth, or log Z with its standard errors.
     """
 
     row: str
@@ -99,9 +109,10 @@ class Results:
     """The results of an experiment.
 
     Attributes:
-        ours: the reference row of all comparisons.
-        cells, differences: sorted by row, source and task.
-        parameters: number of trained weights by row, for rows with weights.
+        ours: name of the reference row of all comparisons.
+        cells: metrics of all rows, sorted by row, data source and task.
+        differences: paired differences from the reference row, sorted by row, data source and task.
+        parameters: number of trained weights by row name, for rows with weights.
         asked: number of scenes of each task.
     """
 
@@ -124,13 +135,15 @@ class Results:
     def markdown(
         self, shown: Mapping[str, tuple[str, ...]] | None = None, *, changes: bool = False
     ) -> str:
-        """Return one Markdown table per metric, rows by sources, and remarks on each task.
+        """Return one Markdown table per metric, and remarks on each task.
 
-        A star marks a row that is worse than the reference row over the whole paired interval.
+        A table has one line per row and one column per data source. A star marks a row that is
+        worse than the reference row: the whole interval of the paired difference agrees.
 
         Args:
-            shown: metrics by task; by default those of `TASKS`.
-            changes: show in brackets the interval of the difference: row minus reference row.
+            shown: names of the metrics by task. None means the metrics in `TASKS`.
+            changes: True replaces the intervals of the metrics by intervals of the differences. A
+                difference is the row minus the reference row.
         """
         parts: list[str] = []
         if shown is None:
@@ -165,7 +178,7 @@ class Results:
         if task.startswith(_RELATION_TASKS):
             parts.append(f"{UNLISTED}.")
         if changes:
-            parts.append(f"In brackets: the row minus {self.ours}, 95 % interval, same scenes.")
+            parts.append(f"In brackets: paired 95 % interval of the row minus {self.ours}.")
         return "\n\n".join([*parts, grid(["", "weights", *sources], lines)])
 
 
@@ -185,7 +198,7 @@ def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
-    """Write results.json and results.md of a folder, each atomically."""
+    """Write `values` into results.json and `text` into results.md. Replace each file atomically."""
     write_whole(folder / "results.md", text)
     write_whole(folder / "results.json", json.dumps(values, indent=1) + "\n")
 
@@ -197,14 +210,16 @@ def summarise(
     *,
     groups: Callable[[str], Sequence[str]] | None = None,
 ) -> Results:
-    """Compute the metrics of every row and its paired differences to the reference row.
+    """Compute the metrics of every row, and the paired differences from the reference row.
 
     Args:
-        groups: function of a task that returns the group of each scene. With this function, the
-            bootstrap of differences resamples groups instead of scenes.
+        ours: name of the reference row.
+        parameters: number of trained weights by row name.
+        groups: function that takes a task name and returns the group of each scene. With this
+            function, the bootstrap of differences resamples groups instead of scenes.
 
     Raises:
-        ValueError: the reports lack `ours`.
+        ValueError: the reports lack the reference row.
     """
     means = {
         (row, source, task, name): MeanOverSeeds(metrics)
@@ -212,7 +227,7 @@ def summarise(
         for source, task, name, metrics in _by_metric(reports, row)
     }
     if not any(key[0] == ours for key in means):
-        raise ValueError(f"the reports lack the row {ours}")
+        raise ValueError(f"the reports contain no metric of the reference row {ours}")
     cells = tuple(
         Cell(row, task, source, name, mean.figure(), tuple(m.value for m in mean.members))
         for (row, source, task, name), mean in means.items()
@@ -225,14 +240,18 @@ def summarise(
         for (row, source, task, name), mean in means.items()
         if row != ours
         and (mine := means.get((ours, source, task, name))) is not None
-        # A pooled metric may cover fewer sources for one of the rows.
+        # A row may lack a pooled metric on some data sources. Its scenes then cannot be paired.
         and mine.scenes == mean.scenes
     )
     return Results(ours, cells, differences, parameters or {}, tuple(_asked(reports)))
 
 
 def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:
-    """Return the report with the wanted metrics only, because resampling all takes minutes."""
+    """Return the report with only the wanted metrics, because resampling all metrics is slow.
+
+    Args:
+        wanted: names of the metrics to keep, by task.
+    """
     outcomes = {
         task: outcome
         and replace(
@@ -256,10 +275,10 @@ def _asked(reports: Reports) -> Iterator[Asked]:
 
 
 def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:
-    """Iterate over (source, task, metric name, one metric per seed) of a row.
+    """Iterate over (data source, task, metric name, metrics) of a row, with one metric per seed.
 
-    A metric is left out if it is pooled from different sources for different seeds. For example,
-    skill is undefined on a source where all queried relations hold.
+    A pooled metric is left out if its data sources differ between seeds. For example, the Brier
+    skill of a seed is undefined on a source where all queried relations hold.
     """
     found: dict[tuple[str, str, str], list[Metric]] = {}
     for (name, _), by_source in reports.items():
@@ -275,7 +294,7 @@ def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list
 
 
 def remarks(asked: Sequence[Asked]) -> list[str]:
-    """Return remarks for one task: skipped scenes and notes."""
+    """Return remarks on one task: the number of skipped scenes, and a table of the notes."""
     skipped = []
     for source in dict.fromkeys(one.source for one in asked):
         here = [one for one in asked if one.source == source]
@@ -288,13 +307,16 @@ def remarks(asked: Sequence[Asked]) -> list[str]:
 
 
 def _range(counts: Iterable[int]) -> str:
-    """Format a count over all rows, as a range if the rows differ."""
+    """Format one count if all rows have the same count, else the range of the counts."""
     low, *others = sorted(set(counts))
     return f"{low:,}–{others[-1]:,}" if others else f"{low:,}"
 
 
 def _notes(asked: Sequence[Asked]) -> str:
-    """Format notes by source if all rows agree, by row if all sources agree, else by both."""
+    """Return a table of notes, with one line per data source if the notes of all rows are equal.
+
+    Otherwise the table has one line per row, or one line per row and data source.
+    """
     found: dict[str, Mapping[str, float]] = {}
     for place in ("{0.source}", "{0.row}, seed {0.seed}", "{0.row}, seed {0.seed}, {0.source}"):
         found = {place.format(one): one.notes for one in asked}

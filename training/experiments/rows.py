@@ -1,4 +1,4 @@
-"""The rows of an experiment: machines, tuned baselines, and references."""
+"""The rows of a result table: machines, baselines with tuned settings, and untrained references."""
 
 from __future__ import annotations
 
@@ -33,18 +33,19 @@ CALIBRATION = "calibration.json"
 """File name of a machine's calibration, in the folder of its run."""
 
 Say = Callable[[str], None]
-# Function of a setting that returns the contender of a row. A trained row ignores the setting.
+# Function that takes the evaluation setting and returns the scores of a row. Only the references
+# depend on the setting.
 Rival = Callable[[Setting], Contender]
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The scenes on which the rows are trained.
+    """The scenes of an experiment.
 
     Attributes:
-        data: tensors of the three parts.
-        vocabulary: classes of the scenes.
-        digest: digest of the scenes and their split. A report in a folder is reused only if this
+        data: tensors of the training, validation and test scenes.
+        vocabulary: object classes and room types of the scenes.
+        digest: digest of the scenes and their split. A report on disk is reused only if this
             digest and the identity of its row are unchanged.
     """
 
@@ -54,10 +55,10 @@ class Material:
 
     @classmethod
     def of(cls, scenes: SplitScenes) -> Material:
-        """Create the material from split scenes.
+        """Create the tensors of split scenes.
 
         Raises:
-            ConfigError: a part is empty.
+            ConfigError: the training, validation or test part contains no scenes.
         """
         for part, some in scenes.parts.items():
             if not some:
@@ -77,14 +78,14 @@ Maker = Callable[[Material, Path, Say], Rival]
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One row with one training seed.
+    """One model of an experiment, with one training seed.
 
     Attributes:
-        name: name of the row; all seeds of a row have the same name.
+        name: name of the model. It does not depend on the training seed.
         seed: training seed.
-        identity: text with everything that affects the results, except the scenes. Reports of
-            another identity are rejected.
-        make: function that trains the row, or reads the trained row from its folder.
+        identity: text with all settings that affect the results. Reports on disk with another
+            identity are rejected.
+        make: function that trains the model, or reads the trained model from its folder.
     """
 
     name: str
@@ -105,15 +106,15 @@ def baseline_rows(
     Deterministic baselines have a row for seed 0 only.
 
     Args:
-        related: whether the scenes contain relations. Without relations, relation baselines are
-            left out.
-        whole: add an alarm and place scores to object baselines.
+        names: names of the baselines. None means all baselines.
+        related: True if the scenes contain relations. False leaves out relation baselines.
+        whole: True adds an outlier alarm and place scores to object baselines.
 
     Raises:
         ValueError: a name is not in `BASELINES`.
     """
     if unknown := sorted(set(names or ()) - set(BASELINES)):
-        raise ValueError(f"unknown baselines {unknown}: must be among {list(BASELINES)}")
+        raise ValueError(f"unknown baselines {unknown}: choose from {list(BASELINES)}")
     for name, baseline in BASELINES.items():
         wanted = (names is None or name in names) and (related or not baseline.learns_relations)
         if wanted and (baseline.stochastic or seed == 0):
@@ -122,7 +123,7 @@ def baseline_rows(
 
 
 def reference_rows() -> Iterator[Row]:
-    """Generate untrained reference rows for the evaluation of generated scenes and densities."""
+    """Generate the untrained references for the evaluation of generated scenes and densities."""
     references: dict[str, Rival] = {
         "independent classes": independent_contender,
         "held-out scenes (floor)": floor_contender,
@@ -136,10 +137,11 @@ def _reference(rival: Rival, material: Material, folder: Path, say: Say) -> Riva
 
 
 def machine_row(config: Config, *, calibrated: bool = True) -> Row:
-    """Return the row of a configuration's machine; its training can resume in the row's folder.
+    """Return the row of a machine. An interrupted training resumes from the row's folder.
 
     Args:
-        calibrated: calibrate the machine as for publication.
+        config: training configuration of the machine.
+        calibrated: True calibrates the machine as for publication.
     """
     if calibrated:
         identity, make = f"{config.digest}, calibrated", partial(_calibrated, config)
@@ -151,7 +153,11 @@ def machine_row(config: Config, *, calibrated: bool = True) -> Row:
 def _fitted(
     baseline: Baseline[Any], seed: int, whole: bool, material: Material, folder: Path, say: Say
 ) -> Rival:
-    """Fit a baseline. The product of an object score and the place table also answers T2-at."""
+    """Fit a baseline, and return its scores for the tasks that it supports.
+
+    An object baseline also supports T2-at (missing object at a place): its score is multiplied by a
+    frequency table of places.
+    """
     data = material.data
     score = _fit(baseline, data, seed, folder, say).score
     values: dict[str, Any] = dict.fromkeys(baseline.scores, score)
@@ -202,14 +208,17 @@ def _trained(config: Config, data: TrainingData, run: Path, say: Say) -> Boltzma
 
 
 def always(contender: Contender) -> Rival:
-    """Return the same contender for all settings."""
+    """Return a function that returns the same contender for every evaluation setting."""
     return lambda _: contender
 
 
 def _fit(
     baseline: Baseline[Any], data: TrainingData, seed: int, folder: Path, say: Say
 ) -> Fitted[Any]:
-    """Fit a baseline and write all its trials; replace the trials of an interrupted fit."""
+    """Fit a baseline, and write all tried settings into trials.jsonl.
+
+    Trials of an earlier, interrupted fit are replaced.
+    """
     fitted = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
     before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []
@@ -220,5 +229,5 @@ def _fit(
 
 
 def has_relations(scenes: SceneTensors) -> bool:
-    """Return True if a scene has an annotated relation."""
+    """Return True if any of the scenes has an annotated relation."""
     return any(scene.evidence.holds.any() for scene in scenes.scenes)

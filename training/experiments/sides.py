@@ -1,6 +1,6 @@
-"""The two sides of a comparison, and the scenes held out from both.
+"""The two sides of a comparison of models, and the scenes held out from both sides.
 
-A side is a finished run, a published model, or the baselines.
+A side is the model of a finished run, a published model, or a set of baselines.
 """
 
 from __future__ import annotations
@@ -27,12 +27,15 @@ from training.runs import RunError, load_run
 from training.trainer import TrainingData
 
 BASELINE_SIDE = "baselines"
-"""Baseline side: EASE for objects, frequency table for relations, their product for places."""
+"""Name of the side of baselines: EASE for objects, and a frequency table for relations.
+
+Objects at a place are scored by the product of EASE and a frequency table of places.
+"""
 
 _OBJECTS, _RELATIONS = "EASE", "frequency table"
 
 Say = Callable[[str], None]
-# Function of a task name that returns the contender of a side.
+# Function that takes a task name and returns the scores of a side.
 Rival = Callable[[str], Contender]
 
 
@@ -41,11 +44,11 @@ class Side:
     """One of the two compared models.
 
     Attributes:
-        title: name in tables.
-        config: training configuration, or None if unknown.
-        learnt: digest of each training source, by source name.
-        artifact: the model; None for the baselines.
-        data: folder of the scenes of a run.
+        title: name of the model in tables.
+        config: training configuration. None if unknown.
+        learnt: digest of each data source of the training, by source name.
+        artifact: the model. None for the baselines.
+        data: folder with the scene files of a run. None if the side is not a run.
     """
 
     title: str
@@ -56,14 +59,16 @@ class Side:
 
     @property
     def vocabulary(self) -> Vocabulary | None:
-        """Classes of the model; None for the baselines, which use the classes of the other side."""
+        """Classes of the model. None for the baselines, which use the classes of the other side."""
         return None if self.artifact is None else self.artifact.vocabulary
 
     def rival(self, scenes: Vocabulary, data: TrainingData, say: Say) -> Rival:
-        """Return the contender of the side for scenes in the classes of a vocabulary.
+        """Return a function that returns the scores of this side for a task.
 
         Args:
-            data: scenes to fit the baselines on.
+            scenes: vocabulary of the test scenes. If the model has other classes, the questions are
+                translated into the classes of the model.
+            data: scenes on which the baselines are fitted.
         """
         if self.artifact is None:
             fitted = _baselines(data, say)
@@ -76,11 +81,15 @@ class Side:
 
 
 def run_side(folder: Path, data: Path | None, say: Say) -> Side:
-    """Return the side of a finished run, calibrated as for publication.
+    """Load a finished run as a side, and calibrate its model as for publication.
+
+    Args:
+        folder: folder of the run.
+        data: folder with the scene files. None means the folder that the run records.
 
     Raises:
-        RunError: the folder holds no finished run, or its scenes differ from the training scenes.
-        ConfigError, DatasetError: the scenes cannot be read.
+        RunError: the folder holds no finished run, or the scene files have changed since training.
+        ConfigError, DatasetError: the scene files cannot be read.
     """
     run = load_run(folder)
     root = data if data is not None else Path(run.data) if run.data else DATA
@@ -93,7 +102,10 @@ def run_side(folder: Path, data: Path | None, say: Say) -> Side:
 
 
 def stored_side(reference: str, store: Store) -> Side:
-    """Return the side of a published model by alias, name or name@version.
+    """Load a published model as a side.
+
+    Args:
+        reference: alias, name or name@version of the model.
 
     Raises:
         StoreError, ArtifactError: the model does not exist or cannot be used.
@@ -110,11 +122,14 @@ def stored_side(reference: str, store: Store) -> Side:
 
 
 def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
-    """Return the side of a reference: folder of a run, the baselines, or a published model.
+    """Return the side that a reference names.
+
+    Args:
+        reference: folder of a run, `BASELINE_SIDE`, or a published model.
 
     Raises:
-        ConfigError: the reference is neither a run nor the baselines nor a published model. See
-            also `run_side` and `stored_side`.
+        ConfigError: the reference names neither a run nor the baselines nor a published model.
+        RunError: the folder holds no finished run. See also `run_side` and `stored_side`.
     """
     if reference == BASELINE_SIDE:
         # The baselines are fitted later, on the training scenes of the other side.
@@ -126,9 +141,10 @@ def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
         return stored_side(reference, store)
     except StoreError as error:
         if folder.is_dir():
-            raise RunError(f"{reference} contains no finished run") from error
+            raise RunError(f"the folder {reference} contains no finished run") from error
         raise ConfigError(
-            f"{reference!r} must be a finished run or a model in {store.root}: {error}"
+            f"{reference!r} names neither the folder of a finished run nor a model in "
+            f"{store.root}: {error}"
         ) from error
 
 
@@ -147,18 +163,18 @@ def _baselines(data: TrainingData, say: Say) -> Contender:
 
 # --------------------------------------------------------------------------------- held-out scenes
 
-# Filter of scenes: returns False if the model is known to have learnt from the scene.
+# Function that takes a scene. It returns False if a model is known to have learnt from the scene.
 Kept = Callable[[AnnotatedScene], bool]
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Scenes for the comparison.
+    """Scenes held out from both models.
 
     Attributes:
-        scenes: test scenes of the first model that the second model did not learn from.
-        dropped: number of the first model's test scenes that are left out.
-        notes: remarks on the results.
+        scenes: test scenes of the first model, without scenes that the second model learnt from.
+        dropped: number of test scenes of the first model that are left out.
+        notes: remarks on the choice of scenes.
         certain: False if a model may have learnt from some of the scenes.
     """
 
@@ -174,14 +190,17 @@ def held_out(
     """Return the first model's test scenes without scenes that the second model learnt from.
 
     Args:
-        sources: current scenes of the first model's configuration, by source.
-        root: folder of these scenes; sources of the second model are read from it too.
+        sources: current scenes of the first model's configuration, by data source.
+        root: folder with the scene files of both models.
 
     Raises:
-        ConfigError: the first model does not state its split, or all test scenes are left out.
+        ConfigError: the first model does not record its split, its test part is empty, or the
+            second model learnt from all its test scenes.
     """
     if a.config is None:
-        raise ConfigError(f"{a.title} does not record the split of its scenes")
+        raise ConfigError(
+            f"{a.title} does not record the split of its scenes, so its test scenes are unknown"
+        )
     everything = [scene for some in sources.values() for scene in some]
     data = a.config.data
     candidates = split(everything, seed=data.split_seed, protocol=data.split)["test"]
@@ -199,12 +218,13 @@ def held_out(
     dropped = len(candidates) - len(kept)
     if not kept:
         raise ConfigError(
-            f"{b.title} has learnt from all test scenes of {a.title}: no common held-out scenes"
+            f"no scene is held out from both models: {b.title} has learnt from all test scenes of "
+            f"{a.title}"
         )
     if dropped:
         notes.append(
             f"{dropped} of {len(candidates)} test scenes of {a.title} are left out: {b.title} has "
-            "learnt from them, or from scenes of their groups"
+            "learnt from these scenes or from near-duplicates (same group)"
         )
     return HeldOut(kept, dropped, tuple(notes), certain)
 
@@ -212,7 +232,10 @@ def held_out(
 def _kept(
     side: Side, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
 ) -> tuple[Kept, str, bool]:
-    """Return a filter for held-out scenes of a side, a note, and whether the filter is certain."""
+    """Return a filter that keeps the scenes held out from a side.
+
+    Also return a note, or "", and False if the side may have learnt from kept scenes.
+    """
     if side.artifact is None:
         return _all, "", True  # the baselines are fitted on the training scenes of the first model
     digests = {name: digest_of(some) for name, some in sources.items()}
@@ -223,9 +246,9 @@ def _kept(
     }
     if not shared:
         names = ", ".join(side.learnt) or "unknown"
-        return _all, f"{side.title} learnt from other sources ({names})", True
+        return _all, f"{side.title} learnt from other data sources ({names})", True
     if side.config is None:
-        note = f"{side.title} does not state its split: it may have learnt from these scenes"
+        note = f"{side.title} does not record its split and may have learnt from these scenes"
         return _all, note, False
     data = side.config.data
     if data.split == "stable":
@@ -237,9 +260,9 @@ def _kept(
         )
     if (own := _scenes_of(data, side.learnt, sources, digests, root)) is None:
         note = (
-            f"{side.title} learnt from other versions of {', '.join(sorted(shared))}, and its "
-            "split cannot be reproduced: it may have learnt from these scenes (a stable split "
-            "avoids this)"
+            f"{side.title} may have learnt from these scenes: it learnt from other versions of "
+            f"{', '.join(sorted(shared))}, so its split cannot be reproduced. Use the stable split "
+            "to avoid this"
         )
         return _all, note, False
     parts = split(own, seed=data.split_seed, protocol=data.split)
@@ -259,7 +282,14 @@ def _scenes_of(
     digests: Mapping[str, str],
     root: Path,
 ) -> list[AnnotatedScene] | None:
-    """Return all scenes of a side before its split, or None if any source has changed."""
+    """Return all scenes of a side before its split, or None if a data source has changed.
+
+    Args:
+        learnt: digest of each data source of the side's training.
+        sources: scenes that are already read, by data source.
+        digests: digests of `sources`.
+        root: folder with the scene files.
+    """
     found: list[AnnotatedScene] = []
     for source in data.sources:
         name = source_name(source)

@@ -1,8 +1,8 @@
-"""Query a model about scenes in the classes of another model.
+"""Query a model with scenes whose classes are the classes of another model.
 
-Each class of the scenes is looked up in the model by name. Scene classes that map to the same model
-class share its score. A class without a counterpart in the model is unknown: it is not part of the
-model's input. As a missing object and as an outlier, it has the lowest rank.
+Each class of the scenes is looked up in the model by name. Several scene classes can map to the
+same model class: they get the same score. A class that the model lacks is unknown: objects of this
+class are not part of the model's input, and this class ranks last in every task.
 """
 
 from __future__ import annotations
@@ -22,13 +22,16 @@ from training.evaluation.setting import Contender
 
 Score = TypeVar("Score")
 
-# Absolute score of unknown classes: larger than all log-odds, so that these classes rank last, and
-# finite.
+# Absolute score of unknown classes. The score is finite and larger than all log-odds, so that
+# unknown classes rank last.
 BEYOND = 1e9
 
 
 def same_classes(a: Vocabulary, b: Vocabulary) -> bool:
-    """Return True if all class indices have the same meaning; sizes and aliases may differ."""
+    """Return True if each class index names the same class in both vocabularies.
+
+    Typical sizes and aliases of the classes may differ.
+    """
     return a.labels == b.labels and bool((a.structure == b.structure).all())
 
 
@@ -37,7 +40,7 @@ class Translation:
     """Mapping from the classes of scenes to the classes of a model.
 
     Attributes:
-        own: (V,) int64, the model's class for each class of the scenes; -1 for an unknown class.
+        own: (V,) int64, the model's class for each of the V scene classes; -1 for an unknown class.
         size: number of classes of the model.
         unknown: score of an unknown class.
     """
@@ -48,7 +51,7 @@ class Translation:
 
     @classmethod
     def between(cls, scenes: Vocabulary, model: Vocabulary) -> Translation:
-        """Match classes by name, then by alias."""
+        """Match the classes of two vocabularies by name, and then by alias."""
         own = []
         for entry in scenes.objects:
             named = (model.index(name) for name in (entry.label, *entry.aliases))
@@ -56,11 +59,12 @@ class Translation:
         return cls(torch.tensor(own, dtype=torch.int64), len(model))
 
     def contender(self, model: Contender, task: str) -> Contender:
-        """Return the model as a contender for scenes in the other classes.
+        """Return scores of the model that take scenes and return values in the scene classes.
 
         Args:
-            task: name of the task. In T3 and T3b the lowest score ranks first; in other tasks the
-                highest score ranks first.
+            model: scores of the model in its own classes.
+            task: name of the task. In T3 (outliers) and T3b (false relations), the lowest score
+                ranks first. In other tasks, the highest score ranks first.
         """
         if task.startswith("T3"):
             return replace(self, unknown=BEYOND)._contender(model)
@@ -77,8 +81,9 @@ class Translation:
         )
 
     def presence(self, v: Tensor) -> Tensor:
-        """Map presence or counts (B, V) to the model's classes.
+        """Map presence or counts from the scene classes to the model's classes.
 
+        `v` has the shape (scenes, scene classes); the result has the shape (scenes, model classes).
         If several scene classes map to one model class, the result is their maximum.
         """
         known = self.own >= 0
@@ -86,7 +91,10 @@ class Translation:
         return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, known], "amax")
 
     def scores(self, values: Tensor) -> Tensor:
-        """Map scores of the model's classes to (B, V); unknown classes get `unknown`."""
+        """Map scores (scenes, model classes) to scores (scenes, scene classes).
+
+        The score of an unknown class is `unknown`.
+        """
         found = values[:, self.own.clamp(min=0)]
         return found.masked_fill(self.own < 0, self.unknown)
 
@@ -105,7 +113,7 @@ class Translation:
                     anchor=anchor[known],
                     outgoing=places.outgoing[known],
                 )
-                # The score is -inf if a present class maps to the same model class.
+                # Other present classes may map to the anchor's model class; the score is then -inf.
                 values = score(own).clamp(min=-BEYOND)
                 found[known] = self.scores(values)
             return found
@@ -122,7 +130,7 @@ class Translation:
         return translated
 
     def _score_row(self, score: RelationScore, batch: Batch, row: int, found: Tensor) -> None:
-        """Fill in the scores (A, n, n) of one scene."""
+        """Write the scores of one scene into `found`, with shape (relations, classes, classes)."""
         classes = batch.classes[row]
         own = torch.where(classes >= 0, self.own[classes.clamp(min=0)], -1)
         kept = (own >= 0).nonzero().squeeze(1)

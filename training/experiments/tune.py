@@ -1,8 +1,11 @@
 """`python -m training tune`: search for settings on validation scenes with optuna.
 
 <folder>/<configuration>/study.log   all trials, as a journal of optuna
-                         <digest>/   curve, reports and checkpoint of a trial
+                         trial-<n>/  curve, reports and checkpoint of a trial
                          best.toml   the best configuration
+
+Several processes may run the same command. They share the trials through the journal. On several
+machines, --folder is on a shared file system.
 
 A search space is a TOML file of settings with choices or intervals:
 
@@ -16,7 +19,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
+import socket
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -55,16 +60,17 @@ FIGURES = {
     "MRR": ("T2 missing", "MRR"),
     "R-precision": ("T1a relations", "R-precision, instance counts"),
 }
-"""Task and metric of the evaluation, by short name; these metrics rank the trials."""
+"""Metrics that rank the trials, by short name: (task, metric) of the evaluation."""
 
 _BY: dict[By, tuple[str, ...]] = {
     "mrr": ("MRR",),
     "r-precision": ("R-precision",),
     "both": tuple(FIGURES),
 }
-# All trials use the same scenes and seed, so that they differ only in the searched settings.
+# Settings that cannot be searched: trials are comparable only with the same scenes and seed.
 _FIXED = ("data.", "training.seed", "training.threads")
-# Median pruning starts after this number of finished trials, and this share of a trial's epochs.
+# Pruning stops a trial whose metric is below the median of earlier trials. It needs this number of
+# finished trials, and it starts after this share of the epochs of a trial.
 _RIVALS = 4
 _WARM_UP = 1 / 3
 
@@ -82,14 +88,18 @@ class _Interval(BaseModel):
 def tune(
     configuration: Annotated[str, typer.Argument(help="a TOML file, or a shipped configuration")],
     space: Annotated[
-        Path | None, typer.Option(help="TOML file of the search space; by default the shipped one")
+        Path | None, typer.Option(help="TOML file of the search space; by default the shipped file")
     ] = None,
     trials: Annotated[
-        int, typer.Option(min=1, help="number of trials, including earlier ones")
+        int, typer.Option(min=1, help="number of trials, including earlier trials")
     ] = 20,
     by: Annotated[By, typer.Option(help="metric to maximise")] = "both",
     seed: Annotated[int, typer.Option(help="seed of the sampler")] = 0,
     epochs: Annotated[int | None, typer.Option(min=1, help="epochs of a trial")] = None,
+    study: Annotated[
+        Path | None,
+        typer.Option(help="journal of the trials, which processes share; default: in the folder"),
+    ] = None,
     prune: Annotated[bool, typer.Option(help="stop trials below the median")] = True,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
@@ -99,31 +109,33 @@ def tune(
 ) -> None:
     """Search for better settings on validation scenes only.
 
-    The first trial is the unchanged configuration. Optuna samples the settings of the other trials.
-    The command writes the best configuration to <folder>/<configuration>/best.toml. After Ctrl-C,
-    the same command continues with the next trial; finished trials are kept.
+    The first trial uses the unchanged configuration. Optuna chooses the settings of the other
+    trials. The command writes the best configuration to <folder>/<configuration>/best.toml. After
+    Ctrl-C, run the same command again: it keeps finished trials and resumes the interrupted trial.
     """
     with resumable(console):
         original = load_config(configuration)
         distributions = load_space(_space(original, space), original)
         place = folder / original.name
+        journal = study or place / "study.log"
         if fresh:
             shutil.rmtree(place, ignore_errors=True)
+            journal.unlink(missing_ok=True)
         config = with_settings(original, {"training.epochs": epochs} if epochs else {})
         with console.status("reading and encoding scenes"):
             scenes = prepare(config, data_folder(configuration, config, data))
-        search = Search(place, config, scenes.training_data(), distributions, by)
-        study = search.open(scenes.digest, seed, prune=prune)
-        search.run(study, trials + 1)
-    console.print(_table(study, original.name))
-    if not _finished(study):
+        search = Search(place, config, scenes.training_data(), distributions, by, journal)
+        found = search.open(scenes.digest, seed, prune=prune)
+        search.run(found, trials + 1, seed)
+    console.print(_table(found, original.name))
+    if not _finished(found):
         console.print("[red]error:[/red] all trials failed or were stopped early")
         raise typer.Exit(1)
-    _conclude(search, study, original)
+    _conclude(search, found, original)
 
 
 def shipped_spaces() -> dict[str, Path]:
-    """Return the shipped search spaces by the name of their configuration."""
+    """Return the files of the shipped search spaces, by configuration name."""
     folder = Path(__file__).parents[1] / "configs/spaces"
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
@@ -132,18 +144,21 @@ def _space(config: Config, path: Path | None) -> Path:
     shipped = shipped_spaces()
     if path is None and config.name not in shipped:
         raise ConfigError(
-            f"no shipped search space for {config.name}, only for {', '.join(shipped)}: name a "
-            "TOML file with --space"
+            f"{config.name} has no shipped search space (available for: {', '.join(shipped)}). "
+            "Pass a TOML file with --space"
         )
     return path or shipped[config.name]
 
 
 def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
-    """Read a search space; all its values must be valid in the configuration.
+    """Read a search space, and check its values in the configuration.
+
+    Returns:
+        The distribution of each searched setting, by setting name.
 
     Raises:
-        ConfigError: the file is missing or not TOML, an entry is neither choices nor an interval,
-            or a setting is unknown, invalid or fixed.
+        ConfigError: the file is missing or not TOML, an entry is neither a list of choices nor an
+            interval, a value is invalid for its setting, or a setting cannot be searched.
     """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -156,7 +171,7 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
     found = {}
     for name, entry in values.items():
         if name.startswith(_FIXED):
-            raise ConfigError(f"{name!r} must be the same in all trials: remove it from the space")
+            raise ConfigError(f"{name!r} must be equal in all trials: remove it from the space")
         try:
             found[name] = _distribution(entry)
         except (ValueError, ValidationError) as error:
@@ -194,14 +209,15 @@ def _first_line(error: Exception) -> str:
 
 
 class Search:
-    """Trials of a study: train, report each epoch, and measure on all validation scenes.
+    """A search for settings. Each trial trains a machine and measures it on validation scenes.
 
     Args:
-        folder: folder of the study.
-        config: the common configuration.
-        data: the scenes.
-        space: the settings to search.
+        folder: folder of the trials.
+        config: configuration whose settings the trials change.
+        data: scenes for training and validation.
+        space: distribution of each searched setting, by setting name.
         by: metric to maximise.
+        journal: file of the study; default: in the folder.
     """
 
     def __init__(
@@ -211,14 +227,18 @@ class Search:
         data: TrainingData,
         space: Mapping[str, BaseDistribution],
         by: By,
+        journal: Path | None = None,
     ) -> None:
         self.folder, self.config, self.data, self.space, self.by = folder, config, data, space, by
+        self.journal = journal or folder / "study.log"
 
     def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
-        """Open the study on disk or create it.
+        """Open the optuna study in the folder, or create it.
 
         Args:
             scenes: digest of the scenes.
+            seed: seed of the sampler.
+            prune: True stops trials that are below the median of earlier trials.
 
         Raises:
             ConfigError: the folder holds a search with another configuration, scenes or metric.
@@ -228,7 +248,8 @@ class Search:
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.folder.mkdir(parents=True, exist_ok=True)
-        backend = JournalFileBackend(str(self.folder / "study.log"))
+        self.journal.parent.mkdir(parents=True, exist_ok=True)
+        backend = JournalFileBackend(str(self.journal))
         warm_up = math.ceil(self.config.training.epochs * _WARM_UP) - 1
         study = optuna.create_study(
             storage=optuna.storages.JournalStorage(backend),
@@ -239,47 +260,67 @@ class Search:
             if prune
             else optuna.pruners.NopPruner(),
         )
-        # With the same seed, a resumed sampler would repeat its first points.
-        study.sampler = optuna.samplers.TPESampler(seed=seed + len(study.trials))
         identity = {"config": self.config.digest, "scenes": scenes, "by": self.by}
         if study.user_attrs.setdefault("identity", identity) != identity:
             raise ConfigError(
-                f"{self.folder} holds a search with another configuration, scenes or metric; use "
+                f"{self.journal} holds a search with another configuration, scenes or metric; use "
                 "--fresh or another folder"
             )
         study.set_user_attr("identity", identity)
         return study
 
-    def run(self, study: Study, trials: int) -> None:
-        """Run trials until the study has `trials`; the first trial uses the unchanged settings."""
+    def run(self, study: Study, trials: int, seed: int = 0) -> None:
+        """Run trials until the study has `trials`; the first trial uses the unchanged settings.
+
+        Several processes may run trials of the study.
+        """
+        import optuna
+
+        self._requeue(study)
+        while len(_counted(study)) < trials:
+            trial = study.ask()
+            if sum(other.number < trial.number for other in _counted(study)) >= trials:
+                # Another process took the last trial in the meantime.
+                study.tell(trial, state=optuna.trial.TrialState.FAIL)
+                return
+            trial.set_user_attr("process", _process())
+            # With one seed for all, each process would draw the same settings.
+            study.sampler = optuna.samplers.TPESampler(seed=seed + trial.number)
+            original = trial.user_attrs.get("as it is", trial.number == 0)
+            self._run(study, trial, {} if original else _suggested(trial, self.space))
+
+    def _requeue(self, study: Study) -> None:
+        """Queue the trials of ended processes again; the new trials resume from the checkpoints."""
+        from optuna.trial import TrialState
+
+        for halted in study.get_trials(states=(TrialState.RUNNING,)):
+            if _alive(halted.user_attrs.get("process", "")):
+                continue
+            attributes = {
+                "as it is": halted.user_attrs.get("as it is", halted.number == 0),
+                "folder": _folder(halted),
+            }
+            study.enqueue_trial(halted.params, user_attrs=attributes)
+            study.tell(halted.number, state=TrialState.FAIL)
+
+    def _run(self, study: Study, trial: Trial, settings: Mapping[str, Any]) -> None:
         import optuna
         from optuna.trial import TrialState
 
-        if not study.trials:
-            study.enqueue_trial({}, user_attrs={"as it is": True})
-        for halted in study.get_trials(states=(TrialState.RUNNING,)):
-            # Queue an interrupted trial again. The new trial resumes from the checkpoint.
-            original = halted.user_attrs.get("as it is", False)
-            study.enqueue_trial(halted.params, user_attrs={"as it is": original})
-            study.tell(halted.number, state=TrialState.FAIL)
-        while sum("settings" in known.user_attrs for known in study.trials) < trials:
-            trial = study.ask()
-            original = trial.user_attrs.get("as it is", False)
-            settings = {} if original else _suggested(trial, self.space)
-            state, reason, value = TrialState.COMPLETE, "", None
-            try:
-                value = self.value_of(trial, settings)
-            except FloatingPointError as error:
-                state, reason = TrialState.FAIL, str(error)
-            except optuna.TrialPruned:
-                state, reason = TrialState.PRUNED, "below the median of earlier trials"
-            trial.set_user_attr("settings", settings)
-            trial.set_user_attr("reason", reason)
-            study.tell(trial, value, state)
-            console.print(f"{shown(settings)}: {reason or value}", markup=False)
+        state, reason, value = TrialState.COMPLETE, "", None
+        try:
+            value = self.value_of(trial, settings)
+        except FloatingPointError as error:
+            state, reason = TrialState.FAIL, str(error)
+        except optuna.TrialPruned:
+            state, reason = TrialState.PRUNED, "below the median of earlier trials"
+        trial.set_user_attr("settings", settings)
+        trial.set_user_attr("reason", reason)
+        study.tell(trial, value, state)
+        console.print(f"{shown(settings)}: {reason or value}", markup=False)
 
     def value_of(self, trial: Trial, settings: Mapping[str, Any]) -> float:
-        """Train and measure one trial.
+        """Train the machine of one trial, and return its metric on validation scenes.
 
         Raises:
             FloatingPointError: the training diverged.
@@ -288,8 +329,7 @@ class Search:
         import optuna
 
         config = with_settings(self.config, settings)
-        place = self.folder / config.digest[:12]
-        trial.set_user_attr("digest", config.digest)
+        place = self.folder / _folder(trial)
         trainer = Trainer(config, self.data, place)
         trainer.resume()
         reported = 0
@@ -322,12 +362,12 @@ class Search:
             self.data.validation, self.data.structure, self.data.train, seen=None
         ):
             measure(place / f"{source}.json", contender, setting, source, tasks=tasks)
-        return self.metrics(trainer.config.digest)
+        return self.metrics(place)
 
-    def metrics(self, digest: str) -> dict[str, Metric]:
-        """Return `FIGURES` of a finished trial, over all validation scenes."""
+    def metrics(self, place: Path) -> dict[str, Metric]:
+        """Return `FIGURES` of a finished trial in its folder, over all validation scenes."""
         texts = (
-            (self.folder / digest[:12] / f"{source}.json").read_text(encoding="utf-8")
+            (place / f"{source}.json").read_text(encoding="utf-8")
             for source in sorted({scene.source for scene in self.data.validation.scenes})
         )
         report = pooled([SourceReport.from_dict(json.loads(text)) for text in texts])
@@ -339,8 +379,38 @@ class Search:
 
 
 def shown(settings: Mapping[str, Any]) -> str:
-    """Format settings in one line."""
+    """Format the changed settings of a trial in one line."""
     return ", ".join(f"{name.partition('.')[2]} {v}" for name, v in settings.items()) or "as it is"
+
+
+def _counted(study: Study) -> list[FrozenTrial]:
+    """Return the trials that ended by themselves or that still run."""
+    return [
+        trial
+        for trial in study.trials
+        if "settings" in trial.user_attrs or trial.state.name == "RUNNING"
+    ]
+
+
+def _folder(trial: Trial | FrozenTrial) -> str:
+    """Return the name of a trial's folder, which a trial that is queued again keeps."""
+    return str(trial.user_attrs.get("folder", f"trial-{trial.number}"))
+
+
+def _process() -> str:
+    return f"{socket.gethostname()} {os.getpid()}"
+
+
+def _alive(process: str) -> bool:
+    """Return whether another process runs; those of other machines count as running."""
+    host, _, number = process.partition(" ")
+    if host != socket.gethostname():
+        return True
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return False
+    return process != _process()
 
 
 def _finished(study: Study) -> list[FrozenTrial]:
@@ -364,7 +434,7 @@ def _suggested(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str,
 
 
 def _table(study: Study, title: str) -> Table:
-    """Return a table of trials from best to worst; trials without a value come last."""
+    """Return a table of the trials from best to worst. Trials without a metric come last."""
     table = Table(*FIGURES, "state", "settings", title=title)
     trials = [trial for trial in study.trials if "settings" in trial.user_attrs]
     for trial in sorted(trials, key=lambda t: math.inf if t.value is None else -t.value):
@@ -377,22 +447,23 @@ def _table(study: Study, title: str) -> Table:
 
 
 def _conclude(search: Search, study: Study, original: Config) -> None:
-    """Write the best configuration with the original number of epochs."""
+    """Write the best configuration to best.toml, with the original number of epochs."""
     best = study.best_trial
     base = next((t for t in _finished(study) if not t.user_attrs["settings"]), None)
-    settings, digest = best.user_attrs["settings"], best.user_attrs["digest"]
+    settings = best.user_attrs["settings"]
     tuned = with_settings(original, settings).model_copy(update={"name": f"{original.name}-tuned"})
     figures = ", ".join(f"{name} {text}" for name, text in best.user_attrs["figures"].items())
     comment = [
         f"{original.name}, {shown(settings)}.",
-        f"Validation scenes, {search.config.training.epochs} epochs: {figures}.",
+        f"Metrics on validation scenes, {search.config.training.epochs} epochs: {figures}.",
     ]
     if settings and base is not None:
-        ours, theirs = search.metrics(digest), search.metrics(base.user_attrs["digest"])
+        ours, theirs = (search.metrics(search.folder / _folder(trial)) for trial in (best, base))
         gaps = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
-        comment.append(f"Difference to {original.name}, paired by scenes: {', '.join(gaps)}.")
+        comment.append(f"Paired difference from {original.name}: {', '.join(gaps)}.")
         comment.append(
-            f"The best of {len(study.trials)} trials is optimistic: train both with more seeds."
+            f"The figures of the best of {len(study.trials)} trials are optimistic: train both "
+            "configurations with several seeds."
         )
     path = search.folder / "best.toml"
     text = "".join(f"# {line}\n" for line in comment) + "\n" + config_toml(tuned)

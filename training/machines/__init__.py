@@ -1,7 +1,8 @@
 """The Boltzmann machines: energies, conditionals, expectations and samplers, on tensors only.
 
-The symbols are those of the project's model page: v, r, h1, h2; b, c1, c2, W, J; d, s, o, S, O, R,
-M, U.
+The page docs/models.md defines the symbols. Units: v objects, r relations, h1 and h2 hidden units.
+Weights: b, c1, c2, W and J of objects and hidden units; d, s, o, S, O, R, M and U of relations.
+Sizes: B scenes, V object classes, A relations, E relation units, H1 and H2 hidden units.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ VARIANTS: dict[str, type[BoltzmannMachine]] = {
 
 
 def build(spec: MachineSpec) -> BoltzmannMachine:
-    """Return a machine of the given shape with all weights zero."""
+    """Return a machine with the sizes in `spec`. All its weights are zero."""
     return VARIANTS[spec.variant](spec)
 
 

@@ -1,4 +1,4 @@
-"""Convert a machine to the arrays of the service, and back."""
+"""Convert a torch machine to the numpy arrays of the service, and back."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ def weights_of(machine: BoltzmannMachine) -> Weights:
 
 @lru_cache(maxsize=16)
 def machine_of(weights: Weights) -> BoltzmannMachine:
-    """Return the machine with these weights; it shares their memory, so do not change it."""
+    """Return the machine with these weights.
+
+    The machine and `weights` share memory, so do not change the machine.
+    """
     with torch.device("meta"):
         machine = build(weights.spec)
     state = {name: torch.from_numpy(array) for name, array in weights.arrays.items()}

@@ -1,18 +1,19 @@
 """Starting states of Gibbs chains: stored samples of the machine's own long chains.
 
-A chain with an empty start needs thousands of sweeps to reach all kinds of rooms, because scenes
-between two kinds are improbable. A trained machine therefore stores N chain samples, each with its
-room type. The artifact names them `fantasies` and `fantasy_rooms`. A new chain continues from one
-of the samples.
+A Gibbs chain that starts with an empty scene needs thousands of sweeps to visit all room types,
+because scenes between two room types are improbable. A trained machine therefore stores N samples
+of its chains, each with a room type. The model file stores the samples as `fantasies` and their
+room types as `fantasy_rooms`. A new chain starts at one of these samples.
 
-With evidence, each chain draws its sample by the weight w:
+A start sample is drawn with probability proportional to its weight w given the evidence:
 
-    log w = sum_{i observed} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
-            - 6 [drawn under another room type than t],
+    log w = sum_{i observed} log p(v_i = 1 | h1) + sum_{k clamped} log p(h1_k = 1)
+            - 6 [the room type of the sample differs from the requested room type t].
 
-where h1 is at its mean given the sample. This is sampling importance resampling, followed by
-sweeps. If no sample was drawn under t, the last term is h1·Q[t]. The term is needed because a few
-sweeps do not lead from one kind of room to another, whatever Q is.
+Here h1 is the mean of the hidden units given the sample. The method is sampling importance
+resampling, followed by Gibbs sweeps. If no sample has room type t, the last term is h1·Q[t]. Q
+contains the bias of the hidden units for each room type. The last term is needed because a few
+sweeps rarely change the room type of a scene.
 
 Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for
 fantasy particles; Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian
@@ -37,12 +38,12 @@ from training.machines.mean_field import Evidence, mean_field
 
 
 def words(classes: int) -> int:
-    """Return the number of 32-bit words for a scene over `classes` classes."""
+    """Return the number of 32-bit words that store one bit for each of `classes` classes."""
     return -(-classes // weights.WORD)
 
 
 def pack_scenes(v: Tensor) -> Tensor:
-    """Return presence (N, V) packed into bits, (N, words) int32."""
+    """Pack the presence of objects, (scenes, classes), into bits, (scenes, words) int32."""
     bits = np.zeros((len(v), words(v.shape[1]) * weights.WORD), dtype=np.uint8)
     bits[:, : v.shape[1]] = v.numpy() > 0
     packed = np.packbits(bits, axis=1, bitorder="little").view("<i4").astype(np.int32)
@@ -50,15 +51,15 @@ def pack_scenes(v: Tensor) -> Tensor:
 
 
 def unpack_scenes(packed: Tensor, classes: int) -> Tensor:
-    """Return presence (N, V) as floats from packed bits."""
+    """Unpack bits to the presence of objects, (scenes, classes) floats."""
     return torch.from_numpy(weights.unpack_scenes(packed.numpy(), classes))
 
 
 class ChainSamples:
-    """The stored samples of a machine, with weights given the evidence.
+    """The stored samples of a machine, from which new Gibbs chains start.
 
     Args:
-        machine: a machine with fixed weights; its weights are read at construction only.
+        machine: trained machine. Later changes of its weights have no effect on this object.
     """
 
     def __init__(self, machine: BoltzmannMachine) -> None:
@@ -69,20 +70,21 @@ class ChainSamples:
             self.v = unpack_scenes(machine.fantasies, machine.spec.V).to(machine.b.dtype)
             field = mean_field(machine, Evidence(self.v))
             self.h1, self.h2 = field.y.sigmoid(), field.h2
-            # Terms of log w for each given class, room type and held unit; one row for each sample.
+            # The terms of log w: for observed classes, room types and clamped hidden units. Each
+            # array has one row for each stored sample.
             self._present = logsigmoid(machine.object_logits(self.h1))
             self._room = self.h1 @ machine.Q.T
             self._unit = logsigmoid(field.y)
 
     @torch.no_grad()
     def start(self, given: Tensor, generator: torch.Generator, clamp: Clamp = FREE) -> State:
-        """Return a state for each chain: a sample drawn by its weight given the evidence.
+        """Return the start state of each chain: a stored sample, drawn by its weight.
 
-        Without stored samples, the chains start at the evidence.
+        If the machine stores no samples, each chain starts at the objects in `given`.
 
         Args:
-            given: (B, V), 1 for classes that must be present.
-            clamp: room types and held units, which are also evidence; see `Clamp`.
+            given: observed objects, (chains, classes). 1 means that the class must be present.
+            clamp: room types and clamped hidden units. They also enter the weights.
         """
         machine = self.machine
         if not machine.spec.N:
@@ -93,7 +95,7 @@ class ChainSamples:
         return _held(bare_state(machine, self.v[chosen].maximum(given), h1, h2), clamp)
 
     def log_weight(self, given: Tensor, clamp: Clamp = FREE) -> Tensor:
-        """Return log w of every sample, (B, N); see the module."""
+        """Return the log weight log w of each stored sample for each chain, (chains, samples)."""
         weight = given @ self._present.T
         if clamp.room is not None and self.machine.spec.C:
             known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
@@ -107,7 +109,7 @@ class ChainSamples:
 
 
 def _held(state: State, clamp: Clamp) -> State:
-    """Return the state with the held units on."""
+    """Return the state with the clamped hidden units set to 1."""
     h1 = state.h1 if clamp.h1 is None else torch.where(clamp.h1, 1.0, state.h1)
     h2 = state.h2 if clamp.h2 is None else torch.where(clamp.h2, 1.0, state.h2)
     return replace(state, h1=h1, h2=h2)

@@ -1,17 +1,17 @@
-"""Weighted draws of h1 from p(h1 | evidence), used for every answer without a closed form.
+"""Estimate the posterior of the hidden units h1 by self-normalised importance sampling.
 
-Given h1, unobserved relations sum out, and the likelihood of observed relations is a product over
-units. The proposal q is the factorial mean-field fixed point. Each draw h then has the weight
+The samples serve all answers that have no closed form. The proposal distribution q is the factorial
+mean-field approximation of the posterior p(h1 | evidence). A sample h has the importance weight w:
 
-    log w = h·x + sum_e term_e(ℓ_e(h)) - log q(h),   x = c1 + v'W + J h2,
+    log w = h·x + sum_e term_e(ℓ_e(h)) - log q(h),   x = c1 + v'W + J h2.
 
-where term_e is `BoltzmannMachine.relation_term`. The likelihood of observed relations can be raised
-to a power (`pull`) to reduce their influence. An expectation over p(h1 | evidence) is the weighted
-mean over the draws. The uniform numbers are fixed (a scrambled Sobol sequence), so equal evidence
-always gives the same answer. With two layers, h2 stays at its mean-field value.
+`BoltzmannMachine.relation_term` computes term_e from the logit ℓ_e of relation unit e. The argument
+`pull` is an exponent on the likelihood of the observed relations. An exponent below 1 reduces the
+influence of these relations. An expectation over p(h1 | evidence) is the weighted mean over the
+samples. The uniform numbers are a fixed, scrambled Sobol sequence, so equal evidence always gives
+the same answer. With two hidden layers, h2 stays at its mean-field value.
 
-The method is self-normalised importance sampling. It is Rao–Blackwellised: only h1 is sampled, and
-unobserved relations are summed out.
+The method is Rao–Blackwellised: only h1 is sampled, and unobserved relations are summed out.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from training.machines.mean_field import Evidence, MeanField, mean_field
 
 @dataclass(frozen=True)
 class HiddenDraws:
-    """Weighted draws of the first hidden layer.
+    """Weighted samples ("draws") of the first hidden layer h1.
 
     Attributes:
-        h1: (M, B, H1) binary.
-        log_weight: (M, B), normalised over M.
-        log_evidence: (B,) estimate of log sum_{h1, unobserved r} exp(-E) without the object biases.
-        field: the mean-field fixed point of the proposal.
+        h1: binary samples, (draws, scenes, hidden units).
+        log_weight: log importance weights, (draws, scenes). The weights of a scene sum to 1.
+        log_evidence: estimate of log sum_{h1, unobserved r} exp(-E), (scenes,). The energy E is
+            without the object biases.
+        field: the mean-field fixed point, from which the draws are sampled.
     """
 
     h1: Tensor
@@ -46,37 +47,37 @@ class HiddenDraws:
 
     @property
     def effective_size(self) -> Tensor:
-        """Effective number of draws, 1 / sum w², (B,)."""
+        """Effective sample size 1 / sum w² of each scene, (scenes,)."""
         return (-(2 * self.log_weight).logsumexp(0)).exp()
 
     def implied(
         self, machine: BoltzmannMachine, edges: Edges, given: Tensor, *, apart: bool = False
     ) -> Tensor:
-        """Return the logit shifts (B, E) that given relations imply for other relations.
+        """Return the change of each relation logit due to the given relations, (scenes, units).
 
-        The shifts depend on the context h1. Here h1 is its mean given the objects only.
+        The change also depends on the hidden units h1, which are at their mean given the objects.
 
         Args:
-            given: (B, E), 1 where a relation is given as holding.
-            apart: leave out the implications between relations of the same two classes.
+            given: given relations, (scenes, units). 1 means that the relation holds.
+            apart: True leaves out the effects between relations of the same two classes.
         """
         return machine.implied(edges, given, self.field.x.sigmoid(), apart=apart)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the expectation of values (M, B, ...) over the draws, (B, ...)."""
+        """Return the weighted mean over the draws of values (draws, scenes, ...)."""
         weight = self.log_weight.exp()
         return torch.einsum("mb,mb...->b...", weight, values)
 
     def log_mean_exp(self, values: Tensor) -> Tensor:
-        """Return log E[exp(values)], (B, ...)."""
+        """Return log E[exp(values)] over the draws, for values (draws, scenes, ...)."""
         weight = self.log_weight.reshape(*self.log_weight.shape, *[1] * (values.dim() - 2))
         return (values + weight).logsumexp(0)
 
     def standard_error(self, values: Tensor) -> Tensor:
-        """Return the standard error of `mean(values)` by the delta method, (B, ...).
+        """Return the standard error of `mean(values)` by the delta method, (scenes, ...).
 
-        In practice it is an upper bound, because a Sobol sequence has smaller errors than
-        independent draws.
+        The formula assumes independent draws. The draws of a Sobol sequence have smaller errors, so
+        the result is an upper bound in practice.
         """
         deviation = (values - self.mean(values)) ** 2
         return torch.einsum("mb,mb...->b...", (2 * self.log_weight).exp(), deviation).sqrt()
@@ -84,7 +85,7 @@ class HiddenDraws:
 
 @lru_cache(maxsize=8)
 def fixed_uniforms(count: int, units: int) -> Tensor:
-    """Return (count, units) quasi-random numbers in (0, 1), the same in every process."""
+    """Return quasi-random numbers in (0, 1), (count, units). Every process gets equal numbers."""
     engine = torch.quasirandom.SobolEngine(units, scramble=True, seed=20180521)
     return engine.draw(count, dtype=torch.float64).clamp(min=1e-9)
 
@@ -96,11 +97,11 @@ def draw_hidden(
     draws: int = 64,
     pull: float = 1.0,
 ) -> HiddenDraws:
-    """Return weighted draws of h1 given the evidence.
+    """Return weighted draws of the hidden units h1 given the evidence.
 
     Args:
-        draws: number of draws M; a power of two keeps the Sobol sequence balanced.
-        pull: weight of the observed relations' likelihood, from 0 to 1.
+        draws: number of draws. A power of two keeps the Sobol sequence balanced.
+        pull: exponent of the likelihood of the observed relations, from 0 to 1.
     """
     field = mean_field(machine, evidence, pull=pull)
     y = field.y

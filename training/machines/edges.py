@@ -1,8 +1,9 @@
-"""The layout of relation units r.
+"""The layout of the relation units r of a machine.
 
-A relation unit e = (a, i, j) states that object class i has the canonical relation a to class j.
-There are A·V² units, which is too many to allocate. Every computation therefore lists the units it
-uses. A row of `Edges` belongs to a scene; units outside the row are off.
+A relation unit e = (a, i, j) is 1 if object class i has the canonical relation a to object class j.
+With A relations and V classes there are A·V² units, too many to allocate. Every computation
+therefore lists its units in an `Edges` object, which has one row for each scene. Units that the row
+of a scene does not list are 0.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ from torch import Tensor
 
 
 class Edges(ABC):
-    """Relation units, with one row for each scene or one row for all scenes.
+    """The relation units of some scenes.
 
     Attributes:
-        relation, subject, object: (B or 1, E) int64, the a, i, j of each unit.
-        valid: (B or 1, E) bool; False marks padding, and such a unit is off.
+        relation, subject, object: indices a, i and j of each unit, (scenes or 1, units) int64. A
+            single row applies to all scenes.
+        valid: bool, (scenes or 1, units). False marks padding. Padded units are 0.
     """
 
     relation: Tensor
@@ -32,12 +34,12 @@ class Edges(ABC):
     @property
     @abstractmethod
     def shape(self) -> torch.Size:
-        """Shape of the tensors of units, (B or 1, E)."""
+        """Shape of tensors with one value for each unit, (scenes or 1, units)."""
 
     @property
     @abstractmethod
     def classes(self) -> Tensor:
-        """Classes (B or 1, n) int64 from which `BoltzmannMachine.edges` builds these units."""
+        """Class indices that `BoltzmannMachine.edges` needs for these units, (scenes or 1, n)."""
 
     @abstractmethod
     def expand(self, rows: int) -> Edges:
@@ -45,12 +47,12 @@ class Edges(ABC):
 
     @abstractmethod
     def ends_present(self, v: Tensor) -> Tensor:
-        """Return (..., B, E) floats: 1 where both ends of a unit are present in v (..., B, V)."""
+        """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
 
 
 @dataclass(frozen=True)
 class TripleEdges(Edges):
-    """A table of units that all scenes share; attributes as in `Edges`, (1, E)."""
+    """A fixed table of relation units for all scenes. Tensors have the shape (1, units)."""
 
     relation: Tensor
     subject: Tensor
@@ -59,20 +61,20 @@ class TripleEdges(Edges):
 
     @property
     def shape(self) -> torch.Size:
-        """Shape of the tensors of units, (1, E)."""
+        """Shape of tensors with one value for each unit, (1, units)."""
         return self.valid.shape
 
     @property
     def classes(self) -> Tensor:
-        """An empty tensor (1, 0), because the table does not depend on the classes of a scene."""
+        """Empty tensor (1, 0), because the table does not depend on the classes of a scene."""
         return self.subject.new_zeros(1, 0)
 
     def expand(self, rows: int) -> TripleEdges:
-        """Return this object, because all scenes share the row."""
+        """Return this object, because its single row of units applies to all scenes."""
         return self
 
     def ends_present(self, v: Tensor) -> Tensor:
-        """Return (..., B, E) floats: 1 where both ends of a unit are present."""
+        """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
         present: Tensor = v[..., self.subject[0]] * v[..., self.object[0]] * self.valid
         return present
 
@@ -81,14 +83,17 @@ class TripleEdges(Edges):
 class PairEdges(Edges):
     """All A·n·m units between n subject classes and m object classes of each scene.
 
-    Units have the layout (A, n, m), flattened, so that shared weights act by small matrix products.
-    The indices of single units are computed on first use.
+    The units of a scene have the flattened layout (relations, subjects, objects). With this layout,
+    shared weights need only small matrix products. The index tensors of the units are computed on
+    first use.
 
     Attributes:
         relations: number of canonical relations A.
-        subjects, objects: (B, n) and (B, m) int64 class indices, 0 where padded.
-        valid_subjects, valid_objects: (B, n) and (B, m) bool, False where padded.
-        log_subjects, log_objects: (B, n) and (B, m), log of the number of instances of each class.
+        subjects: class indices of the subjects, (scenes, n) int64. Padding is 0.
+        objects: class indices of the objects, (scenes, m) int64. Padding is 0.
+        valid_subjects, valid_objects: bool, shaped like the classes. False marks padding.
+        log_subjects, log_objects: log of the number of instances of each class, shaped like the
+            classes.
     """
 
     relations: int
@@ -101,13 +106,13 @@ class PairEdges(Edges):
 
     @property
     def shape(self) -> torch.Size:
-        """Shape of the tensors of units, (B, A·n·m)."""
+        """Shape of tensors with one value for each unit, (scenes, A·n·m)."""
         (B, n), m = self.subjects.shape, self.objects.shape[1]
         return torch.Size((B, self.relations * n * m))
 
     @property
     def classes(self) -> Tensor:
-        """The subject classes, (B, n), -1 where padded."""
+        """Class indices of the subjects, (scenes, n). Padding is -1."""
         return torch.where(self.valid_subjects, self.subjects, -1)
 
     def expand(self, rows: int) -> PairEdges:
@@ -117,28 +122,28 @@ class PairEdges(Edges):
 
     @cached_property
     def relation(self) -> Tensor:  # type: ignore[override]
-        """The relation a of each unit, (B, E) int64."""
+        """Relation index a of each unit, (scenes, units) int64."""
         axis = torch.arange(self.relations, device=self.subjects.device)
         return self._flat(axis[:, None, None])
 
     @cached_property
     def subject(self) -> Tensor:  # type: ignore[override]
-        """The subject class i of each unit, (B, E) int64."""
+        """Class index i of the subject of each unit, (scenes, units) int64."""
         return self._flat(self.subjects[:, None, :, None])
 
     @cached_property
     def object(self) -> Tensor:  # type: ignore[override]
-        """The object class j of each unit, (B, E) int64."""
+        """Class index j of the object of each unit, (scenes, units) int64."""
         return self._flat(self.objects[:, None, None, :])
 
     @cached_property
     def valid(self) -> Tensor:  # type: ignore[override]
-        """False where a unit is padding, (B, E) bool."""
+        """False where a unit is padding, else True, (scenes, units) bool."""
         pairs = self.valid_subjects.unsqueeze(-1) & self.valid_objects.unsqueeze(-2)
         return self._flat(pairs.unsqueeze(1))
 
     def ends_present(self, v: Tensor) -> Tensor:
-        """Return (..., B, E) floats: 1 where both ends of a unit are present in v (..., B, V)."""
+        """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
         lead = v.shape[:-1]
         subject = v.gather(-1, self.subjects.expand(*lead, -1)) * self.valid_subjects
         object_ = v.gather(-1, self.objects.expand(*lead, -1)) * self.valid_objects
@@ -146,7 +151,7 @@ class PairEdges(Edges):
         return pairs.expand(*lead, self.relations, -1, -1).flatten(-3)
 
     def unflatten(self, values: Tensor) -> Tensor:
-        """Reshape (..., E) to (..., A, n, m)."""
+        """Reshape the units of `values` (..., units) to (..., relations, subjects, objects)."""
         shape = (self.relations, self.subjects.shape[-1], self.objects.shape[-1])
         return values.reshape(*values.shape[:-1], *shape)
 
@@ -166,11 +171,12 @@ def pair_edges(
     """Return the relation units between the given classes.
 
     Args:
-        subjects: (B, n) int64, -1 where padded.
+        subjects: class indices of the subjects, (scenes, n) int64. Padding is -1.
         relations: number of canonical relations A.
-        objects: (B, m) int64, -1 where padded; default: the subjects.
-        log_subjects, log_objects: log of the instances of each class, shaped like the classes;
-            default: one instance each.
+        objects: class indices of the objects, (scenes, m) int64. Padding is -1. The default is
+            `subjects`.
+        log_subjects, log_objects: log of the number of instances of each class, shaped like the
+            classes. The default is one instance of each class.
     """
     if objects is None:
         objects, log_objects = subjects, log_subjects
@@ -192,41 +198,47 @@ def pair_edges(
 
 
 def triple_edges(triples: Tensor) -> TripleEdges:
-    """Return one shared row of units from a (T, 3) table of (a, i, j)."""
+    """Return the relation units of a table of triples, which apply to all scenes.
+
+    Args:
+        triples: triples (relation a, subject class i, object class j), (triples, 3).
+    """
     relation, subject, object_ = triples.long().T.unsqueeze(1).unbind(0)
     return TripleEdges(relation, subject, object_, torch.ones_like(subject, dtype=torch.bool))
 
 
 def triple_keys(relation: Tensor, subject: Tensor, object_: Tensor, classes: int) -> Tensor:
-    """Return one int64 key for each unit, ordered as (a, i, j)."""
+    """Return one int64 key for each unit. The keys have the same order as the triples (a, i, j)."""
     return (relation * classes + subject) * classes + object_
 
 
 def find_triples(table: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the index of each key in a sorted table, and whether the table contains the key."""
+    """Return the index of each key in a sorted table, and True where the table has the key."""
     if not table.numel():
         return torch.zeros_like(keys), torch.zeros_like(keys, dtype=torch.bool)
     position = torch.searchsorted(table, keys.contiguous()).clamp(max=table.numel() - 1)
     return position, table[position] == keys
 
 
-def present_classes(v: Tensor, leading: Tensor | None = None) -> Tensor:
+def present_classes(v: Tensor, leading: Tensor | None = None, least: int = 0) -> Tensor:
     """Return the classes present in each row of v, (B, n) int64, padded with -1.
 
     Args:
         leading: (B, k) present classes that come first, in the given order.
+        least: least number of columns n.
     """
     # numpy lists the active units several times faster than torch.
-    present = v.detach().numpy() > 0
-    lead = np.zeros((len(v), 0), np.int64) if leading is None else leading.numpy()
+    present = v.detach().cpu().numpy() > 0
+    lead = np.zeros((len(v), 0), np.int64) if leading is None else leading.cpu().numpy()
     rows = np.arange(len(v))[:, None]
     if lead.size:
         present[rows, lead] = False
     row, column = present.nonzero()
     counts = present.sum(1)
     width = lead.shape[1] + int(counts.max(initial=0))
+    width = max(width, least)
     classes = np.full((len(v), width), -1, dtype=np.int64)
     classes[:, : lead.shape[1]] = lead
     place = np.arange(len(row)) - np.repeat(counts.cumsum() - counts, counts)
     classes[row, lead.shape[1] + place] = column
-    return torch.from_numpy(classes)
+    return torch.from_numpy(classes).to(v.device)

@@ -3,7 +3,8 @@
     E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2
                    - sum_t r_t (d_t + g_t v_i + g'_t v_j + U_t·h1)
 
-for t = (a,i,j) among the triples seen in training.
+The sum runs over the triples t = (relation a, subject class i, object class j) seen in training.
+This is the seed form of the energy. `training.machines.machine` also defines the local form.
 """
 
 from __future__ import annotations
@@ -29,14 +30,17 @@ class GBM(RBM):
         self.g = nn.Parameter(torch.zeros(spec.T, 2))
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """Return d_t + g_t v_i + g'_t v_j + U_t·h1."""
+        """Return the logit d_t + g_t v_i + g'_t v_j + U_t·h1 of each relation unit t."""
         subject = v[..., edges.subject[0]]
         object_ = v[..., edges.object[0]]
         two_way = subject * self.g[:, 0] + object_ * self.g[:, 1]
         return super().relation_logits(edges, v, h1) + two_way
 
     def relation_input(self, edges: Edges, r: Tensor) -> Tensor:
-        """Return sum_t r_t (g_t [i is the subject] + g'_t [i is the object]), (..., B, V)."""
+        """Return the sum that active relations add to each object logit, (..., scenes, classes).
+
+        Class i receives sum_t r_t (g_t [i is the subject of t] + g'_t [i is the object of t]).
+        """
         result = r.new_zeros(*r.shape[:-1], self.spec.V)
         result = result.index_add(-1, edges.subject[0], r * self.g[:, 0])
         return result.index_add(-1, edges.object[0], r * self.g[:, 1])
@@ -52,17 +56,18 @@ class GBM(RBM):
         held: Tensor | None = None,
         collapsed: bool = True,
     ) -> Tensor:
-        """Sample v given h1; in the seed form also given r."""
+        """Sample the objects v given h1. In the seed form, v also depends on the relations r."""
         logits = self._object_input(h1)
         if self.relations_act:
             logits = logits + self.relation_input(edges, r)
         return bernoulli(logits.sigmoid_(), generator)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Return the attraction of each candidate i by its relations R_i, (..., B, N).
+        """Return the part of each candidate's log-odds that comes from its unobserved relations.
 
-        In the seed form it is the sum over R_i of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0).
-        In the local form it is 0.
+        The result has the shape (..., scenes, candidates). In the seed form, the part of candidate
+        i is the sum of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0) over the relations of i. In
+        the local form, the part is 0.
         """
         if not self.relations_act:
             return super().attraction(v, h1, edges, candidates)
@@ -82,5 +87,5 @@ class GBM(RBM):
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """Scale as in the RBM; the two-way edges are multiplied by beta."""
+        """Scale the weights as in the RBM, and multiply the two-way weights g by beta."""
         return scale(self, beta, base, keep=("b", "d"))

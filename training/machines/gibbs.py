@@ -1,19 +1,22 @@
-"""Block Gibbs sampling, in which any units can be clamped or unobserved.
+"""Block Gibbs sampling. Any units can be clamped (fixed to their value) or unobserved.
 
-One step samples the blocks in this order:
+One step samples four blocks: the hidden units h1, the hidden units h2, the objects v and the
+relations r. `local` and `seed` are the two forms of the energy (`training.machines.machine`).
 
-    h1 | v, r, h2   factorial in the seed form. In the local form unobserved relations drop out.
-                    Observed relations are handled by Metropolis–Hastings, which proposes blocks of
-                    h1 from p(h1 | v, h2)
-    h2 | h1         factorial
-    v  | h1         RBM and GBM: factorial, given r. Triway: with every unobserved relation summed
-                    out; factorial in the local form, object after object in the seed form
-    r  | v, h1      factorial. If relations imply each other, they are sampled in groups, each group
-                    given the earlier groups (chain rule)
+    h1 | v, r, h2   Seed form: all units are independent. Local form: unobserved relations have no
+                    effect. For observed relations, a Metropolis–Hastings step proposes blocks of h1
+                    from p(h1 | v, h2).
+    h2 | h1         All units are independent.
+    v  | h1         RBM and GBM: all units are independent, given r. Triway: unobserved relations
+                    are summed out. The objects are independent in the local form and are sampled
+                    one after another in the seed form.
+    r  | v, h1      All units are independent. If relations imply each other, they are sampled in
+                    groups. Each group is conditioned on the earlier groups (chain rule).
 
-A plain block sampler cannot leave its state in the gated seed form: while a relation of object i is
-on, p(v_i = 1) = 1. Hence v is sampled with the relations R_i of object i summed out (`collapsed`,
-the default). Contrastive divergence can use the plain kernel, because its single step need not mix.
+In the seed form of a Triway, ordinary block sampling cannot remove an object i while one of its
+relations is on, because then p(v_i = 1) = 1. By default (`collapsed`), v is therefore sampled with
+the relations of object i summed out. Contrastive divergence can sample v without this sum, because
+its chains run for a single step.
 """
 
 from __future__ import annotations
@@ -25,22 +28,31 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from training.machines.bernoulli import bernoulli
+from training.distributed import widest
+from training.machines.bernoulli import bernoulli, integers, uniform
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
 
 _PROPOSAL_BLOCKS = 8
-# Relations that imply each other are sampled in twice this number of groups.
+# Relations that imply each other are sampled in 2 · _RELATION_GROUPS groups.
 _RELATION_GROUPS = 4
-# With fewer chains, or with a larger share of present objects, the dense product is faster.
+# A dense matrix product is faster with fewer chains than _CHAINS, or if the share of present
+# objects exceeds _PRESENT.
 _CHAINS = 16
 _PRESENT = 0.12
 
 
 @dataclass(frozen=True)
 class State:
-    """One state of each chain: v (B, V), r (B, E) over `edges`, h1 (B, H1), h2 (B, H2)."""
+    """The state of several Gibbs chains.
+
+    Attributes:
+        v: presence of objects, (chains, classes).
+        h1, h2: hidden units of each layer, (chains, hidden units).
+        r: values of the relation units, (chains, units).
+        edges: layout of the relation units in r.
+    """
 
     v: Tensor
     h1: Tensor
@@ -51,13 +63,14 @@ class State:
 
 @dataclass(frozen=True)
 class Clamp:
-    """Clamped units and observed relations.
+    """Units that a Gibbs chain keeps at their value, and observed relations.
 
     Attributes:
-        v, h1, h2: bool masks broadcastable to the blocks; None clamps no unit.
-        edges, r, observed: observed relations, as in `Evidence`. In a Triway machine both ends of
-            an observed unit must be clamped as present.
-        room: (B,) int64 room types.
+        v, h1, h2: bool masks of the clamped units, broadcastable to v, h1 and h2 of `State`. None
+            clamps no unit.
+        edges, r, observed: observed relations, as in `Evidence`. In a Triway machine, both objects
+            of an observed relation must be clamped as present.
+        room: index of the room type of each chain, (chains,) int64.
     """
 
     v: Tensor | None = None
@@ -70,11 +83,13 @@ class Clamp:
 
     def __post_init__(self) -> None:
         if len({self.edges is None, self.r is None, self.observed is None}) > 1:
-            raise ValueError("a clamp with observed relations needs all of edges, r and observed")
+            raise ValueError(
+                "Clamp has only some of edges, r and observed; pass all three, or none of them"
+            )
 
     @property
     def relations(self) -> tuple[Edges, Tensor, Tensor] | None:
-        """(edges, r, observed), or None without observed relations."""
+        """Layout, values and observed flags of the observed relations, or None without them."""
         if self.edges is None or self.r is None or self.observed is None:
             return None
         return self.edges, self.r, self.observed
@@ -86,7 +101,10 @@ FREE = Clamp()
 def initial_state(
     machine: BoltzmannMachine, v: Tensor, generator: torch.Generator, clamp: Clamp = FREE
 ) -> State:
-    """Return a state at v, with h1 and h2 sampled from their biases and r given v and h1."""
+    """Return a start state with the objects v.
+
+    The hidden units h1 and h2 are sampled from their biases, and the relations r given v and h1.
+    """
     rows = len(v)
     h1 = bernoulli(machine.context_bias(clamp.room).sigmoid().expand(rows, -1), generator)
     h2 = bernoulli(machine.c2.sigmoid().expand(rows, -1), generator)
@@ -95,7 +113,10 @@ def initial_state(
 
 
 def bare_state(machine: BoltzmannMachine, v: Tensor, h1: Tensor, h2: Tensor) -> State:
-    """Return a state without relations, for the local form, where unobserved relations drop out."""
+    """Return a state with all relations 0, for the local form.
+
+    In the local form, unobserved relations have no effect on the other units.
+    """
     edges = machine.edges(torch.zeros(len(v), 0, dtype=torch.int64))
     return State(v, h1, h2, v.new_zeros(len(v), edges.shape[-1]), edges)
 
@@ -110,11 +131,12 @@ def gibbs_step(
     collapsed: bool = True,
     relations: bool = True,
 ) -> State:
-    """Run one sweep over h1, h2, v and r.
+    """Run one sweep: sample the hidden units h1 and h2, the objects v and the relations r.
 
     Args:
-        collapsed: sample v with its unobserved relations summed out (Triway, seed form).
-        relations: sample r at the end; False keeps the old r if only v matters (local form).
+        collapsed: True sums out the unobserved relations when v is sampled (Triway, seed form).
+        relations: True samples r at the end of the sweep. In the local form, False keeps the old r
+            and saves time if only v is needed.
     """
     h1 = sample_h1(machine, state, generator, clamp)
     state = replace(state, h1=h1)
@@ -131,7 +153,10 @@ def reconstruct(
     collapsed: bool = True,
     relations: bool = True,
 ) -> State:
-    """Run the second half of a Gibbs step: sample h2, v and r given h1."""
+    """Run the second half of a Gibbs step: given h1, sample h2, the objects v and the relations r.
+
+    `gibbs_step` describes the arguments.
+    """
     h1, h2 = state.h1, state.h2
     if machine.spec.H2:
         drawn = bernoulli(machine.second_layer_logits(h1).sigmoid(), generator)
@@ -153,7 +178,7 @@ def run(
     *,
     relations: bool = True,
 ) -> State:
-    """Run `sweeps` Gibbs steps; see `gibbs_step`."""
+    """Run `sweeps` Gibbs steps, and return the last state. `gibbs_step` describes the arguments."""
     for _ in range(sweeps):
         state = gibbs_step(machine, state, generator, clamp, relations=relations)
     return state
@@ -162,7 +187,7 @@ def run(
 def sample_h1(
     machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp = FREE
 ) -> Tensor:
-    """Sample h1 | v, r, h2, (B, H1)."""
+    """Sample the hidden units h1 given v, r and h2, (chains, hidden units)."""
     v, h2 = state.v, state.h2
     second = h2 if machine.spec.H2 else None
     x = presence_product(v, machine.W).add_(machine.context_bias(clamp.room))
@@ -176,26 +201,27 @@ def sample_h1(
         return _keep(clamp.h1, state.h1, bernoulli(prior, generator))
     h1 = state.h1
     weight = _observed_weight(machine, v, h1, given)
-    block = torch.randint(_PROPOSAL_BLOCKS, h1.shape, generator=generator)
+    block = integers(_PROPOSAL_BLOCKS, h1.shape, generator)
     for k in range(_PROPOSAL_BLOCKS):
         proposal = torch.where(block == k, bernoulli(prior, generator), h1)
         proposal = _keep(clamp.h1, h1, proposal)
         new = _observed_weight(machine, v, proposal, given)
-        accept = torch.rand(new.shape, generator=generator, dtype=new.dtype).log() < new - weight
+        accept = uniform(new.shape, generator, new.dtype).log() < new - weight
         h1 = torch.where(accept.unsqueeze(-1), proposal, h1)
         weight = torch.where(accept, new, weight)
     return h1
 
 
 def presence_product(v: Tensor, W: Tensor) -> Tensor:
-    """Return v @ W, (B, H), for binary v (B, V) and W (V, H), as a sum of rows of W.
+    """Return v @ W, (chains, hidden units), for binary v, as a sum of rows of W.
 
-    A scene has about a dozen of some hundred classes, so a dense product mostly multiplies by zero.
+    A scene contains about a dozen of several hundred classes. A dense product therefore consists
+    mostly of multiplications by zero.
     """
     if len(v) < _CHAINS:
         return v @ W
     # numpy lists the active units several times faster than torch.
-    on = np.flatnonzero(v.detach().numpy() != 0)
+    on = np.flatnonzero(v.detach().cpu().numpy() != 0)
     if on.size > _PRESENT * v.numel():
         return v @ W
     chains, classes = v.shape
@@ -217,7 +243,10 @@ def sample_v(
     *,
     collapsed: bool = True,
 ) -> Tensor:
-    """Sample v | h1 with unobserved relations summed out (`collapsed`), else v | h1, r; (B, V)."""
+    """Sample the objects v given the hidden units h1, (chains, classes).
+
+    If `collapsed` is True, unobserved relations are summed out. Otherwise v also depends on r.
+    """
     drawn = machine.sample_objects(
         *(state.v, state.h1, state.r, state.edges, generator), held=clamp.v, collapsed=collapsed
     )
@@ -231,12 +260,13 @@ def sample_relations(
     generator: torch.Generator,
     clamp: Clamp = FREE,
 ) -> tuple[Edges, Tensor]:
-    """Sample r | v, h1 over the units that may be on given v; observed units keep their value.
+    """Sample the relations r given v and h1. Observed relations keep their value.
 
     Returns:
-        The units and r (B, E). In a Triway machine the classes of `clamp.edges` come first.
+        The layout of the relation units that can be 1 given v, and their values r, (chains, units).
+        In a Triway machine, the units between the classes of `clamp.edges` come first.
     """
-    edges, r, known = machine.open_units(v, clamp.relations)
+    edges, r, known = machine.open_units(v, clamp.relations, widest(v, generator))
     logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
     if not machine.spec.G:
         return edges, torch.where(known, r, bernoulli(logits.sigmoid() * gate, generator))
@@ -249,12 +279,12 @@ def sample_relations(
 
 
 def _drawing_order(like: Tensor, generator: torch.Generator) -> Tensor:
-    """Return a random group for each unit (..., n, n).
+    """Return a random group number for each relation unit, (..., n, n) over pairs of classes.
 
-    The units a(i, j) and a(j, i) are always in different groups.
+    The units of relation a from i to j and from j to i are always in different groups.
     """
-    group = torch.randint(_RELATION_GROUPS, like.shape, generator=generator)
-    later = torch.randint(2, like.shape, generator=generator).triu(1)
+    group = integers(_RELATION_GROUPS, like.shape, generator)
+    later = integers(2, like.shape, generator).triu(1)
     later = later + (1 - later.mT).tril(-1)
     return group + _RELATION_GROUPS * later
 
@@ -262,7 +292,7 @@ def _drawing_order(like: Tensor, generator: torch.Generator) -> Tensor:
 def _observed_weight(
     machine: BoltzmannMachine, v: Tensor, h1: Tensor, relations: tuple[Edges, Tensor, Tensor]
 ) -> Tensor:
-    """Return log p(observed r | v, h1), (B,)."""
+    """Return the log-probability of the observed relations given v and h1, (chains,)."""
     edges, r, observed = relations
     logits = machine.relation_logits(edges, v, h1)
     return machine.relation_term(logits, machine.gate(edges, v), r, observed).sum(-1)

@@ -1,9 +1,11 @@
 """Log-odds of objects and relations, from which all scores are computed.
 
-    object    log p(v_i = 1 | rest) - log p(v_i = 0 | rest), with all relations R_i of i unobserved
-    relation  log p(r_e = 1 | rest) - log p(r_e = 0 | rest), with e unobserved
+    object    log p(v_i = 1 | rest) - log p(v_i = 0 | rest)
+    relation  log p(r_e = 1 | rest) - log p(r_e = 0 | rest)
 
-The rest may contain observed and unobserved units. See `Evidence`.
+In the first formula, all relations of object i are unobserved. In the second formula, relation e is
+unobserved. "rest" means all other observed units of the scene (`Evidence`). The energy has two
+forms, seed and local, with different formulas (`training.machines.machine`).
 """
 
 from __future__ import annotations
@@ -22,10 +24,11 @@ from training.machines.mean_field import Evidence, mean_field
 
 
 class _ContextGain(torch.autograd.Function):
-    """Compute G[b,i] = sum_k [softplus(x_bk + W_ik) - softplus(x_bk)] without a (B, V, H1) tensor.
+    """Compute G[b,i] = sum_k [softplus(x_bk + W_ik) - softplus(x_bk)] for scene b and class i.
 
-    The form log(1 + sigmoid(x)(exp(W) - 1)) needs one logarithm for each term; all rows share
-    exp(W). The backward pass recomputes the terms row by row, so it stores one (V, H1) block only.
+    A tensor of shape (scenes, classes, hidden units) would be too large, so the function computes
+    the sum scene by scene. Each term is log(1 + sigmoid(x)(exp(W) - 1)), which needs only one
+    logarithm. All scenes share exp(W). To save memory, the backward pass computes the terms again.
     """
 
     @staticmethod
@@ -33,7 +36,8 @@ class _ContextGain(torch.autograd.Function):
         growth = torch.expm1(W)
         mean = x.sigmoid()
         ctx.save_for_backward(mean, growth)
-        return torch.stack([torch.log1p(growth * row).sum(1) for row in mean])
+        rows = [torch.log1p(growth * row).sum(1) for row in mean]
+        return torch.stack(rows) if rows else mean.new_zeros(0, len(W))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
@@ -43,7 +47,8 @@ class _ContextGain(torch.autograd.Function):
         grad_W = torch.zeros_like(growth)
         scale = growth + 1
         for b, row in enumerate(mean):
-            # Posterior of h1 with i present: sigmoid(x + W) = s e^W / (1 + s (e^W - 1)).
+            # Posterior mean of h1 with object i present, from s = sigmoid(x):
+            # sigmoid(x + W) = s e^W / (1 + s (e^W - 1)).
             posterior = (scale * row).div_(torch.addcmul(torch.ones_like(scale), growth, row))
             weighted = posterior.mul_(gradient[b].unsqueeze(1))
             grad_x[b] = weighted.sum(0) - row * gradient[b].sum()
@@ -52,7 +57,14 @@ class _ContextGain(torch.autograd.Function):
 
 
 def context_gain(x: Tensor, W: Tensor) -> Tensor:
-    """Return sum_k [softplus(x + W_ik) - softplus(x)], (B, V), for hidden logits x (B, H1)."""
+    """Return the log-odds of each object i from the hidden units, (scenes, classes).
+
+    The value is sum_k [softplus(x_k + W_ik) - softplus(x_k)] over hidden units k.
+
+    Args:
+        x: logits of the hidden units, (scenes, hidden units).
+        W: weights between objects and hidden units, (classes, hidden units).
+    """
     gain: Tensor = _ContextGain.apply(x, W)  # type: ignore[no-untyped-call]
     return gain
 
@@ -64,16 +76,17 @@ def object_log_odds(
     candidates: Tensor | None = None,
     pull: float = 1.0,
 ) -> Tensor:
-    """Return the log-odds of candidate objects at the mean-field fixed point, (B, N).
+    """Return mean-field log-odds of absent ("candidate") classes, (scenes, candidates).
 
-    The result is exact for one layer in the local form without observed relations. A second layer
-    h2 stays at its mean-field value. In the seed form, and with observed relations, the result uses
-    a factorial approximation of the context; `presence_log_odds` uses weighted draws instead.
-    Candidates must be absent in `evidence.v`. The result is differentiable.
+    The result is exact in the local form with one hidden layer and without observed relations. With
+    a second layer, h2 stays at its mean-field value. In other cases, the result uses a factorial
+    approximation of the hidden units. `presence_log_odds` uses weighted draws instead. The result
+    is differentiable.
 
     Args:
-        candidates: (B or 1, N) int64; default: all V classes.
-        pull: weight of the observed relations, see `mean_field`.
+        evidence: observed units of the scenes. The candidates must be absent in `evidence.v`.
+        candidates: class indices, (scenes or 1, candidates) int64. The default is all classes.
+        pull: weight of the observed relations, from 0 to 1; see `mean_field`.
     """
     field = mean_field(machine, evidence, pull=pull)
     if candidates is None:
@@ -94,20 +107,21 @@ def presence_log_odds(
     candidates: Tensor,
     draws: HiddenDraws | None = None,
 ) -> Tensor:
-    """Return log p(v_i = 1 | rest) - log p(v_i = 0 | rest) of absent candidates, (B, N).
+    """Return the log-odds of absent ("candidate") classes, (scenes, candidates).
 
-    In the local form without observed relations, this is `object_log_odds`, exact with one layer.
-    Otherwise the formula is
+    In the local form without observed relations, the result is that of `object_log_odds`, which is
+    exact with one hidden layer. Otherwise the formula is
 
         log-odds_i = b_i + G_i + log E_w[exp(W_i·h1 + attraction_i)] - log mean exp(W_i·h1)
 
-    over weighted draws of h1. G_i = log E_q[exp(W_i·h1)] has a closed form under the proposal q of
-    the draws. The last term estimates G_i from the unweighted draws. It is a control variate that
-    cancels the error that both estimates share.
+    E_w is the weighted mean over draws of h1. G_i = log E_q[exp(W_i·h1)] has a closed form, because
+    the draws come from the factorial distribution q. The last term estimates G_i from the
+    unweighted draws. G_i and its estimate are a control variate: their difference cancels a part of
+    the sampling error of E_w.
 
     Args:
-        candidates: (B or 1, N) int64.
-        draws: draws of h1 given the evidence; default: 64 draws.
+        candidates: class indices, (scenes or 1, candidates) int64.
+        draws: draws of h1 given the evidence. The default is 64 new draws.
     """
     if not machine.relations_act and evidence.edges is None:
         return object_log_odds(machine, evidence, candidates=candidates)
@@ -124,15 +138,17 @@ def presence_log_odds(
 def weights_with(
     machine: BoltzmannMachine, evidence: Evidence, draws: HiddenDraws, candidates: Tensor
 ) -> Tensor:
-    """Return weights that turn draws of h1 into draws given one more object.
+    """Return weights that turn draws of h1 into draws given one more present object i.
 
-    p(h1 | rest, v_i = 1) ∝ p(h1 | rest) exp(W_i·h1 + attraction_i(h1)), for one row of evidence.
+    p(h1 | rest, v_i = 1) ∝ p(h1 | rest) exp(W_i·h1 + attraction_i(h1))
 
     Args:
-        candidates: (N,) int64.
+        evidence: the observed units of one scene.
+        draws: draws of h1 given the evidence.
+        candidates: class indices of the added objects, (candidates,) int64.
 
     Returns:
-        (M, N), normalised over M.
+        Weights (draws, candidates). The weights of a candidate sum to 1.
     """
     row = candidates.unsqueeze(0)
     gain = _object_input(machine, draws.h1, row) + _attraction(machine, evidence, draws, row)
@@ -140,7 +156,7 @@ def weights_with(
 
 
 def _object_input(machine: BoltzmannMachine, h1: Tensor, candidates: Tensor) -> Tensor:
-    """W_i·h1, (M, B, N)."""
+    """Return W_i·h1 for each candidate class i, (draws, scenes, candidates)."""
     weights = machine.W[candidates]
     if len(weights) == 1:
         return h1 @ weights[0].T
@@ -150,7 +166,7 @@ def _object_input(machine: BoltzmannMachine, h1: Tensor, candidates: Tensor) -> 
 def _attraction(
     machine: BoltzmannMachine, evidence: Evidence, draws: HiddenDraws, candidates: Tensor
 ) -> Tensor:
-    """Return the contribution of unobserved relations to the log-odds, (M, B, N)."""
+    """Return what unobserved relations add to the log-odds, (draws, scenes, candidates)."""
     if evidence.edges is None:
         return draws.h1.new_zeros(())
     return machine.attraction(evidence.v, draws.h1, evidence.edges, candidates)
@@ -163,24 +179,30 @@ def relation_log_odds(
     *,
     count: int = 64,
 ) -> tuple[Tensor, Tensor]:
-    """Return the log-odds of the unobserved units in `edges`, with standard errors.
+    """Return the log-odds of the unobserved relation units in `edges`, with standard errors.
 
-    p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms. x_e is the shift
-    implied by the observed relations. The log-odds are -inf where the gate is off.
+    p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms of the energy. x_e is
+    the change of the logit of unit e due to the observed relations. In a Triway machine, the
+    log-odds are -inf if an object of the relation is absent.
 
-    Raises:
-        ValueError: the machine has implications (G > 0), and the layout of the observed relations
-            differs from `edges`.
+    Args:
+        count: number of draws of h1.
 
     Returns:
-        (B, E) log-odds and (B, E) standard errors of the log-odds.
+        Log-odds and their standard errors, both (scenes, units).
+
+    Raises:
+        ValueError: the machine has implication weights (G > 0), and the observed relations have a
+            layout other than `edges`.
     """
     draws = draw_hidden(machine, evidence, draws=count)
     logits = machine.relation_logits(edges, evidence.v, draws.h1)
     relations = evidence.relations(machine)
     if machine.spec.G and relations is not None:
         if relations[0] is not edges:
-            raise ValueError("the observed relations must have the same layout as edges")
+            raise ValueError(
+                "the layout of the observed relations differs from edges; pass evidence.edges"
+            )
         logits = logits + draws.implied(machine, edges, relations[1] * relations[2])
     on = logits.sigmoid()
     p = draws.mean(on)
@@ -190,21 +212,29 @@ def relation_log_odds(
 
 
 def relation_log_odds_observed(machine: BoltzmannMachine, evidence: Evidence) -> Tensor:
-    """Return log-odds of every unit given all other units, in closed form (seed form), (B, E).
+    """Return the log-odds of each relation unit given all other units, (scenes, units).
 
-        ℓ⁰_e + sum_k [softplus(x_k + U_ek) - softplus(x_k)],   x without e
+    In the seed form, the log-odds of unit e have a closed form:
 
-    The result is exact for one layer. With two layers, h2 stays at its mean-field value given all
-    relations.
+        ℓ⁰_e + sum_k [softplus(x_k + U_ek) - softplus(x_k)].
+
+    ℓ⁰_e is the logit at h1 = 0, and x the hidden logits without unit e. The result is exact for one
+    hidden layer. With two layers, h2 stays at its mean-field value given all relations.
 
     Raises:
-        ValueError: the machine has the local form, or a unit is unobserved.
+        ValueError: the machine has the local form, or a relation is unobserved.
     """
     if not machine.relations_act:
-        raise ValueError("relation log-odds have a closed form only in a machine of the seed form")
+        raise ValueError(
+            "the machine has the local form; the closed form of relation log-odds needs a machine "
+            "of the seed form"
+        )
     relations = evidence.relations(machine)
     if relations is None or not bool(relations[2].all()):
-        raise ValueError("the closed form of relation log-odds needs every relation unit observed")
+        raise ValueError(
+            "a relation is unobserved; the closed form of relation log-odds needs all relations "
+            "observed"
+        )
     edges, r, _ = relations
     field = mean_field(machine, evidence)
     context = machine.relation_context(edges)

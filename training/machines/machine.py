@@ -2,20 +2,21 @@
 
     E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_e r_e ℓ_e(v,h1)
 
-The sum runs over the variant's relation units e = (a,i,j). A variant defines the existing units,
-the gate that allows a unit to be on, and the logit ℓ_e. All other terms are defined here. If a room
-type t is given, c1 means c1 + Q[t]. The room type is a condition, not a unit of the model.
+The sum runs over the relation units e = (a,i,j) of the machine variant. A variant defines its
+relation units, the gate of a unit and the logit ℓ_e. A gate of 0 forces its unit to 0. This module
+defines all other terms. If a room type t is given, c1 means c1 + Q[t]. The model is conditioned on
+the room type, so the room type has no unit.
 
-Every variant has two forms of the relation part:
+Every variant has two forms of the relation part of the energy. A unit with an open gate adds:
 
-    seed    - r_e ℓ_e - κ_a         for every active unit
+    seed    - r_e ℓ_e - κ_a
     local   - r_e ℓ_e + log(1 + exp ℓ_e)
 
-Both forms have the same p(r | v, h1). In the local form, unobserved relations drop out of all other
-conditionals. The seed form keeps the paper's energy. Its κ (0 in the paper) compensates for the
-attraction that a summed-out relation has on its two objects.
+Both forms have the same p(r | v, h1). In the local form, unobserved relations have no effect on
+other units. The seed form is the energy of the paper. A relation that is summed out in the seed
+form raises the probability of its two objects. The weight κ (0 in the paper) compensates for this.
 
-Shapes: leading sample dimensions first, then scenes B, then units. Energies have the leading shape.
+Tensor dimensions: "..." stands for samples. They come first, then scenes, then units.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ from training.machines.edges import Edges, PairEdges, triple_keys
 
 
 class BoltzmannMachine(nn.Module, ABC):
-    """A Boltzmann machine over objects v, relations r and context h1, h2.
+    """A Boltzmann machine over objects v, relations r and hidden units h1 and h2.
 
     Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
     """
 
-    # True if triples have their own weights beside the shared ones; `objectives.relations` may fit
-    # them.
+    # True if single triples have residual weights besides the shared weights. The objective
+    # `objectives.relations` can fit the residual weights.
     has_residuals = False
 
     def __init__(self, spec: MachineSpec) -> None:
@@ -54,7 +55,8 @@ class BoltzmannMachine(nn.Module, ABC):
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         self.triples: Tensor
         if spec.N:
-            # N chain samples as bits, (N, ceil(V / 32)), and their room types, -1 for unknown.
+            # Stored chain samples as bits, (samples, words of 32 classes), and their room types. A
+            # room type of -1 is unknown.
             empty = torch.zeros(spec.N, -(-spec.V // 32), dtype=torch.int32)
             self.register_buffer("fantasies", empty)
             self.register_buffer("fantasy_rooms", torch.full((spec.N,), -1, dtype=torch.int32))
@@ -70,26 +72,32 @@ class BoltzmannMachine(nn.Module, ABC):
     def index_triples(self) -> None:
         """Check the table of triples and build its search keys."""
         table = self.triples.long()
-        limits = torch.tensor([self.spec.A, self.spec.V, self.spec.V])
+        limits = torch.tensor([self.spec.A, self.spec.V, self.spec.V], device=table.device)
         if bool((table < 0).any()) or bool((table >= limits).any()):
-            raise ValueError("triples must hold (a, i, j) within (A, V, V)")
+            raise ValueError(
+                "the table of triples has an index out of range; (a, i, j) must be below (A, V, V)"
+            )
         relation, subject, object_ = table.unbind(1)
         keys = triple_keys(relation, subject, object_, self.spec.V)
         if bool((keys[1:] <= keys[:-1]).any()):
-            raise ValueError("triples must be distinct and sorted by (a, i, j)")
+            raise ValueError(
+                "the table of triples is not strictly sorted; sort it by (a, i, j) without repeats"
+            )
         self.triple_keys = keys
 
     def set_triples(self, triples: Tensor) -> Self:
-        """Set the triples (a, i, j) that have their own weights; (T, 3), distinct and sorted."""
+        """Set the triples (a, i, j) that have their own weights: (triples, 3), sorted, distinct."""
         if tuple(triples.shape) != (self.spec.T, 3):
-            raise ValueError(f"triples must be ({self.spec.T}, 3), not {tuple(triples.shape)}")
+            raise ValueError(
+                f"triples have the shape {tuple(triples.shape)}; expected ({self.spec.T}, 3)"
+            )
         self.triples.copy_(triples)
         self.index_triples()
         return self
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator, scale: float = 0.01) -> Self:
-        """Draw the matrices from N(0, scale²); biases are unchanged."""
+        """Draw the weight matrices from N(0, scale²). Biases keep their values."""
         for parameter in self.parameters():
             if parameter.dim() > 1:
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
@@ -97,12 +105,13 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
-        """Set relation biases to the log-odds seen in training.
+        """Set relation biases to log-odds of the training data.
 
         Args:
-            by_relation: (A,) log-odds that an observed relation holds.
-            by_unit: (T,) log-odds of each triple of the table in scenes with relations.
-            usual: (V,) mean log of the instances of each class.
+            by_relation: log-odds that an observed relation holds, (relations,).
+            by_unit: log-odds that a triple of the table holds in a scene with annotated relations,
+                (triples,).
+            usual: mean log number of instances of each class, (classes,).
         """
 
     @property
@@ -117,112 +126,140 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the relation units between the given classes of each scene.
 
         Args:
-            classes: (B, n) int64, -1 where padded.
-            counts: (B, n) instances of each class, 0 where unknown; default: one each.
+            classes: class indices, (scenes, n) int64. Padding is -1.
+            counts: number of instances of each class, (scenes, n). 0 means that the number is
+                unknown. The default is one instance of each class.
         """
 
     @abstractmethod
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """Return the machine's units, and for each pair the index of its unit and if it has a unit.
+        """Find the machine's unit for each relation in `pairs`.
 
-        The last two have shape (B, A·n·m). For a pair without a unit, the index is arbitrary.
+        Returns:
+            Three values: the units of the machine, the index of the unit of each relation, and True
+            where the machine has a unit for the relation. The last two have the shape (scenes,
+            relations of `pairs`). Where the last value is False, the index is arbitrary.
         """
 
     @abstractmethod
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relations between classes as (edges, r, observed) in this machine's layout.
+        """Return the relations between classes in the layout of this machine.
 
-        In an ungated machine the units of absent classes are off. They count as observed if the
-        scene has any annotated relation.
+        The result is (edges, r, observed): layout, values and observed flags of the relation units.
+        In an RBM or GBM, the units of absent classes are 0. They count as observed if the scene has
+        any annotated relation.
 
         Args:
-            classes, counts: (B, n), as in `edges`.
-            holds, observed: (B, A, n, n).
+            classes, counts: class indices and numbers of instances, (scenes, n), as in `edges`.
+            holds: values of the relations between the classes, (scenes, relations, n, n).
+            observed: True where the relation is observed, (scenes, relations, n, n).
         """
 
     @abstractmethod
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the units that may be on given v, as (edges, r, observed).
+        """Return the relation units that can be 1 given the objects v.
 
         r contains the values of the given units.
+
+        Args:
+            least: least number of classes between which there are units, with padding.
         """
 
     @abstractmethod
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the gates (..., B, E): 1 if a unit may be on given v (..., B, V), else 0."""
+        """Return the gate of each unit, (..., scenes, units).
+
+        The gate is 1 if the unit can be 1 given the objects v, else 0.
+        """
 
     @abstractmethod
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """Return the relation logits ℓ_e(v, h1), (..., B, E).
+        """Return the logit ℓ_e(v, h1) of each relation unit e, (..., scenes, units).
 
         Args:
-            h1: (..., B, H1), binary states or means.
+            h1: binary states or means of the hidden units, (..., scenes, hidden units).
         """
 
     @abstractmethod
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """Return sum_e weight_e U_e, (..., B, H1), for weight (..., B, E)."""
+        """Return sum_e weight_e U_e, the input of relations to h1, (..., scenes, hidden units).
+
+        Args:
+            weight: factor of each relation unit, (..., scenes, units).
+        """
 
     def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sum_e r_e ℓ_e(v, 0), (..., B), and sum_e r_e U_e, (..., B, H1)."""
+        """Return sum_e r_e ℓ_e(v, 0) and sum_e r_e U_e over relation units e.
+
+        The shapes are (..., scenes) and (..., scenes, hidden units).
+        """
         bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
         return (r * bare).sum(-1), self.hidden_input(edges, r)
 
     def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """Return the logit shifts (B, E) that given relations imply for others; see `triway`.
+        """Return the change of each relation logit due to the given relations, (scenes, units).
 
-        The shifts are zero in machines without implication weights.
+        The change is zero in a machine without implication weights (`training.machines.triway`).
 
         Args:
-            given: (B, E), 1 where a unit is given as on.
-            h1: (B, H1) means given the objects.
-            apart: leave out the implications between relations of the same two classes.
+            given: given relations, (scenes, units). 1 means that the relation holds.
+            h1: means of the hidden units given the objects, (scenes, hidden units).
+            apart: True leaves out the effects between relations of the same two classes.
         """
         del edges, h1, apart
         return torch.zeros_like(given)
 
     @abstractmethod
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return the context weights U_e of every unit, (B or 1, E, H1); pass few units only."""
+        """Return the weights U_e between each relation unit e and the hidden units h1.
+
+        The result has the shape (scenes or 1, units, hidden units). It is large, so pass few units.
+        """
 
     @abstractmethod
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Return the log-odds that summing out the unobserved relations R_i adds to candidate i.
+        """Return the part of each candidate's log-odds that comes from its unobserved relations.
 
         Args:
-            v: (..., B, V); each candidate counts as absent.
-            h1: (..., B, H1).
-            edges: the units of the scene; units of a candidate are unobserved.
-            candidates: (B or 1, N) int64.
+            v: presence of objects, (..., scenes, classes). Each candidate counts as absent.
+            h1: hidden units, (..., scenes, hidden units).
+            edges: relation units of the scene. The units of a candidate are unobserved.
+            candidates: class indices, (scenes or 1, candidates) int64.
 
         Returns:
-            (..., B, N): log sum_{R_i} exp(-E) at v_i = 1, minus the same at v_i = 0, given h1,
-            without the object part b_i + W_i·h1.
+            Part of the log-odds of each candidate i, (..., scenes, candidates). The part is
+            log sum_{R_i} exp(-E) at v_i = 1 minus log sum_{R_i} exp(-E) at v_i = 0, given h1. R_i
+            are the relations of i. The terms b_i + W_i·h1 are left out.
         """
 
     @abstractmethod
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return values (B, E) of units as a table (B, A, n, n) over classes; -inf without a unit.
+        """Return values of relation units as a table over pairs of n classes.
+
+        The table has the shape (scenes, relations, n, n). The value of a relation without a unit is
+        -inf.
 
         Args:
-            classes: (B, n) int64, -1 where padded; `edges` has the units between these classes.
+            edges: the relation units between `classes`.
+            values: values of the relation units, (scenes, units).
+            classes: class indices, (scenes, n) int64. Padding is -1.
         """
 
     @property
     def relations_act(self) -> bool:
-        """Whether unobserved relations act on objects and context; never in the local form."""
+        """True if unobserved relations affect objects and hidden units (seed form only)."""
         return not self.spec.is_local
 
     @abstractmethod
     def acting_units(self, v: Tensor) -> Edges | None:
-        """Return the unobserved units that act on objects; None in the local form."""
+        """Return the unobserved relation units that affect objects. The local form returns None."""
 
     def context_units(self, edges: Edges) -> Edges | None:
-        """Return the unobserved units that act on the context while relations are trained."""
+        """Return the unobserved relation units that affect h1 while relations are trained."""
         del edges
         return None
 
@@ -237,11 +274,13 @@ class BoltzmannMachine(nn.Module, ABC):
         held: Tensor | None = None,
         collapsed: bool = True,
     ) -> Tensor:
-        """Sample v given h1 and, in forms where r acts on v, given r, (B, V); see `gibbs`.
+        """Sample the objects v given the hidden units h1, (scenes, classes); see `gibbs`.
+
+        In some forms of the energy, v also depends on the relations r.
 
         Args:
-            held: bool, broadcastable to v; held objects keep their value while others are sampled.
-            collapsed: sum out unobserved relations that act on objects.
+            held: bool, broadcastable to v. True marks objects that keep their value.
+            collapsed: True sums out the unobserved relations that affect objects.
         """
         del v, r, edges, held, collapsed
         return bernoulli(self._object_input(h1).sigmoid_(), generator)
@@ -251,30 +290,31 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.addmm(self.b, h1, self.W.T)
 
     def begin_independent(self, machine: BoltzmannMachine) -> None:
-        """Set this machine's relation weights to those of `machine` at beta = 0, see `scaled`."""
+        """Set the relation weights to those of `machine.scaled(beta=0)`."""
 
     def relation_log_partition(self) -> float:
-        """Return the part of log Z that relation units contribute at beta = 0, see `scaled`."""
+        """Return the contribution of the relation units to log Z at beta = 0 (`scaled`)."""
         return 0.0
 
     @abstractmethod
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """Return the machine at beta on the path from `base` (beta = 0) to this machine (beta = 1).
+        """Return a machine between `base` (beta = 0) and this machine (beta = 1).
 
-        The base has independent objects.
-
-        Without a base, beta multiplies every logit. This is the machine at temperature 1 / beta.
+        The objects of `base` are independent. Without a base, beta multiplies every logit: the
+        result is this machine at temperature 1 / beta.
         """
 
     # -- the relation part ----------------------------------------------------------------------
 
     def relation_term(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Return each unit's part of log sum_{unobserved r} exp(-E), given h1; (..., B, E).
+        """Return the term of each relation unit in log sum_{unobserved r} exp(-E), given h1.
+
+        The result has the shape (..., scenes, units).
 
         Args:
-            logits, gate: ℓ_e and the gate, (..., B, E).
-            r: values of the observed units; ignored where unobserved.
-            observed: bool, broadcastable to logits.
+            logits, gate: logit ℓ_e and gate of each relation unit, (..., scenes, units).
+            r: values of the observed relations. Values of unobserved relations are ignored.
+            observed: bool, broadcastable to `logits`.
         """
         summed = softplus(logits)
         if not self.relations_act:
@@ -282,7 +322,7 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.where(observed, r * logits, summed) * gate
 
     def relation_slope(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Return the derivative of `relation_term` by the logit, (..., B, E)."""
+        """Return the derivative of `relation_term` by the logit ℓ_e, (..., scenes, units)."""
         mean = logits.sigmoid()
         if not self.relations_act:
             return torch.where(observed, r - mean, 0.0) * gate
@@ -291,7 +331,11 @@ class BoltzmannMachine(nn.Module, ABC):
     # -- energies -------------------------------------------------------------------------------
 
     def context_bias(self, room: Tensor | None) -> Tensor:
-        """Return c1 + Q[t], (B or 1, H1); room is (B,) int64, -1 where the room type is unknown."""
+        """Return the bias c1 + Q[t] of the hidden units, (scenes or 1, hidden units).
+
+        Args:
+            room: index t of the room type of each scene, (scenes,) int64. -1 means unknown.
+        """
         if room is None or not self.spec.C:
             return self.c1.unsqueeze(0)
         return self.c1 + self.Q[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
@@ -305,7 +349,10 @@ class BoltzmannMachine(nn.Module, ABC):
         edges: Edges,
         room: Tensor | None = None,
     ) -> Tensor:
-        """Return E(v, r, h1, h2), shape (..., B); +inf if a unit is on and its gate is off."""
+        """Return the energy E(v, r, h1, h2), (..., scenes).
+
+        The energy is +inf if a relation unit with gate 0 is 1.
+        """
         gate = self.gate(edges, v)
         logits = self.relation_logits(edges, v, h1)
         observed = torch.ones_like(gate, dtype=torch.bool)
@@ -314,12 +361,15 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.where((r > gate).any(-1), torch.inf, energy)
 
     def object_energy(self, v: Tensor, h1: Tensor, h2: Tensor, room: Tensor | None) -> Tensor:
-        """Return the energy without relations, (..., B)."""
+        """Return the energy without the terms of relations, (..., scenes)."""
         context = (h1 * (self.context_bias(room) + v @ self.W)).sum(-1)
         return -(v @ self.b + h2 @ self.c2 + context + ((h1 @ self.J) * h2).sum(-1))
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the sum of κ_a over active units, (..., B); 0 unless the seed form has κ."""
+        """Return the sum of κ_a over relation units with an open gate, (..., scenes).
+
+        The sum is 0 in a machine without κ.
+        """
         return v.new_zeros(v.shape[:-1])
 
     def hidden_logits(
@@ -330,10 +380,10 @@ class BoltzmannMachine(nn.Module, ABC):
         h2: Tensor | None = None,
         room: Tensor | None = None,
     ) -> Tensor:
-        """Return x = c1 + v'W + sum_e r_e U_e + J h2.
+        """Return the logits x = c1 + v'W + sum_e r_e U_e + J h2 of the hidden units h1.
 
-        In the seed form p(h1 = 1 | v, r, h2) = sigmoid(x). In the local form relations affect h1
-        only through the weights of draws (`draw_hidden`), so pass zeros for r.
+        In the seed form p(h1 = 1 | v, r, h2) = sigmoid(x). In the local form, pass zeros for r:
+        `draw_hidden` accounts for relations by weights of the draws.
         """
         x = self.context_bias(room) + v @ self.W + self.hidden_input(edges, r)
         return x if h2 is None else x + h2 @ self.J.T
@@ -346,17 +396,20 @@ class BoltzmannMachine(nn.Module, ABC):
         h2: Tensor | None = None,
         room: Tensor | None = None,
     ) -> Tensor:
-        """Return F = -log sum_{h1} exp(-E), shape (..., B), where a closed form exists.
+        """Return the free energy F = -log sum_{h1} exp(-E), (..., scenes), in closed form.
 
-        In the seed form, every unit of `edges` is observed as r and other units are off. In the
-        local form, every relation is unobserved (r = None), and F is exact. A machine with a second
-        layer needs its state h2.
+        In the seed form, r contains the observed values of all units in `edges`. Other units are 0.
+        In the local form, all relations must be unobserved (r = None). A machine with a second
+        hidden layer needs the state h2 of that layer.
 
         Raises:
-            ValueError: there is no closed form.
+            ValueError: the free energy has no closed form for these arguments.
         """
         if self.spec.H2 and h2 is None:
-            raise ValueError("the free energy has no closed form over a second layer: pass h2")
+            raise ValueError(
+                "the free energy of a machine with two hidden layers has a closed form only given "
+                "h2: pass h2"
+            )
         if not self.relations_act:
             if r is not None:
                 raise ValueError(
@@ -376,9 +429,12 @@ class BoltzmannMachine(nn.Module, ABC):
     def free_energy_given(
         self, v: Tensor, context: Tensor, h2: Tensor | None = None, room: Tensor | None = None
     ) -> Tensor:
-        """Return -log sum_{h1} exp(-E) of the object part, with context (..., B, H1) added to x.
+        """Return the free energy of the object part, (..., scenes).
 
-        -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k, shape (..., B).
+        The value is -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k.
+
+        Args:
+            context: addition to the logits of the hidden units h1, (..., scenes, hidden units).
         """
         free = -(v @ self.b)
         x = self.context_bias(room) + v @ self.W + context
@@ -389,9 +445,12 @@ class BoltzmannMachine(nn.Module, ABC):
     # -- conditionals of the other blocks -------------------------------------------------------
 
     def second_layer_logits(self, h1: Tensor) -> Tensor:
-        """Return c2 + h1'J, (..., B, H2): the logits of p(h2 = 1 | h1)."""
+        """Return the logits c2 + h1'J of p(h2 = 1 | h1), (..., scenes, units of h2)."""
         return self.c2 + h1 @ self.J
 
     def object_logits(self, h1: Tensor) -> Tensor:
-        """Return b + W h1, (..., B, V): log-odds of v_i given h1, without the relations of i."""
+        """Return the log-odds b + W h1 of each object given h1, (..., scenes, classes).
+
+        The contributions of relations are left out.
+        """
         return self.b + h1 @ self.W.T

@@ -1,12 +1,15 @@
 """Mean field: the factorial approximation of p(h1, h2 | v, observed r).
 
-The iteration starts with h2 at its prior and alternates, with damping:
+The means m1 of h1 and m2 of h2 are updated in turn, with damping. At the start, m2 is the prior
+mean of h2.
 
     m2 = sigmoid(c2 + m1'J),   y = c1 + v'W + J m2 + sum_e slope_e(m1) U_e,   m1 = sigmoid(y)
 
-slope_e is r_e for an observed unit of the seed form. For other units it is the derivative of the
-relation term by its logit. With one layer, the result is exact in two cases: all relations are
-observed (seed form), or all relations are unobserved (local form).
+The energy has two forms, seed and local (`training.machines.machine`). In the seed form, slope_e is
+r_e for an observed relation unit e. For other units, slope_e is the derivative of
+`BoltzmannMachine.relation_term` with respect to the logit. With one hidden layer, the result is
+exact in two cases: a seed form with all relations observed, and a local form with all relations
+unobserved.
 """
 
 from __future__ import annotations
@@ -23,14 +26,15 @@ from training.machines.machine import BoltzmannMachine
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence of B scenes: the observed values of their units.
+    """The evidence of some scenes: their observed objects, relations and room types.
 
     Attributes:
-        v: (B, V) presence.
-        edges: the relation units that may be on.
-        r: (B, E) values of the observed units, 0 elsewhere.
-        observed: (B, E) bool.
-        room: (B,) int64 room types, -1 where unknown; None if all are unknown.
+        v: presence of objects, (scenes, classes).
+        edges: layout of the relation units that can be 1.
+        r: values of the observed relations, (scenes, units). Unobserved relations are 0.
+        observed: True where a relation is observed, (scenes, units) bool.
+        room: index of each scene's room type, (scenes,) int64. -1 means unknown. None means that
+            all room types are unknown.
     """
 
     v: Tensor
@@ -40,10 +44,10 @@ class Evidence:
     room: Tensor | None = None
 
     def relations(self, machine: BoltzmannMachine) -> tuple[Edges, Tensor, Tensor] | None:
-        """Return (edges, r, observed), or None if relations do not affect the context.
+        """Return layout, values and observed flags of the relation units.
 
-        In the local form unobserved relations drop out, so only observed relations affect the
-        context.
+        The result is None if relations do not affect the hidden units. In the local form, only
+        observed relations affect the hidden units.
         """
         if self.edges is None or not self.edges.shape[-1]:
             return None
@@ -60,7 +64,10 @@ class Evidence:
 
 @dataclass(frozen=True)
 class MeanField:
-    """The fixed point: logits of h1 with (y) and without relations (x), and means of h2."""
+    """The mean-field fixed point of the hidden units.
+
+    y contains the logits of h1, x the logits of h1 without relations, and h2 the means of h2.
+    """
 
     y: Tensor
     x: Tensor
@@ -75,13 +82,13 @@ def mean_field(
     damping: float = 0.8,
     pull: float = 1.0,
 ) -> MeanField:
-    """Return a fixed point of h1 and h2 given the evidence, differentiable in the weights.
+    """Return the mean-field fixed point of h1 and h2, differentiable in the weights.
 
     Args:
-        iterations: number of sweeps over both layers.
-        damping: share of the old relation slopes that a sweep keeps.
-        pull: weight of the observed relations; it interpolates between the fixed point without
-            relations (0) and the fixed point with all of them (1).
+        iterations: number of sweeps over both hidden layers.
+        damping: share of the previous slope_e that remains after a sweep; see the module.
+        pull: weight of the observed relations. The result interpolates between the fixed point
+            without relations (0) and the fixed point with all relations (1).
     """
     if pull < 1 and evidence.relations(machine) is not None:
         without = mean_field(machine, unobserved(evidence), iterations=iterations, damping=damping)
@@ -99,8 +106,8 @@ def mean_field(
     if two_layers:
         h2 = machine.c2.sigmoid().expand(len(base), -1)
         x = torch.addmm(base, h2, machine.J.T)
-    # Contribution of relations to x. In the seed form it is linear in r if all relations are
-    # observed.
+    # `added` is the contribution of relations to the hidden logits. In the seed form with all
+    # relations observed, it is linear in r.
     added = gate = base.new_zeros(())
     slopes = None
     if relations is not None:
@@ -122,7 +129,7 @@ def mean_field(
 
 
 def unobserved(evidence: Evidence) -> Evidence:
-    """Return the evidence with every relation unobserved."""
+    """Return a copy of the evidence in which every relation is unobserved."""
     if evidence.observed is None:
         return evidence
     return replace(evidence, observed=torch.zeros_like(evidence.observed))

@@ -1,9 +1,9 @@
-"""Lower and upper estimates of log Z by annealed importance sampling (AIS).
+"""Estimates of the log-partition function log Z by annealed importance sampling (AIS).
 
-The path runs over machines of the same family (`BoltzmannMachine.scaled`). It starts at beta = 0
-with independent objects, whose log Z is exact, and ends at the machine itself at beta = 1. Forward
-runs give a lower bound in expectation, E[log w] ≤ log Z. Reverse runs start from samples of the
-machine and give an upper bound.
+AIS moves chains through machines between a base (beta = 0) and the machine (beta = 1), as returned
+by `BoltzmannMachine.scaled`. The objects of the base are independent, so its log Z is exact. For
+forward runs, the expected log weight is a lower bound: E[log w] ≤ log Z. Reverse runs start from
+samples of the machine and give an upper bound.
 
 Sources: Neal, "Annealed importance sampling" (2001); Salakhutdinov and Murray, "On the quantitative
 analysis of deep belief networks" (2008); Burda, Grosse and Salakhutdinov, "Accurate and
@@ -32,11 +32,11 @@ class LogPartition:
     """An estimate of log Z.
 
     Attributes:
-        log_z: log of the mean weight (forward), or minus the log of the mean inverse weight
-            (reverse).
+        log_z: estimate of log Z. Forward runs use the log of the mean weight w over chains. Reverse
+            runs use minus the log of the mean inverse weight.
         standard_error: standard error of log_z, by the delta method over chains.
-        bound: mean of log w over chains; in expectation below log Z (forward) or above it
-            (reverse).
+        bound: mean of log w over chains. In expectation, it is a lower bound of log Z for forward
+            runs, and an upper bound for reverse runs.
     """
 
     log_z: float
@@ -45,12 +45,12 @@ class LogPartition:
 
     @classmethod
     def of_weights(cls, base: float, log_weight: Tensor, *, reverse: bool = False) -> LogPartition:
-        """Return the estimate from the log weights (chains,) of forward or reverse runs.
+        """Return the estimate from the log weights of forward or reverse runs.
 
         Args:
-            base: log Z of the base.
-            log_weight: log weights, accumulated along the path in the direction of the runs.
-            reverse: True if the runs end at the base; False if they start there.
+            base: exact log Z of the base machine (beta = 0).
+            log_weight: accumulated log weight of each run, (chains,).
+            reverse: True if the runs end at the base machine, False if the runs start there.
         """
         sign, count = (-1 if reverse else 1), len(log_weight)
         mean = float(log_weight.logsumexp(0)) - math.log(count)
@@ -60,10 +60,13 @@ class LogPartition:
 
 
 def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> BoltzmannMachine:
-    """Return the machine at beta = 0: independent objects with log-odds b (default: the machine's).
+    """Return the base machine at beta = 0, which has independent objects.
 
     The relation units of an RBM or GBM keep their bias d. The relation units of a Triway contribute
     a factor of one to Z.
+
+    Args:
+        b: log-odds of the objects, (classes,). The default is the bias b of the machine.
     """
     base = build(machine.spec).to(machine.b.dtype).requires_grad_(False)
     with torch.no_grad():
@@ -87,7 +90,7 @@ def ais(
     generator: torch.Generator,
     base: BoltzmannMachine | None = None,
 ) -> LogPartition:
-    """Run forward AIS over increasing betas from 0 to 1."""
+    """Run forward AIS through the machines at `betas`, which increase from 0 to 1."""
     _check(betas)
     base = independent_base(machine) if base is None else base
     start = machine.scaled(0.0, base)
@@ -110,7 +113,10 @@ def reverse_ais(
     generator: torch.Generator,
     base: BoltzmannMachine | None = None,
 ) -> LogPartition:
-    """Run reverse AIS from samples of the machine (`state`), over the same increasing betas."""
+    """Run reverse AIS. The chains start at `state`, which contains samples of the machine.
+
+    Pass `betas` in increasing order, as for `ais`.
+    """
     _check(betas)
     base = independent_base(machine) if base is None else base
     log_weight = torch.zeros(len(state.v), dtype=torch.float64)
@@ -133,4 +139,4 @@ def _free_energy(machine: BoltzmannMachine, state: State) -> Tensor:
 def _check(betas: Sequence[float]) -> None:
     rising = all(x < y for x, y in pairwise(betas))
     if len(betas) < 2 or betas[0] != 0 or betas[-1] != 1 or not rising:
-        raise ValueError("betas must rise strictly from 0 to 1")
+        raise ValueError("betas do not increase strictly from 0 to 1; pass such a sequence")

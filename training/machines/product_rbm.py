@@ -1,10 +1,10 @@
-"""An RBM for comparisons: it has the Triway's shared weights (factors) but no tri-way edges.
+"""An RBM for comparisons, with the factorised weights of the Triway but without tri-way edges.
 
     E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
     U_t = P[a] + sum_k S[i,k] M[a,k] O[j,k]
 
-The sum runs over the triples t = (a,i,j) seen in training. Relations have no gate, as in the RBM.
-Their context weights share the factors S, O, M and P, as in the Triway.
+The sum runs over the triples t = (a,i,j) seen in training. As in the RBM, relation units have no
+gate. As in the Triway, the weights U between relations and h1 are products of S, O, M and P.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from training.machines.rbm import RBM, scale
 
 
 class ProductRBM(RBM):
-    """The RBM with logits ℓ_t = d_t + U_t·h1 and factorised U."""
+    """An RBM whose relation logits ℓ_t = d_t + U_t·h1 have factorised weights U."""
 
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__(spec)
@@ -31,10 +31,10 @@ class ProductRBM(RBM):
         self.P = nn.Parameter(torch.zeros(spec.A, spec.H1))
 
     def context_weights(self) -> Tensor:
-        """Return U, (T, H1), computed from the factors."""
+        """Return the weights U, (triples, hidden units), computed from the factors."""
         relation, subject, object_ = self.triples.long().unbind(1)
         product = self.S[subject] * self.O[object_]
-        # The table is sorted by relation, so each relation needs one (T_a, K) by (K, H1) product.
+        # The triples are sorted by relation, so one matrix product for each relation is enough.
         sizes = torch.bincount(relation, minlength=self.spec.A).tolist()
         rows = [
             part @ M + P for part, M, P in zip(product.split(sizes), self.M, self.P, strict=True)
@@ -43,5 +43,5 @@ class ProductRBM(RBM):
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """Scale as in the RBM; U scales with M and P."""
+        """Scale the weights as in the RBM. Scaling M and P also scales U."""
         return scale(self, beta, base, keep=("b", "d"), fixed=("S", "O"))

@@ -1,9 +1,10 @@
-"""The restricted Boltzmann machine of the seed paper: objects and relations on one hidden layer.
+"""The restricted Boltzmann machine (RBM) of the paper: one hidden layer for objects and relations.
 
     E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
 
-Only triples t = (a,i,j) seen in training have a unit; all other relations are always off. Units
-have no gate: only the context connects r_t to its two objects.
+Only triples t = (a,i,j) seen in training have a relation unit. All other relations are always 0.
+The units have no gate, so r_t depends on its two objects only through the hidden units h1. This is
+the seed form of the energy. `training.machines.machine` also defines the local form.
 """
 
 from __future__ import annotations
@@ -37,26 +38,26 @@ class RBM(BoltzmannMachine):
 
     @torch.no_grad()
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
-        """Set d to the log-odds of each unit."""
+        """Set the bias d_t to the training log-odds of each relation unit t."""
         self.d.copy_(by_unit)
 
     def context_weights(self) -> Tensor:
-        """Return U, (T, H1)."""
+        """Return the weights U between relation units and h1, (triples, hidden units)."""
         return self.U
 
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
-        """Return all T units, independent of the classes."""
+        """Return all relation units of the machine, whatever the classes are."""
         return triple_edges(self.triples)
 
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """Look up the pairs in the table of triples."""
+        """Find the relations of `pairs` in the table of triples."""
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         return triple_edges(self.triples), *find_triples(self.triple_keys, keys)
 
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Lay out the relations; relations without a unit are dropped."""
+        """Return the relations in this machine's layout. Relations without a unit are left out."""
         pairs = pair_edges(classes, holds.shape[1])
         edges, position, found = self.places(pairs)
         row, slot = (found & pairs.valid).nonzero(as_tuple=True)
@@ -69,9 +70,9 @@ class RBM(BoltzmannMachine):
         return edges, r, known
 
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return all T units with the given values."""
+        """Return all relation units, with the values of the given relations."""
         if given is not None:
             return given
         r = v.new_zeros(len(v), self.spec.T)
@@ -82,23 +83,23 @@ class RBM(BoltzmannMachine):
         return edges.valid.to(v.dtype).expand(*v.shape[:-1], -1)
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """Return d_t + U_t·h1."""
+        """Return the logit d_t + U_t·h1 of each relation unit t."""
         return self.d + h1 @ self.context_weights().T
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """Return weight @ U."""
+        """Return weight @ U, the input of the relations to the hidden units."""
         return weight @ self.context_weights()
 
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return U with a leading dimension."""
+        """Return the weights U with a leading scene dimension, (1, triples, hidden units)."""
         return self.context_weights().unsqueeze(0)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Return zero, because relations do not act on objects given the context."""
+        """Return zero, because given h1 the relations have no effect on objects."""
         return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
 
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return the units' values as a table over classes; -inf for relations without a unit."""
+        """Return values of relation units as a table over classes; -inf where no unit exists."""
         pairs = pair_edges(classes, self.spec.A)
         _, position, found = self.places(pairs)
         if not self.spec.T:
@@ -107,21 +108,24 @@ class RBM(BoltzmannMachine):
         return pairs.unflatten(torch.where(found & pairs.valid, spread, -torch.inf))
 
     def acting_units(self, v: Tensor) -> Edges | None:
-        """Return all T units; None in the local form."""
+        """Return all relation units in the seed form, and None in the local form."""
         return triple_edges(self.triples) if self.relations_act else None
 
     @torch.no_grad()
     def begin_independent(self, machine: BoltzmannMachine) -> None:
-        """Copy the bias d of the units."""
+        """Copy the relation biases d from `machine`."""
         self.d.copy_(machine.get_parameter("d"))
 
     def relation_log_partition(self) -> float:
-        """Return sum_t softplus(d_t) in the seed form, else 0."""
+        """Return sum_t softplus(d_t) over relation units t in the seed form, else 0."""
         return float(softplus(self.d).sum()) if self.relations_act else 0.0
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """Multiply every weight by beta; d and b interpolate to those of a given `base`."""
+        """Multiply every weight by beta.
+
+        If there is a `base`, the biases d and b are interpolated between `base` and this machine.
+        """
         return scale(self, beta, base, keep=("b", "d"))
 
 
@@ -135,10 +139,13 @@ def scale(
     keep: tuple[str, ...],
     fixed: tuple[str, ...] = (),
 ) -> Machine:
-    """Return a copy with parameters beta·θ, plus (1 - beta)·θ_base for the names in `keep`.
+    """Return a copy of the machine whose parameters θ are multiplied by beta.
 
-    Parameters in `fixed` are unchanged. They are factors of products, of which only one factor may
-    scale.
+    Args:
+        base: machine at beta = 0, or None.
+        keep: names of parameters that become beta·θ + (1 - beta)·θ_base if there is a base.
+        fixed: names of parameters that stay unchanged. Each is a factor of a product, and beta may
+            multiply only one factor of a product.
     """
     result = copy.copy(machine)
     result._parameters = {}

@@ -5,35 +5,36 @@
     w_e = s[a,i] + o[a,j] + sum_k S[i,k] R[a,k] O[j,k] + w_e' + n[a,0] log n_i + n[a,1] log n_j
     U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]
 
-The published code gates w by v_i v_j and does not gate the relation–context weight. Here the state
-space is {r_e ≤ v_i v_j}, so a relation can be on only between present objects. The factors S, O, R
-and M share the weights, which replaces one free weight for each (a,i,j). The residual w' exists for
-triples seen in training. n weighs the instance counts n_i and n_j of the two classes, because a
-class-level relation is the OR over instance pairs. If a count is unknown, the usual log n_i of the
-class is used.
+The published code multiplies w by v_i v_j, but not U. Here, both are multiplied by v_i v_j, and a
+relation can be 1 only between present objects (r_e ≤ v_i v_j). Products of the factors S, O, R and
+M replace a free weight for each triple (a,i,j). Triples seen in training also have a free residual
+weight w'. n_i and n_j are the numbers of instances of the two classes. Their logs enter with the
+weights n, because a relation between classes holds if it holds between any two instances. If a
+number of instances is unknown, the mean log n_i of the class is used.
 
-With G > 0 (local form) observed relations r_G also shift the logits of other relations. For
-example, if A is left of B and B is left of C, then A is left of C. Units that are independent given
-h1 cannot represent such a rule.
+With G > 0 (local form), the observed relations r_G also change the logits of other relations. For
+example, if A is left of B and B is left of C, then A is left of C. Relation units that are
+independent given h1 cannot represent such a rule.
 
     log-odds of r_e given r_G  =  ℓ_e(h1) + x_e(r_G),       e = (a, i, j)
     x_e = sum_f (gamma[0,a,f] + sum_q z_q gamma[q,a,f]) phi_f(i, j; r_G),    z = B E[h1 | v]
 
-The model conditions on r_G, as it conditions on a room type. All other conditionals keep their
-closed form. Without observed relations, x = 0. z makes the strength of the rules depend on the
-context, because some sources list every visible pair and others only a few neighbours. The features
-phi_f use the A relations in both directions (2A relations b and c), but never r_e itself:
+The model is conditioned on r_G and has no energy term for r_G. All other conditionals keep their
+closed form. Without observed relations, x = 0. The strength of the rules depends on the hidden
+units through z, because some data sets annotate every visible pair and others only a few. The
+features phi_f use the A relations in both directions, so b and c are 2A relations. The features of
+r_e never use r_e itself:
 
     pair      r_b(i, j)                                              2A features
     path      there is a class k with r_b(i, k) and r_c(k, j)        (2A)² features
-    degree    number of other classes k with r_b(i, k), and with     4A features, each at most 3
-              r_b(k, j)
+    degree    number of classes k other than j with r_b(i, k)        2A features, each at most 3
+              number of classes k other than i with r_b(k, j)        2A features, each at most 3
 
-Forms: `seed` is the energy above, with a compensating offset κ_a for each active unit (0 in the
-paper). `local` adds softplus(ℓ_e) for every active unit.
+Forms of the energy: `seed` is the energy above, minus κ_a for each pair of present classes and each
+relation a. κ is 0 in the paper. `local` adds softplus(ℓ_e) instead.
 
-The implications follow Mnih, Larochelle and Hinton, "Conditional restricted Boltzmann machines for
-structured output prediction" (2011), which conditions on observed units.
+The rules follow Mnih, Larochelle and Hinton, "Conditional restricted Boltzmann machines for
+structured output prediction" (2011), whose model is also conditioned on observed units.
 """
 
 from __future__ import annotations
@@ -58,12 +59,12 @@ from training.machines.edges import (
 from training.machines.machine import BoltzmannMachine
 from training.machines.rbm import scale
 
-# Degrees are capped, because each further neighbour adds less information.
+# Maximum of a degree feature. Degrees are capped, because more neighbours add little information.
 _MOST = 3.0
 
 
 class Triway(BoltzmannMachine):
-    """Gated, factorised relations on active pairs, in the seed form or the local form."""
+    """A machine whose relation units connect two present objects and the hidden units."""
 
     has_residuals = True
 
@@ -88,15 +89,17 @@ class Triway(BoltzmannMachine):
 
     @torch.no_grad()
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
-        """Set d to the log-odds of each relation."""
+        """Set the bias d_a to the training log-odds of each relation a."""
         self.d.copy_(by_relation)
         self.usual.copy_(usual)
 
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> PairEdges:
-        """Return the A·n² units between the given classes; all other units are off.
+        """Return the A·n² relation units between n classes. All other units are 0.
 
         Args:
-            counts: instances of each class; 0 means unknown and uses the usual count of the class.
+            classes: class indices, (scenes, n) int64. Padding is -1.
+            counts: number of instances of each class, (scenes, n). 0 means unknown; the mean of the
+                class is then used.
         """
         if counts is None:
             return pair_edges(classes, self.spec.A)
@@ -105,22 +108,22 @@ class Triway(BoltzmannMachine):
         return pair_edges(classes, self.spec.A, log_subjects=logs)
 
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """Return the pairs themselves, because every pair has a unit."""
+        """Return `pairs` itself, because this machine has a unit for every relation."""
         place = torch.arange(pairs.shape[-1]).expand(pairs.shape)
         return pairs, place, torch.ones_like(place, dtype=torch.bool)
 
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relations flattened, without further changes."""
+        """Return the relations flattened. This machine needs no other change of layout."""
         return self.edges(classes, counts), holds.flatten(1), observed.flatten(1)
 
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return v_i v_j."""
+        """Return the gate v_i v_j of each unit: 1 if both objects are present."""
         return edges.ends_present(v)
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """Return d_a + w_e + U_e·h1."""
+        """Return the logit d_a + w_e + U_e·h1 of each relation unit e."""
         pairs = _pairs(edges)
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
         left = embedding(pairs.subjects, self.S).unsqueeze(-3) * shared.unsqueeze(-2)
@@ -135,33 +138,40 @@ class Triway(BoltzmannMachine):
         return logits.flatten(-3)
 
     def _end_weights(self, pairs: PairEdges) -> tuple[Tensor, Tensor]:
-        """Return s[a,i] + n[a,0] log n_i, (B, A, n), and o[a,j] + n[a,1] log n_j, (B, A, m)."""
+        """Return the terms of the relation logits that depend only on the subject or object class.
+
+        The terms are s[a,i] + n[a,0] log n_i, (scenes, relations, n), for subjects i, and
+        o[a,j] + n[a,1] log n_j, (scenes, relations, m), for objects j.
+        """
         counts = self.n[:, 0, None] * pairs.log_subjects.unsqueeze(1)
         subject = self.s[:, pairs.subjects].transpose(0, 1) + counts
         counts = self.n[:, 1, None] * pairs.log_objects.unsqueeze(1)
         return subject, self.o[:, pairs.objects].transpose(0, 1) + counts
 
     def _residuals(self, pairs: PairEdges) -> Tensor:
-        """Return w_e', (B, A, n, m); 0 for triples not seen in training."""
+        """Return the residual weight w_e' of each relation unit, (scenes, relations, n, m).
+
+        The weight of a triple that did not occur in training is 0.
+        """
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         position, found = find_triples(self.triple_keys, keys)
         return pairs.unflatten(self.residual[position] * found)
 
     def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """Return the logit shifts x_e; zeros in a machine without the weights gamma and B."""
+        """Return the logit changes x_e. They are 0 in a machine without the weights gamma and B."""
         if not self.spec.G:
             return super().implied(edges, given, h1)
         grid = _pairs(edges).unflatten(given)
         return implied(self.gamma, self.B, grid, h1, apart=apart).flatten(-3)
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """Return sum_e weight_e U_e from the factors, without forming U."""
+        """Return sum_e weight_e U_e. The full matrix U is never stored."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(weight)
         return self._context_input(self._factors(pairs, grid), grid.sum((-1, -2)))
 
     def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sum_e r_e ℓ_e(0) and sum_e r_e U_e from the factors, without forming ℓ or U."""
+        """Return sum_e r_e ℓ_e(0) and sum_e r_e U_e. The full ℓ and U are never stored."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(r)
         factors, outgoing, incoming = self._factors(pairs, grid), grid.sum(-1), grid.sum(-2)
@@ -174,19 +184,22 @@ class Triway(BoltzmannMachine):
         return bare, self._context_input(factors, count)
 
     def _factors(self, pairs: PairEdges, weight: Tensor) -> Tensor:
-        """Return sum_{i,j} weight[a,i,j] S[i,k] O[j,k], (..., B, A, K)."""
-        # One (A·n, m) by (m, K) product for each scene; a broadcast over a would copy O for each a.
+        """Return sum_{i,j} weight[a,i,j] S[i,k] O[j,k], (..., scenes, relations, K)."""
+        # A product of (A·n, m) by (m, K) for each scene avoids a copy of O for each relation a.
         product: Tensor = weight.flatten(-3, -2) @ embedding(pairs.objects, self.O)
         product = product.unflatten(-2, weight.shape[-3:-1])
         subjects = embedding(pairs.subjects, self.S).unsqueeze(-3)
         return (product * subjects).sum(-2)
 
     def _context_input(self, factors: Tensor, count: Tensor) -> Tensor:
-        """Return sum_{a,k} factors[a,k] M[a,k] + sum_a count_a P[a], (..., B, H1)."""
+        """Return the sum over a and k of factors[a,k] M[a,k], plus the sum over a of count_a P[a].
+
+        The result has the shape (..., scenes, hidden units).
+        """
         return factors.flatten(-2) @ self.M.flatten(0, 1) + count @ self.P
 
     def held_objects(self, edges: Edges, r: Tensor) -> Tensor:
-        """Return (B, V) floats: 1 for the objects of relations that are on."""
+        """Return 1 for each class with a relation r = 1, else 0, (scenes, classes)."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(r).amax(-3)
         held = r.new_zeros(len(r), self.spec.V)
@@ -195,7 +208,7 @@ class Triway(BoltzmannMachine):
         return held
 
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return U_e for each unit."""
+        """Return the weights U_e between relation units and h1, (scenes, units, hidden units)."""
         pairs = _pairs(edges)
         subject, object_ = self.S[pairs.subjects], self.O[pairs.objects]
         product = subject.unsqueeze(-2) * object_.unsqueeze(-3)
@@ -203,14 +216,17 @@ class Triway(BoltzmannMachine):
         return (rows + self.P[:, None, None]).flatten(1, 3)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Return the sum over R_i of softplus(ℓ_e) + κ_a in the seed form; 0 in the local form."""
+        """Return the sum of softplus(ℓ_e) + κ_a over the relations of each candidate.
+
+        The sum has the shape (..., scenes, candidates). In the local form, the sum is 0.
+        """
         pairs = _pairs(edges)
         return self._attraction(
             v, h1, pairs.subjects, pairs.valid_subjects, pairs.log_subjects, candidates
         )
 
     def attraction_to_all(self, v: Tensor, h1: Tensor, candidates: Tensor) -> Tensor:
-        """Return `attraction` with one instance of every class as an anchor."""
+        """Return `attraction` by relations to all present classes, with one instance of each."""
         anchors = torch.arange(self.spec.V).expand(len(h1), -1)
         valid = torch.ones_like(anchors, dtype=torch.bool)
         logs = torch.zeros(anchors.shape, dtype=h1.dtype)
@@ -229,8 +245,7 @@ class Triway(BoltzmannMachine):
             return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
         present = v.gather(-1, anchors.expand(*v.shape[:-1], -1)) * valid
         candidates = candidates.expand(len(anchors), -1)
-        # A candidate that is also an anchor counts as absent here; its own unit (a,i,i) is added
-        # below.
+        # Leave out relations of a candidate to its own class. Their units (a,i,i) are added below.
         other = (anchors.unsqueeze(-2) != candidates.unsqueeze(-1)) * present.unsqueeze(-2)
         A = self.spec.A
         outgoing = pair_edges(candidates, A, objects=anchors, log_objects=logs)
@@ -244,7 +259,10 @@ class Triway(BoltzmannMachine):
         return total + (softplus(loop) + self.kappa).sum(-1)
 
     def _loop_logits(self, candidates: Tensor, h1: Tensor) -> Tensor:
-        """Return ℓ of the units (a,i,i), (..., B, N, A)."""
+        """Return the logits of the relations of each candidate to its own class.
+
+        The logits have the shape (..., scenes, candidates, relations).
+        """
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
         product = (self.S * self.O)[candidates] @ shared.mT
         bias = (self.d + h1 @ self.P.T).unsqueeze(-2)
@@ -257,21 +275,24 @@ class Triway(BoltzmannMachine):
         return logits + self.residual[position] * found
 
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the units between present classes; the classes of the given units come first.
+        """Return the relation units between present classes.
+
+        The classes of the given units come first.
 
         Raises:
-            ValueError: the given units do not have one row for each row of v.
+            ValueError: the numbers of scenes in `given` and in v differ.
         """
         frame = None if given is None else _pairs(given[0])
         if frame is not None and len(frame.subjects) != len(v):
             raise ValueError(f"observed relations must have one row per chain, {len(v)} rows")
-        edges = self.edges(present_classes(v, None if frame is None else frame.subjects))
+        leading = None if frame is None else frame.subjects
+        edges = self.edges(present_classes(v, leading, least))
         r = self.b.new_zeros(edges.shape)
         known = torch.zeros_like(r, dtype=torch.bool)
         if frame is not None and given is not None:
-            # Both assignments write into views of r and known.
+            # unflatten() returns views, so both assignments change r and known.
             n = frame.subjects.shape[1]
             edges.unflatten(known)[..., :n, :n] = frame.unflatten(given[2])
             edges.unflatten(r)[..., :n, :n] = frame.unflatten(given[1] * given[2])
@@ -288,13 +309,13 @@ class Triway(BoltzmannMachine):
         held: Tensor | None = None,
         collapsed: bool = True,
     ) -> Tensor:
-        """Sample v given h1.
+        """Sample the objects v given the hidden units h1, (scenes, classes).
 
-        The seed form samples object by object if collapsed. Otherwise it keeps the objects of
-        relations that are on.
+        In the seed form with `collapsed`, the objects are sampled one after another. In the seed
+        form without `collapsed`, objects of relations with r = 1 stay present.
 
         Raises:
-            ValueError: the seed form has κ and is not collapsed.
+            ValueError: `collapsed` is False in a seed-form machine with κ.
         """
         if not self.relations_act:
             return super().sample_objects(v, h1, r, edges, generator)
@@ -302,7 +323,8 @@ class Triway(BoltzmannMachine):
             return self._collapsed_sweep(v.clone(), h1, held, generator)
         if bool(self.kappa.any()):
             raise ValueError(
-                "collapsed=False needs κ = 0: with κ, objects are dependent even given h1 and r"
+                "collapsed=False needs a machine with κ = 0; with κ, the objects depend on each "
+                "other even given h1 and r"
             )
         drawn = super().sample_objects(v, h1, r, edges, generator)
         return drawn.maximum(self.held_objects(edges, r))
@@ -320,25 +342,25 @@ class Triway(BoltzmannMachine):
         return v
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the sum of κ_a over active units."""
+        """Return the sum of κ_a over relation units between present classes, (..., scenes)."""
         if not bool(self.kappa.any()):
             return super().pair_offset(edges, v)
         gate = self.gate(edges, v)
         return _pairs(edges).unflatten(gate).sum((-1, -2)) @ self.kappa
 
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return the values as a table over the classes, which is the layout of the units."""
+        """Return the values of the units as a table over relations and pairs of classes."""
         return _pairs(edges).unflatten(values)
 
     def acting_units(self, v: Tensor) -> Edges | None:
-        """Return the units between the classes present in v (B, V); None in the local form."""
+        """Return the relation units between present classes. The local form returns None."""
         if not self.relations_act:
             return None
         value, index = v.topk(int(v.sum(1).max()), dim=1)
         return self.edges(torch.where(value > 0, index, -1))
 
     def context_units(self, edges: Edges) -> Edges | None:
-        """Return all units in the seed form; None in the local form."""
+        """Return all relation units in the seed form, and None in the local form."""
         return edges if self.relations_act else None
 
     @torch.no_grad()
@@ -351,31 +373,35 @@ class Triway(BoltzmannMachine):
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
         """Multiply every weight by beta.
 
-        With a base, b goes to b_base and κ to -log 2. At beta = 0 the two states of a relation unit
-        then weigh 1/2 each. So relations sum out to one, and objects are independent.
+        With a base, b is interpolated with the b of the base, and κ with -log 2. At beta = 0, both
+        states of a relation unit then have the weight 1/2. The sum over a relation is therefore 1,
+        and objects are independent.
         """
         return scale(self, beta, base, keep=("b", "kappa"), fixed=("S", "O", "B", "usual"))
 
 
 def _pairs(edges: Edges) -> PairEdges:
     if not isinstance(edges, PairEdges):
-        raise TypeError("a Triway machine needs PairEdges; build them with machine.edges(classes)")
+        raise TypeError(
+            "edges have the wrong type; a Triway machine needs PairEdges: build them with "
+            "machine.edges(classes)"
+        )
     return edges
 
 
 def implication_features(given: Tensor) -> Tensor:
-    """Return the features phi, (B, F, n, n), of given relations.
+    """Return the features phi of given relations, (scenes, features, n, n) over pairs of classes.
 
-    The pair feature of relation a equals r_e where e is given, so `implied` ignores it.
+    The pair feature of relation a equals r_e itself, so `implied` does not use that feature for a.
 
     Args:
-        given: (B, A, n, n), 1 where a relation is given as holding, else 0.
+        given: given relations, (scenes, relations, n, n). 1 means that the relation holds.
     """
     n = given.shape[-1]
     between = given * ~torch.eye(n, dtype=torch.bool, device=given.device)
     both = torch.cat([between, between.mT], 1)
     steps = both.shape[1]
-    # All paths at once: (B, 2A·n, n) by (B, n, 2A·n).
+    # One batched product counts the paths of all relation pairs: (B, 2A·n, n) by (B, n, 2A·n).
     paths = both.flatten(1, 2) @ both.transpose(1, 2).flatten(2)
     paths = paths.view(len(given), steps, n, steps, n).transpose(2, 3).flatten(1, 2).clamp(max=1.0)
     outgoing = both.sum(-1, keepdim=True) - both
@@ -385,20 +411,22 @@ def implication_features(given: Tensor) -> Tensor:
 
 
 def implied(gamma: Tensor, B: Tensor, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-    """Return the logit shifts x, (B, A, n, n).
+    """Return the changes x of the relation logits due to given relations.
+
+    The result has the shape (scenes, relations, n, n) over pairs of n classes.
 
     Args:
-        gamma: (1 + G, A, F).
-        B: (G, H1).
-        given: (B, A, n, n), 1 where a relation is given as holding, else 0.
-        h1: (B, H1), means of the context given the objects.
-        apart: leave out the implications between relations of the same pair.
+        gamma: weights of the features, (1 + G, relations, features).
+        B: weights from hidden units to z, (G, hidden units).
+        given: given relations, (scenes, relations, n, n). 1 means that the relation holds.
+        h1: means of the hidden units given the objects, (scenes, hidden units).
+        apart: True leaves out the effects between relations of the same pair of classes.
     """
     A = given.shape[1]
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool, device=gamma.device)
     itself[:, :A].fill_diagonal_(True)
     if apart:
-        # The path and degree features remain: they are about other classes.
+        # The path and degree features remain, because they depend on relations to other classes.
         itself[:, : 2 * A] = True
     gamma = gamma.masked_fill(itself, 0.0)
     weight = gamma[0] + torch.einsum("bq,qaf->baf", h1 @ B.T, gamma[1:])

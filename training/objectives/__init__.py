@@ -1,8 +1,8 @@
 """Training objectives by name.
 
-An objective is called with the machine, a batch and a generator. It returns a loss whose gradient
-is the update direction (`Objective`). It may keep state between calls, such as persistent chains;
-checkpoints store this state.
+The trainer calls an objective with the machine, a batch and a random generator. The objective
+returns a loss whose gradient is the update direction (`Objective`). An objective can keep state
+between calls, for example persistent chains. Checkpoints store this state.
 """
 
 from __future__ import annotations

@@ -1,26 +1,27 @@
 """Composite conditional likelihood of masked objects, presence and relations.
 
-In each scene one present class i is removed, with all its instances and relations:
+In each scene, one present class i is removed with all its instances and relations. The loss then
+has two terms for objects:
 
-    ranking    - log softmax over absent candidates of the log-odds, at i
+    ranking    - log softmax_i of the log-odds, over all absent classes including i
     presence   n·softplus(-log-odds_i) + sum over the other absent classes of softplus(log-odds)
 
-n is the number of removable classes. The factor n makes the second term an unbiased estimate of the
-pseudo-likelihood, which balances present and absent units. With the ranking term alone, the
-log-odds of different objects are not comparable.
+n is the number of classes that can be removed. With the factor n, the presence term is an unbiased
+estimate of the negative pseudo-likelihood. With the ranking term alone, log-odds from different
+scenes would not be comparable.
 
-For scenes with annotated relations:
+Scenes with annotated relations have a third term:
 
-    relations  - sum over observed units of log p(r_e | v, E[h1 | v])
+    relations  - sum over observed relations e of log p(r_e | v, E[h1 | v])
 
-This term approximates the bound log p(r | v) ≥ E[log p(r | v, h1)] (Jensen, h1 from p(h1 | v)) by
-the mean of h1. Unannotated relations are summed out. Scenes without annotated relations train the
-object part only. For a machine with implications, the loss has a second relation term: a random
-share of the relations of each scene is given, and the term is the sum of
-- log p(r_e | r_given, v, E[h1 | v]) over the other relations.
+By Jensen's inequality, log p(r | v) ≥ E[log p(r | v, h1)] for h1 from p(h1 | v). The relation term
+approximates this bound by using the mean of h1. Unannotated relations are summed out. A machine
+with implication weights has a second relation term. That term is the sum of
+- log p(r_e | r_given, v, E[h1 | v]). r_given is a random share of the relations of a scene, and e
+runs over the other relations.
 
-A class that a source never mentions counts as absent from the scenes of the source. The reason is
-that a request has no source, and the service has to rank all classes.
+A class that a data source never mentions counts as absent in all scenes of that source. A request
+to the service has no source, so the service must rank all classes.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Varin, Reid and Firth, "An
 overview of composite likelihood methods" (2011).
@@ -36,8 +37,9 @@ from torch.nn.functional import softplus
 
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
+from training.distributed import anywhere, gather, mean_part, share, total
 from training.machines import BoltzmannMachine
-from training.machines.bernoulli import bernoulli
+from training.machines.bernoulli import bernoulli, categorical, uniform
 from training.machines.gibbs import Clamp, bare_state, initial_state, run
 from training.machines.log_odds import object_log_odds
 from training.machines.mean_field import Evidence, mean_field
@@ -46,14 +48,14 @@ from training.objectives.base import Objective, relation_nll, withhold_counts, w
 
 @dataclass(frozen=True)
 class Masked:
-    """Scenes with one class removed.
+    """Scenes from each of which one class is removed.
 
     Attributes:
-        batch: the scenes that have a removable class.
-        v: (B, V) presence without the removed class.
-        target: (B,) the removed class.
-        absent: (B, V) bool, the candidates, which include the target.
-        removable: (B,) number of removable classes.
+        batch: the complete scenes.
+        v: presence of objects without the removed class, (scenes, classes).
+        target: index of the removed class, (scenes,).
+        absent: True for absent classes, which include the removed class, (scenes, classes).
+        removable: number of classes that can be removed, (scenes,).
     """
 
     batch: Batch
@@ -64,40 +66,41 @@ class Masked:
 
 
 def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) -> Masked | None:
-    """Remove one class from each scene with at least two removable classes.
+    """Remove one random class from each scene that has at least two removable classes.
 
-    The result is None if all scenes have fewer.
+    The result is None if the scenes of all processes have fewer.
 
     Args:
-        structure: (V,) bool; structure classes are neither removed nor candidates.
+        structure: True for structure classes such as walls, (classes,) bool. Structure classes are
+            never removed or ranked.
     """
     removable = batch.v * ~structure
     enough = removable.sum(1) >= 2
-    if not bool(enough.any()):
+    if not anywhere(enough):
         return None
     batch, removable = batch.rows(enough), removable[enough]
-    target = torch.multinomial(removable, 1, generator=generator).squeeze(1)
+    target = categorical(removable, generator)
     v = batch.v.scatter(1, target.unsqueeze(1), 0.0)
     absent = (v == 0) & ~structure
     return Masked(batch, v, target, absent, removable.sum(1))
 
 
 class ObjectChains:
-    """Persistent chains over objects and context: a generative gradient for the local form.
+    """Persistent Gibbs chains over objects and hidden units, for machines of the local form.
 
-    In the local form, relations sum to one, so the chains need only (v, h1, h2). The loss is the
-    difference of free energies, in which h1 is summed out:
+    In the local form (`training.machines.machine`), the sum over relations is 1, so the chains
+    contain only v, h1 and h2. The loss is a difference of free energies, in which h1 is summed out:
 
         mean F(data, h2) - mean F(chains, h2),   F = -b·v - c2·h2 - sum softplus(c1 + v'W + J h2)
 
-    Each chain keeps a room type (or none) drawn from the training scenes. So data and chains have
-    the same distribution of room types.
+    Each chain keeps the room type of a random training scene, which can be unknown. The chains and
+    the data therefore have the same distribution of room types.
 
     Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
 
     Args:
         count: number of chains.
-        steps: Gibbs steps for each update.
+        steps: number of Gibbs steps before each update of the weights.
     """
 
     def __init__(self, count: int, steps: int) -> None:
@@ -107,25 +110,29 @@ class ObjectChains:
     def loss(
         self, machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """Run the chains, then return mean F(data) - mean F(chains).
+        """Run the chains, then return mean F(data) - mean F(chains). F is the free energy.
 
         Args:
-            v, room: (B, V) and (B,), the data.
+            v: presence of objects in the training scenes, (scenes, classes).
+            room: index of the room type of each training scene, (scenes,).
         """
         with torch.no_grad():
             h2 = bernoulli(mean_field(machine, Evidence(v, room=room)).h2, generator)
             self._advance(machine, v, room, generator)
         chains = self.blocks
-        data = machine.free_energy(v, h2=h2, room=room).mean()
-        return data - machine.free_energy(chains["v"], h2=chains["h2"], room=chains["room"]).mean()
+        data = mean_part(machine.free_energy(v, h2=h2, room=room))
+        model = machine.free_energy(chains["v"], h2=chains["h2"], room=chains["room"])
+        return data - mean_part(model)
 
     def _advance(
         self, machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
     ) -> None:
         if not self.blocks:
-            pick = torch.randint(len(v), (self.count,), generator=generator)
-            state = initial_state(machine, v[pick], generator, Clamp(room=room[pick]))
-            self.blocks = {"v": state.v, "h1": state.h1, "h2": state.h2, "room": room[pick]}
+            v, room = gather(v), gather(room)
+            pick = share(torch.randint(len(v), (self.count,), generator=generator, device="cpu"))
+            v, room = v[pick], room[pick]
+            state = initial_state(machine, v, generator, Clamp(room=room))
+            self.blocks = {"v": state.v, "h1": state.h1, "h2": state.h2, "room": room}
         clamp = Clamp(room=self.blocks["room"])
         state = bare_state(machine, self.blocks["v"], self.blocks["h1"], self.blocks["h2"])
         state = run(machine, state, generator, self.steps, clamp, relations=False)
@@ -135,9 +142,8 @@ class ObjectChains:
 class CompositeLikelihood(Objective):
     """The loss ranking + presence_weight · presence + relation_weight · relations.
 
-    With a generative_weight (local form), the weighted persistent-chain gradient is added
-    (`ObjectChains`). Conditionals alone give a joint distribution whose samples differ from the
-    data.
+    With a `generative_weight` (local form), the loss also includes the term of `ObjectChains`.
+    Without that term, samples of the trained machine differ from the training scenes.
     """
 
     def __init__(
@@ -148,14 +154,14 @@ class CompositeLikelihood(Objective):
 
     def state(self) -> dict[str, Tensor]:
         """Return the persistent chains."""
-        return self.chains.blocks
+        return {name: gather(block) for name, block in self.chains.blocks.items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore the persistent chains."""
-        self.chains.blocks = dict(state)
+        self.chains.blocks = {name: share(block) for name, block in state.items()}
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the mean over scenes of the weighted terms."""
+        """Return the weighted sum of the terms, averaged over the scenes of the batch."""
         total = machine.b.sum() * 0.0
         if self.config.relation_weight:
             total = total + self.config.relation_weight * self.relation_part(
@@ -174,7 +180,7 @@ class CompositeLikelihood(Objective):
         ranking = others.logsumexp(1) - chosen
         off = softplus(log_odds) * masked.absent.scatter(1, masked.target.unsqueeze(1), False)
         presence = masked.removable * softplus(-chosen) + off.sum(1)
-        return total + (ranking + self.config.presence_weight * presence).mean()
+        return total + mean_part(ranking + self.config.presence_weight * presence)
 
     def _log_odds(
         self,
@@ -182,13 +188,16 @@ class CompositeLikelihood(Objective):
         masked: Masked,
         generator: torch.Generator,
     ) -> Tensor:
-        """Return the log-odds (B, V) of each class given the others, with relations unobserved."""
+        """Return the log-odds of each class given the other classes, (scenes, classes).
+
+        All relations are unobserved.
+        """
         v, batch = masked.v, masked.batch
         if self.config.structure_dropout:
-            drop = torch.rand(v.shape, generator=generator) < self.config.structure_dropout
+            drop = uniform(v.shape, generator) < self.config.structure_dropout
             v = v * ~(drop & self.structure)
         if self.config.object_dropout:
-            v = v * (torch.rand(v.shape, generator=generator) >= self.config.object_dropout)
+            v = v * (uniform(v.shape, generator) >= self.config.object_dropout)
         room = withhold_rooms(batch, self.config.room_dropout, generator)
         edges = None
         if machine.relations_act:
@@ -199,12 +208,13 @@ class CompositeLikelihood(Objective):
     def relation_part(
         self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
     ) -> Tensor:
-        """Return -log p(observed r | v, E[h1 | v]), summed over units, averaged over the batch.
+        """Return the relation term of the loss, averaged over the scenes of the batch.
 
-        A machine with implications adds the second term of `relation_nll`.
+        The term is -log p(observed r | v, E[h1 | v]). For a machine with implication weights, it
+        includes the second term of `relation_nll`.
         """
         annotated = batch.observed.flatten(1).any(1)
-        if not bool(annotated.any()):
+        if not anywhere(annotated):
             return machine.b.sum() * 0.0
         some = batch.rows(annotated)
         if self.config.unlisted == "off":
@@ -217,11 +227,14 @@ class CompositeLikelihood(Objective):
         logits = machine.relation_logits(edges, some.v, h1)
         counted = observed * machine.gate(edges, some.v)
         nll = relation_nll(machine, edges, logits, r, observed, counted, h1, generator)
-        return nll / len(batch)
+        return nll / int(total(torch.tensor(len(batch))))
 
 
 def unlisted_off(batch: Batch, structure: Tensor) -> Batch:
-    """Return the batch with all relations between non-structure classes of a scene observed."""
+    """Return the batch with all relations between the classes of a scene observed.
+
+    Unlisted relations count as false. Relations of structure classes keep their status.
+    """
     n = batch.classes.shape[1]
     thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
     pairs = thing[:, :, None] & thing[:, None, :] & ~torch.eye(n, dtype=torch.bool)

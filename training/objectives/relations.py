@@ -1,27 +1,28 @@
-"""Conditional likelihood of relations that sources state as true or false.
+"""Conditional likelihood of relations that data sources annotate as true or false.
 
-    - sum over scenes and known units of log p(r_e | v, E[h1 | v]),   logit_e = ℓ_e + δ[source, a]
+    loss = - sum over scenes and annotated relations e of log p(r_e | v, E[h1 | v])
+    logit of r_e = ℓ_e + δ[source, a]
 
-A unit is known if its source states whether the relation holds (`training.datasets.sources`). Other
-units drop out. Sources differ in what they list: people mention notable relations, and a procedural
-room lists all. Each source therefore has its own trained offset δ for each relation. The service
-does not use the offsets.
+Relations without an annotation have no term (`training.datasets.sources`). Data sources annotate
+different relations. For example, people mention notable relations, and generated rooms list all
+relations. Each source therefore has a trained logit correction δ, called offset, for each relation
+a. The service leaves the offsets out.
 
-Weights and offsets have normal priors, with the precisions `weight_prior` and `offset_prior`. With
-word vectors X, the factors and end weights of a class are a trained map of its vector plus a small
-deviation of the class:
+Weights and offsets have normal priors, with the precisions `weight_prior` and `offset_prior`. The
+relation weights of a class can depend on its word vector. With the matrix X of word vectors, the
+weights are a trained linear map of X plus a small deviation of each class:
 
     S = X A_S + S',   O = X A_O + O',   s = (X B_s)' + s',   o = (X B_o)' + o'
 
-A rare class then behaves like classes with similar word vectors.
+A rare class then has weights similar to those of classes with similar word vectors.
 
-A robot seldom sees a whole scene. In training, the context h1 therefore depends on a random subset
-of the objects; the share is drawn uniformly for each scene. Otherwise the context would learn
-relations that hold in complete scenes of one source, and would not predict them in other scenes.
+A robot seldom sees a whole scene. In training, the hidden units h1 therefore depend on a random
+subset of the objects. The size of the subset is drawn uniformly for each scene. Otherwise, the
+relations of complete scenes of one source would fit well, but relations in other scenes would not.
 
-For a machine with implications, the loss has a second term: a random share of the relations of each
-scene is given, and the term is the sum of - log p(r_e | r_given, v, E[h1 | v]) over the other
-relations. The object part of the machine is not trained.
+For a machine with implication weights, the loss has a second term. That term is the sum of
+- log p(r_e | r_given, v, E[h1 | v]). r_given is a random share of the relations of a scene, and e
+runs over the other relations. The object weights of the machine stay fixed.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Salakhutdinov,
 "Probabilistic matrix factorization" (2007), for normal priors on factors.
@@ -45,7 +46,9 @@ from torch.nn.utils.parametrize import (
 
 from training.batches import Batch, SceneTensors, relation_units
 from training.config import ObjectiveConfig
+from training.distributed import size, total
 from training.machines import BoltzmannMachine, build
+from training.machines.bernoulli import uniform
 from training.machines.mean_field import Evidence, mean_field
 from training.objectives.base import Objective, relation_nll, withhold_counts, withhold_rooms
 
@@ -53,13 +56,15 @@ if TYPE_CHECKING:
     from training.trainer import TrainingData
 
 _OBJECT_PART = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B", "usual", "d"})
-# All classes share the map of word vectors, so its prior is weaker than that of one class.
+# Factor of the prior precision for the map of word vectors. All classes share the map, so its prior
+# is weaker than the prior of the weights of a class.
 _MAP_PRIOR = 0.1
 _ROWS = ("S", "O")
 _COLUMNS = ("s", "o")
-# τ, the precision of the prior of a residual. It weighs as much as four scenes with p(r) = 1/2.
+# Precision τ of the normal prior of a residual weight. A scene with p(r) = 1/2 has the Fisher
+# information 1/4, so the prior has the weight of four such scenes.
 _PRECISION = 1.0
-# Minimum number of scenes that observe a triple, and minimum size of a stored residual.
+# Minimum number of scenes with an annotation of a triple, and minimum size of a stored residual.
 _SPEAKING_SCENES = 5
 _LEAST_RESIDUAL = 0.1
 _NEWTON_STEPS = 12
@@ -67,33 +72,36 @@ _BATCH = 64
 
 
 class WordPrior(nn.Module):
-    """Add a trained map of word vectors to the weights of classes.
+    """Add a trained linear map of word vectors to the weights of classes.
 
     Args:
-        words: (V, D) scaled word vectors.
-        width: number of weights of a class.
-        columns: True if the weights have shape (width, V), False for (V, width).
+        words: scaled word vectors, (classes, dimensions).
+        width: number of weights of each class.
+        columns: True if the weights have the shape (width, classes), False for (classes, width).
     """
 
     def __init__(self, words: Tensor, width: int, *, columns: bool) -> None:
         super().__init__()
-        self.words, self.columns = words, columns
+        self.register_buffer("words", words, persistent=False)
+        self.words: Tensor
+        self.columns = columns
         self.map = nn.Parameter(torch.zeros(words.shape[1], width))
 
     def forward(self, deviation: Tensor) -> Tensor:
-        """Return the weights of all classes."""
+        """Return the weights of all classes: the map of the word vectors plus the deviations."""
         shared = self.words @ self.map
         return deviation + (shared.T if self.columns else shared)
 
 
 class RelationLikelihood(Objective):
-    """Conditional likelihood of relations; see the module.
+    """The negative conditional log-likelihood of annotated relations, plus priors.
 
     Args:
-        config: weights and priors.
-        machine: the machine that gets the word prior.
-        train: scenes that give the source names and the number of scenes.
-        words: (V, D) unit vectors of the classes; None without a word prior.
+        config: weights of the terms, and precisions of the priors.
+        machine: the machine to train. The constructor adds the word prior to its weights.
+        train: the training scenes. They give the names of the sources and the number of scenes.
+        words: word vectors of the classes with length 1, (classes, dimensions). None means no word
+            prior.
     """
 
     keeps_last = True
@@ -111,7 +119,7 @@ class RelationLikelihood(Objective):
         weights = [config.source_weights.get(name, 1.0) for name in train.source_names]
         self.source_weights = torch.tensor(weights)
         if words is not None and config.word_weight:
-            add_word_prior(machine, words * config.word_weight)
+            add_word_prior(machine, words.to(machine.b.device) * config.word_weight)
 
     @classmethod
     def of(cls, config: ObjectiveConfig, machine: BoltzmannMachine, data: TrainingData) -> Self:
@@ -119,29 +127,32 @@ class RelationLikelihood(Objective):
         return cls(config, machine, data.train, data.words)
 
     def finish(self, machine: BoltzmannMachine, train: SceneTensors) -> BoltzmannMachine:
-        """Return the machine with the word prior in its weights, and with fitted residuals."""
+        """Return the machine for storage, with word prior and residuals included in its weights."""
         bake_word_prior(machine)
         if machine.has_residuals and machine.get_parameter("residual").requires_grad:
             return with_counted_residuals(
-                machine, train, self.offsets.detach(), self.source_weights
+                machine, train, self.offsets.detach().cpu(), self.source_weights.cpu()
             )
         return machine
 
     def parameters(self) -> list[nn.Parameter]:
-        """Return the offsets."""
+        """Return the trained logit offsets of the data sources."""
         return [self.offsets]
 
     def state(self) -> dict[str, Tensor]:
-        """Return the offsets."""
+        """Return the logit offsets of the data sources for a checkpoint."""
         return {"offsets": self.offsets.detach()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the offsets."""
+        """Restore the logit offsets of the data sources from a checkpoint."""
         with torch.no_grad():
             self.offsets.copy_(state["offsets"])
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the mean over scenes of the negative log-likelihood, plus the prior's share."""
+        """Return the negative log-likelihood plus the negative log prior, divided by scenes.
+
+        The likelihood is divided by the scenes of the batch, and the prior by all training scenes.
+        """
         with cached():
             return self._loss(machine, batch, generator)
 
@@ -158,10 +169,11 @@ class RelationLikelihood(Objective):
         logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
         known = observed * machine.gate(edges, batch.v) * weight
         nll = relation_nll(machine, edges, logits, r, observed, known, h1, generator)
-        return nll / len(batch) + self._prior(machine) / max(self.scenes, 1)
+        scenes = int(total(torch.tensor(len(batch))))
+        return nll / scenes + self._prior(machine) / max(self.scenes, 1) / size()
 
     def _prior(self, machine: BoltzmannMachine) -> Tensor:
-        """Return -log p(weights), without a constant."""
+        """Return the negative log prior of weights and offsets, up to a constant."""
         total = 0.5 * self.config.offset_prior * (self.offsets**2).sum()
         half = 0.5 * self.config.weight_prior
         for name, parameter in machine.named_parameters():
@@ -174,12 +186,15 @@ class RelationLikelihood(Objective):
 
 def partly_shown(v: Tensor, generator: torch.Generator) -> Tensor:
     """Hide objects of scenes (B, V) at random, each scene with its own uniform probability."""
-    chance = torch.rand(len(v), 1, generator=generator)
-    return v * (torch.rand(v.shape, generator=generator) < chance)
+    chance = uniform((len(v), 1), generator)
+    return v * (uniform(v.shape, generator) < chance)
 
 
 def add_word_prior(machine: BoltzmannMachine, words: Tensor) -> None:
-    """Add a word prior to the class weights of a factorised machine; ignore other machines."""
+    """Add a word prior to the class weights S, O, s and o of a machine.
+
+    A machine without these factors stays unchanged.
+    """
     for names, columns in ((_ROWS, False), (_COLUMNS, True)):
         for name in names:
             weight = dict(machine.named_parameters()).get(name)
@@ -189,7 +204,7 @@ def add_word_prior(machine: BoltzmannMachine, words: Tensor) -> None:
 
 
 def bake_word_prior(machine: BoltzmannMachine) -> None:
-    """Add the word prior to the weights, for storage."""
+    """Replace each weight by the sum of word map and class deviation, for storage."""
     for name in (*_ROWS, *_COLUMNS):
         if is_parametrized(machine, name):
             remove_parametrizations(machine, name, leave_parametrized=True)
@@ -198,22 +213,22 @@ def bake_word_prior(machine: BoltzmannMachine) -> None:
 def with_counted_residuals(
     machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
 ) -> BoltzmannMachine:
-    """Return the machine with weights of single triples, smoothed towards counts.
+    """Return the machine with fitted residual weights of single triples.
 
-    Shared factors describe a relation over all classes. For some pairs, the factors give a high
+    All classes share the factors of a relation. For some pairs of classes, the factors give a high
     probability although the relation is false in many scenes (a window on a stove). After training,
-    this function therefore fits a weight δ_e for each triple e = (a,i,j) that enough scenes
-    observe. δ_e maximises
+    this function therefore fits a change δ_e of the residual weight w_e' of each triple e = (a,i,j)
+    that enough scenes annotate. Newton's method maximises
 
-        sum over scenes of log p(r_e | v, E[h1 | v], w_e' + δ_e) - τ/2 δ_e²
+        sum over scenes of log p(r_e | v, E[h1 | v], w_e' + δ_e) - τ/2 δ_e².
 
-    by Newton's method. All other weights are fixed. As in training, the context depends on a random
-    subset of the objects. With few scenes, δ_e stays close to 0.
+    All other weights are fixed. As in training, the hidden units depend on a random subset of the
+    objects. With few scenes, δ_e stays close to 0.
 
     Args:
-        train: scenes with known relations.
-        offsets: (sources, A), added to the logits of each source's scenes.
-        source_weights: (sources,) weight of a relation of each source.
+        train: training scenes with annotated relations.
+        offsets: corrections of the logits for each data source, (sources, relations).
+        source_weights: weight of a relation from each data source, (sources,).
     """
     keys, logits, holds, weights = _known_units(machine, train, offsets, source_weights)
     triples, which, counts = np.unique(keys, return_inverse=True, return_counts=True)
@@ -235,7 +250,7 @@ def with_counted_residuals(
 def _known_units(
     machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return keys (U,), logits, values and weights of all known units."""
+    """Return keys, logits, values and weights of all annotated relations, each (relations,)."""
     columns: list[list[Tensor]] = [[], [], [], []]
     V = machine.spec.V
     generator = torch.Generator().manual_seed(0)

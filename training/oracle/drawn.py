@@ -1,4 +1,4 @@
-"""The posterior of any scene under any machine, from weighted draws of the context."""
+"""The posterior of any scene under any machine, from weighted draws of the hidden units."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ from training.oracle.units import NO_UNIT, Units, mean_log_p, units_between
 Floats = NDArray[np.floating[Any]]
 Places = NDArray[np.int64]
 
-# Maximum of relation units × draws in a block of rows or candidates.
+# Maximum number of values (relation units × draws) in a block of rows or candidates.
 _BLOCK = 1 << 22
 
 
 class _Between(NamedTuple):
-    """The units between the classes of a scene.
+    """The relation units between the classes of a scene.
 
     Attributes:
-        units: layout of the E units.
-        logits: (M, E), one row for each draw.
-        said: (M, E) change of the log-weights that removes the observation of a unit from the
-            draws; 0 without observed relations.
-        holds: (1, E), 1 where a unit is observed as on; None without observed relations.
+        units: layout of the relation units.
+        logits: logit of each relation unit, (draws, units).
+        said: change of the log-weights of the draws that removes the observation of a unit, (draws,
+            units). It is 0 without observed relations.
+        holds: 1 where a relation is observed as true, else 0, (1, units). None means that no
+            relation is observed.
     """
 
     units: Units
@@ -44,9 +45,10 @@ class _Between(NamedTuple):
 
 
 class DrawnPosterior:
-    """A `Posterior` from weighted draws.
+    """An implementation of `app.questions.posterior.Posterior` by weighted draws of h1.
 
-    In the local form without observed relations, the log-odds of objects have a closed form.
+    The energy has two forms, seed and local (`training.machines.machine`). In the local form
+    without observed relations, the log-odds of objects have a closed form.
     """
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
@@ -57,7 +59,7 @@ class DrawnPosterior:
 
     @property
     def unit_count(self) -> int:
-        """Number of relation units of the evidence (seed form: between all present classes)."""
+        """Number of relation units in the evidence. The seed form has units between all classes."""
         return self.observation.unit_count
 
     @cached_property
@@ -76,7 +78,7 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def absent_log_odds(self, absent: Places) -> Floats:
-        """See `Posterior`; the local form without observed relations has a closed form."""
+        """Implement `Posterior.absent_log_odds`, by a closed form where one exists."""
         machine, evidence = self.observation.machine, self.observation.evidence
         where = torch.from_numpy(np.asarray(absent, dtype=np.int64))
         if not machine.relations_act and evidence.edges is None:
@@ -88,7 +90,7 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def absent_posterior(self, absent: Places, coverage: float) -> Floats:
-        """See `with_unlisted`; with a second layer, h2 stays at its mean field."""
+        """Implement `Posterior.absent_posterior`. A second hidden layer stays at its mean field."""
         log_odds, y = self.absent_log_odds(absent), self.object_draws.field.y[0].numpy()
         closed = None
         if self._artifact.completions is not None:
@@ -99,13 +101,14 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def relation_log_odds(self) -> Floats:
-        """Return log-odds of every relation between the classes of a scene, given all other units.
+        """Return the log-odds of every relation e between the classes of the scene.
 
             p(r_e = 1 | rest) = E[ sigmoid(ℓ_e(h1) + x_e) ],   h1 from p(h1 | rest)
 
-        x_e is the shift that the observed relations imply for e. Samples of h1 are conditioned on
-        the observed objects and relations. Reweighting removes an observed unit from the evidence:
-        w ← w / p(r_e | v, h1). A relation without a unit has log-odds `NO_UNIT`.
+        "rest" means all other observed units. x_e is the change of the logit due to the observed
+        relations. The draws of h1 are conditioned on all observed units. If r_e is observed, the
+        weights w ← w / p(r_e | v, h1) remove r_e from the condition. A relation without a unit has
+        the log-odds `NO_UNIT`.
         """
         between = self._between
         weight = torch.softmax(self.draws.log_weight + between.said, dim=0)
@@ -114,7 +117,10 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
-        """See `Posterior`; all units of the pair, in both directions, reweight the draws."""
+        """Implement `Posterior.log_odds_apart`.
+
+        New weights of the draws remove all relations of the pair, in both directions.
+        """
         units, said = self._between.units, self._between.said
         logits = self._between.logits + self._implied(apart=True)
         ends = torch.from_numpy(one), torch.from_numpy(other)
@@ -122,7 +128,7 @@ class DrawnPosterior:
         log_weight = self.draws.log_weight
         if said.dim():
             forward, backward = (way.grid(said, 0.0).sum(1) for way in ways)
-            # For a pair of equal classes, both directions have the same units.
+            # If both classes of a pair are equal, both directions use the same relation units.
             log_weight = log_weight + forward + backward * (ends[0] != ends[1])
         weight = torch.softmax(log_weight, dim=0).unsqueeze(1)
         found = []
@@ -145,12 +151,12 @@ class DrawnPosterior:
         r = units.flat(observation.holds).to(logits.dtype)
         gate = machine.gate(units.edges, evidence.v)
         unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
-        # For an unobserved unit, the difference is zero and the weights do not change.
+        # For an unobserved unit, the difference is zero, so the weights of the draws stay the same.
         said = self._pull.relations * (unseen - machine.relation_term(logits, gate, r, observed))
         return _Between(units, logits, said, (r * observed).unsqueeze(0))
 
     def _implied(self, *, apart: bool) -> Tensor:
-        """Return the logit shift that the observed relations imply for each unit, (E,)."""
+        """Return the change of each relation logit due to the observed relations, (units,)."""
         between = self._between
         if between.holds is None:
             return between.logits.new_zeros(())
@@ -158,12 +164,15 @@ class DrawnPosterior:
         return self.draws.implied(machine, edges, between.holds, apart=apart).squeeze(0)
 
     def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
-        """See `Posterior`; the result is a selection from the log-odds of all relations."""
+        """Implement `Posterior.unit_log_odds`, by selection from the log-odds of all relations."""
         return self.relation_log_odds()[relation, subject, object_]
 
     @torch.inference_mode()
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
-        """See `Posterior`; the draws are weighted as if the candidate were present."""
+        """Implement `Posterior.placement_log_odds`.
+
+        The draws have weights as if the candidate object were present.
+        """
         size = 2 * self.observation.machine.spec.A * max(1, len(anchors)) * len(self.draws.h1)
         places = torch.from_numpy(np.asarray(anchors, dtype=np.int64))
         found: tuple[list[Tensor], list[Tensor]] = ([], [])
@@ -178,7 +187,10 @@ class DrawnPosterior:
     def placed_log_p(
         self, candidates: Places, relation: int, anchor: int, *, outgoing: bool
     ) -> Floats:
-        """See `Posterior`; the draws are weighted as if the candidate were present."""
+        """Implement `Posterior.placed_log_p`.
+
+        The draws have weights as if the candidate object were present.
+        """
         where = torch.from_numpy(np.asarray(candidates, dtype=np.int64))
         on, _ = self._log_p(where, torch.tensor([anchor]), outgoing=outgoing)
         return _numpy(on[relation, :, 0].clamp(min=NO_UNIT))
@@ -186,11 +198,15 @@ class DrawnPosterior:
     def _log_p(
         self, candidates: Tensor, anchors: Tensor, *, outgoing: bool
     ) -> tuple[Tensor, Tensor]:
-        """Return log p and log (1 - p) of the units between candidates and anchors, (A, N, m)."""
+        """Return log p and log (1 - p) of the relations between candidates and present objects.
+
+        Both results have the shape (relations, candidates, anchors), where an anchor is a present
+        object.
+        """
         observation, draws = self.observation, self.draws
         machine, evidence = observation.machine, observation.evidence
         classes, counts = observation.classes[anchors], observation.counts[anchors]
-        # All candidates can be present at once, because a unit involves one candidate only.
+        # Each relation unit involves only one candidate, so all candidates can be present at once.
         v = evidence.v.clone()
         v[:, candidates] = 1.0
         weight = weights_with(machine, evidence, draws, candidates)
@@ -206,7 +222,10 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def log_odds_given_rest(self) -> Floats:
-        """See `Posterior`; each class has its own draws if relations are observed."""
+        """Implement `Posterior.log_odds_given_rest`.
+
+        If relations are observed, each class has its own draws.
+        """
         observation = self.observation
         machine, n = observation.machine, len(observation.classes)
         alone = torch.eye(n, dtype=torch.bool)
@@ -222,10 +241,11 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def reasons(self, rows: Places) -> Floats:
-        """See `Posterior`; both log-odds of a difference use the mean field of the context.
+        """Implement `Posterior.reasons`, with mean-field estimates of both log-odds.
 
-        With draws, the noise would exceed the difference of two estimates. One scene, without i and
-        j, gives both the log-odds of i without j and the log-odds of j without i.
+        A reason is a difference of two log-odds. With draws, the noise of the estimates would
+        exceed the difference. A scene without the classes i and j gives two log-odds: of i without
+        j, and of j without i.
         """
         observation = self.observation
         machine, n = observation.machine, len(observation.classes)
@@ -248,18 +268,18 @@ class DrawnPosterior:
         i, j = pairs.unbind(1)
         without[i, j], without[j, i] = log_odds.unbind(1)
         without = without[places]
-        # On the diagonal only the class itself is removed. This gives its log-odds given the rest.
+        # The diagonal contains the log-odds of each class given all other classes.
         change = without.gather(1, places.unsqueeze(1)) - without
         change[torch.arange(len(places)), places] = 0.0
         return _numpy(change)
 
     @torch.inference_mode()
     def reasons_for_absent(self, candidates: Places) -> Floats:
-        """See `Posterior`; both log-odds of a difference use the mean field, as in `reasons`."""
+        """Implement `Posterior.reasons_for_absent`, with mean-field estimates as in `reasons`."""
         observation = self.observation
         machine, n = observation.machine, len(observation.classes)
         where = torch.from_numpy(np.asarray(candidates, dtype=np.int64)).unsqueeze(0)
-        # The first row is the unchanged scene.
+        # The first row keeps all classes. Each other row removes one class of the scene.
         removed = torch.eye(n + 1, dtype=torch.bool)[:, 1:]
         size = observation.unit_count + where.shape[1] * max(1, machine.spec.H1)
         log_odds = torch.cat(
@@ -277,11 +297,11 @@ class DrawnPosterior:
 
 
 def _rows(size: int) -> int:
-    """Return the number of rows of that size in a block."""
+    """Return how many rows of `size` values fit in a block of `_BLOCK` values, at least 1."""
     return max(1, _BLOCK // max(1, size))
 
 
 def _numpy(values: Tensor) -> Floats:
-    """Return a contiguous array, as compiled functions expect."""
+    """Return the values as a contiguous array, because the compiled functions need one."""
     found: Floats = values.contiguous().numpy()
     return found

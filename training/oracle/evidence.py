@@ -1,12 +1,13 @@
 """Convert a scene to evidence in the tensor layout of a machine.
 
-Presence is soft: a class seen with confidence c < 1 enters as v = c. This is a first-order
-approximation. The energy is linear in v_i, so v = c gives the mean energy over v_i ~ Bernoulli(c).
-The context is computed once from v = c, and not averaged over v_i. Unseen classes enter as v = 0.
+A class seen with confidence c < 1 has the presence v = c. The energy is linear in v_i, so v = c
+gives the mean energy over v_i ~ Bernoulli(c). The hidden units are computed once from v = c instead
+of averaged over v_i, which is a first-order approximation. Unseen classes have v = 0.
 
-Listed relations and relations derived from poses are observed; all other relations are unobserved.
-In the local form, unobserved relations drop out, so only classes with an observed relation have
-units. A relation without a unit in the machine is ignored.
+Listed relations and relations derived from poses are observed. All other relations are unobserved.
+In the local form of the energy (`training.machines.machine`), unobserved relations have no effect,
+so only classes with an observed relation have relation units. A relation for which the machine has
+no unit is ignored.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from training.machines.mean_field import Evidence
 from training.oracle.units import Units, units_between
 
 DRAWS = 64
-"""Number of draws of the context for an estimate; a power of two balances the Sobol sequence."""
+"""Number of draws of the hidden units for an estimate. A power of two suits a Sobol sequence."""
 
-# Minimum number of draws. With very many relations, fewer draws limit the time of a question.
+# Minimum number of draws. Scenes with very many relations use fewer draws to limit the time.
 _FEWEST_DRAWS = 8
 _RELATION_DRAWS = 1 << 25
 
@@ -39,14 +40,14 @@ def draw_context(
     rows: int | None = None,
     pull: float = 1.0,
 ) -> HiddenDraws:
-    """Return weighted draws of h1 given the evidence; equal evidence gives equal draws.
+    """Return weighted draws of h1 given the evidence. Equal evidence gives equal draws.
 
-    The number of draws is `DRAWS`. It is smaller if rows × relation units × draws would exceed a
+    The number of draws is `DRAWS`, or smaller if rows × relation units × draws would exceed a
     bound.
 
     Args:
-        rows: number of all rows of the question; default: the rows of the evidence.
-        pull: weight of the observed relations, see `draw_hidden`.
+        rows: total number of evidence rows of the request. The default is the rows of `evidence`.
+        pull: exponent of the likelihood of the observed relations, from 0 to 1.
     """
     units = 0 if evidence.edges is None else evidence.edges.shape[-1]
     size = (len(evidence.v) if rows is None else rows) * units
@@ -58,16 +59,18 @@ def draw_context(
 
 @dataclass(frozen=True)
 class Observation:
-    """One scene in the layout of a machine.
+    """One scene in the tensor layout of a machine.
 
     Attributes:
         machine: the machine.
-        scene: the classes of the scene, as arrays.
-        classes, counts: (n,) int64, the distinct classes, ascending, and their instances.
-        holds, observed: (A, n, n) bool.
-        evidence: the scene in the machine's layout, one row.
-        units: layout of the evidence's relations; None if relations do not affect the context.
-        touched: (n,) bool, the classes with a unit in `units`.
+        scene: classes of the scene as arrays.
+        classes: indices of the n distinct classes in ascending order, (n,) int64.
+        counts: number of instances of each class, (n,) int64.
+        holds, observed: values and observed flags of the relations, (relations, n, n) bool.
+        evidence: the scene as evidence with one row.
+        units: layout of the relation units in the evidence. None means that relations do not affect
+            the hidden units.
+        touched: True for classes with a relation unit in `units`, (n,) bool.
     """
 
     machine: BoltzmannMachine
@@ -82,14 +85,14 @@ class Observation:
 
     @property
     def unit_count(self) -> int:
-        """Number of relation units E of the evidence."""
+        """Number of relation units in the evidence."""
         return 0 if self.units is None else self.units.edges.shape[-1]
 
     def without(self, removed: Tensor) -> Evidence:
         """Return the scene without some classes and without the relations of these classes.
 
         Args:
-            removed: (B, n) bool, the classes to remove in each row of the result.
+            removed: True for classes to remove, (rows of the result, classes of the scene) bool.
         """
         evidence, size = self.evidence, len(removed)
         v = evidence.v.repeat(size, 1)
@@ -103,16 +106,17 @@ class Observation:
         observed = evidence.observed & self.units.flat(kept)
         edges = self.units.edges
         if self.machine.relations_act:
-            # In the seed form unobserved relations act, and each row has its own anchors.
+            # In the seed form, unobserved relations also have an effect, so each row needs units
+            # between its own classes.
             edges = edges.expand(size)
         return Evidence(v, edges, evidence.r.expand(size, -1), observed, room)
 
 
 def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
-    """Return the observation of a scene.
+    """Convert a scene to the tensor layout of a machine.
 
     Raises:
-        ValueError: the machine lacks the class of an object or the room type.
+        ValueError: the machine does not have the class of an object, or the room type.
     """
     spec = machine.spec
     found = class_evidence(scene)
@@ -120,7 +124,7 @@ def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
     v = torch.zeros(1, spec.V, dtype=machine.b.dtype)
     v[0, classes] = torch.from_numpy(found.confidence).to(v.dtype)
     room = None if scene.room_type is None else torch.tensor([scene.room_type])
-    # A machine may have fewer relations than the vocabulary of canonical relations.
+    # A machine can have fewer relations than the vocabulary, so the extra relations are cut off.
     holds = torch.from_numpy(found.holds[: spec.A])
     observed = torch.from_numpy(found.observed[: spec.A])
     observation = Observation(

@@ -1,14 +1,15 @@
-"""Score of a sampled scene: its log-likelihood up to a constant of the model.
+"""Score of a sampled scene: its log-likelihood up to a constant of the machine.
 
-Score of objects v and relations r, at temperature 1:
+The energy has two forms (`training.machines.machine`). At temperature 1, the score of objects v and
+relations r is:
 
     local form   b·v + sum_k softplus(x_k) + log p(r | v, h1)
     seed form    b·v + sum_k softplus(x_k + sum_e r_e U_ek) + sum_e r_e ℓ⁰_e
 
-with x = c1 + v'W + J m. In the seed form, the score is log p(v, r) + log Z. In the local form, the
-score is log p(v) + log Z, plus the log-likelihood of r given the h1 from which r was sampled. With
-a second layer, m is the mean field of h2. The score then also contains c2·m and the entropy of m,
-which gives a lower bound on the sum over h2.
+with x = c1 + v'W + J m. Z is the partition function. In the seed form, the score is log p(v, r) +
+log Z. In the local form, the score is log p(v) + log Z, plus the log-likelihood of r given the
+hidden units h1 from which r was sampled. With a second hidden layer h2, m is the mean field of h2.
+The score then also contains c2·m and the entropy of m, and is a lower bound of the exact value.
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ def log_score(
     h1: Tensor,
     room: Tensor | None,
 ) -> Tensor:
-    """Return the score of each scene, (B,).
+    """Return the score of each scene, (scenes,).
 
     Args:
-        v: (B, V) presence.
-        r: (B, E) over `edges`, off wherever the gate is off.
-        h1: (B, H1), the context from which the relations were sampled.
+        v: presence of objects, (scenes, classes).
+        r: relations, (scenes, units). A unit with gate 0 must be 0.
+        edges: layout of the relation units in r.
+        h1: hidden units from which the relations were sampled, (scenes, hidden units).
+        room: index of the room type of each scene, (scenes,). None means unknown.
     """
     known = torch.ones_like(r, dtype=torch.bool)
     local = not machine.relations_act

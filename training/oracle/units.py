@@ -1,7 +1,8 @@
-"""Relation units between classes, independent of the layout of the machine.
+"""A table of the relation units between classes, in one layout for all machines.
 
-A Triway machine has a unit for every pair of classes. The RBM and the GBM have units only for the
-triples seen in training; all other relations are always off.
+A Triway machine has a relation unit for every relation and pair of classes. The RBM and the GBM
+have units only for the triples (relation, subject, object) seen in training. Their other relations
+are always 0.
 """
 
 from __future__ import annotations
@@ -15,18 +16,20 @@ from app.inference import relations
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges, pair_edges
 
-# A Python float, because tensors do not accept numpy scalars.
+# Tensors accept a Python float but no numpy scalar.
 NO_UNIT = float(relations.NO_UNIT)
 
 
 @dataclass(frozen=True)
 class Units:
-    """The units between n subject classes and m object classes.
+    """The relation units between n subject classes and m object classes.
 
     Attributes:
-        edges: (1, E) units in the machine's layout.
-        place: (A, n, m) int64, the index in `edges` of each unit; or (A, P), see `of_pairs`.
-        exists: (A, n, m) bool; where False, `place` is arbitrary.
+        edges: the relation units in the machine's layout, (1, units).
+        place: index in `edges` of each relation, (relations, n, m) int64. After `of_pairs`, the
+            shape is (relations, pairs).
+        exists: True where the machine has a unit for the relation, shaped like `place`. Where
+            False, `place` is arbitrary.
     """
 
     edges: Edges
@@ -34,20 +37,29 @@ class Units:
     exists: Tensor
 
     def grid(self, values: Tensor, missing: float) -> Tensor:
-        """Return values (..., E) of the units as (..., A, n, m); `missing` if there is no unit."""
+        """Return values of units, (..., units), as a table (..., relations, n, m).
+
+        Relations without a unit have the value `missing`.
+        """
         if not values.shape[-1]:
             return values.new_full((*values.shape[:-1], *self.place.shape), missing)
         return torch.where(self.exists, values[..., self.place], missing)
 
     def of_pairs(self, subjects: Tensor, objects: Tensor) -> Units:
-        """Return the units of P pairs of class indices (P,); `grid` then gives (..., A, P)."""
+        """Return only the relation units of some pairs of classes.
+
+        The method `grid` of the result returns tables of shape (..., relations, pairs).
+
+        Args:
+            subjects, objects: indices into the subject and object classes, (pairs,).
+        """
         place, exists = (grid[:, subjects, objects] for grid in (self.place, self.exists))
         return Units(self.edges, place, exists)
 
     def flat(self, grid: Tensor) -> Tensor:
-        """Return values (..., A, n, m) as (..., E).
+        """Return a table of values, (..., relations, n, m), as values of units, (..., units).
 
-        Values without a unit are dropped. Units without a value are 0.
+        Values of relations without a unit are left out. Units outside the table have the value 0.
         """
         values = grid.new_zeros(*grid.shape[:-3], self.edges.shape[-1])
         values[..., self.place[self.exists]] = grid[..., self.exists]
@@ -61,10 +73,11 @@ def units_between(
     subject_counts: Tensor | None = None,
     object_counts: Tensor | None = None,
 ) -> Units:
-    """Return the units from subject classes (n,) to object classes (m,).
+    """Return the relation units from subject classes, (n,), to object classes, (m,).
 
     Args:
-        subject_counts, object_counts: instances of each class; default: one each.
+        subject_counts, object_counts: number of instances of each class. The default is one
+            instance of each class.
     """
     A = machine.spec.A
     pairs = pair_edges(
@@ -86,13 +99,13 @@ def _logs(machine: BoltzmannMachine, classes: Tensor, counts: Tensor | None) -> 
 
 
 def mean_log_p(weight: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-    """Return log E[sigmoid(ℓ)] and log E[sigmoid(-ℓ)] over draws.
+    """Return log E[sigmoid(ℓ)] and log E[sigmoid(-ℓ)], where E is the weighted mean over draws.
 
-    Both tails are summed separately, because 1 - p loses precision for p near one.
+    The two means are computed separately, because 1 - p loses precision for p near 1.
 
     Args:
-        weight: (M, ...) normalised over M, broadcastable to the logits.
-        logits: (M, ...).
+        weight: log-weights of the draws, (draws, ...), broadcastable to `logits`.
+        logits: logits ℓ of relations, (draws, ...).
     """
     tiny = torch.finfo(logits.dtype).tiny
     on = (weight * logits.sigmoid()).sum(0).clamp(min=tiny).log()

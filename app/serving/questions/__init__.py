@@ -1,6 +1,7 @@
-"""The questions of the service. Each module reads a request, calls the model and builds the answer.
+"""The questions of the service. The module of a question contains its route function.
 
-To add a question, add a module to this package and an entry to `QUESTIONS`.
+A route function reads a request, calls the model and builds the answer. To add a question, add a
+module to this package and an entry to `QUESTIONS`.
 """
 
 from __future__ import annotations

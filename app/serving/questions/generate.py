@@ -31,14 +31,17 @@ from app.serving.request import Request
 from scene_client.schemas import GenerateAnswer, GenerateRequest
 
 DRAWN_SEED_BITS = 53
-"""A double holds a seed of this size exactly, so every JSON reader can send it back unchanged."""
+"""Size in bits of a seed that the service chooses.
 
-_WARM_UP_STEPS: Final = 1  # one Gibbs sweep compiles all loops
-_UNIT_BYTES = 12  # for the number of one hidden unit
+A JSON reader may store numbers as doubles. A double represents an integer of 53 bits exactly.
+"""
+
+_WARM_UP_STEPS: Final = 1  # one Gibbs sweep compiles all kernels
+_UNIT_BYTES = 12  # maximum size in bytes of the number of one hidden unit
 
 
 async def generate(request: Request, asked: GenerateRequest) -> Answer:
-    """Draw scenes that contain the evidence. The same seed draws the same scenes."""
+    """Sample scenes that contain the given objects and relations. Equal seeds give equal scenes."""
     model, reading = request.read(asked, may_be_empty=True)
     _check_context(asked, model)
     seed = secrets.randbits(DRAWN_SEED_BITS) if asked.seed is None else asked.seed
@@ -80,11 +83,16 @@ def _check_context(asked: GenerateRequest, model: ServedModel) -> None:
         size = model.context_sizes.get(layer)
         if size is None:
             layers = tuple(model.context_sizes)
-            faults.add(Reason.INVALID, ("context", layer), "the model has no such layer", layers)
+            faults.add(
+                Reason.INVALID,
+                ("context", layer),
+                "the model lacks this hidden layer",
+                layers,
+            )
             continue
         for place, unit in enumerate(units):
             if unit >= size:
-                message = f"the layer has units 0 to {size - 1}"
+                message = f"the hidden layer has only the units 0 to {size - 1}"
                 faults.add(Reason.INVALID, ("context", layer, place), message)
     faults.raise_any()
 
@@ -110,7 +118,7 @@ _EXAMPLES: Final = {
     ),
     "poses": Example("scenes around the objects that the robot sees", {**POSES, "seed": 7}),
     "context": Example(
-        "hidden units held on (GET /models/{name}/contexts lists the units)",
+        "active hidden units (GET /models/{name}/contexts lists all units)",
         {"context": {"h1": [0, 3]}, "seed": 7},
     ),
     "varied": Example(

@@ -39,16 +39,16 @@ _OFFSET_BYTES = 250
 
 
 async def missing(request: Request, asked: MissingRequest) -> Answer:
-    """Rank the classes that the scene does not list, likeliest first, with their likeliest places.
+    """Rank the classes that the scene does not list, most probable first, with likely places.
 
-    Listed classes are never proposed: the models do not estimate the number of instances of a
-    class.
+    The answer contains only classes that the scene does not list, because the models do not
+    estimate the number of instances of a class.
     """
     model, reading = request.read(asked)
     faults = Faults()
-    # The default may exceed the vocabulary's size. A number from the client must not.
+    # Only the default of `top_k` may exceed the size of the vocabulary.
     if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:
-        message = f"must be at most {len(model.vocabulary)}, the size of the model's vocabulary"
+        message = f"`top_k` must be at most {len(model.vocabulary)}, the size of the vocabulary"
         faults.add(Reason.INVALID, ("top_k",), message)
     candidates = at = None
     if asked.candidates is not None:
@@ -99,7 +99,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
 def _candidates(
     labels: list[str], model: ServedModel, reading: Reading, faults: Faults
 ) -> list[int]:
-    """Class indices of the candidate labels."""
+    """Return the class indices of the labels in the request's field `candidates`."""
     indices: dict[int, None] = {}
     for place, label in enumerate(labels):
         index = model.vocabulary.index(label)
@@ -121,7 +121,7 @@ def _place(
 
 
 def _axes(asked: MissingRequest) -> Axes | None:
-    """The viewer's axes in the frame of the offsets; None if the viewing direction is unknown."""
+    """Return the viewer's axes in `frame_id`, or None if the viewing direction is unknown."""
     if asked.frame_id is None and asked.viewpoint is None:
         return VIEWER
     return viewer_axes(asked.frame_id, None if asked.viewpoint is None else asked.viewpoint.yaw)
@@ -164,7 +164,7 @@ _EXAMPLES: Final = {
         {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
     ),
     "coverage": Example(
-        "complete list: unlisted classes count as absent",
+        "a complete list: unlisted classes count as absent",
         {**LABELS, "coverage": 1.0},
     ),
     "candidates": Example(

@@ -33,10 +33,10 @@ from scene_client.schemas import OutliersAnswer, OutliersRequest
 
 
 async def outliers(request: Request, asked: OutliersRequest) -> Answer:
-    """Judge every object, least fitting first, and every stated relation, least likely first.
+    """Return probabilities that each object is an outlier and that each observed relation is false.
 
-    In `outliers`, all instances of a class have the same probability. `misplaced` judges each
-    relation of each instance.
+    The list `outliers` starts with the most probable outlier. All instances of a class have the
+    same probability. The list `misplaced` starts with the relation that is most probably false.
     """
     model, reading = request.read(asked)
     found = await request.ask(
@@ -89,7 +89,7 @@ def _size(found: questions.OutliersFound) -> Callable[[int], int]:
 
 
 def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> Answer:
-    """Express a canonical relation with the subject and object of the request."""
+    """Convert a canonical relation to the name, subject and object that the request uses."""
     ids = reading.ids
     if (CANONICAL.index(relation), subject, object_) in reading.flipped:
         subject, relation, object_ = object_, opposite(relation), subject
@@ -97,7 +97,7 @@ def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> Ans
 
 
 def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
-    # With threshold 0 every object is an outlier, so companions are computed, too.
+    # With threshold 0, every object is an outlier. So the function also computes `usually_with`.
     _, found, misplaced = questions.outliers(artifact, scenes[0], threshold=0.0)
     for scene in scenes[1:]:
         found += questions.outliers(artifact, scene).outliers
@@ -109,7 +109,7 @@ _EXAMPLES: Final = {
     "intruder": Example("a toilet in a bedroom", WITH_TOILET),
     **SCENES,
     "misplaced": Example(
-        "relations that may be wrong",
+        "relations that the request states and that may be wrong",
         {
             "objects": ["bed", "pillow", "nightstand"],
             "relations": [

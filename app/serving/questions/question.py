@@ -1,4 +1,4 @@
-"""The record of a question: its function, its schemas and its worked examples."""
+"""The class `Question`: the function, the schemas and the examples of one question."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ RequestT = TypeVar("RequestT", bound=schemas.SceneRequest)
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A worked example for the documentation.
+    """An example request for the documentation.
 
     Attributes:
         summary: title of the example.
         value: the request body.
-        problem: slug of the problem in the response; None if the request is valid.
+        problem: slug (short name) of the problem in the response. None means that the request is
+            valid.
     """
 
     summary: str
@@ -36,14 +37,17 @@ class Question(Generic[RequestT]):
     """One question about a scene. Routes, documentation, warm-up and metrics use this record.
 
     Attributes:
-        answer: function that answers a request. Its name is the name of the question. Its docstring
-            is the description of the route. It raises the errors of `Request.read` and
-            `Request.ask`, and `RequestError` if the answer would be too large.
-        warm_up: function that asks a model about scenes and returns the numbers of the answers. It
-            must call every compiled loop of the question, since the first call compiles the loop.
-        request, response: schemas of the HTTP contract.
-        examples: examples by name; the default model knows their labels.
-        example_answer: an answer with illustrative figures, without its envelope.
+        answer: function that answers a request. The name of this function is the name of the
+            question, and its docstring is the description of the route. The function raises the
+            errors of `Request.read` and `Request.ask`, and `RequestError` if the answer would be
+            too large.
+        warm_up: function that asks a model about scenes and returns all numbers of the answers. The
+            function must call every compiled kernel of the question, because the first call
+            compiles the kernel.
+        request, response: schemas of the request and of the answer.
+        examples: dictionary from names to example requests. The default model knows all labels of
+            the examples.
+        example_answer: an answer with illustrative figures, without the common fields of answers.
         has_batch: whether one request can ask the question about many scenes.
     """
 
@@ -57,22 +61,22 @@ class Question(Generic[RequestT]):
 
     @property
     def name(self) -> str:
-        """The name of the question, which is also its path."""
+        """Name of the question. The path of the route is the same name."""
         return self.answer.__name__
 
     @property
     def summary(self) -> str:
-        """Summary of the route."""
+        """Summary of the route, for the API documentation."""
         return getdoc(self.request) or ""
 
     @property
     def description(self) -> str:
-        """Description of the route."""
+        """Description of the route, for the API documentation."""
         return getdoc(self.answer) or ""
 
     @property
     def empty_answer(self) -> Answer:
-        """An answer with empty lists, without its envelope."""
+        """An answer with empty lists, without the common fields of answers."""
         return {name: [] for name, part in self.example_answer.items() if isinstance(part, list)}
 
 
@@ -139,7 +143,7 @@ SCENES: Final[dict[str, Example]] = {
         {"objects": ["bed", "nigthstand", "big lamp"], "unknown_labels": "nearest"},
     ),
 }
-"""Valid examples for every question that needs a list of objects."""
+"""Valid example requests for every question that needs a list of objects."""
 
 REFUSED: Final[dict[str, Example]] = {
     "unknown-labels": Example(
@@ -162,14 +166,14 @@ REFUSED: Final[dict[str, Example]] = {
         "a model that does not exist", {**LABELS, "model": "nobody@9.9.9"}, "model-not-found"
     ),
 }
-"""Invalid examples for every question."""
+"""Invalid example requests for every question."""
 
 BATCH: Final[dict[str, Example]] = {
     "scenes": Example("two scenes", {"scenes": [LABELS, BEDROOM]}),
     "bad-entry": Example(
-        "an invalid scene: only its own entry fails",
+        "an invalid scene, which does not affect the other scenes",
         {"scenes": [LABELS | {"room_type": "bedroom"}, {"objects": ["desk", "nigthstand"]}]},
     ),
     "empty": Example("an empty list of scenes", {"scenes": []}, "invalid-request"),
 }
-"""Examples for every batch route."""
+"""Example requests for every batch route."""

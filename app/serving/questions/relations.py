@@ -26,9 +26,10 @@ from scene_client.schemas import RelationsAnswer, RelationsRequest
 
 
 async def relations(request: Request, asked: RelationsRequest) -> Answer:
-    """Rank the relations between the objects of a scene, likeliest first, and list disagreements.
+    """Rank the relations between the objects of a scene, most probable first.
 
-    A disagreement is a pair of objects with another relation than the rest of the scene suggests.
+    The answer also lists disagreements: pairs of objects whose observed relation differs from the
+    relation that the model expects from the rest of the scene.
     """
     model, reading = request.read(asked)
     found, disagreements = await request.ask(
@@ -36,7 +37,8 @@ async def relations(request: Request, asked: RelationsRequest) -> Answer:
         questions.relations,
         reading.scene,
         top_k=asked.top_k,
-        # Slightly lower: the final comparison below uses rounded probabilities.
+        # This threshold is slightly lower than the requested minimum, because the final comparison
+        # below uses rounded probabilities.
         min_probability=asked.min_probability * (1 - 1e-5),
         pairs=None if asked.pairs is None else _pairs(asked, reading),
         include_opposites=asked.include_opposites,
@@ -88,11 +90,12 @@ def _size(
 
 
 def _disagreement(entry: questions.Disagreement, reading: Reading) -> Answer:
-    """A disagreement with the subject and object of the request's relation."""
+    """Return a disagreement with the subject and the object of the relation in the request."""
     subject, object_, observed, expected, probability, observed_probability = entry
     triples = {canonicalise(subject, relation, object_) for relation in observed}
-    # For each observed relation: whether the request states it with this subject. `flipped` holds
-    # the canonical triples that the request states by their opposite.
+    # The set contains True if the request states an observed relation with this subject, and False
+    # if the request states the opposite relation. `flipped` contains the triples stated by their
+    # opposite.
     from_here = {(triple[1] == subject) != (triple in reading.flipped) for triple in triples}
     if from_here == {False} and reading.flipped:
         subject, object_ = object_, subject
@@ -120,7 +123,7 @@ _EXAMPLES: Final = {
         {"objects": ["chair", "chair", "desk"], "top_k": 10},
     ),
     "pairs": Example(
-        "one ordered pair, all eight relations",
+        "all eight relations of one ordered pair of objects",
         {
             **BEDROOM,
             "pairs": [{"subject": "lamp_1", "object": "bed"}],

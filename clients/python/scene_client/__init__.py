@@ -1,6 +1,6 @@
 """Python clients of the scene-reasoning service, based on httpx and pydantic.
 
-docs/clients.md describes them.
+docs/clients.md describes the clients.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ __all__ = [
     "UnreachableError",
 ]
 
-# The package imports these modules on first use. The service needs only the schemas, and starts
-# faster without httpx and websockets.
+# Maps each name to the module that defines the name. The package imports the module on first use of
+# the name. So the service, which needs only the schemas, starts without httpx and websockets.
 _MODULES = {
     "AsyncClient": "asynchronous",
     "Client": "sync",

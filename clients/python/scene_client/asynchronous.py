@@ -40,29 +40,32 @@ from scene_client.schemas import (
 )
 
 MAX_ANSWER: Final = 256 * 2**20
-"""Maximum size of an answer in bytes. An answer to 256 scenes of 4,096 relations is smaller."""
+"""Maximum size of an answer in bytes.
+
+The answer to a batch of 256 scenes with 4,096 relations each is smaller.
+"""
 
 
 class AsyncClient:
-    """A client of the service.
+    """A client of the scene-reasoning service.
 
     `Client` and `AsyncClient` have the same methods. The methods of `Client` block until the answer
     arrives. Several threads may share one `Client`. The methods of `AsyncClient` are coroutines.
 
     Args:
-        url: address of the service.
+        url: base URL of the service.
         timeout: maximum time of a call in seconds, including all retries and pauses.
-        api_key: API key, if the service requires one.
-        admin_key: key for `refresh` and `promote`.
-        model: model for requests without the field ``model``. By default, the service chooses its
+        api_key: API key, if the service requires an API key.
+        admin_key: admin key of the service, for `refresh` and `promote`.
+        model: model for requests without the field ``model``. By default, the service uses its
             default model.
-        retries: maximum number of retries of a call. The client retries after status 429 or 503 and
-            after connection errors, within the timeout.
-        transport: transport of the requests. The default is a pool of connections.
+        retries: maximum number of retries of a call. Within the timeout, the client retries after
+            status 429 or 503 and after connection errors.
+        transport: httpx transport that sends the requests. The default is a pool of connections.
 
-    The first argument of a question is the list of objects. Other fields of the request are keyword
-    arguments. The first argument may also be a whole request, without keyword arguments. The
-    argument ``timeout`` of a method replaces the timeout of the client for this call.
+    The first argument of a question method is the list of objects. Other fields of the request are
+    keyword arguments. The first argument may also be a whole request, without keyword arguments.
+    The argument ``timeout`` of a method replaces the timeout of the client for this call.
 
     Raises:
         InvalidRequestError: the request is invalid. The client has not sent it.
@@ -110,7 +113,7 @@ class AsyncClient:
         timeout: float | None = None,
         **fields: Unpack[MissingFields],
     ) -> MissingAnswer:
-        """Return classes that are probably missing from the list, and their likely places."""
+        """Return classes that are probably missing from the scene, and their likely places."""
         form, answer = MissingRequest, MissingAnswer
         call = ask("/missing", form, answer, objects, fields, self.options.model)
         return await self._call(call, timeout)
@@ -135,7 +138,7 @@ class AsyncClient:
         timeout: float | None = None,
         **fields: Unpack[GenerateFields],
     ) -> GenerateAnswer:
-        """Return scenes sampled from the model that contain the given objects."""
+        """Sample scenes from the model. Each sampled scene contains the given objects."""
         call = ask(
             "/generate", GenerateRequest, GenerateAnswer, objects, fields, self.options.model
         )
@@ -149,7 +152,7 @@ class AsyncClient:
         *,
         timeout: float | None = None,
     ) -> BatchAnswer[RelationsAnswer]:
-        """Ask `relations` for up to 256 scenes. An invalid scene affects only its own entry."""
+        """Ask `relations` about up to 256 scenes. Each scene has its own answer or problem."""
         form, answer = RelationsRequest, BatchAnswer[RelationsAnswer]
         call = ask_each("/relations", form, answer, scenes, self.options.model)
         return await self._call(call, timeout)
@@ -160,7 +163,7 @@ class AsyncClient:
         *,
         timeout: float | None = None,
     ) -> BatchAnswer[MissingAnswer]:
-        """Ask `missing` for up to 256 scenes. An invalid scene affects only its own entry."""
+        """Ask `missing` about up to 256 scenes. Each scene has its own answer or problem."""
         form, answer = MissingRequest, BatchAnswer[MissingAnswer]
         call = ask_each("/missing", form, answer, scenes, self.options.model)
         return await self._call(call, timeout)
@@ -171,7 +174,7 @@ class AsyncClient:
         *,
         timeout: float | None = None,
     ) -> BatchAnswer[OutliersAnswer]:
-        """Ask `outliers` for up to 256 scenes. An invalid scene affects only its own entry."""
+        """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
         form, answer = OutliersRequest, BatchAnswer[OutliersAnswer]
         call = ask_each("/outliers", form, answer, scenes, self.options.model)
         return await self._call(call, timeout)
@@ -179,7 +182,7 @@ class AsyncClient:
     # --------------------------------------------------------------------------------- models
 
     async def models(self, *, timeout: float | None = None) -> ModelList:
-        """Return the models, their versions and the aliases."""
+        """Return the models of the service, their versions and their aliases."""
         return await self._call(Call("GET", "/models", ModelList), timeout)
 
     @overload
@@ -215,7 +218,7 @@ class AsyncClient:
         return await self._call(Call("GET", path, ContextsAnswer), timeout)
 
     async def refresh(self, *, timeout: float | None = None) -> RefreshAnswer:
-        """Make the service load the current state of its store. This needs the admin key."""
+        """Make the service load the current state of its store. The call needs the admin key."""
         call = Call("POST", "/models/refresh", RefreshAnswer, administers=True)
         return await self._call(call, timeout)
 
@@ -227,7 +230,7 @@ class AsyncClient:
         timeout: float | None = None,
         **fields: Unpack[AliasFields],
     ) -> AliasAnswer:
-        """Point an alias at a model or at one version of the model. This needs the admin key.
+        """Point an alias at a model or at one version of the model. The call needs the admin key.
 
         The client does not retry after a connection error, because the service may already have
         moved the alias.
@@ -235,15 +238,15 @@ class AsyncClient:
         Args:
             alias: ``default``, or any other alias.
             model: ``name@version``, or ``name`` for the newest version.
-            **fields: ``expected``: required current target of the alias. None means that the alias
-                must not exist yet.
+            **fields: optional field ``expected``, the required current target of the alias. None
+                means that the alias must not exist yet.
         """
         return await self._call(promote(alias, {"model": model, **fields}), timeout)
 
     # --------------------------------------------------------------------------------- health
 
     async def is_live(self, *, timeout: float | None = None) -> bool:
-        """Return whether the service answers. The client does not retry."""
+        """Return whether the service answers a health check. The client does not retry."""
         return await self._is("live", timeout)
 
     async def is_ready(self, *, timeout: float | None = None) -> bool:
@@ -289,13 +292,13 @@ class AsyncClient:
                 attempt += 1
                 await anyio.sleep(pause)
             else:
-                # An answer that the client has read after the deadline counts as late.
+                # If the client has read the answer only after the deadline, the call fails.
                 if monotonic() < ends:
                     return answer
         raise DeadlineError(f"The answer did not arrive within {limit:g} s.")
 
     async def _attempt(self, call: Call[T], left: float) -> T:
-        """Send a call once and return its answer. The attempt may take at most `left` seconds."""
+        """Send a call once and return the answer. The attempt takes at most `left` seconds."""
         options, body = self.options, bytearray()
         with async_deadline(left):
             try:

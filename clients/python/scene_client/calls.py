@@ -1,4 +1,4 @@
-"""Conversion of the arguments of a call to an HTTP request, and of a response to an answer."""
+"""Conversion of method arguments to an HTTP request, and of the response to an answer."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from scene_client.validation import field_errors
 
 FIRST_PAUSE: Final = 0.05
 LONGEST_PAUSE: Final = 2.0
-"""Maximum pause in seconds between attempts without a Retry-After header.
+"""Maximum pause in seconds between two attempts, without the time in a Retry-After header.
 
-The limit of the random pause starts at `FIRST_PAUSE` and doubles with each attempt.
+The pause is random. Its upper limit starts at `FIRST_PAUSE` and doubles with each attempt.
 """
 
 Objects: TypeAlias = Iterable[str | Detection | Body]
-"""Objects of a scene: labels, `Detection` objects, or dictionaries as in the HTTP contract."""
+"""Objects of a scene: labels, `Detection` objects, or dictionaries with the same fields."""
 
 
 # ------------------------------------------------------------------------------------ one call
@@ -52,15 +52,15 @@ RequestT = TypeVar("RequestT", bound=SceneRequest)
 
 @dataclass(frozen=True, slots=True)
 class Call(Generic[T]):
-    """One call of the HTTP contract.
+    """One HTTP request to the service, and the class of its answer.
 
     Attributes:
         method: HTTP method.
-        path: URL-encoded path.
+        path: URL-encoded path of the route.
         answer: class of the answer.
-        body: body as JSON text, or None for a call without a body.
-        administers: whether the call needs the admin key.
-        repeatable: whether the client may send the call twice without harm.
+        body: body of the request as JSON text. None means a request without a body.
+        administers: whether the request needs the admin key.
+        repeatable: whether the client may send the request again after a connection error.
     """
 
     method: str
@@ -71,7 +71,7 @@ class Call(Generic[T]):
     repeatable: bool = True
 
     def read(self, status: int, headers: Mapping[str, str], body: bytes) -> T:
-        """Return the answer in a response.
+        """Return the answer that a response contains.
 
         Raises:
             ProblemError: the service answered with a problem.
@@ -84,7 +84,7 @@ class Call(Generic[T]):
                 raise DeadlineError(problem.detail or problem.title, problem.request_id)
             raise problem
         try:
-            # A newer service may send fields that this client does not have.
+            # A newer service may send fields that the schemas of this client do not contain.
             return self.answer.model_validate_json(body, extra="ignore")
         except ValidationError as error:
             raise AnswerError(
@@ -96,8 +96,8 @@ class Call(Generic[T]):
         """Return the pause before a retry in seconds, or None if the client must not retry.
 
         Args:
-            error: error of the attempt.
-            attempt: number of the attempt, from 0.
+            error: error of the last attempt.
+            attempt: number of the last attempt. The first attempt has number 0.
         """
         pause = min(LONGEST_PAUSE, FIRST_PAUSE * 2**attempt) * random()  # noqa: S311 # nosec B311
         if isinstance(error, ProblemError):
@@ -113,10 +113,14 @@ def segment(name: str) -> str:
     Raises:
         InvalidRequestError: the name is empty or contains only dots.
     """
-    # In a URL, the segments "." and ".." mean a folder.
+    # In a URL, the segments "." and ".." refer to folders, so they cannot be names.
     if not name or set(name) <= {"."}:
         raise InvalidRequestError(
-            [FieldError(pointer="#", message="a name must contain a character other than a dot")]
+            [
+                FieldError(
+                    pointer="#", message="a name must not be empty, and must not contain only dots"
+                )
+            ]
         )
     return quote(name, safe="")
 
@@ -136,9 +140,9 @@ def ask(
 
     Args:
         path: path of the question's route.
-        form, answer: schemas of the request and the answer.
-        scene: objects, or a whole request as an object or a dictionary.
-        fields: other fields of the request, if ``scene`` contains only objects.
+        form, answer: classes of the request and of the answer.
+        scene: list of objects, or a whole request as a ``form`` or a dictionary.
+        fields: other fields of the request, if ``scene`` is a list of objects.
         model: model for requests without the field ``model``.
 
     Raises:
@@ -157,7 +161,7 @@ def ask_each(
     """Build a batch request: one question about many scenes. `ask` describes the arguments.
 
     Raises:
-        InvalidRequestError: the request about a scene is invalid.
+        InvalidRequestError: the batch or the request about one of its scenes is invalid.
     """
     requests = [
         _json(_request(form, scene, {}, model, ("scenes", place)))
@@ -171,7 +175,7 @@ def ask_each(
 
 
 def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
-    """Build the call that points an alias at another target.
+    """Build the call that points the alias ``alias`` at a model or a version.
 
     Raises:
         InvalidRequestError: the request is invalid.
@@ -182,13 +186,13 @@ def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
         AliasAnswer,
         _json(_validated(AliasRequest, dict(fields))),
         administers=True,
-        # If the first attempt has moved the alias, a second attempt with `expected` would fail.
+        # If the first attempt has changed the alias, a second attempt with `expected` would fail.
         repeatable=False,
     )
 
 
 def _json(request: BaseModel) -> str:
-    # The body leaves out unset fields, because an older service may refuse them.
+    # The body does not contain unset fields, because an older service may refuse unknown fields.
     return request.model_dump_json(exclude_unset=True)
 
 
@@ -202,7 +206,7 @@ def _request(
     if isinstance(scene, SceneRequest | Mapping):
         if fields:
             names = ", ".join(fields)
-            message = f"put these fields into the whole request, not beside it: {names}"
+            message = f"these fields must be members of the whole request: {names}"
             raise InvalidRequestError([FieldError(pointer="#", message=message)])
         given = _plain(scene)
     else:
@@ -213,7 +217,8 @@ def _request(
     return _validated(kind, spelt_out, at)
 
 
-# Short forms: in these fields, a tuple may replace an object with these members.
+# Short forms. Maps a field of a request to the members of its objects. In such a field, a tuple of
+# the members' values may replace the object.
 _TUPLES: Final = {
     "relations": ("subject", "relation", "object"),
     "pairs": ("subject", "object"),
@@ -222,7 +227,7 @@ _TUPLES: Final = {
 
 
 def _spelt_out(name: str, value: Any) -> Any:
-    """Return the value of a field as in the HTTP contract. Tuples in it become objects."""
+    """Return the value of a field with each tuple replaced by an object."""
     members = _TUPLES.get(name, ())
     if name == "at":
         return _member(value, members)

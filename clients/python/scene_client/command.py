@@ -1,8 +1,14 @@
-"""The command ``scene``: it asks the questions from the command line.
+"""The command ``scene``. It sends questions to the service from the command line.
 
-The exit status is 0 after an answer, 1 if the service refused the request, and 2 for wrong usage.
-It is 3 if the service cannot be reached, 4 if the answer did not arrive in time, 5 if the service
-is busy or not ready, and 6 for any other error. The command writes errors to standard error.
+The command writes errors to standard error. It has these exit statuses:
+
+0. The service has answered.
+1. The service refused the request.
+2. The usage of the command is wrong.
+3. The service cannot be reached.
+4. The answer did not arrive in time.
+5. The service is busy or not ready.
+6. Any other error.
 """
 
 from __future__ import annotations
@@ -40,7 +46,7 @@ from scene_client.vision_msgs import from_message, is_message
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
 
 MAX_FILE: Final = 64 * 2**20
-"""Maximum size of a scene file in bytes. Every service refuses larger bodies."""
+"""Maximum size of a scene file in bytes. The service has the same upper limit for a body."""
 
 _FLAGS: Final = ("--json",)
 _VALUED: Final = ("--url", "--model", "--offline", "--timeout")
@@ -48,7 +54,7 @@ _RELATIONS: Final = get_args(RelationName)
 
 
 class _Group(TyperGroup):
-    """A command whose general options may also follow the subcommand."""
+    """A group of commands whose general options may also follow the subcommand."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Move the general options before the subcommand, then parse all arguments."""
@@ -74,8 +80,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     help="Ask which objects are missing from a scene, which do not belong, and how they relate.",
-    epilog="The options above may also follow the subcommand. Exit status: 1 refused, 2 wrong "
-    "usage, 3 no service, 4 too late, 5 busy or not ready, 6 any other error.",
+    epilog="The options above may also follow the subcommand. Exit status: 1 request refused, "
+    "2 wrong usage, 3 service not reached, 4 answer too late, 5 service busy or not ready, "
+    "6 other error.",
 )
 
 
@@ -90,15 +97,15 @@ class Asked:
     as_json: bool
 
     def ask(self, question: Callable[[Client], T]) -> T:
-        """Return the answer of the service or the store. An error ends the program."""
+        """Return the answer to a question. An error ends the program."""
         with _failing(), self._client() as client:
             return question(client)
 
     def _client(self) -> Client:
         if self.store is not None:
             return OfflineClient(self.store, timeout=self.timeout, model=self.model)
-        # The key is not an option, because other users of a machine can read the options of a
-        # process.
+        # An environment variable sets the API key, because other users of the machine can read the
+        # options of a process.
         key = os.environ.get("SCENE_API_KEY") or None
         return Client(self.url, timeout=self.timeout, model=self.model, api_key=key)
 
@@ -112,7 +119,7 @@ class Asked:
             return answer
         console = Console(markup=False, highlight=False, emoji=False)
         if not console.is_terminal:
-            # The output goes to a file or a program, so the table must not be cut or wrapped.
+            # The output goes to a file or a program, so rich must not cut or wrap the table.
             console.width = 10_000
         console.print(table(answer))
         for note in tables.notes(answer):
@@ -133,20 +140,25 @@ def main(
         str, typer.Option(envvar="SCENE_URL", help="Address of the service.")
     ] = "http://127.0.0.1:8000",
     model: Annotated[
-        str | None, typer.Option(help="An alias, a name, or name@version.", show_default="default")
+        str | None,
+        typer.Option(
+            help="Model to ask: an alias, a name, or name@version.", show_default="default"
+        ),
     ] = None,
     offline: Annotated[
         Path | None,
         typer.Option(metavar="STORE", help="Answer from this model store, without a service."),
     ] = None,
-    timeout: Annotated[float, typer.Option(help="Seconds for the whole call.")] = 10.0,
+    timeout: Annotated[
+        float, typer.Option(help="Maximum time of the whole call in seconds.")
+    ] = 10.0,
     json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
-    version: Annotated[  # noqa: ARG001 — the callback handles it
+    version: Annotated[  # noqa: ARG001 — the callback prints the version
         bool,
         typer.Option("--version", help="Print the version.", callback=_version, is_eager=True),
     ] = False,
 ) -> None:
-    """Store the options of every question."""
+    """Store the general options for the subcommand."""
     context.obj = Asked(url, model, offline, timeout, json)
 
 
@@ -156,8 +168,8 @@ Things = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="LABEL... | SCENE.json | -",
-        help="Labels, or a file, or - for standard input. A file holds a request as in the HTTP "
-        "contract, or detections as rosbridge writes them.",
+        help="Labels of the objects, or a JSON file, or - for standard input. The JSON is a "
+        "request of the HTTP contract, or detections in the format of rosbridge.",
         show_default=False,
     ),
 ]
@@ -175,7 +187,8 @@ Unknown = Annotated[
 UnknownChoice = Annotated[
     UnknownLabels | None,
     typer.Option(
-        "--unknown-labels", help="Unknown labels: refuse, ignore, or use the nearest class."
+        "--unknown-labels",
+        help="Unknown labels: refuse them, ignore them, or use the nearest class.",
     ),
 ]
 
@@ -212,13 +225,14 @@ def missing(
     context: typer.Context,
     things: Things = None,
     coverage: Annotated[
-        float | None, typer.Option(help="Probability that a present object is listed, 0 to 1.")
+        float | None,
+        typer.Option(help="Probability that an object of the scene is listed, 0 to 1."),
     ] = None,
     at: Annotated[
-        str | None, typer.Option(help='Only objects at this place, such as "on-top desk".')
+        str | None, typer.Option(help='Answer only about this place, such as "on-top desk".')
     ] = None,
     candidate: Annotated[
-        list[str] | None, typer.Option(help="Only the class with this label; repeatable.")
+        list[str] | None, typer.Option(help="Consider only this class; repeatable.")
     ] = None,
     relation: Stated = None,
     room: Room = None,
@@ -246,7 +260,7 @@ def outliers(
         Sensitivity | None, typer.Option(help="Alarm rate: low, medium or high.")
     ] = None,
     threshold: Annotated[
-        float | None, typer.Option(help="Probability from which an object is an outlier.")
+        float | None, typer.Option(help="Minimum probability of an outlier.")
     ] = None,
     relation: Stated = None,
     room: Room = None,
@@ -269,13 +283,18 @@ def generate(
     things: Things = None,
     count: Annotated[int | None, typer.Option(help="Number of scenes.")] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Random seed; an equal seed gives equal scenes.")
+        int | None, typer.Option(help="Random seed. Equal seeds give equal scenes.")
     ] = None,
     steps: Annotated[int | None, typer.Option(help="Number of Gibbs sweeps.")] = None,
-    temperature: Annotated[float | None, typer.Option(help="Above 1: more varied scenes.")] = None,
+    temperature: Annotated[
+        float | None,
+        typer.Option(help="Sampling temperature. Values above 1 give more varied scenes."),
+    ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(help="Draw the scenes into this file (.png, .svg, .pdf).", dir_okay=False),
+        typer.Option(
+            help="Draw the scenes as a picture into this file (.png, .svg or .pdf).", dir_okay=False
+        ),
     ] = None,
     relation: Stated = None,
     room: Room = None,
@@ -285,7 +304,7 @@ def generate(
     """Sample scenes that contain the given objects."""
     asked: Asked = context.obj
     if plot is not None and find_spec("matplotlib") is None:
-        _fail("--plot needs matplotlib: pip install matplotlib", MEANINGLESS)
+        _fail("the option --plot needs matplotlib: run pip install matplotlib", MEANINGLESS)
     scene = _scene(things or [], relation, room, ignore_unknown, unknown_labels)
     request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
     answer = asked.show(lambda client: client.generate(request), tables.generate)
@@ -317,14 +336,14 @@ def vocabulary(context: typer.Context) -> None:
 
 @app.command()
 def contexts(context: typer.Context) -> None:
-    """List the hidden units of the model with their strongest classes."""
+    """List the hidden units of the model with the classes of their largest weights."""
     asked: Asked = context.obj
     asked.show(Client.contexts, tables.contexts)
 
 
 @app.command()
 def ready(context: typer.Context) -> None:
-    """Check that the service is ready; the exit status is the only output."""
+    """Check that the service is ready. The only output is the exit status."""
     asked: Asked = context.obj
     asked.ask(Client.check_ready)
 
@@ -339,16 +358,17 @@ def _scene(
     ignore_unknown: bool,
     unknown_labels: UnknownLabels | None,
 ) -> dict[str, Any]:
-    """Return the fields of the request. Options override the fields of a file."""
+    """Return the fields of the request from files and options. Options override files."""
     if ignore_unknown and unknown_labels not in (None, "ignore"):
-        _fail("use only one of --ignore-unknown and --unknown-labels", MEANINGLESS)
+        _fail("use either --ignore-unknown or --unknown-labels, not both", MEANINGLESS)
     if things is None:
-        _fail("name the objects: labels, a file that ends in .json, or - for stdin", MEANINGLESS)
+        _fail(
+            "the objects are missing: give labels, a file that ends in .json, or - for stdin",
+            MEANINGLESS,
+        )
     files = [thing for thing in things if _is_file(thing)]
     if files and things != files[:1]:
-        _fail(
-            f"{files[0]} is a whole scene; do not give labels or other files with it", MEANINGLESS
-        )
+        _fail(f"{files[0]} is a whole scene: remove the labels and other files", MEANINGLESS)
     scene = _read(files[0]) if files else {"objects": things}
     return scene | _named(
         relations=[_relation(text) for text in stated] if stated else None,
@@ -363,7 +383,7 @@ def _named(**options: Any) -> dict[str, Any]:
 
 
 def _is_file(thing: str) -> bool:
-    """Return whether an argument is a file. A label never ends in .json or contains a slash."""
+    """Return whether an argument is a file. Labels do not end in .json or contain a slash."""
     return thing == "-" or thing.endswith(".json") or os.sep in thing
 
 
@@ -375,9 +395,9 @@ def _read(name: str) -> dict[str, Any]:
             with Path(name).open("rb") as file:
                 text = file.read(MAX_FILE + 1)
     except OSError as error:
-        _fail(f"{name}: {error.strerror}", MEANINGLESS)
+        _fail(f"cannot read {name}: {error.strerror}", MEANINGLESS)
     if len(text) > MAX_FILE:
-        _fail(f"{name} has more than {MAX_FILE} bytes", MEANINGLESS)
+        _fail(f"{name} is too large: it has more than {MAX_FILE} bytes", MEANINGLESS)
     try:
         scene = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -392,7 +412,7 @@ def _read(name: str) -> dict[str, Any]:
 
 
 def _detected(name: str, message: Any) -> dict[str, Any]:
-    """Return the request for a message of detections from rosbridge."""
+    """Return the request fields for a ROS message with detections, as JSON from rosbridge."""
     try:
         fields = from_message(message)
     except MessageError as error:
@@ -421,7 +441,7 @@ def _relation(text: str) -> dict[str, str]:
     if place is None:
         names = ", ".join(_RELATIONS)
         _fail(
-            f'--relation must be an object, a relation and an object, such as "lamp on-top desk"; '
+            f'--relation must be a subject, a relation and an object, as in "lamp on-top desk"; '
             f"relations: {names}",
             MEANINGLESS,
         )

@@ -1,8 +1,9 @@
 """Options of a client, and connections with a deadline for a whole call.
 
-httpx limits only each wait on the socket. If a server sends single bytes, a call could take much
-longer than the limit. So anyio cancels a coroutine at the deadline of the call. In a blocking call,
-each wait lasts at most until the deadline. The name resolution of blocking calls has no limit.
+A timeout of httpx limits only each single wait on the socket. If a server sends single bytes, a
+call could take much longer than the timeout. So anyio cancels the coroutine of an asynchronous call
+at the deadline. In a blocking call, each wait on the socket ends at the deadline at the latest.
+Only the name resolution of blocking calls has no time limit.
 """
 
 from __future__ import annotations
@@ -31,19 +32,20 @@ RETRIES: Final = 5
 """Default for the maximum number of retries of a call."""
 
 MAX_CONNECTIONS: Final = 100
-"""Maximum number of open connections. More calls wait for a free connection."""
+"""Maximum number of open connections of a client. Further calls wait for a free connection."""
 
 KEEP_ALIVE: Final = 4.0
 """The client closes a connection after this idle time in seconds.
 
-uvicorn closes idle connections after five seconds. A request sent at that moment would be lost."""
+By default, uvicorn closes an idle connection after five seconds, and a request sent at that moment
+would be lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
     """The checked arguments of `AsyncClient`.
 
-    ``url`` includes the path prefix, if a proxy strips one.
+    If a proxy strips a path prefix, ``url`` must include this prefix.
 
     Raises:
         InvalidRequestError: the URL, the timeout or the number of retries is invalid.
@@ -63,7 +65,7 @@ class Options:
         if parts.query or parts.fragment:
             raise _refused("the URL must not have a query or a fragment")
         if self.retries < 0:
-            raise _refused("retries must not be negative")
+            raise _refused("the number of retries must not be negative")
         self.limit(self.timeout)
 
     def limit(self, timeout: float | None) -> float:
@@ -78,10 +80,10 @@ class Options:
         return seconds
 
     def ssl_context(self) -> ssl.SSLContext:
-        """Return the SSL context. Only for https, it contains the system's CA bundle."""
+        """Return the SSL context. For an https URL, it contains the CA bundle of the system."""
         if urlsplit(self.url).scheme == "https":
             return httpx.create_ssl_context()
-        # For http, the bundle is not needed. Its load takes longer than a question.
+        # For http, the CA bundle is not needed. To load it takes longer than a question.
         return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 
     def address(self, call: Call[T]) -> str:
@@ -89,11 +91,11 @@ class Options:
         return self.url.rstrip("/") + call.path
 
     def headers(self, call: Call[T], left: float) -> dict[str, str]:
-        """Return the headers of a call. The call has `left` seconds until its deadline."""
+        """Return the HTTP headers of a call whose deadline is in `left` seconds."""
         headers = {
             "Accept": "application/json",
-            # The client refuses compression, because a small compressed body could unpack to any
-            # size.
+            # The client asks for uncompressed answers, because a small compressed answer could
+            # decompress to any size.
             "Accept-Encoding": "identity",
             "X-Request-Timeout-Ms": str(max(1, int(left * 1e3))),
         }
@@ -109,7 +111,7 @@ class Options:
     def unreachable(self, error: Exception) -> UnreachableError:
         """Convert an exception of the connection to `UnreachableError`."""
         parts = urlsplit(self.url)
-        # The message leaves out the user name and the password of the URL.
+        # The message must not contain the user name and the password of the URL.
         host = parts.netloc.rpartition("@")[2]
         return UnreachableError(f"{parts.scheme}://{host}: {str(error) or type(error).__name__}")
 
@@ -124,7 +126,7 @@ async_deadline = anyio.fail_after
 
 
 def async_transport(ssl_context: ssl.SSLContext) -> httpx.AsyncHTTPTransport:
-    """Return a transport with pooled connections."""
+    """Return an httpx transport with a pool of connections."""
     limits = httpx.Limits(max_connections=MAX_CONNECTIONS, keepalive_expiry=KEEP_ALIVE)
     return httpx.AsyncHTTPTransport(verify=ssl_context, limits=limits)
 
@@ -133,7 +135,7 @@ def async_transport(ssl_context: ssl.SSLContext) -> httpx.AsyncHTTPTransport:
 
 
 class _Deadline(threading.local):
-    """The deadline of the current call of each thread, on the monotonic clock."""
+    """The deadline of each thread's current call, as a value of `time.monotonic`."""
 
     ends = float("inf")
 
@@ -143,7 +145,7 @@ _DEADLINE: Final = _Deadline()
 
 @contextmanager
 def deadline(seconds: float) -> Iterator[None]:
-    """Limit the total time that this thread waits for connections of `DeadlineTransport`."""
+    """Limit the total time for which this thread waits on connections of `DeadlineTransport`."""
     _DEADLINE.ends = monotonic() + seconds
     try:
         yield
@@ -155,7 +157,7 @@ def _left(timeout: float | None) -> float:
     """Return the maximum time of the next wait in seconds.
 
     Raises:
-        httpcore.TimeoutException: the deadline has passed. Without this exception, a wait for data
+        httpcore.TimeoutException: the deadline has passed. Without this exception, a read of data
             that have already arrived would succeed after the deadline.
     """
     left = _DEADLINE.ends - monotonic()
@@ -227,7 +229,7 @@ class _Body(httpx.SyncByteStream):
 
 
 class DeadlineTransport(httpx.BaseTransport):
-    """A pool of connections. Each wait on a connection ends at the `deadline` at the latest."""
+    """Pool of connections for blocking calls. A wait on a connection ends at the `deadline`."""
 
     def __init__(self, ssl_context: ssl.SSLContext) -> None:
         self._pool = httpcore.ConnectionPool(
@@ -238,7 +240,7 @@ class DeadlineTransport(httpx.BaseTransport):
         )
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        """Send one request; see `httpx.BaseTransport`."""
+        """Send one request and return the response."""
         url = request.url
         sent = httpcore.Request(
             request.method,

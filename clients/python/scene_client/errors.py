@@ -1,4 +1,4 @@
-"""The exceptions that a call can raise."""
+"""The exceptions that a call of the client can raise."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from scene_client.schemas import Failure, FieldError, Problem
 
 
 class ClientError(Exception):
-    """The call failed."""
+    """Base class of the exceptions. A call of the client failed."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Process pools pickle exceptions. `_restored` restores the attributes without the
-        # constructor.
+        # Process pools pickle exceptions. `_restored` restores the attributes of the exception
+        # without a call of the constructor.
         return _restored, (type(self), self.args, self.__dict__)
 
 
@@ -27,7 +27,7 @@ class InvalidRequestError(ClientError, ValueError):
     """The request is invalid. The client has not sent it.
 
     Attributes:
-        errors: the errors, with their locations in the body of the request.
+        errors: list of the errors. Each error has a location in the body of the request.
     """
 
     def __init__(self, errors: Sequence[FieldError]) -> None:
@@ -39,16 +39,18 @@ class ProblemError(ClientError):
     """The service answered with a problem (RFC 9457).
 
     Attributes:
-            type: path of the problem's page, such as ``/problems/unknown-labels``. It never
-                changes, so programs can compare it. It is ``about:blank`` if the answer is not from
-                the service, but for example from a proxy.
-            status: HTTP status.
-            title: short summary. All problems of this type have the same title.
+            type: path of the page about the problem type, such as ``/problems/unknown-labels``. The
+                path never changes, so programs can compare it. The type is ``about:blank`` if
+                another server, such as a proxy, has sent the answer.
+            status: HTTP status code of the response.
+            title: short summary. All problems of one type have the same title.
             detail: description of this problem.
-            errors: the errors in the request, with their locations and similar known names.
-            failures: entries of the store that a refresh refused, with reasons.
-            request_id: id of the request in the service's log, or "" if the response has none.
-            retry_after: seconds to wait before the next request.
+            errors: errors in the request. Each error has a location and similar known names.
+            failures: versions and aliases of the model store that a refresh refused, with reasons.
+            request_id: id of the request in the log of the service. It is "" if the response does
+                not contain an id.
+            retry_after: time in seconds to wait before the next request, or None if the response
+                does not contain this time.
     """
 
     def __init__(
@@ -83,7 +85,8 @@ class DeadlineError(ClientError):
     """The timeout expired before the answer arrived.
 
     Attributes:
-        request_id: id of the request if the service stopped the request, else "".
+        request_id: id of the request, if the service stopped the request at its deadline. It is ""
+            if the client stopped waiting.
     """
 
     def __init__(self, message: str, request_id: str = "") -> None:
@@ -100,7 +103,7 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
 
     Args:
         status: HTTP status.
-        headers: headers with lower-case names.
+        headers: headers of the response, with lower-case names.
         body: body of the response.
     """
     retry_after = _seconds(headers.get("retry-after"))
@@ -116,8 +119,8 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
             request_id=problem.request_id,
             retry_after=retry_after,
         )
-    # The response comes from a proxy or another server. The error leaves out its text, because this
-    # text may change at any time.
+    # The response comes from a proxy or another server. The error does not contain the text of the
+    # response, because this text may change at any time.
     try:
         title = HTTPStatus(status).phrase
     except ValueError:
@@ -153,7 +156,7 @@ def _restored(kind: type[ClientError], args: tuple[Any, ...], state: dict[str, A
 
 
 def _placed(error: FieldError) -> str:
-    # "#" means the whole body, so the message needs no location.
+    # The pointer "#" means the whole body, so the message needs no location.
     where = "" if error.pointer == "#" else f"{error.pointer}: "
     return where + _worded(error)
 

@@ -1,14 +1,16 @@
 """Relations of two boxes in an image: left, right, above and below, as the camera sees the boxes.
 
-Training on images and detections without depth use the same rule. Without depth, front and on-top
-are unknown. An object that is *above* another in the image may be farther away on the floor.
+Training on images uses the same rule as the conversion of detections without depth. Without depth,
+the relations front and on-top are unknown. An object that is *above* another object in the image
+may be farther away on the floor.
 
-An image has no metres, so the unit of length is the mean diagonal of the two boxes. Boxes are
-neighbours if the gap between them is at most one unit. The larger of the horizontal and the
-vertical distance between the centres decides the relation. If both are equal, the horizontal
-distance decides. If both are under 10 % of the unit, there is no relation.
+Lengths in an image are not in metres, so the unit of length is the mean diagonal of the two boxes.
+Two boxes are neighbours if the gap between the boxes is at most one unit. The larger of the
+horizontal and the vertical distance between the centres decides the relation. If the two distances
+are equal, the horizontal distance decides. If both distances are under 10 % of the unit, the boxes
+have no relation.
 
-The module is plain Python, because a client does not have numpy.
+The module uses only the standard library, because the client does not depend on numpy.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from typing import Final, Literal, TypeAlias
 Box: TypeAlias = tuple[float, float, float, float]
 """A box (xmin, ymin, xmax, ymax), with y downwards. A box with NaN has no neighbours."""
 
-MIN_OFFSET: Final = 0.10  # minimum distance between the centres, in mean diagonals
+MIN_OFFSET: Final = 0.10  # minimum distance between the centres, as a part of the mean diagonal
 
 
 def are_neighbours(box: Box, other: Box) -> bool:
@@ -36,7 +38,7 @@ def relation_between(box: Box, other: Box) -> Literal["left", "right", "above", 
     down = (box[1] + box[3]) / 2 - (other[1] + other[3]) / 2
     if not max(abs(across), abs(down)) >= MIN_OFFSET * _unit(box, other):
         return None
-    # Boxes without extent have a unit of 0, and their centres may be equal.
+    # Two boxes of size zero have a unit of 0, and their centres may be equal.
     if abs(across) >= abs(down):
         return "left" if across < 0 else "right" if across > 0 else None
     return "above" if down < 0 else "below"
@@ -45,11 +47,11 @@ def relation_between(box: Box, other: Box) -> Literal["left", "right", "above", 
 def left_pairs(boxes: Sequence[Box | None], order: Sequence[int]) -> list[tuple[int, int]]:
     """Return all pairs (i, j) of neighbours where box i is left of box j.
 
-    Pairs of boxes that are early in ``order`` come first.
+    The result starts with the pairs of boxes that stand first in ``order``.
 
     Args:
-        boxes: boxes of the objects, or None for objects without a box.
-        order: indices of ``boxes``.
+        boxes: box of each object, or None for an object without a box.
+        order: indices of ``boxes``, for example by descending confidence.
     """
     found = []
     for rank, i in enumerate(order):
@@ -66,7 +68,7 @@ def left_pairs(boxes: Sequence[Box | None], order: Sequence[int]) -> list[tuple[
 
 
 def upright_box(centre: tuple[float, float], size: tuple[float, float], theta: float) -> Box:
-    """Return the upright box around a box that is rotated by ``theta`` radians."""
+    """Return the smallest upright box around a box that is rotated by ``theta`` radians."""
     cos, sin = abs(math.cos(theta)), abs(math.sin(theta))
     across = (cos * size[0] + sin * size[1]) / 2
     down = (sin * size[0] + cos * size[1]) / 2

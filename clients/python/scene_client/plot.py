@@ -1,9 +1,9 @@
-"""Pictures of generated scenes. They show the relations, and their boxes never overlap.
+"""Pictures of generated scenes. A picture shows objects as boxes that never overlap.
 
-A picture shows the scene from the view of the robot: left objects are left, near objects are at the
-bottom, and supported objects are above their support. If relations contradict each other, the
-earlier relation decides. The module needs matplotlib, which the dependency group `training`
-contains.
+A picture shows the scene from the view of the robot. Objects on the left of the scene are on the
+left, near objects are at the bottom, and a supported object is above its support. If relations
+contradict each other, the earlier relation of the answer decides. The module needs matplotlib,
+which is in the dependency group `training`.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ HEIGHT: Final = 1.0
 GAP: Final = 0.6
 """Gap between neighbouring boxes, in the unit of `HEIGHT`, the height of a box."""
 
-# Colour and line style of each relation. On-top has no line, because its boxes touch.
+# Colour and line style of each relation. The relation on-top has no line, because its boxes touch.
 _STYLES: Final = {
     "left": ("#1f5fa8", "-"),
     "front": ("#b34700", "--"),
     "above": ("#2d7a2d", ":"),
 }
-# Inches per unit of length. With this scale, labels of `_POINTS` points fit into their boxes.
+# Inches per unit of length (the height of a box). With this scale, a label fits into its box.
 _UNIT: Final = 0.32
 _POINTS: Final = 7
-# Units of length for the title above each scene and the legend below it.
+# Space for the title and the legend of each scene, in units of length.
 _MARGIN: Final = 4.0
 _MAX_PIXELS: Final = 6000
 
 
 def draw(answer: GenerateAnswer, path: Path) -> None:
-    """Write a picture of all scenes to a file. The suffix of ``path`` selects the format.
+    """Write a picture of all scenes to a file. The suffix of ``path`` selects the file format.
 
     Raises:
-        ValueError: matplotlib does not support the format.
+        ValueError: matplotlib does not support the file format.
         OSError: the file cannot be written.
     """
     boxes = [arrange(scene.objects, scene.relations) for scene in answer.scenes]
@@ -117,7 +117,8 @@ def _join(axes: Axes, subject: Box, object: Box, relation: str) -> None:
 
 # ------------------------------------------------------------------------------------ layout
 
-# Maps each opposite relation to the relation that the picture shows, with exchanged ends.
+# Maps a relation to its opposite. The picture shows only the opposite, with subject and object
+# exchanged.
 _OPPOSITES: Final = {"right": "left", "behind": "front", "under": "on-top", "below": "above"}
 
 
@@ -139,13 +140,13 @@ def extent(boxes: Sequence[Box]) -> tuple[float, float]:
 
 
 class _Order:
-    """The order of the objects along one axis, without cycles."""
+    """Order of the objects along one axis of the picture, as a graph without cycles."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self._before: dict[str, set[str]] = {name: set() for name in names}
 
     def add(self, first: str, second: str) -> None:
-        """Put ``first`` before ``second``, unless this closes a cycle."""
+        """Put the object ``first`` before ``second``, unless this would close a cycle."""
         if second == first or second in self._before[first]:
             return
         earlier = {first} | self._before[first]
@@ -154,7 +155,7 @@ class _Order:
                 before |= earlier
 
     def ranks(self) -> dict[str, int]:
-        """Map each object to the length of its longest chain of predecessors."""
+        """Return the length of the longest chain of predecessors of each object."""
         ranks: dict[str, int] = {}
         for name in sorted(self._before, key=lambda name: len(self._before[name])):
             ranks[name] = max((ranks[other] + 1 for other in self._before[name]), default=0)
@@ -162,7 +163,7 @@ class _Order:
 
 
 def arrange(objects: Sequence[str], relations: Iterable[Relation]) -> list[Box]:
-    """Return a box for each object, in any order. The smallest x and y of all boxes are 0.
+    """Return the boxes of all objects, in no particular order. The smallest x and y are 0.
 
     Args:
         objects: names of the objects, without duplicates.
@@ -203,9 +204,10 @@ def _drawn(relation: Relation) -> tuple[str, str, str]:
 
 
 def _supporters(stated: Sequence[tuple[str, str, str]]) -> dict[str, tuple[str, str]]:
-    """Map each object that is on top of or above another object to this object and the relation.
+    """Return the lower object and the relation of each object with a relation on-top or above.
 
-    The function ignores relations that would close a cycle.
+    The keys of the dictionary are the upper objects. The function ignores a relation that would
+    close a cycle.
     """
     below: dict[str, tuple[str, str]] = {}
     for wanted in ("on-top", "above"):
@@ -222,7 +224,7 @@ def _root(name: str, below: dict[str, tuple[str, str]]) -> str:
 
 
 def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
-    """Return the box of an object at (0, 0), and the boxes of all objects that stand above it."""
+    """Return the boxes of an object at (0, 0) and of all objects that are above this object."""
     boxes: list[Box] = []
     x = 0.0
     for other, (supporter, relation) in below.items():
@@ -235,7 +237,7 @@ def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
 
 
 def _shelved(piles: Sequence[list[Box]]) -> list[Box]:
-    """Arrange piles that have no order in rows. There are about as many rows as piles in a row."""
+    """Arrange unordered piles in rows. The number of rows is about the number of piles in a row."""
     boxes: list[Box] = []
     length = ceil(sqrt(len(piles)))
     y = 0.0
@@ -255,7 +257,8 @@ def _widest(
 ) -> list[tuple[tuple[int, int], list[Box]]]:
     """Return the cells sorted by width (axis 0) or height (axis 1), in ascending order.
 
-    So in a dictionary by column or row, the widest or highest cell remains.
+    A dictionary that the caller builds from this list by column (or by row) then keeps the widest
+    (or highest) cell of each column (or row).
     """
     return sorted(cells.items(), key=lambda cell: extent(cell[1])[axis])
 
@@ -265,7 +268,7 @@ def _moved(boxes: Iterable[Box], x: float, y: float) -> list[Box]:
 
 
 def _offsets(extents: dict[int, float]) -> dict[int, float]:
-    """Return the x where each column starts, or the y where each row starts."""
+    """Return the start of each column (x) or row (y) from the extents of the columns or rows."""
     offsets: dict[int, float] = {}
     at = 0.0
     for rank in sorted(extents):

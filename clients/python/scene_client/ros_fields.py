@@ -5,8 +5,8 @@ and infinity are null. The functions of this module return None for a field that
 the wrong type.
 
 Detectors report a class id as text, which is often a number ("56"). A label map contains the label
-of each class id. It is a mapping, a list in the order of the numbers, a vision_msgs/LabelInfo
-message, or the name of a well-known list.
+of each class id. A label map is a mapping, a list of labels with the class ids as indices, a
+vision_msgs/LabelInfo message, or the name of a well-known list of labels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ class MessageError(ValueError):
 
 
 def take(message: Any, *path: str) -> Any:
-    """Return the field at the end of a path of names, or None if a part of the path is missing."""
+    """Return a nested field, or None if a part of its path is missing.
+
+    Args:
+        message: message or field that contains the path.
+        *path: names of the fields from the message to the nested field.
+    """
     for name in path:
         if message is None:
             return None
@@ -36,12 +41,12 @@ def take(message: Any, *path: str) -> Any:
 
 
 def has(message: Any, name: str) -> bool:
-    """Return whether a message has a field. The value of the field may be null."""
+    """Return whether a message has a field with this name. The value of the field may be null."""
     return name in message if isinstance(message, Mapping) else hasattr(message, name)
 
 
 def items(field: Any, name: str) -> Sequence[Any]:
-    """Return the entries of a list field, or an empty sequence if the field is missing.
+    """Return the entries of a list field, or an empty sequence for a missing field.
 
     Raises:
         MessageError: the field is not a list.
@@ -54,7 +59,7 @@ def items(field: Any, name: str) -> Sequence[Any]:
 
 
 def number(field: Any) -> float | None:
-    """Return the field as a float, or None if it is not a finite number."""
+    """Return the field as a float, or None if the field is not a finite number."""
     if type(field) is not float:
         if isinstance(field, bool) or not isinstance(field, Real):
             return None
@@ -66,21 +71,24 @@ def number(field: Any) -> float | None:
 
 
 def integer(field: Any) -> int | None:
-    """Return the field as an int, or None if it is not a whole number."""
+    """Return the field as an int, or None if the field is not a whole number."""
     value = number(field)
     return int(value) if value is not None and value.is_integer() else None
 
 
 def numbers(message: Any, names: str) -> tuple[float, ...] | None:
-    """Return the fields whose names are the letters of ``names``, or None if one is not finite."""
+    """Return the numbers in the fields with one-letter names, for example "xyz".
+
+    The result is None if one of the numbers is missing or not finite.
+    """
     values = [number(take(message, name)) for name in names]
     return None if None in values else tuple(value for value in values if value is not None)
 
 
 def text(field: Any) -> str:
-    """Return the field as text without surrounding blanks. Whole numbers are also accepted.
+    """Return a field with a text or a whole number as text without surrounding blanks.
 
-    The result is "" for other values.
+    The result is "" for a field of another type.
     """
     if isinstance(field, str):
         return field.strip()
@@ -89,19 +97,19 @@ def text(field: Any) -> str:
 
 
 def is_plain(value: str, longest: int) -> bool:
-    """Return whether the service accepts a text as a name or a label."""
+    """Return whether the service accepts a text of at most ``longest`` characters as a name."""
     return 0 < len(value) <= longest and value.isprintable()
 
 
 def frame_of(header: Any) -> str:
-    """Return the frame of a header, or "" without a frame."""
+    """Return the name of the frame in a std_msgs/Header, or "" if the header has no frame."""
     frame = take(header, "frame_id")
-    # tf2 has no leading slashes, but older drivers still send them.
+    # In tf2, a frame name has no leading slash. Older drivers still send a leading slash.
     return frame.strip().lstrip("/") if isinstance(frame, str) else ""
 
 
 def time_of(stamp: Any) -> dict[str, int] | None:
-    """Convert a time of ROS 2 or ROS 1 to the form of a request. Return None if it is invalid."""
+    """Convert a time of ROS 1 or ROS 2 to the field `stamp`. Return None for an invalid time."""
     seconds = integer(take(stamp, "sec"))
     seconds = integer(take(stamp, "secs")) if seconds is None else seconds
     rest = integer(take(stamp, "nanosec"))
@@ -130,7 +138,7 @@ COCO: Final = (
     *("refrigerator", "book", "clock", "vase", "scissors", "teddy bear", "hair drier"),
     "toothbrush",
 )
-"""The 80 box classes of COCO. Their order is the usual numbering of detectors, from 0 to 79."""
+"""Labels of the 80 classes of COCO. The index of a label is the usual class id of detectors."""
 
 _WELL_KNOWN: Final = {"coco": COCO}
 
@@ -138,15 +146,15 @@ _WELL_KNOWN: Final = {"coco": COCO}
 def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
     """Return a dictionary from class ids (as text) to labels.
 
-    A class with the label None does not become part of a scene.
+    Objects of a class with the label None do not become part of a scene.
 
     Args:
-        label_map: a mapping from class ids (text or numbers) to labels, a list of labels in the
-            order of the numbers, a vision_msgs/LabelInfo (message or JSON), or "coco". None means
-            an empty map.
+        label_map: a mapping from class ids (text or numbers) to labels, a list of labels with the
+            class ids as indices, a vision_msgs/LabelInfo (message or JSON), or "coco". None means
+            an empty label map.
 
     Raises:
-        MessageError: `label_map` has another form.
+        MessageError: `label_map` has another type.
     """
     if label_map is None:
         return {}

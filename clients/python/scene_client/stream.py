@@ -35,19 +35,19 @@ Objects = Sequence[str | dict[str, Any] | Detection]
 
 _PATH: Final = "/stream"
 _MAX_EVENT: Final = 64 * 2**20
-# Close codes of broken connections and of services that stop or fail. After other codes, the
-# service would close a new connection too.
+# Close codes after which the client reconnects: the connection broke, or the service stopped or
+# failed. After any other code, the service would close a new connection, too.
 _TRANSIENT: Final = frozenset({1001, 1006, 1011, 1012, 1013})
 _FIRST_PAUSE: Final = 0.1
 _LONGEST_PAUSE: Final = 5.0
 
 
 class StreamProblemError(ClientError):
-    """The service refused a message. The stream stays open.
+    """The service refused a message of the stream. The stream stays open.
 
     Attributes:
-        problem: the problem document. Its `type` identifies the problem type.
-        seq: number of the refused message, or None if the message has none.
+        problem: the problem document. The member `type` identifies the problem type.
+        seq: sequence number of the refused message, or None if the message has no number.
     """
 
     def __init__(self, message: ProblemMessage) -> None:
@@ -60,12 +60,12 @@ class StreamClosedError(ClientError):
     """The stream has ended.
 
     Attributes:
-        code: close code (RFC 6455, section 7.4), or 1006 if the connection broke.
-        reason: reason of the service, such as `draining` or `stream-idle`, or "".
+        code: WebSocket close code (RFC 6455, section 7.4), or 1006 if the connection broke.
+        reason: reason that the service gave, such as `draining` or `stream-idle`, or "".
     """
 
     def __init__(self, code: int, reason: str) -> None:
-        super().__init__(f"the stream was closed with code {code} {reason}".rstrip())
+        super().__init__(f"the stream has ended with close code {code} {reason}".rstrip())
         self.code = code
         self.reason = reason
 
@@ -82,17 +82,17 @@ class StreamClient:
     sends the whole scene. After a `StreamProblemError`, the program may start a new iteration.
 
     Args:
-        url: address of the service, with http, https, ws or wss.
-        api_key: API key, if the service requires one.
+        url: base URL of the service, with the scheme http, https, ws or wss.
+        api_key: API key, if the service requires an API key.
         timeout: maximum time in seconds to connect, and to close the stream.
         reconnect: maximum time in seconds from the loss of the connection to the next answer.
             After this time, the client stops reconnecting.
         **fields: fields of the opening message, such as `model`, `ask`, `room_type` or `frame_id`.
 
     Attributes:
-        seq: number of the newest sent message.
-        limits: limits of the service.
-        answer: the newest answer, or None before the first answer.
+        seq: sequence number of the newest message that the client has sent.
+        limits: limits of the service on messages and scenes.
+        answer: newest answer that has arrived, or None before the first answer.
     """
 
     limits: StreamLimits
@@ -149,12 +149,12 @@ class StreamClient:
     async def update(
         self, objects: Objects = (), *, remove: Sequence[str] = (), **fields: Any
     ) -> int:
-        """Send added, changed and removed objects. Return the number of the message.
+        """Send added, changed and removed objects. Return the sequence number of the message.
 
         Args:
-            objects: added and changed objects. An object without an id has its label as id.
-            remove: ids of removed objects.
-            **fields: fields of the scene, such as `relations`, `room_type` or `stamp`.
+            objects: objects to add or to change. An object without an id has its label as id.
+            remove: ids of objects to remove.
+            **fields: other fields of the scene, such as `relations`, `room_type` or `stamp`.
 
         Raises:
             pydantic.ValidationError: the message is invalid. The client has not sent it.
@@ -166,7 +166,7 @@ class StreamClient:
         return await self._next(Update(type="update", seq=self.seq + 1, objects=things, **fields))
 
     async def replace(self, objects: Objects, **fields: Any) -> int:
-        """Send a whole scene that replaces the previous scene. Return the number of the message.
+        """Send a whole scene in place of the previous one. Return the message's sequence number.
 
         Raises:
             pydantic.ValidationError, StreamClosedError: see `update`.
@@ -175,7 +175,7 @@ class StreamClient:
         return await self._next(Whole(type="scene", seq=self.seq + 1, objects=things, **fields))
 
     async def ping(self) -> None:
-        """Keep an idle stream open.
+        """Send a ping message, so that the service does not close an idle stream.
 
         Raises:
             StreamClosedError: the stream has ended.
@@ -198,7 +198,7 @@ class StreamClient:
         return message.seq
 
     async def _send(self, message: BaseModel) -> bool:
-        """Send a message. Return False if the connection is broken."""
+        """Send a message. Return whether the connection has accepted the message."""
         if self._ended is not None:
             raise self._ended
         if self._connection is None:
@@ -210,14 +210,14 @@ class StreamClient:
         return True
 
     def _merge(self, seq: int) -> None:
-        """Merge all messages up to number `seq` into the client's copy of the scene."""
+        """Merge all messages up to sequence number `seq` into the client's copy of the scene."""
         for number in [number for number in self._unanswered if number <= seq]:
             self._scene = self._scene.after(self._unanswered.pop(number))
 
     # -- receiving ------------------------------------------------------------------------------
 
     def __aiter__(self) -> Self:
-        """Iterate over the answers as they arrive."""
+        """Return the stream itself, which is an iterator over the arriving answers."""
         return self
 
     async def __anext__(self) -> AnswerMessage:
@@ -227,7 +227,7 @@ class StreamClient:
             StreamProblemError: the service refused a message.
             StreamClosedError: the service closed the stream, or the client could not reconnect.
             ProblemError: the service refused a new connection.
-            StopAsyncIteration: `close` ended the stream.
+            StopAsyncIteration: the program has ended the stream by `close`.
         """
         if self._connection is None:
             raise RuntimeError("the stream is not open: open it with `async with`")

@@ -1,7 +1,7 @@
 """Messages of ``GET /stream`` as pydantic models. The service and its clients use the same models.
 
-The messages of clients have the strict validation of requests. docs/stream.md describes the
-protocol.
+The validation of messages from clients is as strict as the validation of requests. docs/stream.md
+describes the protocol.
 """
 
 from __future__ import annotations
@@ -30,18 +30,22 @@ from scene_client.schemas import (
 )
 
 MAX_SEQ: Final = 2**53 - 1
-"""Maximum number of a message. JSON readers that use doubles read it exactly."""
+"""Maximum sequence number of a message. A double represents every integer up to it exactly."""
 
 Seq = Annotated[
     int,
-    Field(ge=1, le=MAX_SEQ, description="number of the message; it must grow with each message"),
+    Field(
+        ge=1,
+        le=MAX_SEQ,
+        description="sequence number of the message; it must grow with each message",
+    ),
 ]
 
 # --------------------------------------------------------------------------------- from clients
 
 
 class Ask(Request):
-    """The questions to answer. Each question has the options of its route."""
+    """The questions that the service answers on a stream, with the options of their routes."""
 
     missing: MissingOptions | None = None
     outliers: OutliersOptions | None = None
@@ -77,7 +81,7 @@ class Open(SceneMessage):
 
 
 class Whole(SceneMessage):
-    """A whole scene that replaces the previous one."""
+    """A whole scene that replaces the previous scene of the stream."""
 
     type: Literal["scene"]
     seq: Seq
@@ -86,7 +90,7 @@ class Whole(SceneMessage):
 class Update(SceneMessage):
     """Added, changed and removed objects. An object replaces an earlier object with the same id.
 
-    The fields of the message replace earlier values.
+    Other fields of the message, such as `room_type`, replace their earlier values.
     """
 
     type: Literal["update"]
@@ -94,12 +98,12 @@ class Update(SceneMessage):
     remove: list[Name] = Field(
         default_factory=list,
         max_length=256,
-        description="ids of removed objects; the service removes their relations too",
+        description="ids of objects to remove, together with their relations",
     )
 
 
 class Ping(Request):
-    """A request for a `pong`. It keeps an idle stream open."""
+    """A message that keeps an idle stream open. The service answers with a `pong`."""
 
     type: Literal["ping"]
 
@@ -112,7 +116,7 @@ COMMANDS: Final[dict[str, type[Command]]] = {
     "ping": Ping,
 }
 
-# If a message of type `scene` does not contain these fields, their earlier values stay.
+# If a message of type `scene` does not contain one of these fields, the earlier value stays.
 _KEPT: Final = frozenset({"model", "unknown_labels", "ask", "timeout_ms"})
 _FIELDS: Final = frozenset(SceneMessage.model_fields) - {"objects", "seed"}
 
@@ -122,17 +126,17 @@ class MergedScene:
     """The scene that results from several messages. Service and client each keep a copy.
 
     Attributes:
-        objects: maps ids to objects, in the order of their arrival.
-        fields: maps the names of all other fields of the messages to their values.
+        objects: dictionary from ids to objects, in the order in which the objects arrived.
+        fields: dictionary from the names of all other fields of the scene to their values.
     """
 
     objects: Mapping[str, str | Detection] = field(default_factory=dict)
     fields: Mapping[str, Any] = field(default_factory=dict)
 
     def after(self, message: SceneMessage) -> MergedScene:
-        """Return a copy of the scene with a message merged into it.
+        """Return a copy of the scene that also contains the changes of a message.
 
-        The method ignores unknown ids in `remove`.
+        The method ignores ids in `remove` that the scene does not contain.
         """
         objects, fields = dict(self.objects), dict(self.fields)
         if isinstance(message, Whole):
@@ -153,7 +157,7 @@ class MergedScene:
 
 
 def object_id(thing: str | Detection) -> str:
-    """Return the id of an object, or its label if it has no id."""
+    """Return the id of an object. An object without an id has its label as id."""
     return thing if isinstance(thing, str) else thing.id or thing.label
 
 
@@ -161,7 +165,7 @@ def object_id(thing: str | Detection) -> str:
 
 
 class StreamLimits(Reply):
-    """Limits of a stream."""
+    """Limits of the service on the messages and scenes of a stream."""
 
     max_message_bytes: int
     max_objects: int
@@ -173,24 +177,26 @@ class StreamLimits(Reply):
 
 
 class Opened(Reply):
-    """The stream is open."""
+    """The service has accepted the opening message, so the stream is open."""
 
     type: Literal["opened"] = "opened"
-    seq: Annotated[int, Field(description="always 0, the number of the opening message")] = 0
+    seq: Annotated[int, Field(description="sequence number of the opening message, always 0")] = 0
     request_id: str
     limits: StreamLimits
 
 
 class AnswerMessage(Reply):
-    """The answers about the newest scene. Each answer has the form of its route's answer."""
+    """The answers about the newest scene. Each answer has the schema of its question's route."""
 
     type: Literal["answer"] = "answer"
     seq: Annotated[
         int,
-        Field(description="number of the newest message that the answer covers; 0 for the opening"),
+        Field(
+            description="sequence number of the newest message in the scene; 0: the opening message"
+        ),
     ]
     superseded: Annotated[
-        int, Field(description="number of earlier messages that the answer covers too")
+        int, Field(description="number of earlier messages without an answer of their own")
     ]
     missing: MissingAnswer | None = None
     outliers: OutliersAnswer | None = None
@@ -201,17 +207,18 @@ class AnswerMessage(Reply):
 
 
 class ProblemMessage(Reply):
-    """The service refused a message. The scene is unchanged."""
+    """The service refused a message. The scene of the stream is unchanged."""
 
     type: Literal["problem"] = "problem"
     seq: Annotated[
-        int | None, Field(description="number of the refused message, if it has one")
+        int | None,
+        Field(description="sequence number of the refused message, if it has a valid one"),
     ] = None
     problem: Problem
 
 
 class Pong(Reply):
-    """The answer to a ping."""
+    """The answer to a message of type `ping`."""
 
     type: Literal["pong"] = "pong"
 

@@ -25,11 +25,14 @@ from scene_client.schemas import (
 )
 
 MOST_MISPLACED: Final = 10
-"""Maximum number of rows with false relations. Twelve positions can give a hundred relations."""
+"""Maximum number of table rows with probably false relations.
+
+A scene of twelve objects with positions can have a hundred relations.
+"""
 
 
 def relations(answer: RelationsAnswer) -> RenderableType:
-    """Return relations, most probable first, and a table of the disagreements."""
+    """Return a table of relations, most probable first, and a table of disagreements."""
     rows = [
         (
             entry.subject,
@@ -58,7 +61,7 @@ def relations(answer: RelationsAnswer) -> RenderableType:
 
 
 def missing(answer: MissingAnswer) -> RenderableType:
-    """Return missing objects, most probable first, with likely places and reasons."""
+    """Return a table of missing objects, most probable first, with likely places and reasons."""
     rows = [
         (
             entry.label,
@@ -73,7 +76,7 @@ def missing(answer: MissingAnswer) -> RenderableType:
 
 
 def outliers(answer: OutliersAnswer) -> RenderableType:
-    """Return objects, most probable outlier first, and relations that are probably false."""
+    """Return a table of objects, most probable outlier first, and a table of false relations."""
     rows = [
         (
             entry.object,
@@ -108,7 +111,7 @@ def outliers(answer: OutliersAnswer) -> RenderableType:
 
 
 def notes(answer: BaseModel) -> list[str]:
-    """Return notes on the scene: mapped labels and warnings."""
+    """Return one line for each mapped label and each warning of the answer."""
     if not isinstance(answer, Answer):
         return []
     mapped = [
@@ -123,7 +126,7 @@ def notes(answer: BaseModel) -> list[str]:
 
 
 def generate(answer: GenerateAnswer) -> RenderableType:
-    """Return the sampled scenes."""
+    """Return a table of the sampled scenes."""
     rows = [
         (
             str(number),
@@ -138,7 +141,7 @@ def generate(answer: GenerateAnswer) -> RenderableType:
 
 
 def models(answer: ModelList) -> RenderableType:
-    """Return versions with their aliases, and unusable entries of the store."""
+    """Return a table of versions with their aliases, and the unusable entries of the store."""
     rows = [
         (
             f"{model.name}@{version.version}",
@@ -157,7 +160,7 @@ def models(answer: ModelList) -> RenderableType:
 
 
 def contexts(answer: ContextsAnswer) -> RenderableType:
-    """Return hidden units with their strongest classes."""
+    """Return a table of hidden units with the classes of their largest weights."""
     rows = [
         (layer, str(unit.unit), _weighted(unit.objects), _weighted(unit.room_types))
         for layer, units in answer.layers.items()
@@ -167,7 +170,7 @@ def contexts(answer: ContextsAnswer) -> RenderableType:
 
 
 def vocabulary(answer: VocabularyAnswer) -> RenderableType:
-    """Return object classes with their aliases."""
+    """Return a table of object classes with their aliases."""
     rows = [
         (entry.label, ", ".join(entry.aliases), "structure" if entry.structure else "")
         for entry in answer.objects
@@ -180,7 +183,7 @@ def _table(*columns: str, rows: Iterable[Sequence[str]], title: str | None = Non
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     for column in columns:
         numbers = column.startswith("probability") or column in {"log-odds", "log score"}
-        # Only the list of a scene's objects can be long. Other cells are short or have line breaks.
+        # Only cells with the objects of a scene can be long. Other cells have short lines.
         width = 60 if column == "objects" else None
         table.add_column(column, justify="right" if numbers else "left", max_width=width)
     for row in rows:

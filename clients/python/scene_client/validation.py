@@ -36,8 +36,8 @@ _MESSAGES: Final = {
     "dict_type": "must be an object",
     "list_type": "must be an array",
 }
-# A pointer contains a member name of the request only if the name is short and plain. So a request
-# cannot choose the text of an error. At any other name, the pointer ends at the parent.
+# A pointer contains a member name of the request only if this pattern matches the name. Otherwise
+# the pointer ends at the parent. So a request cannot put arbitrary text into an error.
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _MARKS: Final = frozenset({*OBJECT_TAGS, "[key]"})
 
@@ -52,13 +52,13 @@ def field_errors(
     """Return the first `MAX_ERRORS` of pydantic's errors.
 
     Args:
-        errors: validation errors.
-        body: the validated value.
+        errors: validation errors in the format of pydantic.
+        body: the value that pydantic has validated.
         at: location of ``body`` in the request.
-        skip: number of steps to remove from the start of each error's location.
+        skip: number of names and indices to remove from the start of each error's location.
     """
     found = []
-    # The limit also bounds the time: suggestions for 100,000 members take a minute.
+    # The limit also bounds the time, because suggestions for 100,000 unknown members take a minute.
     for error in errors[:MAX_ERRORS]:
         location = error["loc"][skip:]
         unknown = str(location[-1]) if error["type"] == "extra_forbidden" else ""
@@ -73,18 +73,18 @@ def field_errors(
 
 
 def _like(unknown: str) -> list[str]:
-    """Return field names that are similar to an unknown name."""
+    """Return names of fields of requests that are similar to an unknown name."""
     return [name for name in get_close_matches(unknown[:64], _FIELDS) if name != unknown]
 
 
 def pointer(location: tuple[str | int, ...], body: Any = None) -> str:
-    """Return the JSON pointer of a location. ``#`` is the whole body.
+    """Return the JSON pointer of a location in a request. ``#`` is the whole body.
 
     Args:
         location: field names and list indices from the root. It may contain pydantic's marks for
             members of unions and for keys.
-        body: the parsed request, if available. It stops the pointer at an object that is only a
-            label, because a label has no members.
+        body: the parsed request, or None. With this value, the pointer ends at an object that is
+            only a label, because a label has no members.
     """
     steps: list[str] = []
     value = body

@@ -3,10 +3,11 @@
     fields = from_detection3d_array(message, label_map="coco")
     answer = client.missing(**fields, top_k=5)
 
-A message may be JSON (rosbridge, with or without its envelope) or an object (rclpy, bags). It may
-have the message layout of ROS Galactic and later (``results[].hypothesis.class_id``, ``id``) or the
-earlier layout (``results[].id``, ``tracking_id``). The request leaves out unknown and unset values,
-and `SceneFields.notes` lists them. The module never guesses a value.
+A message may be JSON (from rosbridge, with or without its envelope) or a Python object (from rclpy
+or bags). The message may have the layout of ROS Galactic and later (fields
+``results[].hypothesis.class_id`` and ``id``) or the earlier layout (``results[].id`` and
+``tracking_id``). The request does not contain unknown and unset values of the message, and
+`SceneFields.notes` lists these values. The module never guesses a value.
 """
 
 from __future__ import annotations
@@ -39,16 +40,16 @@ MAX_RELATIONS: Final = 4096
 
 _MAX_LABEL, _MAX_ID, _MAX_FRAME = 100, 128, 256
 _MAX_METRES, _MAX_EXTENT, _MAX_YAW = 1e8, 1e4, 1e3
-# A quaternion below this length is unset. Its direction would be a rounding error.
+# A quaternion shorter than this length counts as unset.
 _MIN_NORM: Final = 1e-6
 
 Reason = Literal[
     "no-hypothesis",  # the detection has no class with a score
     "low-score",  # the score is 0, negative or below min_score
     "high-score",  # the score is above 1 and counts as 1
-    "no-label",  # the class is a number without a label, or is not plain text
+    "no-label",  # the class id is a number without a label, or is not plain text
     "unwanted",  # the label map maps the class to None
-    "too-many",  # the scene has too many detections or relations; the least confident are left out
+    "too-many",  # the message has too many detections or relations for a request
     "no-position",  # the position is unset, not finite, or in another frame
     "no-box",  # the box in the image is empty, not finite, or in another frame
     "renamed",  # the id is a duplicate, or is not plain text
@@ -57,7 +58,7 @@ Reason = Literal[
 
 
 class Note(NamedTuple):
-    """A note that the conversion left out or changed a value, with the reason.
+    """A note that the conversion omitted or changed a value of the message, with the reason.
 
     Attributes:
         detection: index of the detection in the message. None if the note concerns the whole
@@ -75,7 +76,7 @@ class SceneFields(dict[str, Any]):
     """The fields of a request, for `Client.missing(**fields)` or `SceneRequest(**fields)`.
 
     Attributes:
-        notes: notes on omitted and changed values, in the order of the detections.
+        notes: notes on omitted and changed values. The notes have the order of the detections.
     """
 
     def __init__(self, fields: Mapping[str, Any], notes: tuple[Note, ...] = ()) -> None:
@@ -97,20 +98,20 @@ def from_detection3d_array(
 ) -> SceneFields:
     """Convert objects with poses. The service derives their relations in the axes of ``frame_id``.
 
-    If a box is unset, the pose of the best hypothesis replaces it. Extents that are not positive
-    count as unknown. An all-zero quaternion means no rotation. An object without a finite position
-    has no position in the request.
+    If the box of a detection is unset, the pose of the best hypothesis replaces the box. Extents
+    that are not positive count as unknown. An all-zero quaternion means no rotation. An object
+    without a finite position has no position in the request.
 
     Args:
         message: a vision_msgs/Detection3DArray.
-        label_map: labels of the class ids, see `read_label_map`. A class id without an entry is
-            itself the label.
-        min_score: the request leaves out detections with a lower score.
-        boxes: False for detectors whose boxes are in pixels instead of metres. Positions then come
-            from the hypotheses, and extents are unknown.
+        label_map: labels of the class ids (see `read_label_map`). A class id that the label map
+            does not contain is itself the label.
+        min_score: minimum score of the detections in the request.
+        boxes: whether the boxes are in metres. False means that the boxes are in pixels. Positions
+            then come from the hypotheses, and extents are unknown.
         viewpoint: position and viewing direction (x, y, yaw) of the robot in the frame of the
-            detections. In a map, odom or world frame, left and front need it. By default, the
-            robot is at the origin of the frame and looks along x.
+            detections. In a map, odom or world frame, the relations left and front need the
+            viewpoint. By default, the robot is at the origin of the frame and looks along x.
         unknown_labels: field of the request. The default is "ignore", because detectors often have
             classes that the model lacks.
 
@@ -132,9 +133,10 @@ def from_detection2d_array(
     min_score: float = 0.0,
     unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
-    """Convert objects without poses. The relation left comes from neighbours in the image.
+    """Convert objects without poses. The relation left comes from neighbouring boxes in the image.
 
-    An image does not show depth or support, so front, on-top and above stay unobserved.
+    An image does not show depth or support, so the relations front, on-top and above stay
+    unobserved.
 
     Args:
         message: a vision_msgs/Detection2DArray.
@@ -158,10 +160,13 @@ def from_message(
     viewpoint: Viewpoint | None = None,
     unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
-    """Convert a Detection3DArray or a Detection2DArray. The boxes show the type of the message.
+    """Convert a Detection3DArray or a Detection2DArray.
+
+    The fields of the boxes show the type of the message.
 
     Raises:
-        MessageError: the message has another type, or see `from_detection3d_array`.
+        MessageError: the message has another type, does not contain a valid scene, or an argument
+            is invalid.
     """
     if _is_flat(message):
         return from_detection2d_array(
@@ -178,7 +183,7 @@ def from_message(
 
 
 def is_message(value: Any) -> bool:
-    """Return whether a value is a message with detections. A request, for example, is not."""
+    """Return whether a value is a ROS message with detections."""
     return take(_unwrapped(value), "detections") is not None
 
 
@@ -197,7 +202,7 @@ class _Sighting:
 
 
 class _Reader:
-    """Reader of one message. It collects the sightings and the notes."""
+    """Reader of one message. It collects the usable detections and the notes."""
 
     def __init__(self, message: Any, label_map: LabelMap | None, min_score: float) -> None:
         if not is_message(message):
@@ -238,7 +243,9 @@ class _Reader:
             self.note(place, "no-hypothesis", "the detection has no hypothesis with a score")
             return None
         if not score > 0 or score < min_score:
-            self.note(place, "low-score", f"the score {score:g} is too low")
+            self.note(
+                place, "low-score", f"the score {score:g} is not positive or is below min_score"
+            )
             return None
         label = self.labels.get(class_id, class_id)
         if label is None:
@@ -262,7 +269,7 @@ class _Reader:
         )
 
     def _surest(self, sightings: list[_Sighting]) -> list[_Sighting]:
-        """Return the most confident sightings that fit a request, in the order of the message."""
+        """Return at most `MAX_OBJECTS` sightings, those of highest confidence, in message order."""
         if len(sightings) <= MAX_OBJECTS:
             return sightings
         ranked = sorted(sightings, key=lambda seen: -seen.confidence)
@@ -275,9 +282,9 @@ class _Reader:
         return sorted(ranked[:MAX_OBJECTS], key=lambda seen: seen.place)
 
     def _ids(self) -> dict[int, str]:
-        """Map the index of each detection to an id.
+        """Return a dictionary from the index of each detection to an id.
 
-        The id is the detector's id if it is unique, else the label with a number.
+        A unique id of the detector stays. Otherwise the id is the label with a number.
         """
         own: dict[str, int] = {}
         ids: dict[int, str] = {}
@@ -305,7 +312,7 @@ class _Reader:
         return ids
 
     def _frame(self) -> str | None:
-        """Return the frame of the message, or of the first detection with a frame."""
+        """Return the frame in the message's header, or else in the first detection's header."""
         for header in (self.header, *(take(seen.detection, "header") for seen in self.sightings)):
             if frame := frame_of(header):
                 if not is_plain(frame, _MAX_FRAME):
@@ -324,7 +331,7 @@ class _Reader:
         }
 
     def pose(self, seen: _Sighting, boxes: bool) -> dict[str, Any]:
-        """Return the known parts of position, size and orientation."""
+        """Return the fields position, size and orientation of a detection, as far as known."""
         if self._is_elsewhere(seen):
             self.note(seen.place, "no-position", "the detection has another frame than the message")
             return {}
@@ -352,9 +359,9 @@ class _Reader:
         return found
 
     def image_relations(self, ids: list[str]) -> list[dict[str, str]]:
-        """Return left and right between neighbours in the image."""
+        """Return the relations left between neighbouring boxes in the image."""
         boxes = [self._image_box(seen) for seen in self.sightings]
-        # If there are too many relations, the relations of the most confident objects stay.
+        # If there are too many relations, the request contains those of the most confident objects.
         order = sorted(range(len(ids)), key=lambda i: -self.sightings[i].confidence)
         found = left_pairs(boxes, order)
         if len(found) > MAX_RELATIONS:
@@ -367,7 +374,7 @@ class _Reader:
         ]
 
     def _image_box(self, seen: _Sighting) -> Box | None:
-        """Return the upright box around a box that may be rotated."""
+        """Return the smallest upright box around the box of a detection, which may be rotated."""
         if self._is_elsewhere(seen):
             self.note(seen.place, "no-box", "the detection has another frame than the message")
             return None
@@ -385,7 +392,7 @@ class _Reader:
         return upright_box((middle[0], middle[1]), (width, height), theta or 0.0)
 
     def finish(self, fields: dict[str, Any], unknown_labels: str) -> SceneFields:
-        """Add the frame and the time of the message, and return all fields with the notes."""
+        """Add the frame and the time of the message to the fields. Return them with the notes."""
         if unknown_labels not in get_args(UnknownLabels):
             raise MessageError("unknown_labels must be 'error', 'ignore' or 'nearest'")
         fields["unknown_labels"] = unknown_labels
@@ -403,7 +410,7 @@ class _Reader:
 
 
 def _unwrapped(message: Any) -> Any:
-    """Return the message without the envelope of rosbridge."""
+    """Return the ROS message without the envelope that rosbridge adds."""
     if isinstance(message, Mapping) and "detections" not in message:
         return message.get("msg", message)
     return message

@@ -39,9 +39,9 @@ def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
     ("row", "message"),
     [
         ("nobody\tcup\ton-top\ttable\t1\t", "line 2: unknown source 'nobody'"),
-        ("tidybot\tcup\ton-top\ttable\t1", "line 2: has 5 columns, not 6"),
-        ("x" * MAX_LINE, f"line 2: is longer than {MAX_LINE} bytes"),
-        ("\udcff", "line 2: not UTF-8"),
+        ("tidybot\tcup\ton-top\ttable\t1", "line 2: the row has 5 columns, not 6"),
+        ("x" * MAX_LINE, f"line 2: the line is longer than {MAX_LINE} bytes"),
+        ("\udcff", "line 2: is not UTF-8"),
     ],
 )
 def test_malformed_rows(tmp_path: Path, row: str, message: str) -> None:

@@ -162,12 +162,12 @@ def test_counts_belong_to_the_one_object_of_their_label(alfred: Callable[..., Pa
     (scene,) = read_scenes(alfred(counts={"cup": 3}))
     assert [thing.count for thing in scene.objects] == [3, 1]
     for counts, problem in (
-        ({"fork": 1}, "exactly one object 'fork', found 0"),
+        ({"fork": 1}, "'fork', which needs exactly one object, but the scene has 0"),
         ({"cup": 0}, "must be 1 to 1000000"),
         ({"cup": 10**20}, "must be 1 to 1000000"),
         ({"cup": 1.5}, "must be an integer"),
         ({"cup": True}, "must be an integer"),
-        ([3], "must be a mapping"),
+        ([3], "must be null, or an object"),
     ):
         with pytest.raises(ValueError, match=problem):
             read_scenes(alfred(counts=counts))
@@ -599,8 +599,8 @@ def test_missing_files(name: str, tmp_path: Path) -> None:
 def test_a_number_of_400_digits_in_a_json_file_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "instances.json"
     path.write_text('{"categories": [], "images": [], "annotations": [{"bbox": [' + "9" * 400)
-    with pytest.raises(DatasetError, match=r"instances\.json: not JSON: an integer of 400 digits"):
+    with pytest.raises(DatasetError, match=r"is not JSON: an integer of 400 digits"):
         read_scenes(path)
     path.write_text("[" * 100_000)
-    with pytest.raises(DatasetError, match=r"instances\.json: not JSON"):
+    with pytest.raises(DatasetError, match=r"instances\.json: is not JSON"):
         read_scenes(path)

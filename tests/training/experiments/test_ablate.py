@@ -119,7 +119,7 @@ def test_the_table_has_the_row_minus_the_full_model(finished):
     text = markdown(finished)
     assert "An unlisted relation counts as wrong." in text
     section = text[text.index("### T2 missing: MRR") :]
-    assert "In brackets: the row minus rooms-triway" in section
+    assert "interval of the row minus rooms-triway" in section
     header, _, *lines = section.split("\n\n")[2].splitlines()
     columns = [column.strip() for column in header.split("|")]
     assert columns[2:-1] == [
@@ -192,10 +192,10 @@ def test_bad_requests_are_named(finished, tmp_path):
     for request, message in (
         (
             (*arguments(tmp_path), "--row", "nobody"),
-            "unknown rows ['nobody']: must be seed-form",
+            "unknown rows ['nobody']: choose from seed-form",
         ),
         ((*arguments(tmp_path), "--rows", "nowhere.toml"), "ablation file nowhere.toml"),
-        (("ablate", config), "name a TOML file with --rows"),
+        (("ablate", config), "TOML file of ablations with --rows"),
         ((*arguments(finished), "--limit", "20"), "another configuration of rooms-triway"),
     ):
         code, output = run(*request)

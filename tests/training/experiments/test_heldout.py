@@ -71,7 +71,7 @@ def test_a_random_split_leaves_no_group_untouched_that_it_learnt_from(tmp_path) 
     try:
         groups = {scene.group for scene in held_out(a, b, SCENES, tmp_path).scenes}
     except ConfigError as error:
-        assert "no common held-out scenes" in str(error)  # noqa: PT017
+        assert "no scene is held out from both models" in str(error)  # noqa: PT017
         groups = set()
     assert not groups & learnt
 
@@ -98,7 +98,7 @@ def test_a_model_of_other_sources_has_seen_nothing(tmp_path) -> None:
         tmp_path,
     )
     assert found.certain
-    assert any("other sources (kitchens)" in note for note in found.notes)
+    assert any("other data sources (kitchens)" in note for note in found.notes)
     assert held_out(side("a"), BASELINES, SCENES, tmp_path).certain
 
 

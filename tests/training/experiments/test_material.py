@@ -149,7 +149,7 @@ def test_the_control_leaves_relations_out_as_well(unrelated):
 def test_a_control_of_relations_alone_needs_some(unrelated, tmp_path):
     (domain,) = read_domains([str(unrelated / "config.toml")])
     options = Options(unrelated, ("T1a relations",), quick=True)
-    with pytest.raises(ValueError, match="the scenes of flats contain none"):
+    with pytest.raises(ValueError, match="the scenes of flats contain no relations"):
         compare_on_shuffled(domain, tmp_path, options)
 
 

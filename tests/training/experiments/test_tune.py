@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import optuna
 import pytest
@@ -16,6 +19,7 @@ from training.experiments.tune import Search
 from training.pipeline import prepare
 from training.trainer import Trainer
 
+ROOT = Path(__file__).resolve().parents[3]
 CONFIG = """
 name = "rooms-triway"
 [data]
@@ -49,8 +53,9 @@ def run(*arguments):
     return result.exit_code, " ".join(result.output.split())
 
 
-def recorded(folder):
-    backend = JournalFileBackend(str(folder / "tuning/rooms-triway/study.log"))
+def recorded(place):
+    journal = place / "tuning/rooms-triway/study.log" if place.is_dir() else place
+    backend = JournalFileBackend(str(journal))
     storage = optuna.storages.JournalStorage(backend)
     trials = optuna.load_study(study_name="rooms-triway", storage=storage).trials
     return [trial for trial in trials if "settings" in trial.user_attrs]
@@ -132,7 +137,7 @@ def test_bad_requests_are_refused_before_anything_runs(tmp_path):
     assert not (tmp_path / "tuning").exists()
     _, config, *_ = arguments(tmp_path)
     code, output = run("tune", config)
-    assert (code, "name a TOML file with --space" in output) == (1, True)
+    assert (code, "Pass a TOML file with --space" in output) == (1, True)
 
 
 def test_other_scenes_are_another_search(finished, tmp_path):
@@ -140,6 +145,26 @@ def test_other_scenes_are_another_search(finished, tmp_path):
     code, output = run(*other, "--folder", str(finished / "tuning"))
     assert code == 1
     assert "another configuration, scenes or metric" in output
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_two_processes_share_a_study(tmp_path):
+    """Together they run as many trials as asked, each trial once."""
+    space = '"training.learning_rate" = { low = 0.001, high = 0.1, log = true }\n'
+    command = (sys.executable, "-m", "training", *arguments(tmp_path, space=space))
+    journal = tmp_path / "shared.log"
+    both = [
+        subprocess.Popen([*command, "--trials", "5", "--study", str(journal)], cwd=ROOT)
+        for _ in range(2)
+    ]
+    assert [process.wait(timeout=300) for process in both] == [0, 0]
+    trials = recorded(journal)
+    assert [trial.user_attrs["settings"] == {} for trial in trials] == [True, *[False] * 5]
+    rates = [trial.user_attrs["settings"].get("training.learning_rate") for trial in trials]
+    assert len(set(rates)) == 6
+    assert len({trial.user_attrs["process"] for trial in trials}) == 2
+    assert (tmp_path / "tuning/rooms-triway/best.toml").exists()
 
 
 @pytest.mark.slow

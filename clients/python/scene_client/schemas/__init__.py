@@ -1,6 +1,6 @@
 """The HTTP contract as pydantic models. The service and its clients use the same models.
 
-Each question has its own module. `requests` and `answers` contain the parts that questions share.
+Each question has its own module. The modules `requests` and `answers` contain the shared parts.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Answers of the four questions, and problems."""
+"""Schemas of the answers to the four questions, and of problems."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class FieldError(Reply):
 
 
 class Failure(Reply):
-    """An unusable entry of the model store, with the reason."""
+    """An unusable version or alias of the model store, with the reason."""
 
     subject: Annotated[
-        str, Field(description="the unusable entry: `name@version`, an alias, or `store`")
+        str, Field(description="name of the unusable entry: `name@version`, an alias, or `store`")
     ]
     reason: Annotated[str, Field(description="stable code of the reason")]
     detail: str
@@ -45,7 +45,7 @@ class Problem(Reply):
 
     type: Annotated[
         str,
-        Field(description="path of the problem's page; it never changes, so programs can test it"),
+        Field(description="path of the problem type's page, which never changes"),
     ]
     title: str
     status: int
@@ -59,7 +59,7 @@ class Problem(Reply):
     ] = None
     failures: Annotated[
         list[Failure] | None,
-        Field(description="entries of the store that a refresh refused, with reasons"),
+        Field(description="versions and aliases that a refresh refused, with reasons"),
     ] = None
 
 
@@ -72,15 +72,15 @@ class ModelReference(Reply):
     name: str
     version: str
     variant: Annotated[str, Field(description="rbm, gbm or triway")]
-    digest: Annotated[str, Field(description="SHA-256 of the model's manifest")]
+    digest: Annotated[str, Field(description="SHA-256 digest of the model's manifest")]
 
 
 @dataclass(slots=True)
 class ObservedRelation:
     """A relation between two objects, derived from their positions. Objects are named by id."""
 
-    # This is a dataclass, because the creation of a pydantic model takes ten times as long. A scene
-    # of twelve objects has about fifty derived relations.
+    # `ObservedRelation` is a dataclass, because the creation of a pydantic model takes ten times as
+    # long. A scene of twelve objects has about fifty derived relations.
     subject: str
     relation: RelationName
     object: str
@@ -91,24 +91,28 @@ class Mapped(Reply):
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, serialize_by_alias=True)
 
-    label: Annotated[str, Field(description="unknown label of an object, a candidate or the room")]
+    label: Annotated[
+        str, Field(description="unknown label of an object or candidate, or room type")
+    ]
     class_: Annotated[str, Field(alias="class", description="canonical label of the class")]
     similarity: Annotated[
         float,
-        Field(ge=0, le=1, description="similarity of label and class in spelling or common words"),
+        Field(
+            ge=0, le=1, description="similarity of the label and the class, in spelling or words"
+        ),
     ]
 
 
 class SceneWarning(Reply):
-    """A probable mistake in the scene. The service answers the question in spite of it."""
+    """A probable mistake in the scene. The service still answers the question."""
 
     code: Annotated[
         Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"],
         Field(
-            description="implausible-position: the object is more than 100 m away. "
-            "implausible-size: a side is below 1 mm or above 20 m. flat-scene: all objects have "
-            "the same depth in an optical frame. unknown-sizes: vertical relations are unobserved, "
-            "because sizes are unknown"
+            description="implausible-position: an object is more than 100 m from the viewer. "
+            "implausible-size: a side of an object is below 1 mm or above 20 m. flat-scene: all "
+            "objects have the same depth in an optical frame. unknown-sizes: vertical relations of "
+            "an object are unobserved, because its size is unknown"
         ),
     ]
     message: str
@@ -120,22 +124,22 @@ class Answer(Reply):
 
     model: ModelReference
     request_id: Annotated[
-        str, Field(description="value of the X-Request-Id header, or a random id")
+        str, Field(description="id of the request: its X-Request-Id header, or a random id")
     ]
-    frame_id: Annotated[str | None, Field(description="copy of the request's field")] = None
-    stamp: Annotated[Stamp | None, Field(description="copy of the request's field")] = None
+    frame_id: Annotated[str | None, Field(description="`frame_id` of the request")] = None
+    stamp: Annotated[Stamp | None, Field(description="`stamp` of the request")] = None
     ignored: Annotated[
         list[str],
         Field(
-            description="with `unknown_labels: ignore`: ids of objects, candidates and the room "
-            "type that the model does not know; the answer leaves them out"
+            description="with `unknown_labels: ignore`: ids of the objects, candidates and room "
+            "type that the model does not know. The answer ignores them"
         ),
     ] = []
     mapped: Annotated[
         list[Mapped],
         Field(
-            description="with `unknown_labels: nearest`: labels that the model does not know, "
-            "with the class that replaces each"
+            description="with `unknown_labels: nearest`: each label that the model does not know, "
+            "with the class that replaces it"
         ),
     ] = []
     warnings: Annotated[
@@ -158,9 +162,13 @@ class ScoredRelation(Reply):
 
 @dataclass(slots=True)
 class Because:
-    """How much the presence of `object` (an id) changes the log-odds of another object."""
+    """Effect of an object on an entry of the answer.
 
-    # This is a dataclass, because an answer has about thirty of them.
+    `log_odds_change` is the change of the entry's log-odds by the presence of the object with the
+    id `object`.
+    """
+
+    # `Because` is a dataclass for speed, because an answer contains about thirty `Because` objects.
     object: str
     log_odds_change: Finite
 
@@ -177,7 +185,7 @@ class BatchEntry(Reply, Generic[AnswerT]):
 
 
 class BatchAnswer(Reply, Generic[AnswerT]):
-    """One entry for each scene, in the order of the request."""
+    """Answer to a batch: one entry for each scene, in the order of the scenes in the request."""
 
     request_id: str
     results: list[BatchEntry[AnswerT]]

@@ -24,9 +24,9 @@ class GenerateRequest(SceneRequest):
 
     objects: Annotated[
         list[SceneObject],
-        Field(max_length=256, description="objects that every scene contains; [] is allowed"),
+        Field(max_length=256, description="objects in every sampled scene; [] is allowed"),
     ] = []
-    count: Annotated[int, Field(ge=1, le=64, description="number of scenes")] = 1
+    count: Annotated[int, Field(ge=1, le=64, description="number of scenes to sample")] = 1
     steps: Annotated[
         int | None,
         Field(ge=1, le=2000, description="number of Gibbs sweeps; default: the model's value"),
@@ -50,7 +50,7 @@ class GenerateRequest(SceneRequest):
 
 
 class GeneratedScene(Reply):
-    """A sampled scene: labels, relations between labels, and the hidden units that are on."""
+    """A sampled scene: labels, relations between the labels, and the hidden units that are on."""
 
     objects: list[str]
     relations: list[Relation]
@@ -62,7 +62,10 @@ class GeneratedScene(Reply):
 
 
 class GenerateAnswer(Answer):
-    """Scenes that contain the given objects. The same request with this `seed` gives them again."""
+    """Sampled scenes that contain the given objects.
+
+    The same request with the field `seed` of this answer gives the same scenes.
+    """
 
     seed: int
     scenes: list[GeneratedScene]

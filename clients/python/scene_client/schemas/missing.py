@@ -1,4 +1,4 @@
-"""The contract of `/missing`: what else should be here, and where?"""
+"""The HTTP contract of `/missing`: what else should be here, and where?"""
 
 from __future__ import annotations
 
@@ -24,26 +24,24 @@ from scene_client.schemas.requests import (
 
 
 class Anchor(Request):
-    """A place in a ``relation`` to an ``object``, such as "on-top" of the "desk"."""
+    """A place: the relation to an object of the scene, such as "on-top" and "desk"."""
 
     relation: RelationName
     object: Name
 
 
 class MissingOptions(Request):
-    """Options of `/missing`, besides the scene."""
+    """The options of `/missing`, without the fields of the scene."""
 
     coverage: Annotated[
         Probability | None,
         Field(
-            description="probability that the request lists an object of the scene. With 1, "
+            description="probability that the request lists an object of the real scene. With 1, "
             "unlisted classes count as absent. With 0, unlisted classes do not count as evidence. "
-            "Default: the model's value",
+            "Default: the value of the model",
         ),
     ] = None
-    top_k: Annotated[
-        int, Field(ge=1, description="maximum number of classes, up to the size of the vocabulary")
-    ] = 10
+    top_k: Annotated[int, Field(ge=1, description="maximum number of classes in the answer")] = 10
     candidates: Annotated[
         list[Label] | None,
         Field(
@@ -74,14 +72,14 @@ class Vector:
 
 @dataclass(slots=True)
 class Offset:
-    """Offset from the centre of a placement's object to the centre of the missing object.
+    """Offset from the centre of the placement's `object` to the centre of the missing object.
 
-    `mean` plus the position of the placement's object is the expected position. The axes are the
-    axes of `frame_id`. Without a frame, x points away from the viewer, y to the left and z up.
-    `std` is the standard deviation on each axis. 80 % of the objects are within 1.8 standard
-    deviations in the plane, or 2.15 in space. `scenes` is the number of training scenes with this
-    relation of the two classes. With 0, the offset is estimated from the relation and from each
-    class separately.
+    The expected position of the missing object is `mean` plus the position of `object`. The axes
+    are the axes of `frame_id`. Without a frame, x points away from the viewer, y to the left and z
+    up. `std` is the standard deviation on each axis. 80 % of the missing objects are within 1.8
+    standard deviations in the plane, or within 2.15 in space. `scenes` is the number of training
+    scenes with this relation between the two classes. If `scenes` is 0, the offset is estimated
+    from the relation and from each class separately.
     """
 
     mean: Vector
@@ -90,7 +88,7 @@ class Offset:
 
 
 class Placement(Reply):
-    """A likely place of a missing object: it has `relation` to the object with the id `object`."""
+    """A likely place of a missing object: its `relation` to the object with the id `object`."""
 
     relation: RelationName
     object: str
@@ -98,9 +96,9 @@ class Placement(Reply):
     offset: Annotated[
         Offset | None,
         Field(
-            description="offset from the object in metres. It is absent if the training scenes "
-            "have no poses. It is also absent for left, right, front and behind in a map, odom or "
-            "world frame without a viewpoint"
+            description="offset from `object` in metres. The offset is absent if the training "
+            "scenes have no poses. It is also absent for left, right, front and behind in a map, "
+            "odom or world frame without a viewpoint"
         ),
     ] = None
 
@@ -109,7 +107,7 @@ class MissingObject(Reply):
     """A class that the request does not list.
 
     `probability` is the probability that an object of the class is in the scene, given `coverage`.
-    `log_odds` are the log-odds of its presence, before calibration.
+    `log_odds` are the log-odds that the class is present, before calibration.
     """
 
     label: str
@@ -119,18 +117,18 @@ class MissingObject(Reply):
     because: Annotated[
         list[Because],
         Field(
-            description="objects that change the log-odds most, strongest first, at most 3. Only "
-            "the first 32 entries of the answer have this list"
+            description="the objects that change the log-odds most, largest change first, at most "
+            "3. Only the first 32 classes of the answer have this list"
         ),
     ]
 
 
 class MissingAnswer(Answer):
-    """Unlisted classes, likeliest first. Their probabilities do not sum to one."""
+    """Unlisted classes, most probable first. Their probabilities do not sum to one."""
 
     coverage: Annotated[
         Probability | None,
-        Field(description="the applied value of the request's field `coverage`"),
+        Field(description="value of `coverage` that the service has used"),
     ] = None
     missing: list[MissingObject]
 

@@ -1,4 +1,4 @@
-"""Answers about models, and about the health of the service."""
+"""Schemas of the answers about models, and about the health of the service."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scene_client.schemas.requests import Finite, RelationName, Size
 
 
 class Metric(Reply):
-    """A metric on held-out scenes, with its 95 % confidence interval. n is the sample size."""
+    """A metric on held-out scenes, with its 95 % confidence interval. `n` is the sample size."""
 
     task: str
     source: str
@@ -36,7 +36,7 @@ class TrainingSource(Reply):
 
 
 class VersionSummary(Reply):
-    """One version of a model. A refused version has a reason."""
+    """One version of a model. If the service refused the version, `reason` is its code."""
 
     version: str
     status: Literal["ready", "refused"]
@@ -46,7 +46,7 @@ class VersionSummary(Reply):
     reason: Annotated[
         str | None, Field(description="stable code of the reason for the refusal")
     ] = None
-    detail: Annotated[str | None, Field(description="the reason in words")] = None
+    detail: Annotated[str | None, Field(description="the reason for the refusal in words")] = None
 
 
 class ModelSummary(Reply):
@@ -57,7 +57,7 @@ class ModelSummary(Reply):
 
 
 class ModelList(Reply):
-    """The models of the service, and its aliases."""
+    """The models and the aliases of the service."""
 
     models: list[ModelSummary]
     aliases: Annotated[
@@ -69,7 +69,7 @@ class ModelList(Reply):
     ] = []
     generation: Annotated[
         str,
-        Field(description="digest of all versions and aliases; equal in replicas of equal state"),
+        Field(description="digest of all versions and aliases; equal for replicas of equal state"),
     ] = ""
 
 
@@ -86,7 +86,7 @@ class VersionDetails(VersionSummary):
 
 
 class VocabularyEntry(Reply):
-    """One object class. With `structure` (wall, floor, vague name), a model never proposes it."""
+    """One object class. Models never propose a class with `structure`, such as wall or floor."""
 
     label: str
     aliases: list[str]
@@ -98,7 +98,7 @@ class VocabularyEntry(Reply):
 
 
 class VocabularyAnswer(Reply):
-    """The vocabulary of a model. Labels match in any case, with any separators or as plurals."""
+    """The vocabulary of a model. Letter case, separators and plurals of labels do not matter."""
 
     model: ModelReference
     objects: list[VocabularyEntry]
@@ -133,8 +133,8 @@ class ContextUnit(Reply):
     relations: Annotated[
         list[WeightedRelation],
         Field(
-            description="relations seen in training; each weight is the difference from the mean "
-            "weight of the layer"
+            description="relations of the training scenes. Each weight is the difference from "
+            "the mean weight of the layer"
         ),
     ]
     room_types: list[WeightedLabel]
@@ -151,12 +151,14 @@ class RefreshAnswer(Reply):
     """The changes made by a refresh."""
 
     request_id: str
-    default: Annotated[ModelReference, Field(description="the model at which `default` points")]
+    default: Annotated[
+        ModelReference, Field(description="model to which the alias `default` refers")
+    ]
     added: Annotated[list[str], Field(description="new versions, as `name@version`")]
     removed: Annotated[list[str], Field(description="versions no longer served, as `name@version`")]
     failures: Annotated[
         list[Failure],
-        Field(description="unusable entries of the store; they were unusable before, too"),
+        Field(description="entries of the store that were unusable before and still are"),
     ] = []
 
 
@@ -172,10 +174,25 @@ class AliasAnswer(Reply):
 # ------------------------------------------------------------------------------------ health
 
 
+class StoreHealth(Reply):
+    """The contact of a replica to its remote store of models."""
+
+    age_s: Annotated[
+        Finite, Field(description="seconds since the replica last read the remote store")
+    ]
+    reason: Annotated[
+        str | None, Field(description="stable code of the reason why the last reading failed")
+    ] = None
+
+
 class Health(Reply):
     """The status of the service."""
 
     status: Literal["live", "ready"]
+    store: Annotated[
+        StoreHealth | None,
+        Field(description="contact to a remote store; absent for a store in a folder"),
+    ] = None
 
 
 class ServerMetadata(Reply):
@@ -206,7 +223,7 @@ class ModelReady(Reply):
 
 
 class TensorMetadata(Reply):
-    """Open Inference Protocol: metadata of a tensor. This service has no tensor inputs."""
+    """Open Inference Protocol: metadata of a tensor. The models of this service have no tensors."""
 
     name: str
     datatype: str
@@ -214,7 +231,7 @@ class TensorMetadata(Reply):
 
 
 class ModelMetadata(Reply):
-    """Open Inference Protocol: metadata of a model. Ask it by the routes of the questions."""
+    """Open Inference Protocol: metadata of a model. The question routes serve the model."""
 
     name: str
     versions: list[str]

@@ -20,20 +20,20 @@ Sensitivity = Literal["low", "medium", "high"]
 
 
 class OutliersOptions(Request):
-    """Options of `/outliers`, besides the scene."""
+    """The options of `/outliers`, without the fields of the scene."""
 
     sensitivity: Annotated[
         Sensitivity,
         Field(
-            description="alarm rate. With low, medium and high, about 2, 10 and 20 % of the "
-            "unchanged scenes of the hardest large source raise an alarm. The same rates hold for "
-            "short lists"
+            description="rate of alarms in unchanged scenes: about 2, 10 and 20 % of the scenes "
+            "with low, medium and high. The rates apply to the large data source with the most "
+            "alarms, and also to short lists of objects"
         ),
     ] = "medium"
     threshold: Annotated[
         Probability | None,
         Field(
-            description="minimum probability of an outlier; default: the model's threshold for "
+            description="minimum probability of an outlier; default: threshold of the model for "
             "`sensitivity`",
         ),
     ] = None
@@ -46,10 +46,11 @@ class OutliersRequest(OutliersOptions, SceneRequest):
 
 
 class Outlier(Reply):
-    """How well one object fits the scene.
+    """Result for one object: whether the object fits the scene.
 
-    `probability` is the probability that the object does not belong, if half of all scenes contain
-    an intruder. `log_odds` are the log-odds that its class is present, given the rest of the scene.
+    `probability` is the probability that the object does not belong in the scene, under the
+    assumption that half of all scenes contain an outlier. `log_odds` are the log-odds that the
+    class of the object is present, given the rest of the scene.
     """
 
     object: str
@@ -60,8 +61,8 @@ class Outlier(Reply):
     because: Annotated[
         list[Because],
         Field(
-            description="objects that explain `is_outlier`, strongest first, at most 3. They make "
-            "an outlier unlikely, and any other object likely"
+            description="other objects that explain `is_outlier`, largest effect first, at most "
+            "3. For an outlier, they lower its log-odds. Otherwise, they raise its log-odds"
         ),
     ]
     usually_with: Annotated[
@@ -71,22 +72,23 @@ class Outlier(Reply):
 
 
 class MisplacedRelation(ScoredRelation):
-    """A relation, with the name from the request, and the probability that it is false."""
+    """A relation in the form of the request, and the probability that the relation is false."""
 
     is_misplaced: Annotated[
-        bool, Field(description="true if `probability` reaches the threshold of `sensitivity`")
+        bool, Field(description="true if `probability` reaches the threshold for `sensitivity`")
     ] = False
 
 
 class OutliersAnswer(Answer):
-    """Objects, most probable outlier first, and observed relations, most probably false first.
+    """Results for all objects and for all observed relations.
 
-    In `misplaced`, `probability` is the probability that the relation is false.
+    `outliers` starts with the most probable outlier. `misplaced` starts with the relation that is
+    most probably false. There, `probability` is the probability that the relation is false.
     """
 
     threshold: Annotated[
         Probability | None,
-        Field(description="applied minimum probability of an outlier"),
+        Field(description="minimum probability of an outlier that the service has used"),
     ] = None
     outliers: list[Outlier]
     misplaced: list[MisplacedRelation]

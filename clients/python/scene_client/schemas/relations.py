@@ -29,11 +29,11 @@ class Pair(Request):
 
 
 class RelationsOptions(Request):
-    """Options of `/relations`, besides the scene."""
+    """The options of `/relations`, without the fields of the scene."""
 
     top_k: Annotated[int, Field(ge=1, le=4096, description="maximum number of relations")] = 20
     min_probability: Annotated[
-        Probability, Field(description="leave out relations with a lower probability")
+        Probability, Field(description="minimum probability of the relations in the answer")
     ] = 0.0
     pairs: Annotated[
         list[Pair] | None,
@@ -59,13 +59,13 @@ class RelationsRequest(RelationsOptions, SceneRequest):
 class Disagreement:
     """Two objects whose observed relation differs from the expected relation.
 
-    `subject` and `object` are ids. `observed` lists the stated or derived relations between them.
-    `expected` is the most probable relation given the rest of the scene, without the observed
-    relations of the two objects. `probability` is the probability of `expected`.
+    `subject` and `object` are ids. `observed` lists the stated or derived relations between the two
+    objects. `expected` is their most probable relation given the rest of the scene, without the
+    observed relations of the two objects. `probability` is the probability of `expected`.
     `observed_probability` is the probability of the most probable observed relation.
     """
 
-    # This is a dataclass, because an answer may have one for half of the observed relations.
+    # `Disagreement` is a dataclass for speed, because an answer may contain many disagreements.
     subject: str
     object: str
     observed: list[RelationName]
@@ -79,12 +79,12 @@ class ExpectedRelation(ScoredRelation):
 
     observed: Annotated[
         bool,
-        Field(description="true if the request states the relation, or positions imply it"),
+        Field(description="true if the request states the relation or the positions show it"),
     ] = False
 
 
 class RelationsAnswer(Answer):
-    """Relations, most probable first.
+    """Relations between the objects, most probable relation first.
 
     `probability` is the probability that the relation holds, given that both objects are in the
     scene.
@@ -96,7 +96,8 @@ class RelationsAnswer(Answer):
         Field(
             description="pairs whose observed relation differs from the expected relation, at most "
             "`top_k`. Given the rest of the scene, the expected relation has a probability of at "
-            "least one half. The pair with the largest ratio of the two probabilities is first"
+            "least one half. The first pair has the largest ratio of the probabilities of the "
+            "expected and the observed relation"
         ),
     ]
 

@@ -1,8 +1,8 @@
-"""Requests of the HTTP contract.
+"""Schemas of the requests to the service.
 
-Validation is strict: it refuses other types ("1" is not 1, true is not 1), unknown fields, NaN and
-infinity. Every text and list has a maximum length. Unknown labels, ambiguous names and
-contradictions are not checked here, because these checks need the vocabulary of the model.
+Validation is strict: it refuses values of another type ("1" or true in place of 1), unknown fields,
+NaN and infinity. Every text and list has a maximum length. The service checks unknown labels,
+ambiguous names and contradictions later, because these checks need the vocabulary of the model.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ Body: TypeAlias = Mapping[str, Any]
 
 
 class Request(BaseModel):
-    """Base class of all parts of a request. Validation refuses unknown fields and other types."""
+    """Base class of all parts of a request. Validation refuses unknown fields and wrong types."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
@@ -73,7 +73,7 @@ class Position(Request):
 
 
 class Size(Request):
-    """Extents of a box in metres along its own axes, before the rotation by ``orientation``."""
+    """Extents of a box in metres along its own axes, without the rotation by ``orientation``."""
 
     x: Extent
     y: Extent
@@ -90,7 +90,8 @@ class Quaternion(Request):
 
     @model_validator(mode="after")
     def _unit(self) -> Self:
-        # tf2 allows the same deviation. An all-zero quaternion comes from an unset message.
+        # tf2 allows the same deviation from length 1. A ROS message whose orientation is unset has
+        # an all-zero quaternion.
         if abs(math.hypot(self.x, self.y, self.z, self.w) - 1) > 0.01:
             raise PydanticCustomError("unit_quaternion", "must be a unit quaternion (length 1)")
         return self
@@ -120,11 +121,11 @@ class Detection(Request):
     id: Annotated[
         Name | None,
         Field(
-            description="id of the object in this scene; default: its label, with a number if "
-            "the label repeats"
+            description="id of the object in this scene; default: its label, followed by a number "
+            "if several objects have this label"
         ),
     ] = None
-    label: Annotated[Label, Field(description="any spelling that the model's vocabulary accepts")]
+    label: Annotated[Label, Field(description="label in any spelling that the vocabulary accepts")]
     confidence: Annotated[
         float,
         Field(
@@ -149,8 +150,8 @@ def _kind_of_object(value: object) -> str | None:
     return OBJECT_TAGS[1] if isinstance(value, dict | Detection) else None
 
 
-# pydantic puts these tags of the union's members into error locations. They contain a space, so
-# `validation.pointer` can tell them from field names.
+# pydantic puts these tags of the union's members into error locations. The tags contain a space, so
+# `validation.pointer` can distinguish tags from field names.
 OBJECT_TAGS = ("a label", "a detection")
 
 SceneObject = Annotated[
@@ -167,7 +168,7 @@ SomeObjects = Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
 
 
 class Relation(Request):
-    """``subject`` has the ``relation`` to ``object``. Both are an id or an unambiguous label."""
+    """A relation from `subject` to `object`. Each object is an id or an unambiguous label."""
 
     subject: Name
     relation: RelationName
@@ -175,7 +176,7 @@ class Relation(Request):
 
 
 class SceneRequest(Request):
-    """The scene that the robot observes, and the model to ask."""
+    """A request: the scene that the robot observes, and the model that answers."""
 
     objects: Annotated[
         list[SceneObject],
@@ -185,29 +186,29 @@ class SceneRequest(Request):
         list[Relation] | None,
         Field(
             max_length=MAX_RELATIONS,
-            # With this many relations, a list of all errors would need a hundred times the memory
-            # of the request.
+            # Validation stops at the first invalid relation. A list of all errors would need a
+            # hundred times the memory of the request.
             fail_fast=True,
-            description="relations that hold. Unlisted relations are unobserved, unless "
-            "`relations_complete` is true. Without this field, the service derives relations from "
-            "positions. With an empty list, the service does not derive relations",
+            description="relations that hold in the scene. Unlisted relations are unobserved, "
+            "unless `relations_complete` is true. Without this field, the service derives "
+            "relations from positions. An empty list turns this derivation off",
         ),
     ] = None
     relations_complete: Annotated[
-        bool, Field(description="whether all unlisted relations do not hold")
+        bool, Field(description="whether every relation that `relations` does not list is false")
     ] = False
     room_type: Annotated[Label | None, Field(description="one of the model's room types")] = None
     frame_id: Annotated[
         str | None,
         Field(
             max_length=256,
-            description="name of the frame of all positions, as in std_msgs/Header; the answer "
-            "contains it too",
+            description="name of the frame of all positions, as in std_msgs/Header. The answer "
+            "contains the same name",
         ),
     ] = None
     stamp: Annotated[
         Stamp | None,
-        Field(description="time of the scene, as in std_msgs/Header; the answer contains it too"),
+        Field(description="time of the scene, as in std_msgs/Header; copied to the answer"),
     ] = None
     viewpoint: Annotated[
         Viewpoint | None,
@@ -220,7 +221,7 @@ class SceneRequest(Request):
     seed: Annotated[
         int | None,
         Field(
-            ge=0, le=MAX_SEED, description="random seed of `/generate`; other questions ignore it"
+            ge=0, le=MAX_SEED, description="random seed of `/generate`; unused by other questions"
         ),
     ] = None
     unknown_labels: Annotated[
@@ -234,7 +235,10 @@ class SceneRequest(Request):
 
 
 class SceneFields(TypedDict, total=False):
-    """The fields of `SceneRequest` as keyword arguments. A relation may be a tuple of names."""
+    """The fields of `SceneRequest` as keyword arguments.
+
+    A relation may be a tuple (subject, relation, object).
+    """
 
     relations: Iterable[Relation | Body | tuple[str, RelationName, str]]
     relations_complete: bool
@@ -257,7 +261,7 @@ class AliasRequest(Request):
         ModelSpec | None,
         Field(
             description="required current target of the alias, as in GET /models. null means that "
-            "the alias must not exist yet. By default, every target is accepted"
+            "the alias must not exist yet. By default, the service does not check the target"
         ),
     ] = None
 
@@ -276,10 +280,10 @@ def _as_it_came(value: Any, _validate: object) -> Any:
 
 
 class BatchRequest(Request, Generic[RequestT]):
-    """Scenes to answer in order. An invalid scene affects only its own entry of the answer."""
+    """A batch of scenes. The answer has one entry for each scene, in the order of the scenes."""
 
-    # The schema shows RequestT, but the scenes are not validated here. Otherwise one invalid scene
-    # would make the whole batch invalid.
+    # The JSON schema shows RequestT, but the service validates each scene later. Otherwise one
+    # invalid scene would make the whole batch invalid.
     scenes: Annotated[
         list[Annotated[RequestT, WrapValidator(_as_it_came)]],
         Field(min_length=1, max_length=MAX_BATCH),

@@ -1,0 +1,202 @@
+"""Two replicas of one remote store behind the shipped proxy: promotions, a crash, a lost store."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import httpx
+import pytest
+
+from app.registry import AliasTarget, Store, open_store
+from app.registry.index import Signer
+from app.registry.remote import RemoteStore
+from benchmarks.load.connections import prepared
+from scene_client import Client
+from tests.chaos.load import ConstantLoad
+from tests.chaos.test_swaps import SCENES, offline
+from tests.http.stores import make_store
+from tests.registry.object_storage import ObjectStorage, running
+from tests.services import LiveService, launch
+
+pytestmark = [pytest.mark.system, pytest.mark.slow]
+
+PROMOTIONS = 50
+POLL = 0.5
+
+
+class Fleet:
+    """Two replicas behind a proxy, the store that they follow, and its publisher."""
+
+    def __init__(self, storage: ObjectStorage, folder: Path) -> None:
+        self.storage, self.folder = storage, folder
+        url = storage.create_bucket(f"b{uuid4().hex}")
+        Signer.create(folder / "key.pem")
+        remote = open_store(url, signing_key=folder / "key.pem", cache=folder / "publisher")
+        assert isinstance(remote, RemoteStore)
+        self.publisher = remote
+        self.local = Store(make_store(folder / "local"))
+        for version in ("1.0.0", "1.1.0"):
+            remote.upload(self.local.load("home", version), "default")
+        self._variables = {
+            "SCENE_TRUSTED_KEYS": Signer.read(folder / "key.pem").public,
+            "SCENE_STORE_POLL": str(POLL),
+            "SCENE_ACCESS_LOG": "false",
+            **storage.environment(),
+        }
+        self._url = url
+        self.replicas = [self.start(number) for number in range(2)]
+
+    def start(self, number: int, port: int | None = None) -> LiveService:
+        variables = self._variables | {"SCENE_STORE_CACHE": str(self.folder / f"cache{number}")}
+        log = self.folder / f"log{number}"
+        return launch(self._url, log, port=port, **variables)  # type: ignore[arg-type]
+
+    def promote(self, version: str) -> float:
+        """Move the alias, and return the seconds until both replicas serve the version."""
+        self.publisher.set_alias("default", AliasTarget(name="home", version=version))
+        began = time.monotonic()
+        while any(self.default(replica) != version for replica in self.replicas):
+            assert time.monotonic() < began + 30, "the replicas do not converge"
+            time.sleep(0.01)
+        generations = {
+            replica.client.get("/models").json()["generation"] for replica in self.replicas
+        }
+        assert len(generations) == 1
+        return time.monotonic() - began
+
+    @staticmethod
+    def default(replica: LiveService) -> str:
+        answer = replica.client.post("/missing", json={"objects": ["bed"]}).json()
+        return str(answer["model"]["version"])
+
+    @contextmanager
+    def proxy(self, program: Path, shipped: str) -> Iterator[int]:
+        """Start HAProxy with the shipped configuration in front of the replicas."""
+        template = next(line for line in shipped.splitlines() if "server-template" in line)
+        servers = "".join(
+            f"    server replica{number} 127.0.0.1:{replica.port}\n"
+            for number, replica in enumerate(self.replicas)
+        )
+        configuration = self.folder / "haproxy.cfg"
+        configuration.write_text(shipped.replace(template, servers))
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            port = probe.getsockname()[1]
+        variables = {"PROXY_LISTEN": f"127.0.0.1:{port}", "PROXY_REQUESTS": "1000000"}
+        with (self.folder / "proxy").open("w") as output:
+            process = subprocess.Popen(
+                [program, "-db", "-f", configuration],
+                env=os.environ | variables,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+        try:
+            wait_until_ready(port)
+            yield port
+        finally:
+            process.terminate()
+            process.wait(timeout=30)
+
+
+def wait_until_ready(port: int) -> None:
+    for _ in range(300):
+        try:
+            if httpx.get(f"http://127.0.0.1:{port}/health/ready").status_code == 200:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.1)
+    pytest.fail("the service is not ready")
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
+    with running() as storage, ExitStack() as stack:
+        for name, value in storage.environment().items():
+            monkeypatch.setenv(name, value)
+        fleet = Fleet(storage, tmp_path)
+        stack.callback(lambda: [replica.stop() for replica in fleet.replicas])
+        yield fleet
+
+
+@pytest.fixture
+def port(
+    fleet: Fleet, require_system_tool: Callable[[str], Path], repository: Path
+) -> Iterator[int]:
+    os.environ["PATH"] += os.pathsep + "/usr/sbin"
+    shipped = (repository / "deploy" / "haproxy" / "haproxy.cfg").read_text()
+    with fleet.proxy(require_system_tool("haproxy"), shipped) as port:
+        yield port
+
+
+@pytest.fixture
+def load(fleet: Fleet, port: int) -> ConstantLoad:
+    """Requests whose answers must be exactly those of the version that they name."""
+    known = {}
+    for version in ("1.0.0", "1.1.0"):
+        artifact = fleet.local.load("home", version)
+        known[artifact.digest] = offline(artifact)
+
+    def judge(number: int, status: int, answer: Any) -> str | None:
+        if status != 200:
+            return f"status {status}: {answer}"
+        given = [(m["label"], m["probability"], m["log_odds"]) for m in answer["missing"]]
+        return None if given == known[answer["model"]["digest"]][number] else f"mixed: {answer}"
+
+    requests = [prepared("/missing", body) for body in SCENES]
+    return ConstantLoad(port, requests, judge, connections=4)
+
+
+def test_promotions_under_load_lose_and_mix_nothing(fleet: Fleet, load: ConstantLoad) -> None:
+    with load:
+        seconds = [fleet.promote(f"1.{number % 2}.0") for number in range(PROMOTIONS)]
+    assert load.tally.faults == []
+    assert load.tally.statuses[200] == load.tally.sent
+    # Two polls, which may come 10 % late, and half a second for the two loads beside the requests.
+    assert max(seconds) < 2 * 1.1 * POLL + 0.5, sorted(seconds)[-5:]
+
+
+def test_a_killed_replica_costs_at_most_its_requests(fleet: Fleet, load: ConstantLoad) -> None:
+    killed = fleet.replicas[0]
+    with load:
+        time.sleep(1)
+        killed.process.kill()
+        killed.process.wait()
+        time.sleep(5)
+        fleet.replicas[0] = fleet.start(0, killed.port)
+        wait_until_ready(killed.port)
+        time.sleep(3)
+    assert set(load.tally.statuses) <= {200, 502}
+    assert load.tally.statuses[502] <= 4  # one for each connection
+    assert load.tally.statuses[200] > 100
+    killed.client.close()
+
+
+def test_the_client_hides_a_killed_replica(fleet: Fleet, port: int) -> None:
+    killed = fleet.replicas[0]
+    with Client(f"http://127.0.0.1:{port}") as client:
+        for number in range(300):
+            if number == 100:
+                killed.process.kill()
+            client.missing(["bed", "lamp"])
+    killed.process.wait()
+
+
+def test_the_fleet_serves_without_its_store(fleet: Fleet, load: ConstantLoad) -> None:
+    with load:
+        fleet.storage.stop()
+        time.sleep(30)
+        for replica in fleet.replicas:
+            assert replica.client.get("/health/ready").json()["store"]["reason"] == "unreachable"
+        fleet.storage.start()
+        # The replicas poll less often while the store is away: at most every 16 polls.
+        seconds = fleet.promote("1.0.0")
+    assert load.tally.faults == []
+    assert seconds < 2 * 1.1 * 16 * POLL

@@ -1,0 +1,156 @@
+"""Training in several processes: they follow one process, and resume each other's checkpoints."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from training.cli import app
+from training.config import Config, config_toml, with_settings
+from training.distributed import mean_part, new_generator, on_first, share
+from training.machines.bernoulli import categorical, integers, uniform
+from training.runs import load_run
+
+ROOT = Path(__file__).resolve().parents[2]
+ROWS, WIDTH = 7, 5
+
+BASE = Config.model_validate(
+    {
+        "name": "small",
+        "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 40},
+        "machine": {"variant": "triway", "form": "local", "H1": 8, "H2": 4, "K": 3},
+        "objective": {"name": "composite", "chains": 9, "k": 2},
+        # 26 training scenes: three updates of 8 scenes and one of 2 in each epoch.
+        "training": {"epochs": 50, "batch_size": 8, "averaging": 0.9, "device": "cpu"},
+    }
+)
+SEED = {
+    "machine.form": "seed",
+    "training.optimiser": "sgd",
+    "training.schedule": "constant",
+    "training.learning_rate": 0.001,
+}
+CASES = {
+    "composite": {"objective.object_dropout": 0.1, "objective.count_dropout": 0.2},
+    "composite with chains": {"objective.generative_weight": 0.3},
+    "relations": {"objective.name": "relations", "objects.epochs": 1, "machine.G": 2},
+    "contrastive divergence": {"objective.name": "contrastive_divergence"},
+    "contrastive divergence, seed": {"objective.name": "contrastive_divergence", **SEED},
+    "persistent chains": {"objective.name": "persistent_cd"},
+    "persistent chains, GBM": {"objective.name": "persistent_cd", "machine.variant": "gbm", **SEED},
+}
+# Trains up to an epoch, then stops as Ctrl-C does.
+PART = """
+import sys
+from pathlib import Path
+from training.config import load_config
+from training.distributed import process_group
+from training.pipeline import prepare
+from training.trainer import Trainer
+
+def stop(epoch):
+    if epoch.epoch + 1 == int(sys.argv[3]):
+        raise KeyboardInterrupt
+
+config = load_config(sys.argv[1])
+with process_group():
+    trainer = Trainer(config, prepare(config, Path()).training_data(), Path(sys.argv[2]))
+    assert trainer.resume() == (sys.argv[4] == "resume")
+    try:
+        trainer.run(ended=stop)
+    except KeyboardInterrupt:
+        pass
+"""
+
+
+def torchrun(processes: int, *arguments: str) -> str:
+    command = (sys.executable, "-m", "torch.distributed.run", "--standalone")
+    result = subprocess.run(
+        [*command, "--nproc-per-node", str(processes), *arguments],
+        cwd=ROOT,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def written(folder: Path, settings: dict[str, object]) -> str:
+    path = folder / "small.toml"
+    path.write_text(config_toml(with_settings(BASE, settings)))
+    return str(path)
+
+
+def losses(folder: Path) -> list[float]:
+    with (folder / "curve.csv").open() as file:
+        return [float(row["loss"]) for row in csv.DictReader(file)]
+
+
+@pytest.mark.slow
+@pytest.mark.system
+@pytest.mark.parametrize("case", CASES)
+def test_two_processes_follow_one_for_200_updates(tmp_path, case):
+    config = written(tmp_path, CASES[case])
+    one, two = tmp_path / "one", tmp_path / "two"
+    result = CliRunner().invoke(app, ["train", config, "--runs", str(one)])
+    assert result.exit_code == 0, result.output
+    output = torchrun(2, "-m", "training", "train", config, "--runs", str(two))
+    assert output.count("curve in") == 1  # one process prints
+    single, split = (folder / "small/seed-0" for folder in (one, two))
+    assert len(losses(single)) == 50
+    assert losses(split) == pytest.approx(losses(single), rel=1e-4)
+    first, second = (load_run(folder).machine.state_dict() for folder in (single, split))
+    for name, value in first.items():
+        torch.testing.assert_close(second[name], value, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.system
+@pytest.mark.parametrize("case", ["composite with chains", "persistent chains"])
+def test_a_checkpoint_resumes_with_other_numbers_of_processes(tmp_path, case):
+    """Two processes, then one, then three; the last batch has fewer scenes than processes."""
+    config = written(tmp_path, CASES[case] | {"training.epochs": 6})
+    script = tmp_path / "part.py"
+    script.write_text(PART)
+    mixed, whole = tmp_path / "mixed", tmp_path / "whole"
+    torchrun(1, str(script), config, str(whole), "6", "start")
+    for processes, epochs, state in ((2, "2", "start"), (1, "4", "resume"), (3, "6", "resume")):
+        torchrun(processes, str(script), config, str(mixed), epochs, state)
+    assert losses(mixed) == pytest.approx(losses(whole), rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_an_error_of_the_first_process_ends_all(tmp_path):
+    config = written(tmp_path, {"objective.name": "relations", "objects.epochs": 1})
+    place = tmp_path / "runs/small/seed-0"
+    place.mkdir(parents=True)
+    (place / "checkpoint.pt").write_bytes(b"no checkpoint")
+    with pytest.raises(AssertionError, match=r"checkpoint\.pt cannot be read"):
+        torchrun(2, "-m", "training", "train", config, "--runs", str(tmp_path / "runs"))
+
+
+def test_one_process_draws_as_torch_does():
+    weight = torch.rand(ROWS, WIDTH)
+    first, second = new_generator(3), torch.Generator().manual_seed(3)
+    assert torch.equal(uniform((ROWS, WIDTH), first), torch.rand(ROWS, WIDTH, generator=second))
+    drawn = torch.randint(WIDTH, (ROWS,), generator=second)
+    assert torch.equal(integers(WIDTH, (ROWS,), first), drawn)
+    drawn = torch.multinomial(weight, 1, generator=second).squeeze(1)
+    assert torch.equal(categorical(weight, first), drawn)
+
+
+def test_one_process_keeps_its_rows():
+    rows = torch.rand(ROWS)
+    assert torch.equal(mean_part(rows), rows.mean())
+    assert share(rows) is rows
+    assert on_first(lambda: 3) == 3
