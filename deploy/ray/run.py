@@ -53,14 +53,14 @@ def main() -> int:
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     # The folder is private, because HAProxy's admin socket in it is open to every user.
     with tempfile.TemporaryDirectory(prefix="scene-ray-") as scratch:
-        engine = Engine(scratch)
+        engine = Engine(config, scratch)
         try:
             deadline = time.monotonic() + START_TIMEOUT
             deployed = ready = False
             while not stopping and engine.runs():
                 if not deployed:
                     deployed = engine.request("PUT", json.dumps(config))
-                elif not ready and _status(place, "GET", "/health/ready") == 200:
+                elif not ready and _ask(place, "GET", "/health/ready")[0] == 200:
                     ready = True
                     print(f"ready: http://{place[0]}:{place[1]}/", flush=True)
                 if not ready and time.monotonic() > deadline:
@@ -76,10 +76,13 @@ class Engine:
     """A Ray cluster of one node, which listens on the loopback address.
 
     Args:
+        config: configuration of Ray Serve.
         scratch: private folder for HAProxy.
     """
 
-    def __init__(self, scratch: str) -> None:
+    def __init__(self, config: dict[str, Any], scratch: str) -> None:
+        self._config = config
+        self._answer = b""
         self._token = secrets.token_hex(32)
         self._dashboard = _free_port()
         self._process = subprocess.Popen(
@@ -103,11 +106,19 @@ class Engine:
         """Send a request about the applications to the cluster; return whether it succeeds."""
         headers = {"Authorization": f"Bearer {self._token}", "Content-Type": "application/json"}
         place = "127.0.0.1", self._dashboard
-        return _status(place, method, "/api/serve/applications/", body, headers) == 200
+        status, self._answer = _ask(place, method, "/api/serve/applications/", body, headers)
+        return status == 200
+
+    def _has_replicas(self) -> bool:
+        return self.request("GET") and bool(json.loads(self._answer)["applications"])
 
     def end(self) -> None:
         """Finish the requests in progress, stop the cluster and end every process of it."""
-        if self.runs():
+        deadline = time.monotonic() + STOP_TIMEOUT
+        # HAProxy stays until all replicas have ended. So each stream gets its close frame.
+        if self.runs() and self.request("PUT", json.dumps(self._config | {"applications": []})):
+            while self._has_replicas() and time.monotonic() < deadline:
+                time.sleep(0.2)
             self.request("DELETE")
         self._process.terminate()
         with suppress(subprocess.TimeoutExpired):
@@ -201,20 +212,21 @@ def _is_free(host: str, port: int) -> bool:
     return False
 
 
-def _status(
+def _ask(
     place: tuple[str, int],
     method: str,
     path: str,
     body: str | None = None,
     headers: Mapping[str, str] = MappingProxyType({}),
-) -> int:
-    """Send a request; return the status of the answer, or 0 without an answer."""
+) -> tuple[int, bytes]:
+    """Send a request; return status and body of the answer, or status 0 without an answer."""
     connection = http.client.HTTPConnection(*place, timeout=STOP_TIMEOUT)
     try:
         connection.request(method, path, body, dict(headers))
-        return connection.getresponse().status
+        response = connection.getresponse()
+        return response.status, response.read()
     except (OSError, http.client.HTTPException):
-        return 0
+        return 0, b""
     finally:
         connection.close()
 
