@@ -216,7 +216,8 @@ class Buildah:
         try:
             return run(*self.command("pull", "--quiet", f"docker.io/library/{name}"))
         except ImageError as error:
-            print(f"note: no base image {name}, because {str(error).splitlines()[-1]}", flush=True)
+            reason = str(error).rpartition(": ")[2]
+            print(f"note: no base image {name}, because: {reason}", flush=True)
         archive = self.stand_in(name.rpartition("-")[2].partition("@")[0])
         context = self.work / "base"
         context.mkdir()
