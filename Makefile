@@ -4,7 +4,7 @@ PORT ?= 8000
 PYTHON ?= python3
 # Package index with CPU builds of torch. On Linux the default index has CUDA builds. See README.md.
 TORCH_INDEX_URL ?=
-# Further arguments of pytest, audit, bench or lock, such as make test ARGS="-k geometry".
+# Further arguments of pytest, image, audit, bench or lock, such as make test ARGS="-k geometry".
 ARGS ?=
 # Duration of `make soak` in minutes.
 MINUTES ?= 10
@@ -27,7 +27,7 @@ EVERYTHING := $(VENV)/.installed-everything
 RAY := $(RAY_VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: checks help run ray test test-fast test-slow docs chaos soak audit setup format bench lock clean
+.PHONY: checks help run ray test test-fast test-slow docs chaos soak image audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -73,6 +73,9 @@ soak: $(EVERYTHING)  ## check that memory does not grow in ten minutes of mixed 
 	@# Compile in another process, so that the compiler's memory does not count.
 	$(BIN)/python -m app.compile
 	CHAOS_SOAK_MINUTES=$(MINUTES) $(BIN)/python -m pytest tests/chaos/test_soak.py $(ARGS)
+
+image: $(BIN)/python  ## build the image, ask its service the four questions, remove it (Docker or buildah)
+	$(BIN)/python deploy/image.py $(ARGS)
 
 setup: $(EVERYTHING)  ## install everything that training, tests and benchmarks need
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import subprocess
 from collections.abc import Callable
+from configparser import ConfigParser
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +14,41 @@ import pytest
 import yaml
 
 from app.settings import Settings
-from deploy.by_hand import Instruction, parse, split_stages
+from deploy.image import first_base, pip_settings
 
 pytestmark = pytest.mark.system
 
 FindTool = Callable[[str], Path]
 
 
+@dataclass(frozen=True, slots=True)
+class Instruction:
+    """One instruction: `COPY --from=a b c` has the fields COPY, {"from": "a"} and "b c"."""
+
+    keyword: str
+    flags: dict[str, str]
+    argument: str
+
+
+def split_stages(dockerfile: str) -> dict[str, list[Instruction]]:
+    """Return the instructions of each stage by stage name, in the order of the file."""
+    text = re.sub(r"^\s*#.*\n", "", dockerfile, flags=re.MULTILINE)
+    stages: dict[str, list[Instruction]] = {}
+    for line in re.sub(r"\\[ \t]*\n", " ", text).splitlines():
+        if not line.strip():
+            continue
+        keyword, rest = line.split(maxsplit=1)
+        flags, argument = re.fullmatch(r"((?:--\S+ +)*)(.*)", rest).groups()
+        if keyword == "FROM":
+            current = stages.setdefault(argument.split(" AS ")[1], [])
+        pairs = re.findall(r"--([\w-]+)=(\S+)", flags)
+        current.append(Instruction(keyword, dict(pairs), argument.strip()))
+    return stages
+
+
 @pytest.fixture(scope="module")
 def stages(repository: Path) -> dict[str, list[Instruction]]:
-    return split_stages(parse((repository / "Dockerfile").read_text("utf-8")))
+    return split_stages((repository / "Dockerfile").read_text("utf-8"))
 
 
 @pytest.fixture(scope="module")
@@ -170,3 +197,23 @@ def test_smaller_locks_are_subsets_of_the_larger(repository: Path) -> None:
     )
     assert service < training < development
     assert service < ray
+
+
+def test_the_base_image_may_have_a_digest() -> None:
+    assert (
+        first_base("# FROM no\nFROM python:3@sha256:ab AS base\nFROM base") == "python:3@sha256:ab"
+    )
+
+
+def test_settings_of_pip_become_one_file_and_its_paths() -> None:
+    text, paths = pip_settings(
+        ":env:.cert='/certs/all.pem'\n"
+        "global.extra-index-url='\\nfile:///packages/simple\\nhttps://index.example/simple'\n"
+        "install.find-links='/wheels'\n"
+    )
+    parsed = ConfigParser()
+    parsed.read_string(text)
+    assert parsed["global"]["cert"] == "/certs/all.pem"
+    assert parsed["global"]["extra-index-url"].split()[1] == "https://index.example/simple"
+    assert parsed["install"]["find-links"] == "/wheels"
+    assert paths == ["/certs/all.pem", "/packages", "/wheels"]
