@@ -118,6 +118,7 @@ class Runtime:
         self._models: ServedModels | None = None
         self._seen: StoreState | None = None
         self._failed_polls = 0
+        self._random = random.Random()  # noqa: S311 # nosec B311
 
     @property
     def models(self) -> ServedModels:
@@ -289,7 +290,7 @@ class Runtime:
         """
         self._failed_polls = 0 if self._store.error is None else self._failed_polls + 1
         longer = 1 << min(self._failed_polls, _MAX_DOUBLINGS)
-        return self._poll * longer * random.uniform(0.9, 1.1)  # noqa: S311 # nosec B311
+        return self._poll * longer * self._random.uniform(0.9, 1.1)
 
     def _look(self) -> bool:
         """Bring the local copy of the store up to date. Return whether its state has changed."""

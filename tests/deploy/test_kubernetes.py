@@ -16,7 +16,7 @@ import yaml
 
 from app.main import create_app
 from app.settings import Settings
-from deploy.by_hand import parse, split_stages
+from tests.system.test_container import split_stages
 
 pytestmark = pytest.mark.system
 
@@ -123,7 +123,7 @@ def test_probes_ask_routes_of_the_service(container: dict[str, Any]) -> None:
 def test_ports_are_those_of_the_image(
     repository: Path, manifests: Manifests, container: dict[str, Any]
 ) -> None:
-    stage = split_stages(parse((repository / "Dockerfile").read_text("utf-8")))["runtime"]
+    stage = split_stages((repository / "Dockerfile").read_text("utf-8"))["runtime"]
     (exposed,) = [int(i.argument) for i in stage if i.keyword == "EXPOSE"]
     environment = " ".join(i.argument for i in stage if i.keyword == "ENV")
     assert f"SCENE_PORT={exposed}" in environment

@@ -48,10 +48,18 @@ def test_a_flaw_is_named_with_its_cure() -> None:
     [
         # A mirror without the index's JSON pages: pip-audit exits with 0 and finds "no known
         # vulnerabilities".
-        (report(skipped("a"), skipped("b")), "No known vulnerabilities found", "about a, b"),
-        (report(sound("a"), skipped("b")), "No known vulnerabilities found", "about b"),
-        (report(sound("a")), "No known vulnerabilities found", "about b"),
-        (report(), "No known vulnerabilities found", "about a, b"),
+        (
+            report(skipped("a"), skipped("b")),
+            "No known vulnerabilities found",
+            "packages a, b",
+        ),
+        (
+            report(sound("a"), skipped("b")),
+            "No known vulnerabilities found",
+            "packages b",
+        ),
+        (report(sound("a")), "No known vulnerabilities found", "packages b"),
+        (report(), "No known vulnerabilities found", "packages a, b"),
         # No name resolution: a traceback, and nothing on standard output.
         ("", "Traceback (most recent call last):\n  ...\nConnectionError: failed", "Connection"),
         ("", "ERROR:pip_audit._cli:Tip: your network may be blocking this service.", "blocking"),

@@ -128,7 +128,7 @@ def test_from_rooms_to_answers(tmp_path, variant):
         (("publish", "nowhere", "1.0.0"), "no finished run"),
         (("evaluate", "nowhere", "--store", "nowhere"), "error"),
         (("compare", "nowhere"), "names neither the folder of a finished run nor a model"),
-        (("compare", "baselines"), "first model must be trained"),
+        (("compare", "baselines"), "choose a first model that was trained"),
     ],
 )
 def test_errors_are_one_clear_line(arguments, message):

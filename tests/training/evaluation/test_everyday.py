@@ -164,7 +164,7 @@ def test_other_facts_are_other_questions(folder):
     report = SourceReport("pooled", digest(before))
     assert list(run(Contender(), before, report, tasks=("Everyday",))) == ["Everyday"]
     (folder / "facts.json").write_text(json.dumps(FACTS | {"seeds": [7]}))
-    with pytest.raises(ValueError, match="other scenes or questions"):
+    with pytest.raises(ValueError, match="other scenes or tasks"):
         list(run(Contender(), before, report, tasks=("T2 missing",)))
 
 

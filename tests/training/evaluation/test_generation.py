@@ -137,7 +137,7 @@ def test_scenes_that_fit_are_their_own_sampler():
     given = nothing.clone()
     given[:, 2] = True
     assert bool((sample(given, nowhere, 0).v == scenes.v[1]).all())
-    with pytest.raises(ValueError, match="row 0"):
+    with pytest.raises(ValueError, match="test scene 0"):
         sample(given, torch.zeros(3, dtype=torch.int64), 0)
 
 

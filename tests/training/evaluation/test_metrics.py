@@ -74,7 +74,7 @@ def test_pooling_is_measuring_the_union(metric):
 
 def test_metrics_of_whole_sets_do_not_pool():
     assert pool([RESAMPLED, RESAMPLED]) is None
-    with pytest.raises(ValueError, match="2 kinds"):
+    with pytest.raises(ValueError, match="2 types"):
         pool([RATIO, MACRO])
 
 

@@ -106,7 +106,7 @@ def test_reports_are_stored_and_resumed(tmp_path):
     written = json.loads(path.read_text())["tasks"]["T2 missing"]["outcome"]["metrics"]["MRR"]
     assert written["figure"] == asdict(whole.outcomes["T2 missing"].metrics["MRR"].figure())
     for other in (replace(SETTING, seed=1), replace(SETTING, limit=3)):
-        with pytest.raises(ValueError, match="other scenes or questions"):
+        with pytest.raises(ValueError, match="other scenes or tasks"):
             measure(path, CONTENDER, other, "toy")
     with pytest.raises(ValueError, match="unknown tasks"):
         measure(path, CONTENDER, SETTING, "toy", tasks=("T9",))

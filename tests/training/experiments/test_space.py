@@ -47,7 +47,7 @@ def test_choices_and_intervals_are_read(tmp_path):
         ('"epochs" = [3]', "no setting 'epochs': name it section.entry"),
         ('"training.epochs" = [0]', "training.epochs: Input should be greater"),
         ('"training.seed" = [0, 1]', "'training.seed' must be equal in all trials"),
-        ('"data.limit" = [20]', "'data.limit' must be the same in all trials"),
+        ('"data.limit" = [20]', "'data.limit' must be equal in all trials"),
         ('"machine.H1" = [', "is not TOML"),
         ('"machine.H1" = 3', "write a list of choices, or"),
         ('"machine.H1" = []', "write a list of choices, or"),
