@@ -102,7 +102,6 @@ class RemoteStore(Store):
         signer: private key of a publisher. None signs nothing.
         max_weights_bytes: maximum size of a version's weights file.
         max_cache_bytes: maximum size of all versions in the copy.
-
     """
 
     def __init__(
@@ -177,6 +176,7 @@ class RemoteStore(Store):
                 shutil.rmtree(self.root / name / version, ignore_errors=True)
             raise
         if artifact.digest != self._index.versions.get(f"{name}@{version}"):
+            shutil.rmtree(self.root / name / version, ignore_errors=True)
             raise ArtifactError("checksum_mismatch", f"{MANIFEST} does not match the index")
         return artifact
 
@@ -195,7 +195,10 @@ class RemoteStore(Store):
             self._cache.mkdir(mode=0o700, exist_ok=True)
             self._cache.chmod(0o700)
             make_directory(self.root)
-            if not self._index.counter and (known := self._cache / INDEX).exists():
+            known = self._cache / INDEX
+            if not known.exists():  # a new copy, or the copy was deleted
+                self._e_tag = None
+            elif not self._index.counter:
                 with suppress(StoreError):  # the copy is from another store, or a key was removed
                     self._use(read_index(known.read_bytes(), self._trusted))
                     self._synced = known.stat().st_mtime
@@ -203,7 +206,12 @@ class RemoteStore(Store):
             raise StoreError("not_writable", f"the copy of the store: {cause(error)}") from None
 
     def _fetch_index(self) -> tuple[Index, bytes, str | None] | None:
-        """Return the new index, its bytes and its ETag, or None if it is unchanged."""
+        """Return the new index, its bytes and its ETag, or None if it is unchanged.
+
+        Raises:
+            StoreError: `empty`, `unreachable`, `untrusted_index`, `invalid_index`, or `rolled_back`
+                if the index is older than the known index.
+        """
         try:
             known: GetOptions = {} if self._e_tag is None else {"if_none_match": self._e_tag}
             found = obstore.get(self._bucket, INDEX, options=known)
@@ -217,20 +225,21 @@ class RemoteStore(Store):
             raise _unreachable(error) from None
         except ArtifactError as error:
             raise StoreError("invalid_index", error.reason) from None
-        return read_index(data, self._trusted), data, found.meta["e_tag"]
-
-    def _accept(self, index: Index, data: bytes, e_tag: str | None) -> None:
-        """Make an index the current one.
-
-        Raises:
-            StoreError: `rolled_back` if the index is older than the known one, or `not_writable`.
-        """
+        index = read_index(data, self._trusted)
         if index.counter < self._index.counter:
             raise StoreError(
                 "rolled_back",
                 f"the index has the counter {index.counter}, but this replica has seen "
                 f"{self._index.counter}",
             )
+        return index, data, found.meta["e_tag"]
+
+    def _accept(self, index: Index, data: bytes, e_tag: str | None) -> None:
+        """Make an index the current one.
+
+        Raises:
+            StoreError: `not_writable`.
+        """
         try:
             with self._writing():
                 replace_file(self._cache / INDEX, data, prefix=TEMPORARY)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -317,8 +318,40 @@ def test_a_deleted_or_damaged_cache_is_rebuilt(
     assert error_of(replica, "1.0.0") == "truncated"
     replica.sync()
     assert replica.load("home", "1.0.0").manifest.version == "1.0.0"
+    shutil.rmtree(replica.root.parent)
+    replica.sync()
+    assert replica.error is None
+    assert load_model_set(replica).resolve("default").manifest.version == "1.0.0"
     again = synced(reader(url, key, tmp_path / "again"))
     assert again.load("home", "1.0.0").digest == replica.load("home", "1.0.0").digest
+
+
+def test_a_publisher_does_not_build_on_an_older_index(
+    storage: ObjectStorage, url: str, replica: RemoteStore, publisher: RemoteStore
+) -> None:
+    old = storage.get(url, "index.json")
+    publisher.set_alias("default", AliasTarget(name="home", version="1.1.0"))
+    publisher.sync()
+    storage.put(url, "index.json", old)
+    with pytest.raises(StoreError, match="rolled_back"):
+        publisher.set_alias("other", AliasTarget(name="home"))
+
+
+def test_a_version_that_was_replaced_is_downloaded_again(
+    storage: ObjectStorage, url: str, key: Path, replica: RemoteStore, tmp_path: Path
+) -> None:
+    """The owner may have emptied the bucket, and published other files under the same version."""
+    replica.load("home", "1.0.0")
+    local = Store(tmp_path / "other")
+    local.publish(description(name="home", version="1.0.0"), state(seed=5))
+    artifact = local.load("home", "1.0.0")
+    for file in artifact.path.iterdir():
+        storage.put(url, f"home/1.0.0/{file.name}", file.read_bytes())
+    change_index(storage, url, key, versions={"home@1.0.0": artifact.digest})
+    replica.sync()
+    assert error_of(replica, "1.0.0") == "checksum_mismatch"
+    replica.sync()
+    assert replica.load("home", "1.0.0").digest == artifact.digest
 
 
 # -- the command --------------------------------------------------------------------------------
