@@ -339,11 +339,6 @@ class Settings(BaseSettings):
                 "contain a scheme, a port or a wildcard"
             ) from None
 
-    @property
-    def is_remote(self) -> bool:
-        """Whether the store is in object storage."""
-        return "://" in self.store
-
     @field_validator("store")
     @classmethod
     def _is_location(cls, value: str) -> str:
