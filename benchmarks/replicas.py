@@ -1,13 +1,16 @@
-"""``python -m benchmarks.replicas``: waiting times of one and two replicas beside the model.
+"""``python -m benchmarks.replicas``: latency of one and two replicas beside the queueing model.
 
-Requests arrive at random times at a fraction of the measured capacity, through HAProxy. The table
-compares the measured mean latency with the model of `benchmarks.queueing`: the latency without
-load, plus the predicted waiting time. All processes share the cores of this machine, so the
-capacity of two replicas contains the cost of the client.
+Requests arrive at random times at a share of the measured capacity, through HAProxy. The model of
+`benchmarks.queueing` adds the waiting time to the latency at one connection. Each round measures
+latency at one connection, capacity and every share anew, because the speed of a machine changes.
+All processes share the cores of this machine, so the capacity contains the cost of the client.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
 from typing import Annotated
 
 import httpx
@@ -20,43 +23,80 @@ from benchmarks.load.questions import requests
 from benchmarks.load.windows import Window, at_concurrency, at_times
 from benchmarks.queueing import mean_wait
 
-SHARES = (0.3, 0.5, 0.7, 0.8)
+SHARES = (0.3, 0.5, 0.7)
 """Offered rates as fractions of the capacity."""
 
 _ROUTE, _KIND, _MANY = "/missing", "12 labels", 32
 
 
 def main(
-    seconds: Annotated[float, typer.Option(min=0.1, help="length of one window")] = 6,
+    seconds: Annotated[float, typer.Option(min=0.1, help="length of one window")] = 3,
+    rounds: Annotated[int, typer.Option(min=1, help="number of rounds")] = 5,
     replicas: Annotated[list[int] | None, typer.Option(help="numbers of replicas")] = None,
 ) -> None:
     """Measure latency at random arrivals, and compare it with the queueing model."""
-    print("replicas  share  offered/s  mean ms  model ms  p99 ms  other status")
+    print("median (lowest–highest) of the rounds; latency in ms")
+    print("replicas  share  requests/s  mean  model  mean / model      p99  other status")
     for count in replicas or (1, 2):
         with plain_processes(count) as port:
             bodies = requests(_KIND, _ROUTE, _labels(port))
             uvloop.run(at_concurrency(port, bodies, _MANY, 2))
-            capacity = uvloop.run(at_concurrency(port, bodies, _MANY, seconds)).rate
-            alone = float(uvloop.run(at_concurrency(port, bodies, 1, 2)).latency.mean())
-            print(f"{count:8}  capacity {capacity:.0f}/s, {1e3 * alone:.2f} ms at one connection")
-            for share in SHARES:
-                rate = share * capacity
-                window = uvloop.run(at_times(port, bodies, _arrivals(rate, seconds), 256))
-                predicted = alone + mean_wait(rate, count / capacity, count)
-                print(_line(count, share, rate, window, predicted))
+            points = [_round(port, bodies, count, seconds, number) for number in range(rounds)]
+        for share, same in zip(SHARES, zip(*points, strict=True), strict=True):
+            print(_line(count, share, same))
 
 
-def _arrivals(rate: float, seconds: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+@dataclass(frozen=True)
+class Point:
+    """A measured window and the mean latency in seconds that the model predicts."""
+
+    rate: float
+    window: Window
+    predicted: float
+
+    @property
+    def mean(self) -> float:
+        """Measured mean latency in seconds."""
+        return float(self.window.latency.mean())
+
+
+def _round(
+    port: int, bodies: Sequence[bytes], count: int, seconds: float, seed: int
+) -> list[Point]:
+    points = []
+    for share in SHARES:
+        alone = uvloop.run(at_concurrency(port, bodies, 1, seconds / 3)).latency
+        capacity = uvloop.run(at_concurrency(port, bodies, _MANY, seconds / 3)).rate
+        rate = share * capacity
+        window = uvloop.run(at_times(port, bodies, _arrivals(rate, seconds, seed), 256))
+        wait = mean_wait(rate, count / capacity, count)
+        points.append(Point(rate, window, float(alone.mean()) + wait))
+    return points
+
+
+def _arrivals(
+    rate: float, seconds: float, seed: int
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Return the times of a Poisson process."""
-    pauses = np.random.default_rng(0).exponential(1 / rate, round(rate * seconds))
+    pauses = np.random.default_rng(seed).exponential(1 / rate, round(rate * seconds))
     return np.cumsum(pauses)
 
 
-def _line(count: int, share: float, rate: float, window: Window, predicted: float) -> str:
-    mean, p99 = 1e3 * window.latency.mean(), 1e3 * window.quantile(0.99)
+def _line(count: int, share: float, points: Sequence[Point]) -> str:
+    ratios = [point.mean / point.predicted for point in points]
+    rate = median(point.rate for point in points)
+    mean, model, p99 = (
+        1e3 * median(values)
+        for values in (
+            [point.mean for point in points],
+            [point.predicted for point in points],
+            [point.window.quantile(0.99) for point in points],
+        )
+    )
     return (
-        f"{count:8}  {share:5.1f}  {rate:9.0f}  {mean:7.2f}  {1e3 * predicted:8.2f}  {p99:6.2f}  "
-        f"{window.errors}"
+        f"{count:8}  {share:5.1f}  {rate:10.0f}  {mean:4.1f}  {model:5.1f}  "
+        f"{median(ratios):4.2f} ({min(ratios):.2f}–{max(ratios):.2f})  {p99:5.1f}  "
+        f"{sum(point.window.errors for point in points)}"
     )
 
 

@@ -429,7 +429,8 @@ class RemoteStore(Store):
             if error.code == "empty":
                 return Index(), None
             raise
-        assert found is not None  # noqa: S101  # without an ETag, the answer is never "unchanged"
+        if found is None:
+            raise StoreError("unreachable", "the storage answered 304 to a request without an ETag")
         return found[0], found[2]
 
     def _change(self, change: Callable[[Index], Index]) -> None:

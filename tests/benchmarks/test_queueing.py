@@ -11,11 +11,9 @@ from benchmarks.queueing import erlang_c, mean_wait, replicas_for
 
 
 @pytest.mark.parametrize("load", [0.1, 0.5, 0.9])
-def test_one_server_is_the_pollaczek_khinchine_formula(load: float) -> None:
+def test_one_server_is_the_textbook_formula(load: float) -> None:
     assert erlang_c(1, load) == pytest.approx(load)
-    for variation in (0.0, 1.0):
-        exact = load / (1 - load) * (1 + variation) / 2
-        assert mean_wait(load, 1.0, 1, variation) == pytest.approx(exact)
+    assert mean_wait(load, 1.0, 1) == pytest.approx(load / (1 - load))
 
 
 def test_two_servers_are_the_textbook_formula() -> None:
@@ -25,23 +23,24 @@ def test_two_servers_are_the_textbook_formula() -> None:
 
 @pytest.mark.parametrize(("servers", "share"), [(2, 0.7), (8, 0.8)])
 def test_a_simulation_waits_as_long(servers: int, share: float) -> None:
-    """400,000 requests of constant service time, where the approximation is about 10 % too low."""
+    """400,000 requests of exponential service time."""
     generator = np.random.default_rng(1)
     arrivals = np.cumsum(generator.exponential(1 / (servers * share), 400_000))
     free = [0.0] * servers
     waited = 0.0
-    for arrival in arrivals.tolist():
+    services = generator.exponential(1.0, 400_000)
+    for arrival, service in zip(arrivals.tolist(), services.tolist(), strict=True):
         start = max(arrival, heapq.heappop(free))
         waited += start - arrival
-        heapq.heappush(free, start + 1.0)
+        heapq.heappush(free, start + service)
     predicted = mean_wait(servers * share, 1.0, servers)
-    assert waited / len(arrivals) == pytest.approx(predicted, rel=0.15)
+    assert waited / len(arrivals) == pytest.approx(predicted, rel=0.05)
 
 
 def test_many_servers_are_sized() -> None:
     replicas = replicas_for(100_000, 1e-3, 1e-3, share=0.8)
     assert replicas == 125
     assert mean_wait(100_000, 1e-3, replicas) < 1e-6
-    assert replicas_for(900, 1e-3, 2e-4) == 2
+    assert replicas_for(900, 1e-3, 3e-4) == 2
     with pytest.raises(ValueError, match="servers"):
         erlang_c(2, 2.0)
