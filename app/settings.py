@@ -248,7 +248,12 @@ class Settings(BaseSettings):
     ] = 300
     drain_seconds: Annotated[
         float,
-        Field(ge=0, le=300, description="seconds from SIGTERM until the listening socket closes"),
+        Field(
+            ge=0,
+            le=300,
+            description="seconds from SIGTERM until the listening socket closes. The readiness "
+            "check fails in this time, and requests are still answered",
+        ),
     ] = 1.0
     drain_timeout: Annotated[
         int,

@@ -52,10 +52,13 @@ class Shards:
     def parts(self, generator: torch.Generator) -> Iterator[SceneTensors]:
         """Yield the training scenes of each shard, in random order."""
         for k in torch.randperm(len(self.files), generator=generator).tolist():
-            scenes = read_shard(self.files[k], self.source)
-            train = split(scenes, seed=self.seed, protocol="stable")["train"]
-            encoded = encode(train, self.vocabulary)
-            yield scene_tensors(encoded, self.annotated, len(self.vocabulary))
+            yield self._part(self.files[k])
+
+    def _part(self, file: str) -> SceneTensors:
+        scenes = read_shard(file, self.source)
+        train = split(scenes, seed=self.seed, protocol="stable")["train"]
+        encoded = encode(train, self.vocabulary)
+        return scene_tensors(encoded, self.annotated, len(self.vocabulary))
 
 
 def shard_files(pattern: str, root: Path) -> tuple[str, ...]:

@@ -346,6 +346,7 @@ class Trainer:
                 total, steps = total + self._update(scenes, index), steps + 1
                 if progress is not None:
                     progress(number, min(1.0, steps / self.steps_per_epoch), total / steps)
+            del scenes  # so that only one shard is in memory
         everyone = distributed.total(torch.tensor(total, dtype=torch.float64))
         loss = float(everyone) / distributed.size() / steps
         finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
@@ -364,12 +365,11 @@ class Trainer:
         return max(1, math.ceil(scenes / self.config.training.batch_size))
 
     def _parts(self) -> Iterator[SceneTensors]:
-        """Yield the scenes of an epoch, shard by shard."""
+        """Return the scenes of an epoch, shard by shard."""
         if self.data.shards is None:
-            yield self.train
-            return
-        for scenes in self.data.shards.parts(self.generator):
-            yield _with_relations(scenes) if self.config.objects.epochs else scenes
+            return iter([self.train])
+        parts = self.data.shards.parts(self.generator)
+        return map(_with_relations, parts) if self.config.objects.epochs else parts
 
     def _update(self, scenes: SceneTensors, index: Tensor) -> float:
         width = max(len(scenes.scenes[k].evidence.classes) for k in index.tolist())

@@ -205,8 +205,8 @@ DRAINING: Final = ProblemType(
     "draining",
     503,
     "The service is shutting down",
-    "The service finishes the requests in progress and refuses new requests. Send the request to "
-    "another instance, or send it again after the time in Retry-After.",
+    "The service soon closes its socket. It opens no more streams. Use another instance, or send "
+    "the request again after the time in Retry-After.",
 )
 NOT_READY: Final = ProblemType(
     "not-ready",

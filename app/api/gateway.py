@@ -143,6 +143,9 @@ class Gateway:
             if kind.endswith("response.start"):
                 record.begin(message["status"])
                 message["headers"] = _completed(message.get("headers", ()), request_id)
+                if self._backlog.draining:
+                    # The client's next request must go to another replica.
+                    message["headers"].append((b"connection", b"close"))
             elif kind == "websocket.accept":
                 record.begin(_SWITCHED)
                 message["headers"] = [*message.get("headers", ()), (b"x-request-id", request_id)]
@@ -188,8 +191,6 @@ class Gateway:
                     elif name == b"content-length":
                         size = value
                 if not scope["path"].endswith(_NOT_QUEUED):
-                    if self._backlog.draining:
-                        raise self._draining()
                     seconds = self._timeout if allowed is None else self._chosen(allowed)
                     deadline = scope["state"]["deadline"] = monotonic() + seconds
                     await self._backlog.enter(seconds, deadline)
@@ -221,14 +222,6 @@ class Gateway:
             raise error
         with suppress(OSError):  # the client has closed the connection
             await send({"type": "websocket.close", "code": _DEFECT})
-
-    def _draining(self) -> ProblemError:
-        # Without this header, the client would send its next request on the same connection.
-        return ProblemError(
-            catalogue.DRAINING,
-            "The service finishes the requests in progress and then stops.",
-            headers={"Connection": "close"},
-        )
 
     def _may_enter(self, scope: Scope) -> bool:
         path: str = scope["path"].removeprefix(scope.get("root_path", ""))

@@ -81,7 +81,6 @@ def queued(*kinds: ProblemType) -> Responses:
         *kinds,
         catalogue.BAD_REQUEST,
         catalogue.QUEUE_FULL,
-        catalogue.DRAINING,
         catalogue.DEADLINE_PASSED,
     )
 

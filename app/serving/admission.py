@@ -77,7 +77,7 @@ class Backlog:
     Attributes:
         pending: number of started questions without a result. Questions of streams and requests
             that sample scenes are not counted.
-        draining: whether the service has stopped accepting requests.
+        draining: whether the service is shutting down.
     """
 
     def __init__(self, limit: int) -> None:

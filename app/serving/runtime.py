@@ -172,7 +172,7 @@ class Runtime:
             DrainingError: the service is shutting down.
         """
         if self.draining:
-            raise DrainingError("The service finishes the requests in progress and then stops.")
+            raise DrainingError("The service is shutting down.")
         age = self._store.age
         if self._max_age and age is not None and age > self._max_age:
             raise NotReadyError(f"The service has not reached the model store for {age:.0f} s.")
@@ -187,7 +187,7 @@ class Runtime:
         return StoreHealth(age_s=round(age, 1), reason=None if error is None else error.code)
 
     def drain(self) -> None:
-        """Refuse new requests, and answer readiness checks with 503."""
+        """Answer readiness checks with 503, refuse streams, and close connections after answers."""
         self.backlog.draining = True
 
     async def start(self) -> None:

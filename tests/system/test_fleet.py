@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import time
@@ -54,8 +55,9 @@ class Fleet:
         self._url = url
         self.replicas = [self.start(number) for number in range(2)]
 
-    def start(self, number: int, port: int | None = None) -> LiveService:
-        variables = self._variables | {"SCENE_STORE_CACHE": str(self.folder / f"cache{number}")}
+    def start(self, number: int, port: int | None = None, **settings: str) -> LiveService:
+        cache = {"SCENE_STORE_CACHE": str(self.folder / f"cache{number}")}
+        variables = self._variables | cache | settings
         log = self.folder / f"log{number}"
         return launch(self._url, log, port=port, **variables)  # type: ignore[arg-type]
 
@@ -177,6 +179,25 @@ def test_a_killed_replica_costs_at_most_its_requests(fleet: Fleet, load: Constan
     assert load.tally.statuses[502] <= 4  # one for each connection
     assert load.tally.statuses[200] > 100
     killed.client.close()
+
+
+def test_a_rolling_update_of_the_settings_loses_and_mixes_nothing(
+    fleet: Fleet, load: ConstantLoad
+) -> None:
+    with load:
+        for number, old in enumerate(fleet.replicas):
+            time.sleep(3)  # until the proxy has noticed that the other replica is ready
+            old.process.terminate()
+            assert old.process.wait(timeout=30) == -signal.SIGTERM
+            old.client.close()
+            settings = {"SCENE_MAX_OBJECTS": "9"}
+            fleet.replicas[number] = fleet.start(number, old.port, **settings)
+            wait_until_ready(old.port)
+    assert load.tally.faults == []
+    assert load.tally.statuses[200] == load.tally.sent
+    for replica in fleet.replicas:
+        answer = replica.client.post("/missing", json={"objects": ["bed"] * 10})
+        assert answer.status_code == 422, answer.text
 
 
 def test_the_client_hides_a_killed_replica(fleet: Fleet, port: int) -> None:
