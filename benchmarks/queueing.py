@@ -1,4 +1,6 @@
-"""Queueing model of c equal replicas behind a proxy: M/M/c.
+"""``python -m benchmarks.queueing RATE``: number of replicas for a rate of requests.
+
+The queueing model is M/M/c: c equal replicas behind a proxy.
 
 Requests arrive at random times (Poisson), and the proxy sends a request to the replica with the
 fewest requests. The model treats the replicas as servers of one queue.
@@ -14,6 +16,9 @@ answered one request after another in a constant time, W would be about half as 
 from __future__ import annotations
 
 import math
+from typing import Annotated
+
+import typer
 
 
 def erlang_c(servers: int, load: float) -> float:
@@ -62,3 +67,22 @@ def replicas_for(rate: float, service_time: float, wait: float, share: float = 1
     while rate * service_time >= replicas or mean_wait(rate, service_time, replicas) > wait:
         replicas += 1
     return replicas
+
+
+def main(
+    rate: Annotated[float, typer.Argument(help="requests per second of all robots")],
+    capacity: Annotated[
+        float, typer.Option(help="requests per second that one replica can answer")
+    ] = 629,
+    wait: Annotated[float, typer.Option(help="maximum mean waiting time in ms")] = 1,
+    share: Annotated[float, typer.Option(max=1, help="maximum utilisation of a replica")] = 0.7,
+) -> None:
+    """Print the number of replicas that answer a rate of requests."""
+    replicas = replicas_for(rate, 1 / capacity, wait / 1e3, share)
+    used = rate / capacity / replicas
+    waits = 1e3 * mean_wait(rate, 1 / capacity, replicas)
+    print(f"{replicas} replicas, utilisation {used:.2f}, mean waiting time {waits:.2f} ms")
+
+
+if __name__ == "__main__":
+    typer.run(main)

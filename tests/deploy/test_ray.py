@@ -170,6 +170,21 @@ def replicas(service: LiveService) -> set[int]:
     return {pid for pid, command in found if command.startswith("ray::ServeReplica")}
 
 
+def deploy(service: LiveService, config: dict[str, Any]) -> None:
+    """Send a configuration to the cluster, as `serve deploy` does."""
+    found = descendants(service.process.pid).items()
+    pid, command = next((pid, text) for pid, text in found if "--dashboard-port=" in text)
+    (port,) = re.findall(r"--dashboard-port=(\d+)", command)
+    (token,) = re.findall(rb"\0RAY_AUTH_TOKEN=(\w+)", Path(f"/proc/{pid}/environ").read_bytes())
+    response = httpx.put(
+        f"http://127.0.0.1:{port}/api/serve/applications/",
+        json=config,
+        headers={"Authorization": f"Bearer {token.decode()}"},
+        timeout=60,
+    )
+    assert response.is_success, response.text
+
+
 @contextmanager
 def load(service: LiveService, connections: int) -> Iterator[Counter[int]]:
     """Ask on several connections without pauses; count the answers by status, 0 without one."""
@@ -252,7 +267,8 @@ def test_headers_and_problems_equal_those_of_the_plain_service(
 ) -> None:
     ours, plain = (one.client.post(path, json=SCENE, headers=headers) for one in (service, shipped))
     assert ours.status_code == plain.status_code
-    names = ours.headers.keys() - {"server"}
+    # HAProxy closes connections after a change of its configuration.
+    names = ours.headers.keys() - {"server", "connection"}
     assert names == plain.headers.keys()
     for name in names - {"date", "x-request-id", "content-length"}:
         assert ours.headers[name] == plain.headers[name]
@@ -276,6 +292,31 @@ def test_a_stream_gives_the_answers_of_requests(service: LiveService, shipped: L
         assert talk(stream, "open", ask=ASK)["type"] == "opened"
         message = talk(stream, "scene", seq=1, **STREAMED)
     assert answered(message) == posted(shipped.client, STREAMED, ASK)
+
+
+@pytest.mark.slow
+def test_a_new_configuration_replaces_all_replicas_and_loses_nothing(
+    service: LiveService, config: dict[str, Any]
+) -> None:
+    before = replicas(service)
+    new = deepcopy(config)
+    new["http_options"]["port"] = service.port
+    deployment = new["applications"][0]["deployments"][0]
+    deployment.pop("autoscaling_config")
+    deployment["num_replicas"] = 2
+    settings = {"env_vars": {"SCENE_MAX_OBJECTS": "9"}}
+    deployment["ray_actor_options"]["runtime_env"] = settings
+    with load(service, 4) as statuses:
+        wait(lambda: statuses[200] > 100, 30)
+        deploy(service, new)
+        wait(lambda: not replicas(service) & before, 180)
+        count = statuses[200]
+        wait(lambda: statuses[200] > count + 100, 30)
+    assert statuses.keys() == {200}
+    wait(lambda: len(replicas(service)) == 2, 60)
+    for _ in range(10):
+        answer = service.client.post("/missing", json={"objects": ["bed"] * 10})
+        assert answer.status_code == 422, answer.text
 
 
 @pytest.mark.slow

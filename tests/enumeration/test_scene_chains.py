@@ -22,7 +22,7 @@ from training.machines.chain_samples import ChainSamples, pack_scenes
 from training.machines.edges import present_classes
 from training.machines.gibbs import Clamp, run, sample_relations
 
-CHAINS = 20_000
+CHAINS = 10_000
 # McDiarmid: one chain moves a total variation by 1/N, so P(TV > E + t) <= exp(-2 N t²) = 1e-9.
 SLACK = math.sqrt(9 * math.log(10) / (2 * CHAINS))
 NAMES = [name for name, spec in SMALL.items() if spec.form == "local"]
@@ -87,15 +87,15 @@ def check_stationary(name, condition, given, room=None, beta=1.0):
     q = torch.where(where, joint.p, 0.0)
     picked = q.multinomial(CHAINS, True, generator=torch.Generator().manual_seed(1))
     starts = (units[picked].numpy().astype(np.uint8) for units in (joint.v, joint.h1, joint.h2))
-    found = np.zeros(CHAINS, dtype=np.int64)
-    for chain, (on, h1, h2) in enumerate(zip(*starts, strict=True)):
-        drawn = chains.move(on.copy(), h1.copy(), h2.copy(), 1, random_stream(5, chain))
-        r = np.zeros((spec.A, spec.V, spec.V))
+    v, h1 = np.zeros((CHAINS, spec.V)), np.zeros((CHAINS, spec.H1))
+    r = np.zeros((CHAINS, spec.A, spec.V, spec.V))
+    stream = random_stream(5, 0)
+    for chain, start in enumerate(zip(*starts, strict=True)):
+        drawn = chains.move(*(units.copy() for units in start), 1, stream)
         if not spec.G:
-            r[:, drawn.classes[:, None], drawn.classes] = drawn.r
-        v, h1 = np.zeros(spec.V), np.zeros(spec.H1)
-        v[drawn.classes], h1[drawn.h1] = 1, 1
-        found[chain] = code(v, r, h1)
+            r[chain][:, drawn.classes[:, None], drawn.classes] = drawn.r
+        v[chain, drawn.classes], h1[chain, drawn.h1] = 1, 1
+    found = code(v, r, h1)
     place = np.searchsorted(keys, found).clip(max=len(keys) - 1)
     assert (keys[place] == found).all()
     assert (p[place] > 0).all(), "a state of probability zero"
@@ -248,12 +248,12 @@ def test_long_chains_agree_with_those_of_tensors(wide, name, temperature):
 @pytest.mark.slow
 @pytest.mark.parametrize(("layers", "temperature"), [(0, 1.0), (4, 1.6)])
 def test_relations_that_imply_each_other_are_drawn_as_by_tensors(layers, temperature):
-    """Three classes, one relation, strong implications: the law of its six units from 40,000 draws
+    """Three classes, one relation, strong implications: the law of its six units from 16,000 draws
     each. Two samples: total variation within its mean and 1e-9 of McDiarmid.
 
     How strictly implications hold is for the context to say, a second layer included.
     """
-    rows = 40_000
+    rows = 16_000
     spec = MachineSpec("triway", V=3, A=1, H1=3, H2=layers, K=2, G=2, form="local")
     generator = torch.Generator().manual_seed(4)
     machine = build(spec).requires_grad_(False)

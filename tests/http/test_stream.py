@@ -173,12 +173,16 @@ def test_a_late_answer_covers_its_messages(live: LiveService) -> None:
     objects = [{"id": str(k), "label": "bed"} for k in range(250)]
     with opened(live) as stream:
         talk(stream, "open", timeout_ms=1, ask={"relations": {"top_k": 4096}})
-        answer = talk(stream, "update", seq=1, objects=objects)
-        assert (answer["seq"], answer["superseded"]) == (1, 0)
+        # On a busy machine, an answer can be complete before its deadline is checked.
+        for seq in range(1, 100):
+            answer = talk(stream, "scene", seq=seq, objects=objects)
+            assert (answer["seq"], answer["superseded"]) == (seq, 0)
+            if "problems" in answer:
+                break
         is_document(answer["problems"]["relations"], 504, "deadline-passed")
         # It has counted: the next one is about the next message alone.
-        answer = talk(stream, "scene", seq=2, objects=["bed"])
-        assert (answer["seq"], answer["superseded"]) == (2, 0)
+        answer = talk(stream, "scene", seq=100, objects=["bed"])
+        assert (answer["seq"], answer["superseded"]) == (100, 0)
 
 
 def test_no_scene_is_larger_than_a_request_may_have(live: LiveService) -> None:

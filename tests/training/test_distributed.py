@@ -6,17 +6,18 @@ import csv
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 import torch
-from typer.testing import CliRunner
 
-from training.cli import app
-from training.config import Config, config_toml, with_settings
+from training.config import Config, config_toml, load_config, with_settings
 from training.distributed import mean_part, new_generator, on_first, share
 from training.machines.bernoulli import categorical, integers, uniform
-from training.runs import load_run
+from training.pipeline import prepare
+from training.runs import Epoch
+from training.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[2]
 ROWS, WIDTH = 7, 5
@@ -44,28 +45,32 @@ CASES = {
     "contrastive divergence, seed": {"objective.name": "contrastive_divergence", **SEED},
     "persistent chains, GBM": {"objective.name": "persistent_cd", "machine.variant": "gbm", **SEED},
 }
-# Trains up to an epoch, then stops as Ctrl-C does.
+# Trains each configuration up to an epoch, then stops as Ctrl-C does.
 PART = """
 import sys
 from pathlib import Path
-from training.config import load_config
+from tests.training.test_distributed import train
 from training.distributed import process_group
-from training.pipeline import prepare
-from training.trainer import Trainer
 
-def stop(epoch):
-    if epoch.epoch + 1 == int(sys.argv[3]):
-        raise KeyboardInterrupt
-
-config = load_config(sys.argv[1])
 with process_group():
-    trainer = Trainer(config, prepare(config, Path()).training_data(), Path(sys.argv[2]))
-    assert trainer.resume() == (sys.argv[4] == "resume")
-    try:
-        trainer.run(ended=stop)
-    except KeyboardInterrupt:
-        pass
+    for config in sys.argv[4:]:
+        train(config, Path(sys.argv[1]), int(sys.argv[2]), resumes=sys.argv[3] == "resume")
 """
+
+
+def train(path: str, runs: Path, epochs: int, *, resumes: bool = False) -> None:
+    """Train a configuration up to an epoch, in the folder `runs` / name of the file."""
+
+    def stop(epoch: Epoch) -> None:
+        if epoch.epoch + 1 == epochs:
+            raise KeyboardInterrupt
+
+    config = load_config(path)
+    folder = runs / Path(path).stem
+    trainer = Trainer(config, prepare(config, Path()).training_data(), folder)
+    assert trainer.resume() == resumes
+    with suppress(KeyboardInterrupt):
+        trainer.run(ended=stop)
 
 
 def torchrun(processes: int, *arguments: str) -> str:
@@ -82,8 +87,8 @@ def torchrun(processes: int, *arguments: str) -> str:
     return result.stdout
 
 
-def written(folder: Path, settings: dict[str, object]) -> str:
-    path = folder / "small.toml"
+def written(folder: Path, name: str, settings: dict[str, object]) -> str:
+    path = folder / f"{name}.toml"
     path.write_text(config_toml(with_settings(BASE, settings)))
     return str(path)
 
@@ -95,40 +100,43 @@ def losses(folder: Path) -> list[float]:
 
 @pytest.mark.slow
 @pytest.mark.system
-@pytest.mark.parametrize("case", [case for case in CASES if case != "composite with chains"])
-def test_two_processes_follow_one_for_40_updates(tmp_path, case):
-    config = written(tmp_path, CASES[case])
-    one, two = tmp_path / "one", tmp_path / "two"
-    result = CliRunner().invoke(app, ["train", config, "--runs", str(one)])
-    assert result.exit_code == 0, result.output
-    output = torchrun(2, "-m", "training", "train", config, "--runs", str(two))
-    assert output.count("curve in") == 1  # one process prints
-    single, split = (folder / "small/seed-0" for folder in (one, two))
-    assert len(losses(single)) == 10
-    assert losses(split) == pytest.approx(losses(single), rel=1e-4)
-    first, second = (load_run(folder).machine.state_dict() for folder in (single, split))
-    for name, value in first.items():
-        torch.testing.assert_close(second[name], value, rtol=1e-3, atol=1e-4)
+def test_two_processes_follow_one_for_40_updates(tmp_path):
+    script = tmp_path / "part.py"
+    script.write_text(PART)
+    configs = [written(tmp_path, name, settings) for name, settings in CASES.items()]
+    torchrun(2, str(script), str(tmp_path / "two"), "10", "start", *configs)
+    for config, name in zip(configs, CASES, strict=True):
+        train(config, tmp_path / "one", 10)
+        single, split = tmp_path / "one" / name, tmp_path / "two" / name
+        assert len(losses(single)) == 10
+        assert losses(split) == pytest.approx(losses(single), rel=1e-4), name
+        first, second = (
+            torch.load(folder / "checkpoint.pt", weights_only=True)["machine"]
+            for folder in (single, split)
+        )
+        for weight, value in first.items():
+            torch.testing.assert_close(second[weight], value, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.slow
 @pytest.mark.system
 def test_a_checkpoint_resumes_with_other_numbers_of_processes(tmp_path):
     """Two processes, then one, then three; the last batch has fewer scenes than processes."""
-    config = written(tmp_path, CASES["composite with chains"] | {"training.epochs": 6})
+    config = written(tmp_path, "chains", CASES["composite with chains"] | {"training.epochs": 6})
     script = tmp_path / "part.py"
     script.write_text(PART)
     mixed, whole = tmp_path / "mixed", tmp_path / "whole"
-    torchrun(1, str(script), config, str(whole), "6", "start")
-    for processes, epochs, state in ((2, "2", "start"), (1, "4", "resume"), (3, "6", "resume")):
-        torchrun(processes, str(script), config, str(mixed), epochs, state)
-    assert losses(mixed) == pytest.approx(losses(whole), rel=1e-4)
+    train(config, whole, 6)
+    torchrun(2, str(script), str(mixed), "2", "start", config)
+    train(config, mixed, 4, resumes=True)
+    torchrun(3, str(script), str(mixed), "6", "resume", config)
+    assert losses(mixed / "chains") == pytest.approx(losses(whole / "chains"), rel=1e-4)
 
 
 @pytest.mark.slow
 @pytest.mark.system
 def test_an_error_of_the_first_process_ends_all(tmp_path):
-    config = written(tmp_path, {"objective.name": "relations", "objects.epochs": 1})
+    config = written(tmp_path, "small", CASES["relations"])
     place = tmp_path / "runs/small/seed-0"
     place.mkdir(parents=True)
     (place / "checkpoint.pt").write_bytes(b"no checkpoint")
