@@ -1,9 +1,9 @@
 """``python -m benchmarks.replicas``: latency of one and two replicas beside the queueing model.
 
 Requests arrive at random times at a share of the measured capacity, through HAProxy. The model of
-`benchmarks.queueing` adds the waiting time to the latency at one connection. Each round measures
-latency at one connection, capacity and every share anew, because the speed of a machine changes.
-All processes share the cores of this machine, so the capacity contains the cost of the client.
+`benchmarks.queueing` adds the waiting time to the latency at one connection. Each round repeats all
+measurements, because the speed of a machine changes. All processes share the cores of this machine,
+so the capacity contains the cost of the client.
 """
 
 from __future__ import annotations

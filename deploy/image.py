@@ -216,7 +216,7 @@ class Buildah:
         try:
             return run(*self.command("pull", "--quiet", f"docker.io/library/{name}"))
         except ImageError as error:
-            reason = str(error).rpartition(": ")[2]
+            reason = str(error).rpartition(": ")[2].strip()
             print(f"note: no base image {name}, because: {reason}", flush=True)
         archive = self.stand_in(name.rpartition("-")[2].partition("@")[0])
         context = self.work / "base"

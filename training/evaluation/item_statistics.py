@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 Prepared = Callable[[Floats], float]
 
 BINS = 10
+_EDGES = np.linspace(0.0, 1.0, BINS + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,14 +155,17 @@ def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats, 
     items among them.
     """
     total = every.sum()
-    edges = np.linspace(0.0, total, BINS + 1)
-    last = np.cumsum(every)
+    edges = total * _EDGES
+    last = np.zeros(len(every) + 1)
+    np.cumsum(every, out=last[1:])
 
-    def upto(values: Floats) -> Floats:
-        return np.interp(edges, np.append(0.0, last), np.append(0.0, np.cumsum(values)))
+    def means(values: Floats) -> Floats:
+        sums = np.zeros(len(values) + 1)
+        np.cumsum(values, out=sums[1:])
+        upto = np.interp(edges, last, sums)
+        return (upto[1:] - upto[:-1]) * (BINS / total)
 
-    mass = np.diff(edges)
-    return mass / total, np.diff(upto(every * scores)) / mass, np.diff(upto(true)) / mass
+    return np.full(BINS, 1 / BINS), means(every * scores), means(true)
 
 
 STATISTICS: dict[str, Callable[[Floats, NDArray[np.bool_]], Prepared]] = {
