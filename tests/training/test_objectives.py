@@ -172,7 +172,8 @@ def toy_machine(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("objective", [name for name in OBJECTIVES if name != "relations"])
-@pytest.mark.parametrize("name", SMALL)
+# `toy_machine` makes rbm-three-classes the same as rbm.
+@pytest.mark.parametrize("name", [name for name in SMALL if name != "rbm-three-classes"])
 def test_every_objective_trains_every_machine(objective, name):
     """After 200 updates the missing class and the relation of the toy scenes are known."""
     machine = toy_machine(name)
