@@ -6,12 +6,15 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import Lock, Thread
+from typing import Any
 
 import httpx
 import obstore
 import pytest
-from moto.server import ThreadedMotoServer
+from moto.server import DomainDispatcherApplication, MotoRequestHandler, create_backend_app
 from obstore.store import from_url
+from werkzeug.serving import BaseWSGIServer, make_server
 
 CREDENTIALS = {
     "AWS_ACCESS_KEY_ID": "testing",
@@ -32,16 +35,33 @@ class ObjectStorage:
     """
 
     port: int
-    _server: ThreadedMotoServer | None = None
+    _running: tuple[BaseWSGIServer, Thread] | None = None
 
     def start(self) -> None:
-        self._server = ThreadedMotoServer("127.0.0.1", self.port, verbose=False)
-        self._server.start()
+        storage = DomainDispatcherApplication(create_backend_app)
+        lock = Lock()
+
+        def one_at_a_time(environ: Any, start_response: Any) -> Any:
+            # moto checks the condition of a conditional put and writes the object in two steps.
+            with lock:
+                return storage(environ, start_response)
+
+        server = make_server(
+            *("127.0.0.1", self.port, one_at_a_time),
+            threaded=True,
+            request_handler=MotoRequestHandler,
+        )
+        thread = Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        self._running = server, thread
 
     def stop(self) -> None:
-        if self._server is not None:
-            self._server.stop()
-            self._server = None
+        if self._running is not None:
+            server, thread = self._running
+            server.shutdown()
+            thread.join()
+            server.server_close()
+            self._running = None
 
     @property
     def address(self) -> str:
