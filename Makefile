@@ -88,6 +88,7 @@ bench: $(EVERYTHING)  ## run the benchmarks, then load tests of the service, a p
 	$(BIN)/python -m benchmarks $(ARGS)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.load)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.stream)
+	$(if $(ARGS),,$(BIN)/python -m benchmarks.dds)
 
 lock: $(BIN)/python  ## resolve the dependencies of pyproject.toml into requirements*.lock
 	$(BIN)/python scripts/lock.py $(INDEX) $(ARGS)
