@@ -19,7 +19,8 @@ from tests.services import LiveService
 
 pytest.importorskip("cyclonedds", reason="there is no wheel for this processor")
 
-from benchmarks.dds import Robot, bridge, ros
+from benchmarks.dds import Robot, bridge, measure, ros
+from scene_client import Client
 
 ARRAY = "vision_msgs/msg/Detection3DArray"
 
@@ -121,6 +122,14 @@ def test_none_of_a_thousand_messages_is_lost(robot: Robot, recorded: Any) -> Non
     for number in range(1000):
         send(robot, recorded, number, reliable=number % 2 == 0)
         assert hear(robot)["stamp"]["sec"] == number
+
+
+@pytest.mark.system
+def test_the_benchmark_times_every_message(robot: Robot, live: LiveService) -> None:
+    with Client(live.url, timeout=30) as client:
+        seconds = measure(robot, client, 3, objects=4)
+    assert [len(times) for times in seconds.values()] == [3, 3]
+    assert all(0 < time < 30 for times in seconds.values() for time in times)
 
 
 @pytest.mark.system
