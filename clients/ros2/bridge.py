@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,9 +34,13 @@ def options(description: str) -> argparse.ArgumentParser:
 
 @contextmanager
 def advisor(arguments: argparse.ArgumentParser, given: argparse.Namespace) -> Iterator[Advisor]:
-    """Open a connection to the service. Invalid options end the program with status 2."""
+    """Open a connection to the service, with the API key in SCENE_API_KEY.
+
+    Invalid options end the program with status 2.
+    """
     try:
-        client = Client(given.service, timeout=given.timeout)
+        key = os.environ.get("SCENE_API_KEY")
+        client = Client(given.service, timeout=given.timeout, api_key=key or None)
         found = Advisor(client, given.questions, given.label_map)
     except (InvalidRequestError, MessageError) as error:
         arguments.error(str(error))
