@@ -76,6 +76,7 @@ export function moved(things, id, x, y, sized) {
     thing.id === id || carried.has(thing.id)
       ? {
           ...thing,
+          placed: thing.placed || thing.id === id,
           x: round(thing.x + shift.x),
           y: round(thing.y + shift.y),
           z: round(thing.z + shift.z),
