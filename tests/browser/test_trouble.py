@@ -80,16 +80,6 @@ def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
     assert board.rows("missing")
 
 
-def test_a_refused_room_is_told_beside_the_room(open_board: OpenBoard) -> None:
-    scene = {"objects": ["bed"], "room_type": "submarine"}
-    board = open_board(scene, allow=("422",))
-    expect(board.page.locator("#room-error")).not_to_be_empty()
-    board.page.locator("#room").select_option("bedroom")
-    board.settle()
-    expect(board.page.locator("#room-error")).to_be_empty()
-    assert board.rows("missing")
-
-
 @pytest.mark.slow
 def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> None:
     board = open_board(allow=("429",))

@@ -6,7 +6,7 @@ import { edgesOf } from './edges.js';
 import { drawGhosts } from './ghost_drawing.js';
 import { ghostsOf, ROBOT_SIDE } from './ghosts.js';
 import { labelPlaces, LINE, Places, widthOf } from './labels.js';
-import { reading, sizesOf } from './questions.js';
+import { reading, refusedBy, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { fit, gridStep, onScreen } from './view.js';
@@ -98,6 +98,7 @@ export function createBoard(node, store, actions, takeGhost) {
     each
       .classed('selected', (box) => box.id === state.selected)
       .classed('outlier', (box) => !state.draft && Boolean(wrong.get(box.id)?.is_outlier))
+      .classed('unknown', (box) => !state.draft && refusedBy(state, state.models[state.shown]).objects.has(box.label))
       .classed('new', (box) => Boolean(state.draft?.fresh.has(box.id)))
       .classed('anchor', (box) => state.at?.object === box.id)
       .classed('loose', (box) => !state.draft && state.posed && !box.placed)
@@ -122,11 +123,12 @@ export function createBoard(node, store, actions, takeGhost) {
   /** Draws labels inside their boxes if they fit, else beside them. Upper objects take precedence. */
   function drawLabels(state, boxes, places, wrong) {
     const texts = [];
+    const left = refusedBy(state, state.models[state.shown]).objects;
     const half = ROBOT_SIDE / 2;
     const { x, y } = state.viewer;
     places.reserve({ left: view.across(y + half), right: view.across(y - half), top: view.down(x + half), bottom: view.down(x - half) });
     for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
-      const words = (!state.draft && reading(state, state.shown, 'objects', box.label)) || box.id;
+      const words = (!state.draft && !left.has(box.label) && reading(state, state.shown, 'objects', box.label)) || box.id;
       const width = widthOf(words, FONT) + 6;
       const rect = onScreen(box, view);
       const at = places.take(width, LINE, labelPlaces(rect, width));
@@ -159,8 +161,9 @@ export function createBoard(node, store, actions, takeGhost) {
     drawGrid();
     drawRobot(state);
     drawObjects(state, boxes, wrong);
+    for (const ghost of shown) places.reserve(onScreen(ghost, view));
     drawLabels(state, boxes, places, wrong);
-    drawGhosts(ghosts, shown, view, places, takeGhost);
+    drawGhosts(ghosts, shown, boxes, view, places, takeGhost);
     drawEdges(edges, edgesOf(state), boxes, view, places);
   }
 

@@ -10,6 +10,8 @@ import { percent, SPOKEN } from './words.js';
 
 const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'refused', 'posed', 'relations', 'room'];
 
+const PLACES = 2; // listed places of a missing object: first the one on the board, then the likeliest
+
 const spoken = ({ subject, relation, object }) => `${subject} ${SPOKEN[relation]} ${object}`;
 
 /** Reasons in words: "bed, lamp speak for it; oven speaks against it". */
@@ -43,8 +45,9 @@ const ROWS = {
   missing(answer, state, store, column) {
     const ghosts = new Map(column === state.shown ? ghostsOf(state).map((ghost) => [ghost.label, ghost]) : []);
     return answer.missing.map(({ label, probability, placements, because = [] }) => {
-      const places = placements.map((one) => `${SPOKEN[one.relation]} ${one.object} ${percent(one.probability)}`);
       const ghost = ghosts.get(label);
+      const places = placements.slice().sort((a, b) => (b === ghost?.placement) - (a === ghost?.placement)).slice(0, PLACES)
+        .map((one) => `${SPOKEN[one.relation]} ${one.object} ${percent(one.probability)}`);
       if (!ghost && column === state.shown) places.push('no free place on the board');
       const button = ghost && el('button', {
         type: 'button', class: 'icon', 'data-key': `add-${label}`,
@@ -140,7 +143,7 @@ export function createColumns(store, parents, askKey) {
         title: el('h3'), problem: el('div', { class: 'problem', role: 'alert', hidden: true }), rows: el('ol'),
         note: el('p', { class: 'quiet' }), calls: calls(),
       };
-      own.show = el('button', { type: 'button', onclick: () => store.set({ shown: column }) }, 'show on the board');
+      own.show = el('button', { type: 'button', onclick: () => store.set({ shown: column }) }, 'on the board');
       own.node = el('article', {}, el('header', {}, own.title, own.show), own.problem, own.note, own.rows, own.calls.node);
       parents(question).append(own.node);
       made.set(`${column}/${question}`, own);
@@ -154,8 +157,8 @@ export function createColumns(store, parents, askKey) {
     if (!model) return;
     const entry = state.answers[column][question] ?? {};
     const { answer, problem, status } = entry;
+    own.title.parentElement.hidden = !state.models[1];
     own.title.textContent = answer ? `${answer.model.name} ${answer.model.version}` : model;
-    own.show.hidden = !state.models[1];
     own.show.setAttribute('aria-pressed', String(state.shown === column));
     own.problem.hidden = !problem;
     if (problem && own.told !== problem) {

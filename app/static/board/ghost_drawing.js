@@ -1,5 +1,6 @@
 /** Suggestions as dashed boxes ("ghosts") with their probability. */
 
+import { overlap } from './geometry.js';
 import { labelPlaces, widthOf } from './labels.js';
 import { onScreen } from './view.js';
 import { percent, SPOKEN } from './words.js';
@@ -9,11 +10,12 @@ const FONT = '500 12px system-ui, sans-serif';
 const spokenGhost = ({ label, probability, placement }) =>
   `${label}, ${percent(probability)}, ${SPOKEN[placement.relation]} ${placement.object}`;
 
-export function drawGhosts(layer, ghosts, view, places, take) {
+export function drawGhosts(layer, ghosts, boxes, view, places, take) {
   const words = (ghost) => `${ghost.label} ${percent(ghost.probability)}`;
   const texts = new Map();
+  for (const box of boxes) if (!ghosts.some((ghost) => overlap(ghost, box))) places.reserve(onScreen(box, view));
   for (const ghost of ghosts) {
-    const width = widthOf(words(ghost), FONT) + 8;
+    const width = widthOf(ghost.label, FONT) + 8;
     texts.set(ghost.id, places.take(width, 16, labelPlaces(onScreen(ghost, view), width)));
   }
   const each = layer.selectAll('g.ghost').data(ghosts, (ghost) => ghost.id).join((enter) => {
@@ -35,5 +37,5 @@ export function drawGhosts(layer, ghosts, view, places, take) {
     .attr('y', (ghost) => view.down(ghost.x) - (ghost.size.x / 2) * view.scale);
   each.select('text')
     .attr('x', (ghost) => texts.get(ghost.id)?.x ?? 0).attr('y', (ghost) => texts.get(ghost.id)?.y ?? 0)
-    .text((ghost) => (texts.get(ghost.id) ? words(ghost) : ''));
+    .text((ghost) => (texts.get(ghost.id) ? ghost.label : ''));
 }

@@ -1,6 +1,6 @@
 /** Places on the board for missing objects ("ghosts"). */
 
-import { halves, overlap, round, UNKNOWN_SIZE } from './geometry.js';
+import { gap, halves, inside, overlap, round, UNKNOWN_SIZE } from './geometry.js';
 import { sizesOf } from './questions.js';
 import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
 
@@ -12,7 +12,9 @@ const BENEATH = ['under', 'below'];
 const CLEAR = 0.1;
 const NEIGHBOURS = 0.9;
 const THIN = 0.03;
+const OVERHANG = 1.25;
 const GAP = 0.15; // metres between neighbours without a learnt offset
+const MARGINS = [0.3, 0.05]; // metres that stay free between two ghosts, preferred first
 /** Objects stand on floors and rugs, and under ceilings: lower and higher boxes than these are no obstacles. */
 const FLOOR = 0.1;
 const CEILING = 2.2;
@@ -59,7 +61,7 @@ export function standing(missing, boxes, viewer, sizes, at = null) {
     const asked = at && placements.filter((one) => one.relation === at.relation && one.object === at.object);
     for (const placement of asked ? [...asked, { ...at, probability: null }].slice(0, 1) : placements) {
       const anchor = boxes.find((box) => box.id === placement.object);
-      const place = anchor && freeAt(anchor, placement, size, viewer, boxes, [robot, ...ghosts]);
+      const place = anchor && freeAt(anchor, placement, size, viewer, [...boxes, robot], ghosts);
       if (place) {
         ghosts.push({ id: label, label, probability, placement, size, yaw: 0, ...place });
         break;
@@ -70,8 +72,9 @@ export function standing(missing, boxes, viewer, sizes, at = null) {
 }
 
 /** The free place nearest to the learnt offset where the relation to the anchor holds, or undefined. */
-function freeAt(anchor, { relation, offset }, size, viewer, boxes, taken) {
-  // "under" and "below" need free height below the anchor.
+function freeAt(anchor, { relation, offset }, size, viewer, boxes, ghosts) {
+  // An object stands only on a larger one, and "under" and "below" need free height below the anchor.
+  if (relation === 'on-top' && !fits(size, anchor)) return undefined;
   if (BENEATH.includes(relation) && anchor.z + THIN < size.z) return undefined;
   const learnt = offset && { x: anchor.x + offset.mean.x, y: anchor.y + offset.mean.y };
   const centre = offset && anchor.z + anchor.size.z / 2 + offset.mean.z;
@@ -83,25 +86,31 @@ function freeAt(anchor, { relation, offset }, size, viewer, boxes, taken) {
   const carried = near.filter((box) => box.z >= anchor.z + anchor.size.z - THIN);
   // An object on the anchor is also above its supports, and one below the anchor is also below its load.
   const passed = ABOVE.includes(relation) ? supports : BENEATH.includes(relation) ? carried : [];
-  const obstacles = [...others.filter((box) => !passed.includes(box)), ...(vertical ? [] : [anchor]), ...taken]
+  const obstacles = [...others.filter((box) => !passed.includes(box)), ...(vertical ? [] : [anchor])]
     .filter((box) => box.z + box.size.z > FLOOR && box.z < CEILING);
-  for (const [x, y] of vertical ? over(anchor, relation, size, learnt) : beside(anchor, relation, size, viewer, learnt)) {
-    const place = { x: round(x), y: round(y), size, yaw: 0 };
-    // An object beside the anchor may stand on the anchor's support.
-    const support = vertical ? null : supports.find((box) => inside(place, box));
-    if (obstacles.every((box) => box === support || !overlap(place, box))) {
-      return { x: place.x, y: place.y, z: round(support ? support.z + support.size.z : z) };
-    }
+  const places = (vertical ? over(anchor, relation, size, learnt) : beside(anchor, relation, size, viewer, learnt))
+    .map(([x, y]) => ({ x: round(x), y: round(y), size, yaw: 0 }));
+  // An object beside the anchor may stand on the anchor's support.
+  const supportOf = (place) => (vertical ? undefined : supports.find((box) => inside(place, box)));
+  const free = places.filter((place) => {
+    const support = supportOf(place);
+    return obstacles.every((box) => box === support || !overlap(place, box));
+  });
+  for (const margin of MARGINS) {
+    const place = free.find((one) => !ghosts.some((ghost) => overlap(wider(one, margin), ghost)));
+    const support = place && supportOf(place);
+    if (place) return { x: place.x, y: place.y, z: round(support ? support.z + support.size.z : z) };
   }
   return undefined;
 }
 
-/** Whether the footprint of a box lies inside that of another box. */
-function inside(box, other) {
-  const [dx, dy] = within({ yaw: (other.yaw * Math.PI) / 180 }, box.x - other.x, box.y - other.y);
-  const half = halves({ size: box.size, yaw: box.yaw - other.yaw });
-  return Math.abs(dx) + half.x <= other.size.x / 2 && Math.abs(dy) + half.y <= other.size.y / 2;
+/** Whether an object can stand on the anchor, with an overhang of at most a quarter. */
+function fits(size, anchor) {
+  const half = halves({ size, yaw: -anchor.yaw });
+  return half.x <= OVERHANG * (anchor.size.x / 2) && half.y <= OVERHANG * (anchor.size.y / 2);
 }
+
+const wider = (box, by) => ({ ...box, size: { ...box.size, x: box.size.x + 2 * by, y: box.size.y + 2 * by } });
 
 /** Rotates a vector (ahead, left) of the viewer to the axes of the board; `within` is the inverse. */
 function turned(viewer, ahead, left) {
@@ -157,12 +166,10 @@ function beside(anchor, relation, size, viewer, learnt) {
   for (let more = 0; more <= furthest - least; more += 0.15) {
     for (let by = -1.5; by <= 1.5; by += 0.15) all.push([least + more, aside + by]);
   }
-  const told = all.map(([far, by]) => [far, clamp(by, far - THIN)])
-    .filter(([far, by]) => Math.hypot(far - touching, Math.max(0, Math.abs(by) - flush)) <= furthest - touching);
-  return nearest(told, begin).map(([far, by]) => {
+  return nearest(all.map(([far, by]) => [far, clamp(by, far - THIN)]), begin).map(([far, by]) => {
     const [dx, dy] = ahead ? turned(viewer, ahead * far, by) : turned(viewer, by, left * far);
     return [anchor.x + dx, anchor.y + dy];
-  });
+  }).filter(([x, y]) => gap({ x, y, size, yaw: 0 }, anchor) <= NEIGHBOURS);
 }
 
 const clamp = (value, limit) => Math.min(limit, Math.max(-limit, value));

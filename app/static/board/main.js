@@ -134,7 +134,7 @@ store.subscribe((state, previous) => {
 });
 
 combobox(get('search'), get('found'), () => store.get().words[store.get().models[0]]?.objects ?? [],
-  (label) => actions.add(label), (words) => store.set({ complaint: words }));
+  (label) => actions.add(label));
 fileDialog(store, put, say);
 watchService(store, get('banner'), () => void models.load());
 

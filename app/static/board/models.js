@@ -33,11 +33,9 @@ function words({ objects, room_types: rooms, examples = [] }) {
 }
 
 export function createModels(store, first, second, tell) {
-  const asked = new Set();
+  const asked = new Map(); // model → promise of its vocabulary
 
   async function learn(model) {
-    if (!model || asked.has(model)) return;
-    asked.add(model);
     try {
       const found = words(await call(`models/${encodeURIComponent(model)}/vocabulary`));
       store.set({ words: { ...store.get().words, [model]: found } });
@@ -47,7 +45,11 @@ export function createModels(store, first, second, tell) {
     }
   }
 
-  const learnAll = ({ models }) => Promise.all(models.map(learn));
+  function learnAll({ models }) {
+    for (const model of models) if (model && !asked.has(model)) asked.set(model, learn(model));
+    return Promise.all(models.map((model) => asked.get(model)));
+  }
+
   const options = (found) => found.map(({ value, words: text }) => el('option', { value }, text));
 
   async function load() {

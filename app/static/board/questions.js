@@ -11,7 +11,7 @@ export const DEPENDS = [
 
 const SUGGESTIONS = 5;
 const MOST_RELATIONS = 12;
-const LEAST_PROBABILITY = 0.2;
+const LEAST_PROBABILITY = 0.25;
 
 /** Typical sizes of a model's classes, by label. */
 export const sizesOf = (state, model) => state.words[model]?.sizes ?? new Map();

@@ -1,30 +1,32 @@
 /** The controls of the scene and of the questions. */
 
+import { outliersOf } from './board.js';
 import { el } from './dom.js';
-import { wrongIn } from './edges.js';
-import { readings } from './questions.js';
+import { edgesOf, wrongIn } from './edges.js';
+import { ghostsOf } from './ghosts.js';
+import { knownTo, readings } from './questions.js';
 import { changed } from './store.js';
 import { SPOKEN } from './words.js';
 
 const get = (id) => document.getElementById(id);
 
-/** The symbols of the board for each question. The edges of a generated scene are those of the selected object. */
+/** The symbols of the board in words; the legend lists those that are visible. */
 const SYMBOLS = {
-  missing: [['ghost', 'suggestion: click to add it']],
-  outliers: [['misplaced', 'relation that is probably wrong']],
-  relations: [['holds', 'expected and observed'], ['expected', 'expected'], ['disagrees', 'expected instead of the observed relation']],
-  generate: [['fresh', 'generated'], ['drawn', 'relation of the selected object']],
+  robot: 'robot and the direction it looks in', selected: 'selected', outlier: 'does not belong',
+  unknown: 'not known to the model, left out', loose: 'position not given', anchor: 'place of the question', ghost: 'suggestion: click to add it',
+  misplaced: 'probably in the wrong place', holds: 'expected and observed', expected: 'expected',
+  disagrees: 'expected instead of what is observed', fresh: 'generated', drawn: 'relation',
 };
 
-function legend({ tab, draft, posed, at, selected }) {
-  return [
-    ['robot', 'robot and the direction it looks in'],
-    ...(draft || !selected ? [] : [['selected', 'selected']]),
-    ...(draft ? [] : [['outlier', 'does not belong']]),
-    ...(posed && !draft ? [['loose', 'position not given']] : []),
-    ...(at ? [['anchor', 'place of the question']] : []),
-    ...SYMBOLS[tab],
-  ];
+function visible(state) {
+  const { draft, posed, at, selected, things } = state;
+  const edges = new Set(edgesOf(state).map(({ kind }) => kind));
+  const seen = {
+    robot: true, selected, outlier: [...outliersOf(state).values()].some((one) => one.is_outlier),
+    unknown: knownTo(state, state.models[state.shown]).length < things.length,
+    loose: posed && things.some(({ placed }) => !placed), anchor: at, ghost: ghostsOf(state).length,
+  };
+  return Object.keys(SYMBOLS).filter((kind) => edges.has(kind) || (draft ? ['robot', 'fresh'].includes(kind) : seen[kind]));
 }
 
 /** What counts as evidence, in words. */
@@ -72,7 +74,7 @@ export function settings(store) {
       get('alarms').textContent = outliers.length + misplaced.length;
       get('alarms').hidden = get('alarms').textContent === '0';
     }
-    get('legend').replaceChildren(...legend(state).map(([kind, words]) => el('span', { class: kind }, words)));
+    get('legend').replaceChildren(...visible(state).map((kind) => el('span', { class: kind }, SYMBOLS[kind])));
   }
 
   draw(store.get(), {});
