@@ -132,11 +132,15 @@ def test_a_service_with_a_key_is_asked_with_it(
 ) -> None:
     key = "a-key-of-sixteen-letters"
     with launch(repository / "model_store", tmp_path / "log", SCENE_API_KEY=key) as guarded:
-        board = open_board(home=f"http://127.0.0.1:{guarded.port}", allow=("401",))
+        home = f"http://127.0.0.1:{guarded.port}"
+        board = open_board(scene=None, home=home, allow=("401",))
+        assert board.things == []
         board.page.get_by_label("API key").first.fill(key)
         board.page.get_by_label("API key").first.press("Enter")
         board.page.wait_for_timeout(500)
         board.settle()
+        # The page opens with an example as soon as the service answers.
+        assert board.things
         assert board.rows("missing")
         assert '-H "X-API-Key: $SCENE_API_KEY"' in board.curl("missing")
         assert key not in board.page.content()

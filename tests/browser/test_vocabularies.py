@@ -23,12 +23,12 @@ def notes(board: Board, place: int) -> str:
 
 
 @pytest.fixture
-def own(tmp_path: Path) -> Callable[[str], LiveService]:
-    """Start a service with one model of a small vocabulary, under an alias of its own."""
+def own(tmp_path: Path) -> Callable[[str, int], LiveService]:
+    """Start a service with one model that knows so many classes; with all 16 it has examples."""
     from tests.http.stores import publish
 
-    def start(alias: str) -> LiveService:
-        publish(tmp_path / "store", "lab", "1.0.0", classes=6, alias=alias)
+    def start(alias: str, classes: int) -> LiveService:
+        publish(tmp_path / "store", "lab", "1.0.0", classes=classes, alias=alias)
         return launch(tmp_path / "store", tmp_path / "log")
 
     return start
@@ -36,9 +36,9 @@ def own(tmp_path: Path) -> Callable[[str], LiveService]:
 
 @pytest.mark.parametrize("alias", ["default", "mine"])
 def test_a_model_of_one_s_own_opens_without_errors(
-    open_board: OpenBoard, own: Callable[[str], LiveService], alias: str
+    open_board: OpenBoard, own: Callable[[str, int], LiveService], alias: str
 ) -> None:
-    with own(alias) as service:
+    with own(alias, 6) as service:
         board = open_board(scene=None, home=service.url, examples=None)
         labels = [
             one["label"] for one in service.client.get("/models/lab/vocabulary").json()["objects"]
@@ -50,12 +50,17 @@ def test_a_model_of_one_s_own_opens_without_errors(
         expect(board.page.locator(".problem:visible, .error:visible")).to_have_count(0)
 
 
-def test_the_page_opens_with_the_first_example_of_the_model(open_board: OpenBoard) -> None:
-    example = {"name": "A bath", "scene": {"objects": ["sink", "toilet"], "room_type": "bathroom"}}
-    board = open_board(scene=None, examples=[example])
-    assert board.things == ["sink", "toilet"]
-    assert board.scene["room_type"] == "bathroom"
-    assert board.page.locator("#example option").all_text_contents()[1:] == ["A bath"]
+def test_the_page_opens_with_the_first_example_of_the_model(
+    open_board: OpenBoard, own: Callable[[str, int], LiveService]
+) -> None:
+    with own("default", 16) as service:
+        board = open_board(scene=None, home=service.url, examples=None)
+        examples = service.client.get("/models/lab/vocabulary").json()["examples"]
+        first = examples[0]["scene"]["objects"]
+        assert board.things == [one.get("id", one["label"]) for one in first]
+        names = board.page.locator("#example option").all_text_contents()
+        assert names == ["Examples…", *(one["name"] for one in examples)]
+        expect(board.page.locator("#note")).to_be_hidden()
 
 
 def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> None:

@@ -69,8 +69,9 @@ const ROWS = {
     const misplaced = wrongIn(answer).misplaced.map((one) =>
       row('outliers', el('b', {}, spoken(one)), one.probability, { kind: 'alarm', words: 'in the wrong place' }));
     const stated = state.posed || state.relations.length;
+    const alarms = wrongIn(answer).outliers.length; // the first ones, because the least fitting objects come first
     return [
-      ...misplaced, ...objects,
+      ...objects.slice(0, alarms), ...misplaced, ...objects.slice(alarms),
       stated ? null : el('li', { class: 'quiet' }, 'Places are not judged, because positions do not count as evidence.'),
     ].filter(Boolean);
   },

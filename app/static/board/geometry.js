@@ -18,7 +18,7 @@ export function halves(box) {
   return { x: (box.size.x * c + box.size.y * s) / 2, y: (box.size.x * s + box.size.y * c) / 2 };
 }
 
-export function covers(box, x, y) {
+function covers(box, x, y) {
   const a = radians(box.yaw);
   const [dx, dy] = [x - box.x, y - box.y];
   const along = dx * Math.cos(a) + dy * Math.sin(a);

@@ -69,6 +69,15 @@ function openModel() {
   }
 }
 
+/** Loads the models after a failure. A board that is still untouched opens with a scene. */
+async function reload() {
+  await models.load();
+  const { things, canUndo } = store.get();
+  if (things.length || canUndo) return;
+  openModel();
+  store.set({ canUndo: false });
+}
+
 function tell(error) {
   if (error instanceof UnreachableError) {
     store.set({ down: true });
@@ -88,7 +97,7 @@ function askKey() {
       event.preventDefault();
       useKey(input.value);
       get('banner').hidden = true;
-      void models.load();
+      void reload();
       store.set({ epoch: store.get().epoch + 1 });
     },
   }, el('label', {}, 'API key ', input), el('button', {}, 'Use it'));
@@ -136,7 +145,7 @@ store.subscribe((state, previous) => {
 combobox(get('search'), get('found'), () => store.get().words[store.get().models[0]]?.objects ?? [],
   (label) => actions.add(label));
 fileDialog(store, put, say);
-watchService(store, get('banner'), () => void models.load());
+watchService(store, get('banner'), () => void reload());
 
 /** Lists the examples of the first model. */
 function listExamples(state, previous) {
