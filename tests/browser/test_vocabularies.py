@@ -108,6 +108,9 @@ def test_two_models_answer_about_their_common_classes(
         {one["label"] for one in api.get(f"/models/{name}/vocabulary").json()["objects"]}
         for name in ("default", "everyday-triway")
     ]
+    shared = board.body("missing")["candidates"]
+    said = f"Both models answer about their {len(shared)} common classes."
+    expect(board.column("missing")).to_contain_text(said)
     for number in (0, 1):
         rows = board.rows("missing", number)
         assert len(rows) == 5

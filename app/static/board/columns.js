@@ -4,7 +4,7 @@ import { curl, python } from './calls.js';
 import { bar, copy, el, redraw } from './dom.js';
 import { wrongIn } from './edges.js';
 import { accept, ghostsOf } from './ghosts.js';
-import { QUESTIONS, reading, whyNot } from './questions.js';
+import { common, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
 import { percent, SPOKEN } from './words.js';
 
@@ -169,7 +169,11 @@ export function createColumns(store, parents, askKey) {
     const rows = answer ? ROWS[question](answer, state, store, column) : [];
     redraw(own.rows, rows);
     const waiting = status === 'down' ? 'Waiting for the service.' : whyNot(state, question, model);
-    own.note.textContent = `${notes(answer ?? {}, state, column)} ${rows.length ? '' : answer ? NOTHING[question] : waiting}`.trim();
+    const shared = question === 'missing' && column === 0 && common(state);
+    own.note.textContent = [
+      shared ? `Both models answer about their ${shared.length} common classes.` : '',
+      notes(answer ?? {}, state, column), rows.length ? '' : answer ? NOTHING[question] : waiting,
+    ].filter(Boolean).join(' ');
     own.calls.show(question, entry.body);
   }
 

@@ -24,7 +24,7 @@ export const knownTo = (state, model) =>
   state.things.filter((thing) => !refusedBy(state, model).objects.has(thing.label));
 
 /** The classes that both models can propose; null with one model or with equal vocabularies. */
-function common(state) {
+export function common(state) {
   const [first, second] = state.models.map((model) => state.words[model]);
   if (!first || !second) return null;
   const others = new Set(second.proposed);
