@@ -64,7 +64,7 @@ def test_a_drawn_scene_can_be_kept_and_reads_as_it_was_drawn(
     board.settle()
     assert board.things == scene["objects"]
     assert board.scene["room_type"] == "bedroom"
-    # The page placed these objects, so their positions are no evidence.
+    # The page placed these objects, so their positions do not count.
     assert not any("position" in thing for thing in board.scene["objects"])
     board.page.get_by_role("button", name="Undo").click()
     board.settle()

@@ -25,7 +25,7 @@ RELATIONS = ("on-top", "on-top", "above", "under", "below", "left", "right", "fr
 ROBOT = 0.5
 """Side of the square that stays free around the robot, in metres."""
 FLOOR, CEILING = 0.1, 2.2
-"""Lower and higher boxes are no obstacles: objects stand on rugs and under ceilings."""
+"""Suggestions may overlap lower and higher boxes, such as rugs and ceilings."""
 
 STANDING = """async (cases) => {
   const { standing } = await import('./static/board/ghosts.js');

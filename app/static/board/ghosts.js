@@ -15,7 +15,7 @@ const THIN = 0.03;
 const OVERHANG = 1.25;
 const GAP = 0.15; // metres between neighbours without a learnt offset
 const MARGINS = [0.3, 0.05]; // metres that stay free between two ghosts, preferred first
-/** Objects stand on floors and rugs, and under ceilings: lower and higher boxes than these are no obstacles. */
+/** Suggestions may overlap lower and higher boxes, such as floors, rugs and ceilings. */
 const FLOOR = 0.1;
 const CEILING = 2.2;
 /** Side of the square that stays free around the robot, in metres. */
