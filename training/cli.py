@@ -7,7 +7,7 @@ command then continues the run.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -35,6 +35,7 @@ from training.distributed import is_first, process_group
 from training.domain.command import example, fail, init
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
+from training.example_scenes import read_examples
 from training.experiments.ablate import ablate
 from training.experiments.benchmark import benchmark
 from training.experiments.compare import Comparison, compare_command, show
@@ -245,9 +246,10 @@ def list_command(store: StorePath = _STORE) -> None:
 def _prepare(config: Config, data: Path) -> SplitScenes:
     with console.status("reading and encoding scenes"):
         scenes = prepare(config, data)
+    examples = read_examples(config.examples, data, scenes.vocabulary)
     sizes = ", ".join(f"{len(some)} {part}" for part, some in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
-    return scenes
+    return replace(scenes, examples=examples)
 
 
 def _train(

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from app.registry import Example
 from app.scene import CANONICAL, Vocabulary
 from training.batches import SceneTensors, scene_tensors
 from training.config import DATA, Config, ConfigError, DataConfig, is_file, is_sharded, source_name
@@ -47,6 +48,7 @@ class SplitScenes:
         shuffle: seed of the permutation of objects; None if the objects are not permuted.
         words: (V, D) unit word vectors of the classes; None without word vectors.
         shards: files of a sharded source, of which `parts` are a sample.
+        examples: example scenes for the artifact.
     """
 
     data: DataConfig
@@ -57,6 +59,7 @@ class SplitScenes:
     shuffle: int | None = None
     words: torch.Tensor | None = None
     shards: tuple[str, ...] = ()
+    examples: tuple[Example, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -254,5 +257,10 @@ def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
 
 
 def prepare(config: Config, root: Path) -> SplitScenes:
-    """Read the scenes of a configuration from the folder `root`, split and encode them."""
+    """Read the scenes of a configuration from the folder `root`, split and encode them.
+
+    Raises:
+        ConfigError: a file is missing, or the vocabulary is invalid.
+        DatasetError: a file of scenes is invalid.
+    """
     return split_and_encode(config.data, read_sources(config.data, root), root=root)
