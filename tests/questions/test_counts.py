@@ -52,10 +52,7 @@ def by_hand(
         eta += c / m * sum(math.log(listed[j]) for j in others)
         eta += sum(e[j] for j in others) / math.sqrt(m)
     s = [math.exp(x) for x in found.log_share[row].tolist()]
-    weight = [
-        s[n - 1] * n**eta * rho ** (n - k) if n >= k else 0.0
-        for n in range(1, found.log_share.shape[1] + 1)
-    ]
+    weight = [s[n - 1] * n**eta * rho ** (n - k) if n >= k else 0.0 for n in range(1, M + 1)]
     return [w / sum(weight) for w in weight]
 
 

@@ -95,13 +95,11 @@ def _asked(
     room = part.room if part.room >= 0 else None
     listed = replace(of_classes(np.repeat(part.classes, part.listed).tolist()), room_type=room)
     wanted = part.classes[asked].tolist()
-    number = dict(zip(part.classes.tolist(), part.number.tolist(), strict=True))
+    labels = artifact.vocabulary.labels
+    pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
+    known = {labels[index]: (index, number) for index, number in pairs}
     found = questions.more(artifact, listed, top_k=len(wanted), candidates=wanted)
-    answers = []
-    for answer in found:
-        index = artifact.vocabulary.index(answer.label)
-        answers.append((index, number[index], *answer[1:]))
-    return answers
+    return [(*known[answer.label], *answer[1:]) for answer in found]
 
 
 def _means(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:
