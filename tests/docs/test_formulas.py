@@ -41,7 +41,7 @@ from tests.enumeration.small_machines import (
     small_machine,
 )
 from tests.enumeration.test_completions import exactly, machine_of
-from tests.questions.test_counts import CHAIR, COUNTS, DESK, LAMP, C, M, V
+from tests.questions.test_counts import CHAIR, COUNTS, DESK, LAMP, V, by_hand
 from tests.training.test_objectives import toy_batch, toy_machine
 from training.config import ObjectiveConfig
 from training.machines import BoltzmannMachine, MachineSpec, build
@@ -572,20 +572,12 @@ def placements() -> None:
     r" + \frac{c}{m} \sum_j \log k_j + d_t + \frac{1}{\sqrt{m}} \sum_j e_j"
 )
 def numbers_of_instances() -> None:
-    listed, room, rho = {DESK: 2, CHAIR: 1, LAMP: 1}, 1, 0.4
+    listed = {DESK: 2, CHAIR: 1, LAMP: 1}
     order = np.array(sorted(listed))
-    which, p = distribution(COUNTS, V, order, np.array([listed[j] for j in order]), room, rho)
+    which, p = distribution(COUNTS, V, order, np.array([listed[j] for j in order]), 1, 0.4)
     for row, (at, found) in enumerate(zip(which, p, strict=True)):
-        own = int(order[at])
-        k, others = listed[own], [j for j in listed if j != own]
-        m = len(others)
-        a, b, c, *rest = COUNTS.weights[row].tolist()
-        d, e = rest[:C], rest[C:]
-        eta = a + b * math.log(k) + c / m * sum(math.log(listed[j]) for j in others)
-        eta += d[room] + 1 / math.sqrt(m) * sum(e[j] for j in others)
-        s = np.exp(COUNTS.log_share[row].astype(float))
-        weight = [s[n - 1] * n**eta * rho ** (n - k) if n >= k else 0 for n in range(1, M + 1)]
-        assert found == pytest.approx([w / sum(weight) for w in weight], abs=1e-6)
+        assert COUNTS.classes[row] == order[at]
+        assert found == pytest.approx(by_hand(COUNTS, row, listed, 1, 0.4), abs=1e-6)
 
 
 @formula(r"p(\text{intruder}) = \sigma(\alpha + \beta \lambda_i + \gamma \log n)")

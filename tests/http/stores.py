@@ -10,6 +10,7 @@ import torch
 
 from app.registry import (
     Calibration,
+    Counts,
     DataSource,
     Description,
     Metric,
@@ -72,6 +73,7 @@ def publish(
     classes: int = V,
     alias: str | None = None,
     offsets: Offsets | None = None,
+    counts: Counts | None = None,
 ) -> None:
     """Publish a machine with random weights for the first ``classes`` classes."""
     machine = random_machine(variant, seed, classes)
@@ -102,7 +104,9 @@ def publish(
             terms="public domain",
             libraries={"torch": torch.__version__},
         ),
-        machine.state_dict() | ({} if offsets is None else offsets.tensors()),
+        machine.state_dict()
+        | ({} if offsets is None else offsets.tensors())
+        | ({} if counts is None else counts.tensors()),
         alias=alias,
     )
 
