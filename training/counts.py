@@ -54,12 +54,10 @@ def fit_counts(
     """
     counting = counted_classes(train, vocabulary)
     known = [scene for scene in train if scene.source in counting]
-    if not known:
-        return None
-    cases = _Cases.of(_few_of_group(known), counting, vocabulary, _DRAWS)
     classes = _frequent(known, counting, vocabulary)
     if not len(classes):
         return None
+    cases = _Cases.of(_few_of_group(known), counting, vocabulary, _DRAWS)
     share = _shares(cases, len(vocabulary))
     weights = _weights(cases, share, len(vocabulary))
     # The exponent -1 stands for the listed number, which is uniform from 1 to n.
@@ -161,37 +159,39 @@ class _Cases:
         draws: int,
     ) -> _Cases:
         """List each scene in part, `draws` times."""
-        names = sorted(counting)
-        columns, values, lengths, cases = [], [], [], []
-        start = ROOM + len(vocabulary.room_types)
+        names, start = sorted(counting), ROOM + len(vocabulary.room_types)
+        rows: list[tuple[Ints, Floats]] = []
+        cases: list[tuple[int, ...]] = []
         for place, scene in enumerate(scenes):
-            source = names.index(scene.source)
+            counted, source = counting[scene.source], names.index(scene.source)
             for seed in range(draws):
-                part, asked = listed_cases(
-                    scene, counting[scene.source], vocabulary.structure, seed
-                )
-                logs, others = np.log(part.listed), len(part.classes) - 1
-                for k in asked:
-                    row, value = [INTERCEPT, LISTED], [1.0, float(logs[k])]
-                    if part.room >= 0:
-                        row.append(ROOM + part.room)
-                        value.append(1.0)
-                    if others:
-                        row.append(MEAN)
-                        value.append(float(logs.sum() - logs[k]) / others)
-                        row += (start + np.delete(part.classes, k)).tolist()
-                        value += [others**-0.5] * others
-                    columns += row
-                    values += value
-                    lengths.append(len(row))
-                    cases.append((part.classes[k], part.listed[k], part.number[k], place, source))
-        index, listed, number, place, source = np.array(cases, dtype=np.int64).T
-        features = sparse.csr_matrix(
-            (values, columns, np.cumsum([0, *lengths])),
-            shape=(len(cases), start + len(vocabulary)),
-        )
-        weight = source_weights(source, place) / draws
-        return cls(index, listed, number, features, weight)
+                part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
+                rows += [_features(part, k, start) for k in asked.tolist()]
+                numbers = np.stack([part.classes, part.listed, part.number])[:, asked]
+                cases += [(*case, place, source) for case in numbers.T.tolist()]
+        index, listed, number, places, sources = np.array(cases, dtype=np.int64).T
+        columns, values = (np.concatenate(some) for some in zip(*rows, strict=True))
+        bounds = np.cumsum([0, *(len(row) for row, _ in rows)])
+        shape = (len(cases), start + len(vocabulary))
+        features = sparse.csr_matrix((values, columns, bounds), shape=shape)
+        return cls(index, listed, number, features, source_weights(sources, places) / draws)
+
+
+def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
+    """Return columns of `Counts.weights` and their values for the k-th class of a part.
+
+    Args:
+        start: first column of the other classes.
+    """
+    logs, others = np.log(part.listed), len(part.classes) - 1
+    columns, values = [INTERCEPT, LISTED], [1.0, float(logs[k])]
+    if part.room >= 0:
+        columns.append(ROOM + part.room)
+        values.append(1.0)
+    if others:
+        columns += [MEAN, *(start + np.delete(part.classes, k)).tolist()]
+        values += [float(logs.sum() - logs[k]) / others, *[others**-0.5] * others]
+    return np.array(columns, dtype=np.int64), np.array(values)
 
 
 def _shares(cases: _Cases, V: int) -> Floats:

@@ -76,8 +76,8 @@ class Counts:
     def _complaint(self, V: int, C: int) -> str | None:
         if not np.issubdtype(self.classes.dtype, np.integer):
             return "classes must be integers"
-        if (np.diff(self.classes) <= 0).any() or (self.classes[:1] < 0).any():
-            return "classes must be non-negative and in ascending order"
+        if not len(self.classes) or self.classes[0] < 0 or (np.diff(self.classes) <= 0).any():
+            return "classes must be non-negative, in ascending order, and at least one"
         if (self.classes[-1:] >= V).any():
             return "the tensor 'classes' has a class that the model does not have"
         if not 2 <= self.log_share.shape[1] <= _MOST:

@@ -50,6 +50,14 @@ def test_they_come_back_with_the_artifact(tmp_path: Path) -> None:
         ({"classes": np.int64(0)}, "wrong_shape"),
         ({"classes": np.array([0.0, 1.0], "f4")}, "invalid_tensor"),
         ({"classes": np.array([1, 0])}, "invalid_tensor"),
+        (
+            {
+                "classes": np.zeros(0, np.int64),
+                "log_share": np.zeros((0, M), "f4"),
+                "weights": np.zeros((0, 3 + C + V), "f4"),
+            },
+            "invalid_tensor",
+        ),
         ({"classes": np.array([0, 0])}, "invalid_tensor"),
         ({"classes": np.array([-1, 1])}, "invalid_tensor"),
         ({"classes": np.array([0, V])}, "invalid_tensor"),
