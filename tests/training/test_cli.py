@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from training.cli import app
 from training.config import load_config
 from training.offsets import fit_offsets
 from training.pipeline import prepare
+from training.publish import refit
+from training.runs import RunError
 
 ROOT = Path(__file__).parents[2]
 
@@ -72,6 +75,10 @@ def same_weights_with_refitted_statistics(artifact, store) -> None:
     before, after = artifact.manifest, again.manifest
     assert after.calibration == before.calibration
     assert set(after.metrics) == set(before.metrics)
+    other = tuple(source.model_copy(update={"digest": "0" * 64}) for source in before.data)
+    changed = replace(artifact, manifest=before.model_copy(update={"data": other}))
+    with pytest.raises(RunError, match="the scenes of rooms have changed"):
+        refit(changed, Path(), Store(store), "1.0.3")
 
 
 def pinned(name: str) -> set[str]:

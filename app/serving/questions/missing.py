@@ -21,6 +21,7 @@ from app.serving.answers import (
     envelope,
     reasons,
     require_size,
+    rounded,
 )
 from app.serving.errors import Reason
 from app.serving.models import ServedModel
@@ -91,8 +92,6 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
                 numbers += offset[0]
                 numbers += offset[1]
         numbers += [change for _, change in because]
-    for entry in further:
-        numbers += entry.expected_count, entry.probability
     numbered = iter(significant(numbers))
     answer["missing"] = [
         {
@@ -105,13 +104,10 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         for label, _, _, placements, because in found
     ]
     answer["more"] = [
-        {
-            "label": entry.label,
-            "listed_count": entry.listed_count,
-            "expected_count": next(numbered),
-            "low": entry.low,
-            "high": entry.high,
-            "probability": next(numbered),
+        entry._asdict()
+        | {
+            "expected_count": rounded(entry.expected_count),
+            "probability": rounded(entry.probability),
         }
         for entry in further
     ]
