@@ -8,6 +8,7 @@ class and a term that all classes share. `docs/decisions/counts.md` describes th
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from scipy import sparse
 from scipy.optimize import minimize
 
 from app.questions.counts import distribution
-from app.registry.counts import INTERCEPT, LISTED, MEAN, ROOM, Counts
+from app.registry.counts import INTERCEPT, LISTED, ROOM, SEVERAL, Counts
 from app.scene import Vocabulary
 from training.cases import MOST, Part, scene_rng, some_instances
 from training.datasets import EncodedScene
@@ -183,14 +184,13 @@ def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
     Args:
         start: first column of the other classes.
     """
-    logs, others = np.log(part.listed), len(part.classes) - 1
-    columns, values = [INTERCEPT, LISTED], [1.0, float(logs[k])]
+    others, listed = np.delete(part.classes, k), np.delete(part.listed, k)
+    columns = [INTERCEPT, LISTED, SEVERAL, *(start + others).tolist()]
+    values = [1.0, math.log(part.listed[k]), float((listed > 1).any())]
+    values += [1 / math.sqrt(max(len(others), 1))] * len(others)
     if part.room >= 0:
         columns.append(ROOM + part.room)
         values.append(1.0)
-    if others:
-        columns += [MEAN, *(start + np.delete(part.classes, k)).tolist()]
-        values += [float(logs.sum() - logs[k]) / others, *[others**-0.5] * others]
     return np.array(columns, dtype=np.int64), np.array(values)
 
 

@@ -4,12 +4,12 @@ The models score classes. This module adds statistics of counts. Let n be the nu
 a class in the scene, of which the request lists k. Then, for n from k to M,
 
     p(n) ∝ s(n) n^η ρ^(n - k)
-    η = a + b log k + c (1/m) Σ_j log k_j + d_t + (1/√m) Σ_j e_j
+    η = a + b log k + c u + d_t + (1/√m) Σ_j e_j
 
-s(n) is the share of training scenes with n instances. The sums go over the m other listed classes
-j, without structure, with k_j listed instances. a, b, c, d (for the room type t) and e are weights
-of the class. A request that states a coverage above the model's coverage lowers ρ from 1 to
-(1 - coverage) / (1 - model's coverage).
+s(n) is the share of training scenes with n instances. u is 1 if the request lists another class
+several times, and 0 otherwise. The sum goes over the m other listed classes j, without structure.
+a, b, c, d (for the room type t) and e are weights of the class. A request that states a coverage
+above the model's coverage lowers ρ from 1 to (1 - coverage) / (1 - model's coverage).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from app.questions.posterior import present
 from app.registry.artifact import Artifact
-from app.registry.counts import INTERCEPT, LISTED, MEAN, ROOM, Counts
+from app.registry.counts import INTERCEPT, LISTED, ROOM, SEVERAL, Counts
 from app.scene.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -141,12 +141,13 @@ def distribution(
     row[row == len(counts.classes)] = 0
     which = np.flatnonzero((counts.classes[row] == classes) & (listed < M))
     row, number, k = row[which], np.arange(1, M + 1), listed[which, None]
-    logs = np.log(listed)
-    exponent = counts.weights[row, INTERCEPT] + counts.weights[row, LISTED] * logs[which]
+    exponent = counts.weights[row, INTERCEPT].astype(np.float64)
+    exponent += counts.weights[row, LISTED] * np.log(listed[which])
+    several = listed > 1
+    exponent += counts.weights[row, SEVERAL] * (several.sum() > several[which])
     if room is not None:
         exponent += counts.weights[row, ROOM + room]
     if (others := len(classes) - 1) > 0:
-        exponent += counts.weights[row, MEAN] * (logs.sum() - logs[which]) / others
         # The effect of a class on itself is 0, so the sum over all listed classes is correct.
         effects = counts.weights[row[:, None], counts.weights.shape[1] - V + classes]
         exponent += effects.sum(axis=1, dtype=np.float64) / math.sqrt(others)

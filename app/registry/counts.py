@@ -16,10 +16,9 @@ Table = NDArray[np.float32]
 PREFIX: Final = "counts."
 """Prefix of the names of count tensors. They are in the same file as the machine's tensors."""
 
-INTERCEPT, LISTED, MEAN, ROOM = 0, 1, 2, 3
-"""Columns of `Counts.weights`: intercept, log of the listed number, mean of the logs of the listed
-numbers of the other classes, and the first of C room types. The last V columns are those of the
-other classes."""
+INTERCEPT, LISTED, SEVERAL, ROOM = 0, 1, 2, 3
+"""Columns of `Counts.weights`: intercept, log of the listed number, 1 if another class is listed
+several times, and the first of C room types. The last V columns are those of the other classes."""
 
 _LARGEST: Final = 64.0
 _MOST: Final = 256

@@ -569,7 +569,7 @@ def placements() -> None:
 
 @formula(
     r"p(n) \propto s(n) \, n^{\eta} \, \rho^{n - k}, \quad \eta = a + b \log k"
-    r" + \frac{c}{m} \sum_j \log k_j + d_t + \frac{1}{\sqrt{m}} \sum_j e_j"
+    r" + c u + d_t + \frac{1}{\sqrt{m}} \sum_j e_j"
 )
 def numbers_of_instances() -> None:
     listed = {DESK: 2, CHAIR: 1, LAMP: 1}

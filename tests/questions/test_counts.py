@@ -49,7 +49,7 @@ def by_hand(
     m = len(others)
     eta = a + b * math.log(k) + (0.0 if room is None else d[room])
     if m:
-        eta += c / m * sum(math.log(listed[j]) for j in others)
+        eta += c * any(listed[j] > 1 for j in others)
         eta += sum(e[j] for j in others) / math.sqrt(m)
     s = [math.exp(x) for x in found.log_share[row].tolist()]
     weight = [s[n - 1] * n**eta * rho ** (n - k) if n >= k else 0.0 for n in range(1, M + 1)]
