@@ -43,7 +43,7 @@ from training.experiments.gate import MARGIN, WorseError, judge, seat
 from training.experiments.tune import tune
 from training.live import Display, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
-from training.publish import publish_run
+from training.publish import publish_run, refit
 from training.runs import FinishedRun, RunError, load_run, save_run
 from training.trainer import Trainer
 
@@ -122,7 +122,13 @@ def train(
 
 @app.command()
 def publish(
-    folder: Annotated[Path, typer.Argument(help="folder of a finished training run")],
+    folder: Annotated[
+        str,
+        typer.Argument(
+            help="folder of a finished training run; or name@version of a published model, whose "
+            "statistics are fitted again"
+        ),
+    ],
     version: Annotated[str, typer.Argument(help="number of the new version, such as 1.0.0")],
     data: Data = None,
     store: StorePath = _STORE,
@@ -145,7 +151,10 @@ def publish(
         int, typer.Option(min=2, help="with --promote: number of scenes for the comparison")
     ] = 300,
 ) -> None:
-    """Calibrate, evaluate and publish a finished run.
+    """Calibrate, evaluate and publish a finished run, or refit the statistics of a version.
+
+    With name@version, the command fits the offsets and the counts of instances again. The new
+    version keeps weights, calibration and metrics of the old version.
 
     With --promote, the command first compares the new version with the version that the alias
     serves. The comparison uses test scenes that neither version was trained on. The command refuses
@@ -155,7 +164,12 @@ def publish(
     published, and the exit code is 3.
     """
     try:
-        run = load_run(folder)
+        if "@" in folder and not Path(folder).is_dir():
+            if promote:
+                raise ConfigError("--promote compares training runs; use --alias with name@version")
+            _refit(folder, data or DATA, open_for_publisher(store), version, alias)
+            return
+        run = load_run(Path(folder))
         root = data or (Path(run.data) if run.data else DATA)
         scenes = _prepare(run.config, root)
         if promote:
@@ -296,6 +310,13 @@ def _publish(
             measured=measured,
             progress=status.update,
         )
+    _published(artifact)
+
+
+def _refit(reference: str, root: Path, store: Store, version: str, alias: str | None) -> None:
+    artifact = store.load(*store.resolve(reference))
+    with console.status("publishing") as status:
+        artifact = refit(artifact, root, store, version, alias=alias, progress=status.update)
     _published(artifact)
 
 

@@ -1,6 +1,7 @@
 """Published models: their file format, the store of models, and loaded snapshots of the store."""
 
 from app.registry.artifact import Artifact, load_artifact, write_artifact
+from app.registry.counts import Counts
 from app.registry.description import (
     Calibration,
     CountSlope,
@@ -29,6 +30,7 @@ __all__ = [
     "ArtifactFailure",
     "Calibration",
     "CountSlope",
+    "Counts",
     "DataSource",
     "Description",
     "EvidenceWeights",

@@ -10,6 +10,7 @@ import torch
 
 from app.registry import (
     Calibration,
+    Counts,
     DataSource,
     Description,
     Example,
@@ -86,6 +87,7 @@ def publish(
     classes: int = V,
     alias: str | None = None,
     offsets: Offsets | None = None,
+    counts: Counts | None = None,
 ) -> None:
     """Publish a machine with random weights for the first ``classes`` classes."""
     machine = random_machine(variant, seed, classes)
@@ -117,7 +119,9 @@ def publish(
             libraries={"torch": torch.__version__},
             examples=EXAMPLES if classes == V else (),
         ),
-        machine.state_dict() | ({} if offsets is None else offsets.tensors()),
+        machine.state_dict()
+        | ({} if offsets is None else offsets.tensors())
+        | ({} if counts is None else counts.tensors()),
         alias=alias,
     )
 

@@ -119,10 +119,10 @@ def test_reads_back_as_written(change: dict[str, Any]) -> None:
     read = Manifest.from_bytes(data)
     assert read == written
     assert read.to_bytes() == data
-    assert json.loads(data)["format"] == 2
+    assert json.loads(data)["format"] == 3
 
 
-@pytest.mark.parametrize("value", [0, 3, 1.0, "1", None, True])
+@pytest.mark.parametrize("value", [0, 4, 1.0, "1", None, True])
 def test_refuses_an_unknown_format(value: object) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"]

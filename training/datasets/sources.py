@@ -113,6 +113,8 @@ class Source:
         open_vocabulary: True if annotators used free words. An unlisted class is then absent.
             Otherwise annotators chose labels from a list, and a class outside the list is
             unobserved.
+        counts_movables: True if the source counts only movable objects. Other classes occur once
+            in each scene that lists them.
     """
 
     terms: str
@@ -121,6 +123,7 @@ class Source:
     predicates: Mapping[str, str] | None = None
     left_out: tuple[str, ...] = ()
     open_vocabulary: bool = False
+    counts_movables: bool = False
 
 
 _BEDROOMS: Final = Source(
@@ -185,6 +188,7 @@ SOURCES: Final[dict[str, Source]] = {
             on_top="unobserved", above="unobserved", lateral="unobserved", scenes_per_group=3.0
         ),
         predicates=_THE_EIGHT,
+        counts_movables=True,
     ),
     "bddl_goal": Source(
         "BEHAVIOR-1K (Li et al., CoRL 2022): end states of household activities; MIT",

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+from training.evaluation import counts, offsets
 from training.evaluation.answers import QUESTIONS, calibration_task
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.density import density_task
@@ -28,7 +29,6 @@ from training.evaluation.missing import (
     partial_task,
     placed_task,
 )
-from training.evaluation.offsets import METRICS, offsets_task
 from training.evaluation.outliers import outliers_task, sensitivity_task, signature_task
 from training.evaluation.pairs import pairs_task
 from training.evaluation.relations import completion_task, placement_task, relations_task
@@ -178,9 +178,14 @@ SEED_TASKS: dict[str, Task] = {
 }
 """Tasks of the seed protocol (Bozcan et al., 2018). Their results have separate tables."""
 
-# The offsets depend only on the training scenes, not on the machine. They appear in model cards,
+# The statistics depend only on the training scenes, not on the machine. They appear in model cards,
 # but not in tables that compare machines.
-EVERY_TASK = TASKS | SEED_TASKS | {"Offsets": Task(offsets_task, card=METRICS)}
+STATISTICS: dict[str, Task] = {
+    "Offsets": Task(offsets.offsets_task, card=offsets.METRICS),
+    "Counts": _objects(counts.counts_task, (), counts.METRICS),
+}
+
+EVERY_TASK = TASKS | SEED_TASKS | STATISTICS
 
 ONCE = ("Everyday",)
 """Tasks that do not depend on the held-out scenes. They are measured once, not per data source."""
