@@ -38,8 +38,15 @@ from training.evaluation.report import Row, evaluate
 from training.example_scenes import read_examples
 from training.experiments.ablate import ablate
 from training.experiments.benchmark import benchmark
-from training.experiments.compare import Comparison, compare_command, show
-from training.experiments.gate import MARGIN, WorseError, judge, seat
+from training.experiments.compare import compare_command, show
+from training.experiments.gate import (
+    MARGIN,
+    RefusedError,
+    compare_with_served,
+    losses,
+    measure_usefulness,
+    seat,
+)
 from training.experiments.tune import tune
 from training.live import Display, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
@@ -132,7 +139,7 @@ def publish(
         typer.Option(
             "--promote",
             help="point the alias `default` (or --alias) at the new version, unless the new "
-            "version is worse than the served version",
+            "version is useless or worse than the served version",
         ),
     ] = False,
     margin: Annotated[
@@ -147,12 +154,12 @@ def publish(
 ) -> None:
     """Calibrate, evaluate and publish a finished run.
 
-    With --promote, the command first compares the new version with the version that the alias
-    serves. The comparison uses test scenes that neither version was trained on. The command refuses
-    the new version if a primary metric is worse by more than the margin. The loss counts as worse
-    if the whole 95 % interval of the paired difference exceeds the margin. The command also refuses
-    the new version if only the served version has results for relations. A refused version is not
-    published, and the exit code is 3.
+    With --promote, the command first compares the new version with two baselines on the test scenes
+    of the run: it must rank missing objects better than popularity, and not worse than EASE
+    (co-occurrence). Then it compares the new version with the version that the alias serves, on
+    test scenes that neither version was trained on. The command refuses the new version if the
+    whole 95 % interval of the loss in a primary metric exceeds the margin, or if only the served
+    version has results for relations. A refused version is not published, and the exit code is 3.
     """
     try:
         run = load_run(folder)
@@ -163,8 +170,7 @@ def publish(
             _promote(run, scenes, root, open_for_publisher(store), version, gate)
         else:
             _publish(run, scenes, store, version, alias)
-    except WorseError as error:
-        show(error.comparison, console)
+    except RefusedError as error:
         console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
         console.print("nothing was published; --even-if-worse publishes and promotes it anyway")
         raise typer.Exit(3) from None
@@ -317,35 +323,32 @@ class _Gate:
 def _promote(
     run: FinishedRun, scenes: SplitScenes, root: Path, store: Store, version: str, gate: _Gate
 ) -> None:
-    """Publish the version and point the alias at it, unless the served version is better."""
+    """Publish the version and point the alias at it, unless the gate refuses the version."""
     before = seat(store, gate.alias)
-    found: list[Comparison] = []
     with console.status("publishing") as status:
 
         def judged(artifact: Artifact) -> None:
-            if before.holder is None:
-                return
-            try:
-                found.append(
-                    judge(
-                        *(run, scenes, artifact, before.holder, root),
-                        margin=gate.margin,
-                        limit=gate.limit,
-                        say=status.update,
+            limit, say = gate.limit, status.update
+            useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
+            console.print("\n".join(useful.lines()), highlight=False)
+            reasons = useful.objections()
+            if before.holder is not None and (gate.even_if_worse or not reasons):
+                try:
+                    comparison = compare_with_served(
+                        *(run, scenes, artifact, before.holder, root), limit=limit, say=say
                     )
-                )
-            except WorseError as error:
-                if not gate.even_if_worse:
-                    raise
-                found.append(error.comparison)
-            except ConfigError as error:
-                if not gate.even_if_worse:
-                    raise
-                console.print(f"the versions were not compared: {error}", soft_wrap=True)
+                    show(comparison, console)
+                    reasons += losses(comparison, gate.margin)
+                except ConfigError as error:
+                    if not gate.even_if_worse:
+                        raise
+                    console.print(f"the versions were not compared: {error}", soft_wrap=True)
+            if reasons and not gate.even_if_worse:
+                raise RefusedError(reasons)
+            for reason in reasons:
+                console.print(f"accepted by --even-if-worse: {reason}", soft_wrap=True)
 
         artifact = publish_run(run, scenes, store, version, judge=judged, progress=status.update)
-    for comparison in found:
-        show(comparison, console)
     if before.note:
         console.print(before.note, soft_wrap=True)
     _published(artifact)

@@ -25,6 +25,7 @@ from training.datasets import AnnotatedScene, DatasetError, annotated_classes, e
 from training.evaluation.missing import ObjectScore, leave_one_out
 from training.evaluation.report import Progress, SourceReport, digest, run, silent
 from training.evaluation.setting import Setting
+from training.evaluation.tasks import TASKS
 from training.experiments.results import Difference, Results, only, summarise
 from training.experiments.sides import (
     BASELINE_SIDE,
@@ -302,11 +303,12 @@ def side_by_side(
         ValueError: the scenes belong to fewer than two groups, so intervals are undefined.
     """
     setting = Setting(scenes, structure, limit=None)
-    groups = {
-        related: [scene.group for scene in setting.some(related).scenes]
-        for related in (False, True)
-    }
-    if len(set(groups[False])) < 2:
+
+    def groups(task: str) -> list[str]:
+        asked = setting.complete if TASKS[task].of_objects else setting
+        return [scene.group for scene in asked.some(task in _RELATED).scenes]
+
+    if len({scene.group for scene in scenes.scenes}) < 2:
         raise ValueError("the scenes belong to one group, but intervals need at least two groups")
     reports = {}
     for title, rival in zip(titles, rivals, strict=True):
@@ -316,7 +318,7 @@ def side_by_side(
                 pass
         reports[title, 0] = {"held out": only(report, COMPARED)}
     progress("resampling groups")
-    return summarise(reports, titles[0], groups=lambda task: groups[task in _RELATED])
+    return summarise(reports, titles[0], groups=groups)
 
 
 def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
