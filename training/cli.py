@@ -48,6 +48,7 @@ from training.experiments.gate import (
     seat,
 )
 from training.experiments.tune import tune
+from training.fetch import fetch
 from training.live import Display, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import publish_run
@@ -57,6 +58,7 @@ from training.trainer import Trainer
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 app.command()(example)
 app.command()(init)
+app.command()(fetch)
 app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
@@ -68,7 +70,7 @@ Data = Annotated[
     typer.Option(
         "--data",
         help="folder with the scene files; default: the folder of your configuration file, or "
-        f"{DATA} for a shipped configuration",
+        f"{DATA} for a shipped configuration (`fetch` says what belongs there)",
     ),
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
