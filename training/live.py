@@ -155,12 +155,16 @@ def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: C
         table.add_row(title, sparkline(values), *(f"{value:.3f}" for value in ends))
     console.print(table)
     updates = (result.best_epoch + 1) * trainer.steps_per_epoch
+    stopped = len(result.epochs) < trainer.config.training.epochs
+    idle = len(result.epochs) - 1 - result.best_epoch
     console.print(
         f"best epoch {result.best_epoch + 1} of {len(result.epochs)} (update {updates:,}) in "
         f"{result.seconds:.0f} s: {scores(best)}; curve in {folder / 'curve.png'}",
         soft_wrap=True,
     )
-    if advice := _advice(result):
+    if stopped:
+        console.print(f"stopped early: {idle} epochs without a better score on validation scenes")
+    elif advice := _advice(result):
         console.print(advice, soft_wrap=True)
     console.print(
         f"next: python -m training compare {folder}\n"

@@ -20,7 +20,7 @@ from app.registry.references import AliasTarget
 from training.baselines import BASELINES
 from training.batches import subset
 from training.cases import some_scenes
-from training.evaluation.metrics import Figure, Ratio, paired_difference
+from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
 from training.evaluation.missing import MachineScore, ObjectScore, leave_one_out
 from training.evaluation.tasks import in_words
 from training.experiments.compare import Comparison, compare
@@ -35,10 +35,6 @@ MARGIN = 0.02
 
 NEW = "the new version"
 POPULARITY, CO_OCCURRENCE = "popularity", "EASE"
-
-FEWEST_GROUPS = 6
-"""Minimum number of groups of test scenes. A useless model is better than popularity in all of five
-groups with a probability of 1/32, which is more than 2.5 %."""
 
 
 class RefusedError(RuntimeError):
