@@ -133,7 +133,11 @@ def test_the_same_again_is_not_worse_and_may_take_its_place(workplace) -> None:
 def test_a_worse_version_is_refused_unless_somebody_insists(workplace) -> None:
     text = (workplace.folder / "my-lab" / "my-lab.toml").read_text()
     hasty = workplace.folder / "my-lab" / "hasty.toml"
-    changed = {"epochs": "epochs = 1", "learning_rate": "learning_rate = 1e-6"}
+    changed = {
+        "epochs": "epochs = 1",
+        "updates": "updates = 0",
+        "learning_rate": "learning_rate = 1e-6",
+    }
     lines = [changed.get(line.partition(" ")[0], line) for line in text.splitlines()]
     hasty.write_text("\n".join(lines))
     invoke("train", hasty, "--seed", 1, *workplace.places)
