@@ -31,7 +31,7 @@ from training.datasets import (
     split,
     with_typical_sizes,
 )
-from training.datasets.origins import file_of
+from training.datasets.origins import WORDS, file_of
 from training.datasets.words import class_vectors, read_word_vectors
 from training.shards import Shards, read_shard, shard_files, shards_digest
 from training.trainer import TrainingData
@@ -163,24 +163,24 @@ def _path(source: str, root: Path) -> Path:
 
 def _require_files(data: DataConfig, root: Path) -> None:
     """Raise ConfigError if a file of a source, or the file of word vectors, is missing."""
-    paths = [
-        _path(source, root)
+    paths = {
+        source: _path(source, root)
         for source in data.sources
         if source != "rooms" and not is_sharded(source)
-    ]
+    }
     if data.words:
-        paths.append(root / data.words)
-    missing = [path for path in paths if not path.is_file()]
+        paths[WORDS] = root / data.words
+    missing = {source: path for source, path in paths.items() if not path.is_file()}
     if not missing:
         return
-    names = ", ".join(path.relative_to(root).as_posix() for path in missing)
+    names = ", ".join(path.relative_to(root).as_posix() for path in missing.values())
     text = f"{len(missing)} of {len(paths)} files of scenes are missing in {root}: {names}. "
-    if any(map(is_file, data.sources)):
-        raise ConfigError(f"{text}Pass the folder of these files with --data")
-    raise ConfigError(
-        f"{text}The repository does not contain these public data sets. `python -m training fetch` "
-        "says where each of them is to be had; pass the folder of your copies with --data"
-    )
+    if not all(map(is_file, missing)):
+        text += (
+            "The repository does not contain the public data sets. `python -m training fetch` says "
+            "where each of them is to be had. "
+        )
+    raise ConfigError(f"{text}Pass the folder of the files with --data")
 
 
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
