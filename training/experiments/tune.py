@@ -381,7 +381,11 @@ class Search:
 
 def shown(settings: Mapping[str, Any]) -> str:
     """Format the changed settings of a trial in one line."""
-    return ", ".join(f"{name.partition('.')[2]} {v}" for name, v in settings.items()) or "as it is"
+    parts = (
+        f"{name.partition('.')[2]} {f'{value:.4g}' if isinstance(value, float) else value}"
+        for name, value in settings.items()
+    )
+    return ", ".join(parts) or "as it is"
 
 
 def _counted(study: Study) -> list[FrozenTrial]:
