@@ -108,13 +108,14 @@ def measure_usefulness(
 ) -> Usefulness:
     """Compare a new version with popularity and EASE on the test scenes of its run.
 
-    The baselines learn from the training scenes of the run.
+    The baselines learn from the training scenes of the run. Scenes with incomplete object lists are
+    left out, unless all test scenes are such scenes.
 
     Args:
         limit: maximum number of test scenes.
     """
     complete = data.test.complete.nonzero().squeeze(1)
-    scenes = some_scenes(subset(data.test, complete), limit)
+    scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, limit)
     groups = [scene.group for scene in scenes.scenes]
     size = len(scenes), len(set(groups))
     if len(set(groups)) < FEWEST_GROUPS:

@@ -132,6 +132,17 @@ def test_a_useless_model_is_refused_with_its_figures(how: str) -> None:
     assert f"{found.scenes} test scenes" in popularity
 
 
+def test_photographs_with_incomplete_lists_are_used_where_there_are_no_others() -> None:
+    data = rooms().training_data()
+    flags = [replace(scene, complete=False) for scene in data.test.scenes]
+    machine = as_stored(Trainer(small(epochs=1), data).run().machine)
+    artifact = draft_artifact(machine, rooms().vocabulary)
+    incomplete = replace(data, test=replace(data.test, scenes=flags))
+    found = measure_usefulness(artifact, incomplete, limit=300, say=lambda _: None)
+    assert found.ours is not None
+    assert found.scenes == len(flags)
+
+
 def test_too_few_test_scenes_decide_nothing_and_are_refused() -> None:
     data = rooms().training_data()
     few = replace(data, test=subset(data.test, torch.arange(4)))
