@@ -10,8 +10,8 @@ import pytest
 from app.registry import Example
 from app.scene import ObjectClass, Vocabulary
 from scene_client.schemas import SceneRequest
-from training.config import ConfigError, load_config, shipped_configs
-from training.datasets import generate_rooms, indoor_vocabulary, source_vocabulary
+from training.config import ConfigError
+from training.datasets import generate_rooms, source_vocabulary
 from training.datasets.rooms import WORKPLACES
 from training.example_scenes import choose_examples, examples_json, read_examples
 
@@ -46,13 +46,6 @@ def test_supports_become_relations_where_there_are_no_positions() -> None:
 def test_research_only_scenes_are_never_chosen() -> None:
     copied = [replace(scene, source="sunrgbd") for scene in SCENES]
     assert choose_examples(copied, WORDS) == ()
-
-
-@pytest.mark.parametrize("name", shipped_configs())
-def test_shipped_examples_fit_their_vocabulary(name, tmp_path) -> None:
-    config = load_config(name)
-    if config.data.vocabulary == "indoor" and config.examples:
-        assert read_examples(config.examples, tmp_path, indoor_vocabulary())
 
 
 @pytest.mark.parametrize(

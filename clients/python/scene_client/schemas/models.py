@@ -98,7 +98,7 @@ class VocabularyEntry(Reply):
 
 
 class ExampleScene(Reply):
-    """An example scene of the model, such as `client.missing(**example.scene)`."""
+    """An example scene of the model, for `client.missing(example.scene)`."""
 
     name: str
     scene: Annotated[
