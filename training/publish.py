@@ -24,12 +24,13 @@ from app.registry import (
 )
 from app.scene import Vocabulary
 from training.calibrate import calibrate
-from training.config import Config, DataConfig
+from training.config import Config, DataConfig, load_config, shipped_configs
 from training.counts import fit_counts
 from training.datasets.sources import SOURCES
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.evaluation.tasks import STATISTICS
+from training.example_scenes import read_examples
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
 from training.offsets import fit_offsets
@@ -120,9 +121,11 @@ def refit(
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
 
-    The new version keeps weights, calibration and metrics. Only the statistics (offsets, counts)
-    and their metrics are new. The metrics of weights that were trained on test scenes come from
-    statistics that were not fitted to test scenes.
+    The new version keeps weights, calibration and metrics. Only the statistics (offsets, counts),
+    their metrics and the example scenes are new. The examples are those of the shipped
+    configuration with the name of the model, otherwise those of its own configuration. The metrics
+    of weights that were trained on test scenes come from statistics that were not fitted to test
+    scenes.
 
     Args:
         artifact: the published model.
@@ -134,7 +137,11 @@ def refit(
         StoreError, ArtifactError: see `Store.publish`.
     """
     manifest = artifact.manifest
-    data = Config.model_validate(manifest.training["config"]).data
+    config = Config.model_validate(manifest.training["config"])
+    data, named = config.data, config.examples
+    if manifest.name in shipped_configs():
+        named = load_config(manifest.name).examples
+    examples = read_examples(named, root, artifact.vocabulary)
     progress("reading scenes")
     annotated = read_sources(data, root)
     scenes = split_and_encode(data, annotated, artifact.vocabulary, root)
@@ -161,7 +168,8 @@ def refit(
         *(metric for metric in manifest.metrics if metric.task not in STATISTICS),
         *metrics(rows),
     )
-    description = Description(**fields | {"version": version, "created": _now()})
+    changes = {"version": version, "created": _now(), "examples": examples}
+    description = Description(**fields | changes)
     return _stored(store, description, with_statistics(artifact, scenes), alias)
 
 
