@@ -13,6 +13,7 @@ from typing import Annotated
 
 import torch
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -35,6 +36,7 @@ from training.distributed import is_first, process_group
 from training.domain.command import example, fail, init
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
+from training.evaluation.tasks import in_words
 from training.example_scenes import read_examples
 from training.experiments.ablate import ablate
 from training.experiments.benchmark import benchmark
@@ -48,6 +50,7 @@ from training.experiments.gate import (
     seat,
 )
 from training.experiments.tune import tune
+from training.fetch import fetch
 from training.live import Display, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import publish_run
@@ -57,6 +60,7 @@ from training.trainer import Trainer
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 app.command()(example)
 app.command()(init)
+app.command()(fetch)
 app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
@@ -68,7 +72,7 @@ Data = Annotated[
     typer.Option(
         "--data",
         help="folder with the scene files; default: the folder of your configuration file, or "
-        f"{DATA} for a shipped configuration",
+        f"{DATA} for a shipped configuration (`fetch` says what belongs there)",
     ),
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
@@ -330,7 +334,8 @@ def _promote(
         def judged(artifact: Artifact) -> None:
             limit, say = gate.limit, status.update
             useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
-            console.print("\n".join(useful.lines()), highlight=False)
+            for line in useful.lines():
+                console.print(line, highlight=False)
             reasons = useful.objections()
             if before.holder is not None and (gate.even_if_worse or not reasons):
                 try:
@@ -360,14 +365,16 @@ def _promote(
 
 
 def _show(tables: dict[str, list[Row]]) -> None:
-    figures: dict[tuple[str, str, str], dict[str, str]] = {}
+    figures: dict[str, dict[tuple[str, str], dict[str, str]]] = {}
     for name, rows in tables.items():
         for row in rows:
-            key = (row.task, row.source, row.metric)
-            figures.setdefault(key, {})[name] = str(row.figure)
-    table = Table("task", "source", "metric", *tables)
-    for key, values in sorted(figures.items()):
-        table.add_row(*key, *(values.get(name, "") for name in tables))
+            lines = figures.setdefault(row.task, {})
+            lines.setdefault((row.metric, row.source), {})[name] = str(row.figure)
+    table = Table("task, metric", "source", *tables, box=box.SIMPLE_HEAD)
+    for task, lines in sorted(figures.items()):
+        table.add_row(f"[bold]{in_words(task)}[/bold]")
+        for (metric, source), values in lines.items():
+            table.add_row(f"  {metric}", source, *(values.get(name, "") for name in tables))
     console.print(table)
 
 

@@ -1,7 +1,7 @@
 """Where each public data set is to be had, and how to bring it into a file of scenes.
 
-The repository contains none of these data sets, and no command downloads them. The command
-`training fetch` prints this table and checks the files in a folder.
+These data sets are outside the repository. The command `training fetch` prints this table and
+checks the files in a folder; it downloads nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from training.datasets.readers import read_scenes
 from training.datasets.words import read_word_vectors
 
 WORDS: Final = "word_vectors"
-"""Name of the word vectors in `ORIGINS`. They are no scenes, but the indoor models use them."""
+"""Name of the word vectors in `ORIGINS`, which the indoor models use beside the scenes."""
 
 _SENTENCES: Final = (
     "extract (subject, relation, object) from each sentence; one scene per {unit}, one object per "

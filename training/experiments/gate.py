@@ -22,6 +22,7 @@ from training.batches import subset
 from training.cases import some_scenes
 from training.evaluation.metrics import Figure, Ratio, paired_difference
 from training.evaluation.missing import MachineScore, ObjectScore, leave_one_out
+from training.evaluation.tasks import in_words
 from training.experiments.compare import Comparison, compare
 from training.experiments.sides import Say, Side, stored_side
 from training.machines.arrays import machine_of
@@ -208,10 +209,10 @@ def losses(comparison: Comparison, margin: float) -> list[str]:
     """
     a, b, reasons = comparison.a, comparison.b, []
     if rows := comparison.worse_by(margin):
-        names = ", ".join(f"{row.task} {row.metric} ({row.figure})" for row in rows)
+        names = ", ".join(f"{in_words(row.task)}, {row.metric} {row.figure}" for row in rows)
         reasons.append(f"{a} is worse than {b} by more than {margin}: {names}")
     if comparison.unmeasured:
-        names = ", ".join(comparison.unmeasured)
+        names = ", ".join(map(in_words, comparison.unmeasured))
         reasons.append(
             f"{b} was measured in {names}, but {a} was not, because the compared scenes contain "
             "no relations"

@@ -55,7 +55,7 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
         ("T1b completion", "R-precision", 0, 1),
     )
     (text,) = losses(found, 0.02)
-    assert "MRR (-0.250" in text
+    assert "missing object, MRR -0.250" in text
     assert "hit@1" in text
     assert "R-precision" not in text
     assert found.to_dict()["differences"][0]["verdict"] == "worse"
@@ -81,7 +81,7 @@ def test_what_was_measured_at_relations_gives_way_to_nothing_that_was_not(
     reasons = losses(replace(comparison(("T2 missing", "MRR", -0.1, 0.1)), unmeasured=names), 0.02)
     assert len(reasons) == bool(names)
     for text in reasons:
-        assert "old was measured in T1a relations, T3b placement, but new was not" in text
+        assert "old was measured in relations of a scene, false relation, but new was not" in text
         assert "worse" not in text
 
 
