@@ -29,7 +29,7 @@ _CURVES = (
 
 
 class Display:
-    """A progress bar with epoch, updates, loss, validation scores and remaining time.
+    """A progress bar with epoch, validation scores and remaining time.
 
     Args:
         trainer: the trainer of the run.
@@ -41,7 +41,7 @@ class Display:
         self._trainer = trainer
         self._bar = Progress(
             "[progress.description]{task.description}",
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=12),
             TextColumn("{task.fields[note]}"),
             TimeElapsedColumn(),
             "/",
@@ -72,9 +72,8 @@ class Display:
         """Show the progress after an update of the weights."""
         trainer = self._trainer
         total = trainer.config.training.epochs
-        note = f"epoch {epoch + 1}/{total}, update {trainer.updates:,}, objective {loss:.3f}"
-        if trainer.epochs:
-            note += f", {scores(trainer.epochs[-1])}"
+        state = scores(trainer.epochs[-1]) if trainer.epochs else f"objective {loss:.3f}"
+        note = f"epoch {epoch + 1}/{total}, {state}"
         self._bar.update(self._task, completed=epoch + done, note=note)
 
     def objects(self, done: float) -> None:

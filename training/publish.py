@@ -103,6 +103,7 @@ def publish_run(
         metrics=metrics(rows),
         terms=terms(scenes),
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
+        examples=scenes.examples,
     )
     tensors = {} if offsets is None else offsets.tensors()
     state = machine.state_dict() | tensors

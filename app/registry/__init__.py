@@ -14,6 +14,7 @@ from app.registry.description import (
     VocabularyEntry,
 )
 from app.registry.errors import ArtifactError, RegistryError, StoreError
+from app.registry.examples import Example
 from app.registry.location import open_store
 from app.registry.manifest import Manifest
 from app.registry.models import ArtifactFailure, ModelSet, StoreFailure, load_model_set
@@ -31,6 +32,7 @@ __all__ = [
     "DataSource",
     "Description",
     "EvidenceWeights",
+    "Example",
     "Manifest",
     "Metric",
     "ModelSet",

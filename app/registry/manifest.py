@@ -15,8 +15,9 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator
 
-from app.registry.description import Count, Description, Frozen, Many, Sha256, to_json
+from app.registry.description import Description
 from app.registry.errors import ArtifactError
+from app.registry.fields import Count, Frozen, Many, Sha256, to_json
 from app.registry.offsets import PREFIX
 
 FORMAT: Final = 2

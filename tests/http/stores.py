@@ -12,6 +12,7 @@ from app.registry import (
     Calibration,
     DataSource,
     Description,
+    Example,
     Metric,
     Offsets,
     Store,
@@ -62,6 +63,19 @@ def random_machine(variant: str, seed: int = 0, classes: int = V) -> BoltzmannMa
     return machine.requires_grad_(False)
 
 
+EXAMPLES = (
+    Example.model_validate(
+        {
+            "name": "A bedroom",
+            "scene": {
+                "room_type": "bedroom",
+                "objects": ["bed", {"label": "lamp", "position": {"x": 1, "y": 0.5, "z": 1}}],
+            },
+        }
+    ),
+)
+
+
 def publish(
     root: Path,
     name: str,
@@ -101,6 +115,7 @@ def publish(
             ),
             terms="public domain",
             libraries={"torch": torch.__version__},
+            examples=EXAMPLES if classes == V else (),
         ),
         machine.state_dict() | ({} if offsets is None else offsets.tensors()),
         alias=alias,

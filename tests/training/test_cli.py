@@ -121,7 +121,12 @@ def test_from_rooms_to_answers(tmp_path):
     ("arguments", "message"),
     [
         (("train", "nowhere.toml"), "no configuration"),
-        (("train", "indoor-triway", "--data", "nowhere"), "pass the folder of this file"),
+        (
+            ("train", "indoor-triway", "--data", "nowhere"),
+            "13 of 13 files of scenes are missing in nowhere: sunrgbd.jsonl.gz",
+        ),
+        (("train", "everyday-gbm", "--data", "nowhere"), "`python -m training fetch` says where"),
+        (("fetch", "nowhere"), "neither a source nor a shipped configuration"),
         (("publish", "nowhere", "1.0.0"), "no finished run"),
         (("evaluate", "nowhere", "--store", "nowhere"), "error"),
         (("compare", "nowhere"), "names neither the folder of a finished run nor a model"),

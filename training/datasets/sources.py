@@ -107,8 +107,8 @@ class Source:
         meaning: meaning of unlisted relations. None means `LISTS` for scenes with listed relations
             and `BOXES` for other scenes.
         predicates: maps predicates of the data source to relations of the service. The reader skips
-            other predicates, such as "inside" and "wear". None means that predicates are names of
-            relations, and another predicate is an error.
+            other predicates, such as "inside" and "wear". None means that another predicate is an
+            error. Names of relations are predicates of every source.
         left_out: labels that are ignored because their annotation is too incomplete.
         open_vocabulary: True if annotators used free words. An unlisted class is then absent.
             Otherwise annotators chose labels from a list, and a class outside the list is
@@ -232,7 +232,7 @@ def relation_of(source: str, predicate: str) -> str | None:
         ValueError: the predicate is unknown, and the data source has no table of predicates.
     """
     known = SOURCES.get(source)
-    if known is not None and known.predicates is not None:
+    if known is not None and known.predicates is not None and predicate not in RELATIONS:
         return known.predicates.get(predicate)
     if predicate not in RELATIONS:
         raise ValueError(f"unknown relation {predicate!r}: must be one of {', '.join(RELATIONS)}")

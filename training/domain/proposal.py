@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from app.registry import Example
 from app.scene import Vocabulary, label_key
 from training.config import Config, ConfigError, sections_toml
 from training.datasets import (
@@ -25,6 +26,7 @@ from training.datasets import (
 )
 from training.domain.labels import Label, Lookalike, count_labels, lookalikes
 from training.domain.look import Facts, look
+from training.example_scenes import choose_examples
 
 # Possible minimum numbers of objects of a class, in order of preference. A class with few objects
 # is hardly trained. A small data set needs a small minimum, so that the vocabulary covers enough
@@ -54,6 +56,7 @@ class Proposal:
         values: maps each section of the configuration to its entries.
         reasons: maps "section.entry" to the reason for the value.
         parts: number of scenes in each part of the proposed split.
+        examples: example scenes for the visual page.
     """
 
     name: str
@@ -67,6 +70,7 @@ class Proposal:
     values: dict[str, Any]
     reasons: dict[str, str]
     parts: dict[str, int]
+    examples: tuple[Example, ...]
 
     @property
     def config(self) -> Config:
@@ -77,7 +81,8 @@ class Proposal:
         """Return the configuration as TOML text. A comment above each entry gives the reason."""
         return (
             f"# Proposed by `python -m training init {self.name}`; you can change every entry.\n"
-            "# `python -m training tune` searches for better values on the validation scenes.\n\n"
+            "# `python -m training tune` searches for better values on the validation scenes.\n"
+            "# The published model contains the scenes of examples.json, for the visual page.\n\n"
             f"{sections_toml(self.values, self.reasons)}"
         )
 
@@ -130,6 +135,7 @@ def propose(
     values = {
         "name": name,
         "description": f"{values['machine']['variant'].capitalize()} machine over {name} scenes.",
+        "examples": "examples.json",
         "data": data,
     } | values
     return Proposal(
@@ -144,6 +150,7 @@ def propose(
         values=values,
         reasons=reasons,
         parts=parts,
+        examples=choose_examples(scenes, vocabulary),
     )
 
 
