@@ -137,17 +137,11 @@ class Walk:
 
     def own_model(self) -> None:
         """Train on 300 scenes of a workplace, and promote the model."""
-        record = self._record
-        record.step("Prepare 300 scenes of one's own")
-        self._command("python -m training example scenes.jsonl --scenes 300")
-        self._command('python -m training init my-lab scenes.jsonl --terms "Generated"')
-        record.step("Train")
-        self._command("python -m training train my-lab")
-        record.step("Compare and promote")
-        self._command("python -m training compare runs/my-lab/seed-0 --store my-store")
-        self._command(
-            "python -m training publish runs/my-lab/seed-0 1.0.0 --store my-store --promote"
-        )
+        self._record.step("Train on 300 scenes of one's own, as docs/training.md describes")
+        guide = (ROOT / "docs" / "training.md").read_text("utf-8")
+        for block in re.findall(r"^```sh\n(.*?)^```", guide, re.MULTILINE | re.DOTALL):
+            for command in block.splitlines():
+                self._command(command)
         require(self._served() == "my-lab@1.0.0", "the own model is not promoted")
 
     def own_page(self) -> None:
