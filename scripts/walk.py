@@ -252,9 +252,10 @@ class Walk:
         started = time.monotonic()
         try:
             with urllib.request.urlopen(request, timeout=30) as response:
-                found, answer = response.status, json.load(response)
+                found, content = response.status, response.read()
         except urllib.error.HTTPError as error:
-            found, answer = error.code, json.load(error)
+            found, content = error.code, error.read()
+        answer: dict[str, Any] = json.loads(content)
         shown = json.dumps(answer, indent=1, ensure_ascii=False)
         self._record.block(f"{method} /{path} {text}", shown, time.monotonic() - started)
         require(found == status, f"/{path} has status {found}: {shown}")
