@@ -1,15 +1,15 @@
-"""From somebody's scenes of a domain that no shipped model knows to a served model.
+"""The walk of `scripts/walk.py`, and what a user of its own model does next.
 
-The commands are those of docs/training.md. The scenes are generated: 300 of laboratories,
-workshops and storerooms.
+The scenes are generated: 300 of laboratories, workshops and storerooms.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
+import os
 import re
-import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -21,7 +21,6 @@ from training.cli import app
 
 pytestmark = [pytest.mark.slow, pytest.mark.anyio]
 
-GUIDE = Path(__file__).parents[2] / "docs" / "training.md"
 BENCH = ["electronics bench", "soldering irons", "multimeter", "lab stool"]
 
 
@@ -38,7 +37,6 @@ class Workplace:
         self.folder, self.store = folder, folder / "my-store"
         self.places = ("--runs", folder / "runs")
         self.run = folder / "runs" / "my-lab" / "seed-0"
-        self.told: dict[str, str] = {}
 
     def publish(self, run: Path, version: str, *options: object, code: int = 0) -> str:
         return invoke("publish", run, version, "--store", self.store, *options, code=code)
@@ -58,34 +56,24 @@ class Workplace:
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory) -> Workplace:
-    """What the guide says, command by command."""
-    place = Workplace(tmp_path_factory.mktemp("workplace"))
-    blocks = re.findall(r"^```sh\n(.*?)^```", GUIDE.read_text(encoding="utf-8"), re.M | re.S)
-    lines = [line for block in blocks for line in block.splitlines()]
-    commands = [shlex.split(line.removeprefix("python -m training ")) for line in lines]
-    assert [command[0] for command in commands] == [
-        "example",
-        "init",
-        "train",
-        "compare",
-        "publish",
-    ]
-    with contextlib.chdir(place.folder):
-        for command in commands:
-            place.told[command[0]] = invoke(*command)
-    return place
+def workplace(tmp_path_factory, repository, require_system_tool) -> Workplace:
+    """The folder of a user who took the walk, on a machine without a network."""
+    record = tmp_path_factory.mktemp("walk") / "record"
+    for tool in ("chromium", "ip"):
+        require_system_tool(tool)
+    isolated = [require_system_tool("unshare"), "--net", *([] if os.geteuid() == 0 else ["-r"])]
+    shell = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
+    walk = [sys.executable, "scripts/walk.py", record]
+    subprocess.run([*isolated, *shell, *walk], cwd=repository, check=True)
+    return Workplace(record / "work")
 
 
-def test_every_command_says_what_it_did(workplace) -> None:
-    told = workplace.told
-    assert "300 generated scenes" in told["example"]
-    assert "next:" in told["init"]
-    assert "best epoch" in told["train"]
-    assert "baselines" in told["compare"]
-    assert "removed:" in told["compare"]
-    assert "default is a new alias" in told["publish"]
-    assert "promoted: default → my-lab@1.0.0" in told["publish"]
+def test_the_walk_is_recorded(workplace) -> None:
+    record = (workplace.folder.parent / "walk.md").read_text()
+    for word in ("300 generated scenes", "next:", "best epoch", "removed:", "refused:"):
+        assert word in record
+    for name in re.findall(r"\(([a-z-]+\.png)\)", record):
+        assert (workplace.folder.parent / name).stat().st_size > 20_000
 
 
 def test_the_model_is_worth_having(workplace) -> None:
