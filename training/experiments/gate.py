@@ -81,16 +81,14 @@ class Usefulness:
         reasons = []
         gain, loss = self.differences[POPULARITY], self.differences[CO_OCCURRENCE]
         if not gain.low > 0:
-            advice = "check the labels and the training"
-            if gain.value > 0:
-                advice = "the gain may be chance: provide more scenes, or train longer"
             reasons.append(
                 f"{NEW} is not better than popularity, which only knows how frequent each class "
-                f"is: {_signed(gain)}, {self._place()}; {advice}"
+                f"is: difference {_signed(gain)}, {self._place()}. Check the labels, train longer "
+                "or provide more scenes"
             )
         if loss.high < 0:
             reasons.append(
-                f"{NEW} is worse than EASE, a plain model of co-occurrence: "
+                f"{NEW} is worse than EASE, a plain model of co-occurrence: difference "
                 f"{_signed(loss)}, {self._place()}"
             )
         return reasons
