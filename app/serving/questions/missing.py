@@ -67,6 +67,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         at=at,
         axes=_axes(asked),
         coverage=asked.coverage,
+        details=asked.detail == "full",
     )
     require_size(_size(found), reading, request.limits.answer_bytes, "top_k")
     answer = envelope(asked, request.id, model.reference, reading)
@@ -88,12 +89,23 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
             "label": label,
             "probability": next(numbered),
             "log_odds": next(numbered),
-            "placements": [_placement(place, ids, numbered) for place in placements],
-            "because": reasons(because, ids, numbered),
+            **(_details(placements, because, ids, numbered) if asked.detail == "full" else {}),
         }
         for label, _, _, placements, because in found
     ]
     return answer
+
+
+def _details(
+    placements: Sequence[questions.Placement],
+    because: Sequence[questions.Because],
+    ids: Sequence[str],
+    numbered: Iterator[float],
+) -> Answer:
+    return {
+        "placements": [_placement(place, ids, numbered) for place in placements],
+        "because": reasons(because, ids, numbered),
+    }
 
 
 def _candidates(
@@ -170,6 +182,10 @@ _EXAMPLES: Final = {
     "candidates": Example(
         "only these candidates",
         {**LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3},
+    ),
+    "scores": Example(
+        "probabilities only, for a fast and short answer",
+        {**LABELS, "detail": "scores"},
     ),
     **REFUSED,
     "invalid-request": Example(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from app import questions
@@ -45,6 +45,7 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
         reading.scene,
         sensitivity=asked.sensitivity,
         threshold=asked.threshold,
+        details=asked.detail == "full",
     )
     require_size(_size(found), reading, request.limits.answer_bytes, "objects")
     answer = envelope(asked, request.id, model.reference, reading)
@@ -63,8 +64,7 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
             "probability": next(numbered),
             "log_odds": next(numbered),
             "is_outlier": is_outlier,
-            "because": reasons(because, ids, numbered),
-            "usually_with": list(usually_with),
+            **(_details(because, usually_with, ids, numbered) if asked.detail == "full" else {}),
         }
         for place, label, _, _, is_outlier, because, usually_with in found.outliers
     ]
@@ -77,6 +77,15 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
         for entry in found.misplaced
     ]
     return answer
+
+
+def _details(
+    because: Sequence[questions.Because],
+    usually_with: Sequence[str],
+    ids: Sequence[str],
+    numbered: Iterator[float],
+) -> Answer:
+    return {"because": reasons(because, ids, numbered), "usually_with": list(usually_with)}
 
 
 def _size(found: questions.OutliersFound) -> Callable[[int], int]:
@@ -125,6 +134,10 @@ _EXAMPLES: Final = {
     "threshold": Example(
         "a threshold set by the client",
         {**WITH_TOILET, "threshold": 0.5},
+    ),
+    "scores": Example(
+        "probabilities only, for a fast and short answer",
+        {**WITH_TOILET, "detail": "scores"},
     ),
     **REFUSED,
 }

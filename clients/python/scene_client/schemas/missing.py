@@ -11,9 +11,11 @@ from pydantic import Field
 from scene_client.schemas.answers import Answer, Because, Reply
 from scene_client.schemas.requests import (
     Body,
+    Detail,
     Finite,
     Label,
     Name,
+    OrArray,
     Probability,
     RelationName,
     Request,
@@ -51,8 +53,12 @@ class MissingOptions(Request):
         ),
     ] = None
     at: Annotated[
-        Anchor | None, Field(description="limit the answer to objects missing at this place")
+        Annotated[Anchor, OrArray()] | None,
+        Field(description="limit the answer to objects missing at this place"),
     ] = None
+    detail: Annotated[
+        Detail, Field(description="`scores` leaves `placements` and `because` out of the answer")
+    ] = "full"
 
 
 class MissingRequest(MissingOptions, SceneRequest):
@@ -96,9 +102,9 @@ class Placement(Reply):
     offset: Annotated[
         Offset | None,
         Field(
-            description="offset from `object` in metres. The offset is absent if the training "
-            "scenes have no poses. It is also absent for left, right, front and behind in a map, "
-            "odom or world frame without a viewpoint"
+            description="offset from `object` in metres. The offset is absent if `object` has no "
+            "position, or if the training scenes have no poses. It is also absent for left, right, "
+            "front and behind in a map, odom or world frame without a viewpoint"
         ),
     ] = None
 
@@ -113,14 +119,20 @@ class MissingObject(Reply):
     label: str
     probability: Probability
     log_odds: Finite
-    placements: list[Placement]
+    placements: Annotated[
+        list[Placement],
+        Field(
+            description="the likeliest place, and at most 2 further places with a probability of "
+            "at least 0.3"
+        ),
+    ] = []
     because: Annotated[
         list[Because],
         Field(
-            description="the objects that change the log-odds most, largest change first, at most "
-            "3. Only the first 32 classes of the answer have this list"
+            description="objects that at least double or halve the odds, largest change first, at "
+            "most 3. Only the first 32 classes of the answer have reasons"
         ),
-    ]
+    ] = []
 
 
 class MissingAnswer(Answer):
@@ -140,3 +152,4 @@ class MissingFields(SceneFields, total=False):
     top_k: int
     candidates: Iterable[str]
     at: Anchor | Body | tuple[RelationName, str]
+    detail: Detail
