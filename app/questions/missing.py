@@ -9,7 +9,7 @@ placements.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -42,12 +42,6 @@ _BLOCK: Final = 32
 PLACES: Final = 3
 """Maximum number of placements in the answer for one class."""
 
-LEAST_PLACE: Final = 0.3
-"""Minimum probability of the second and third placement of a class."""
-
-LEAST_CHANGE: Final = math.log(2)
-"""Minimum absolute change of the log-odds by a reason. It doubles or halves the odds."""
-
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
 _UNTURNED: Final = np.eye(3)
 _PER_METRE: Final = 1000.0  # answers are rounded to millimetres
@@ -74,8 +68,7 @@ class Placement(NamedTuple):
         relation: relation from the missing object to the listed object.
         object: index of the listed object in `Scene.objects`.
         probability: probability that the relation holds if the missing object is present.
-        offset: vector from the listed object to the missing object. It is None if it is unknown, or
-            if the listed object has no position.
+        offset: vector from the listed object to the missing object, or None if unknown.
     """
 
     relation: str
@@ -93,10 +86,8 @@ class MissingAnswer(NamedTuple):
             the request names a place, it is the probability that the class is present at this
             place.
         log_odds: log-odds that the class is present, before calibration.
-        placements: likeliest places of the class, likeliest first. Only the first can have a
-            probability below `LEAST_PLACE`.
-        because: listed objects that change the log-odds by at least `LEAST_CHANGE`, in order of the
-            absolute change.
+        placements: likeliest places of the class, likeliest first.
+        because: listed objects that change the log-odds most, in order of the absolute change.
     """
 
     label: str
@@ -172,7 +163,7 @@ def missing(
     standing: Sequence[tuple[Placement, ...]] = [()] * len(found)
     because: Sequence[tuple[Because, ...]] = [()] * len(found)
     if details:
-        standing = placements(artifact, given, found, axes, scene, place)
+        standing = placements(artifact, given, found, axes, place, scene.relations or ())
         because = _reasons(given, found)
     return tuple(
         entries(
@@ -223,11 +214,7 @@ def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, 
     if not len(given.present.classes):
         return [()] * len(found)
     explained = found[:EXPLAINED]
-    strongest = strongest_reasons(given.present.first, given.reasons_for_absent(explained))
-    reasons = [
-        tuple([reason for reason in some if abs(reason.log_odds_change) >= LEAST_CHANGE])
-        for some in strongest
-    ]
+    reasons = strongest_reasons(given.present.first, given.reasons_for_absent(explained))
     return reasons + [()] * (len(found) - len(explained))
 
 
@@ -295,26 +282,25 @@ def placements(
     given: Posterior,
     candidates: NDArray[np.int64],
     axes: Axes | None,
-    scene: Scene,
     at: tuple[int, int, bool] | None = None,
+    stated: Collection[tuple[int, int, int]] = (),
 ) -> list[tuple[Placement, ...]]:
     """Return the likeliest relations of each candidate to the listed objects, likeliest first.
 
     The candidate is subject or object of the relation. Structural classes (floor, wall) are never
     anchors. If a class has several instances, the first instance is the anchor. If an object stands
-    on top of another object, candidates are never placed under the upper object. Placements below
-    `LEAST_PLACE` are left out, except the first placement of a candidate.
+    on top of another object, candidates are never placed under the upper object.
 
     Args:
         artifact: the model.
         given: posterior of the scene.
         candidates: (N,) indices of absent classes.
         axes: viewer's axes, or None; see `offsets_of`.
-        scene: the listed objects and their relations.
         at: the place in the request, as returned by `_place`. It comes first in each result, even
             if other places are likelier. None means that the request names no place.
+        stated: triples (canonical relation, subject, object) between objects of the scene.
     """
-    present, stated = given.present, scene.relations
+    present = given.present
     anchors = np.flatnonzero(~artifact.vocabulary.structure[present.classes])
     if not len(anchors):
         return [()] * len(candidates)
@@ -340,21 +326,20 @@ def placements(
     )
     if asked_p is not None:
         probabilities[:: len(which) // len(candidates)] = asked_p
-    objects = [first[number] for number in anchor.tolist()]
     offsets: Sequence[Offset | None] = [None] * len(which)
-    placed = [scene.objects[number].position is not None for number in objects]
-    if artifact.offsets is not None and any(placed):
+    if artifact.offsets is not None:
         ends = candidates[which], present.classes[anchors[anchor]]
         offsets = offsets_of(artifact.offsets, relations, *ends, outgoing, axes)
-        offsets = [one if known else None for one, known in zip(offsets, placed, strict=True)]
     named = zip(relations.tolist(), outgoing.tolist(), strict=True)
-    names = [(RELATIONS if out else _SEEN_FROM_ANCHORS)[number] for number, out in named]
-    listed = entries(Placement, names, objects, probabilities.tolist(), offsets)
+    listed = entries(
+        Placement,
+        [(RELATIONS if out else _SEEN_FROM_ANCHORS)[number] for number, out in named],
+        [first[number] for number in anchor.tolist()],
+        probabilities.tolist(),
+        offsets,
+    )
     each = len(listed) // len(candidates)
-    return [
-        (listed[k], *[one for one in listed[k + 1 : k + each] if one.probability >= LEAST_PLACE])
-        for k in range(0, len(listed), each)
-    ]
+    return [tuple(listed[k : k + each]) for k in range(0, len(listed), each)]
 
 
 def offsets_of(

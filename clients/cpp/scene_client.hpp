@@ -326,13 +326,22 @@ class Client {
       // Less than 1 ms before the deadline counts as late: it is too short for a retry.
       const bool late = Clock::now() + std::chrono::milliseconds(1) >= ends;
       outcome.kind = late ? Outcome::Late : Outcome::Lost;
-      outcome.reason = httplib::to_string(result.error());
+      outcome.reason = worded(result.error());
       return outcome;
     }
     outcome.status = result->status;
     outcome.reason = result->reason;
     outcome.headers = result->headers;
     return outcome;
+  }
+
+  static std::string worded(httplib::Error error) {
+    switch (error) {
+      case httplib::Error::Connection: return "connection refused, or unknown host";
+      case httplib::Error::Read: return "the connection broke before the answer was complete";
+      case httplib::Error::Write: return "the connection broke before the request was complete";
+      default: return httplib::to_string(error);
+    }
   }
 
   // Random pause; its maximum doubles with each attempt, up to kLongestPause seconds.

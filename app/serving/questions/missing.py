@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final
@@ -36,6 +37,8 @@ from app.serving.request import Request
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
 _OFFSET_BYTES = 250
+_LEAST_PLACE: Final = 0.3  # minimum probability of the second and third placement of a class
+_LEAST_CHANGE: Final = math.log(2)  # a reason at least doubles or halves the odds
 
 
 async def missing(request: Request, asked: MissingRequest) -> Answer:
@@ -69,6 +72,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         coverage=asked.coverage,
         details=asked.detail == "full",
     )
+    found = tuple([_notable(entry, reading.scene) for entry in found])
     require_size(_size(found), reading, request.limits.answer_bytes, "top_k")
     answer = envelope(asked, request.id, model.reference, reading)
     coverage = asked.coverage
@@ -94,6 +98,17 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         for label, _, _, placements, because in found
     ]
     return answer
+
+
+def _notable(entry: questions.MissingAnswer, scene: Scene) -> questions.MissingAnswer:
+    """Leave out unlikely placements, weak reasons, and offsets from objects without a position."""
+    places = [
+        place if scene.objects[place.object].position is not None else place._replace(offset=None)
+        for place in entry.placements
+    ]
+    likely = [place for place in places[1:] if place.probability >= _LEAST_PLACE]
+    because = [one for one in entry.because if abs(one.log_odds_change) >= _LEAST_CHANGE]
+    return entry._replace(placements=(*places[:1], *likely), because=tuple(because))
 
 
 def _details(
