@@ -37,7 +37,7 @@ class Caller(Protocol):
 
 def _plain(answer: Any) -> Any:
     if isinstance(answer, BaseModel):
-        return json.loads(answer.model_dump_json(exclude_none=True))
+        return json.loads(answer.model_dump_json(exclude_unset=True))
     return answer
 
 

@@ -89,7 +89,7 @@ def test_json_is_the_service_s_answer(
     with Client(url) as client:
         expected = getattr(client, question)(objects, **fields)
     assert found == {
-        **json.loads(expected.model_dump_json(exclude_none=True)),
+        **json.loads(expected.model_dump_json(exclude_unset=True)),
         "request_id": found["request_id"],
     }
 

@@ -317,7 +317,7 @@ def test_a_fault_is_pointed_at_in_the_message_or_the_kept_scene(live: LiveServic
     cases: list[tuple[dict[str, Any], str]] = [
         ({"objects": ["bad"]}, "#/objects/0"),
         ({"objects": [{"id": "a", "label": "bad"}]}, "#/objects/0/label"),
-        ({"objects": ["bed", "bed"]}, "#/objects/1/id"),
+        ({"objects": ["bed", "bed"]}, "#/objects/1"),
         ({"remove": ["bed", "nobody"]}, "#/remove/1"),
         ({"room_type": "cellar"}, "#/room_type"),
         ({"relations": [pair | {"relation": "left", "object": "sofa"}]}, "#/relations/0/object"),

@@ -115,7 +115,7 @@ class Asked:
         """Ask a question, and print the answer as JSON or as a table."""
         answer = self.ask(question)
         if self.as_json:
-            print(answer.model_dump_json(exclude_none=True))
+            print(answer.model_dump_json(exclude_unset=True))
             return answer
         console = Console(markup=False, highlight=False, emoji=False)
         if not console.is_terminal:
