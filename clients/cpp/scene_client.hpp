@@ -263,23 +263,23 @@ class Client {
     const auto late = [&] {
       std::ostringstream what;
       what << address_.server << path << " did not answer within " << timeout.count() << " s";
-      return DeadlineError(what.str());
+      return what.str();
     };
     for (int attempt = 0;; ++attempt) {
       const Seconds left = ends - Clock::now();
-      if (left.count() <= 0) throw late();
+      if (left.count() <= 0) throw DeadlineError(late());
       auto outcome = send(method, path, body, ends, left);
       // A valid answer after the deadline is an error, too: the caller relies on the deadline.
       const bool fine = outcome.kind == Outcome::Received && outcome.status == 200;
       if (outcome.kind == Outcome::Late || (fine && Clock::now() >= ends))
-        throw late();
+        throw DeadlineError(late());
       if (fine) return outcome;
 
       Seconds pause = pause_after(attempt);
       std::optional<ProblemError> problem;
       if (outcome.kind == Outcome::Received) {
         problem = problem_of(outcome);
-        if (problem->status == 504) throw DeadlineError(problem->what());
+        if (problem->status == 504) throw DeadlineError(late() + ": " + problem->detail);
         if (problem->status != 429 && problem->status != 503) throw *problem;
         // The random pause comes on top of Retry-After, so that clients do not retry all at once.
         if (problem->retry_after) pause += *problem->retry_after;

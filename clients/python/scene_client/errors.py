@@ -149,7 +149,7 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
         "about:blank",
         status,
         title,
-        "The answer does not come from the service, but for example from a proxy.",
+        "The answer comes from another server, for example from a proxy.",
         request_id=headers.get("x-request-id", ""),
         retry_after=retry_after,
     )
