@@ -374,7 +374,7 @@ async def test_a_client_is_told_and_goes_on(live: LiveService) -> None:
         assert told.value.seq == refused
         assert told.value.problem.type == "/problems/unknown-labels"
         assert "#/objects/0: the model does not know this label" in str(told.value)
-        with pytest.raises(InvalidRequestError, match="#/relations/0/1: must be .*mean on-top"):
+        with pytest.raises(InvalidRequestError, match=r"#/relations/0/1: must be .*mean on-top"):
             await stream.update(relations=[("bed", "on_top", "bed")])
         sent = await stream.replace(["bed", "desk"])
         async for answer in stream:
