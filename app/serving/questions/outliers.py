@@ -118,13 +118,10 @@ _EXAMPLES: Final = {
     "intruder": Example("a toilet in a bedroom", WITH_TOILET),
     **SCENES,
     "misplaced": Example(
-        "relations that the request states and that may be wrong",
+        "relations that the request states, as arrays, and that may be wrong",
         {
             "objects": ["bed", "pillow", "nightstand"],
-            "relations": [
-                {"subject": "pillow", "relation": "on-top", "object": "bed"},
-                {"subject": "bed", "relation": "on-top", "object": "nightstand"},
-            ],
+            "relations": [["pillow", "on-top", "bed"], ["bed", "on-top", "nightstand"]],
         },
     ),
     "sensitivity": Example(
