@@ -83,9 +83,9 @@ async def test_placements_have_offsets_in_the_axes_of_the_frame(
 
 
 def listed(wanted: questions.MissingAnswer) -> list[questions.Placement]:
-    """The placements in the answer: the first, and further ones with p of at least 0.3."""
-    first, *others = wanted.placements
-    return [first, *[place for place in others if place.probability >= 0.3]]
+    """The placements in the answer: the first, and others at least 3/4 as probable."""
+    least = 0.75 * wanted.placements[0].probability
+    return [place for place in wanted.placements if place.probability >= least]
 
 
 async def test_an_object_without_a_position_has_no_offset(client: httpx.AsyncClient) -> None:

@@ -120,9 +120,9 @@ async def test_placements_name_objects_of_the_scene(client: httpx.AsyncClient) -
 async def test_only_likely_places_and_strong_reasons_are_listed(
     client: httpx.AsyncClient, replace: Replace
 ) -> None:
-    """The first place, further ones with p of at least 0.3, reasons that double or halve odds."""
-    places = [questions.Placement("left", 0, p) for p in (0.1, 0.299, 0.3)]
-    because = [questions.Because(0, change) for change in (-0.7, 0.7, 0.69)]
+    """Places at least 3/4 as probable as the first, reasons that change odds by a factor of 3."""
+    places = [questions.Placement("left", 0, p) for p in (0.4, 0.31, 0.29)]
+    because = [questions.Because(0, change) for change in (-1.1, 1.1, 1.09)]
 
     def detailed(missing: Any, *args: Any, **parameters: Any) -> Any:
         found = missing(*args, **parameters)
@@ -130,8 +130,8 @@ async def test_only_likely_places_and_strong_reasons_are_listed(
 
     replace("missing", detailed)
     for entry in (await ask(client, "missing", **SCENE))["missing"]:
-        assert [place["probability"] for place in entry["placements"]] == [0.1, 0.3]
-        assert [reason["log_odds_change"] for reason in entry["because"]] == [-0.7, 0.7]
+        assert [place["probability"] for place in entry["placements"]] == [0.4, 0.31]
+        assert [reason["log_odds_change"] for reason in entry["because"]] == [-1.1, 1.1]
 
 
 @pytest.mark.parametrize(

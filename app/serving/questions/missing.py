@@ -37,8 +37,8 @@ from app.serving.request import Request
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
 _OFFSET_BYTES = 250
-_LEAST_PLACE: Final = 0.3  # minimum probability of the second and third placement of a class
-_LEAST_CHANGE: Final = math.log(2)  # a reason at least doubles or halves the odds
+_LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
+_LEAST_CHANGE: Final = math.log(3)  # substantial evidence: a Bayes factor of at least 3
 
 
 async def missing(request: Request, asked: MissingRequest) -> Answer:
@@ -101,14 +101,15 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
 
 
 def _notable(entry: questions.MissingAnswer, scene: Scene) -> questions.MissingAnswer:
-    """Leave out unlikely placements, weak reasons, and offsets from objects without a position."""
+    """Leave out less likely places, weak reasons, and offsets from objects without a position."""
     places = [
         place if scene.objects[place.object].position is not None else place._replace(offset=None)
         for place in entry.placements
     ]
-    likely = [place for place in places[1:] if place.probability >= _LEAST_PLACE]
+    least = _LEAST_SHARE * places[0].probability if places else 0.0
+    likely = [place for place in places if place.probability >= least]
     because = [one for one in entry.because if abs(one.log_odds_change) >= _LEAST_CHANGE]
-    return entry._replace(placements=(*places[:1], *likely), because=tuple(because))
+    return entry._replace(placements=tuple(likely), because=tuple(because))
 
 
 def _details(

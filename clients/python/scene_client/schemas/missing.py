@@ -122,15 +122,15 @@ class MissingObject(Reply):
     placements: Annotated[
         list[Placement],
         Field(
-            description="the likeliest place, and at most 2 further places with a probability of "
-            "at least 0.3"
+            description="the likeliest place, and at most 2 further places that are at least 3/4 "
+            "as probable. With `at`, this place comes first"
         ),
     ] = []
     because: Annotated[
         list[Because],
         Field(
-            description="objects that at least double or halve the odds, largest change first, at "
-            "most 3. Only the first 32 classes of the answer have reasons"
+            description="objects that change the odds by a factor of at least 3, largest change "
+            "first, at most 3. Only the first 32 classes of the answer have reasons"
         ),
     ] = []
 
