@@ -445,6 +445,8 @@ def addresses() -> Iterator[Hostile]:
                 expected = frozenset({200, 400, 404, 405})
                 yield Hostile(f"GET {path[:80]}", path, b"", "GET", expected=expected)
     for name in names:
+        if name == NUMBER:
+            continue  # would create this alias, and errors list all aliases
         path = f"/models/aliases/{name}"
         body = b'{"model": "home@1.1.0"}'
         expected = frozenset({200, 404, 405, 409, 422})
