@@ -84,10 +84,11 @@ format: $(EVERYTHING)  ## format the sources and generate the blocking client
 	$(BIN)/python -m ruff format .
 	$(BIN)/python scripts/sync_client.py
 
-bench: $(EVERYTHING)  ## run the benchmarks, then load tests of the service, a plain FastAPI app and a stream
+bench: $(EVERYTHING)  ## run the benchmarks, then load tests of the service, a plain FastAPI app, a stream and DDS
 	$(BIN)/python -m benchmarks $(ARGS)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.load)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.stream)
+	$(if $(ARGS),,$(BIN)/python -m benchmarks.dds)
 
 lock: $(BIN)/python  ## resolve the dependencies of pyproject.toml into requirements*.lock
 	$(BIN)/python scripts/lock.py $(INDEX) $(ARGS)
@@ -98,7 +99,7 @@ clean:  ## remove the environment and all caches
 
 $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing the service's packages into $(VENV) ..."
-	@$(PIP) install -qq -r requirements.lock
+	@$(PIP) install -r requirements.lock
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@echo "Compiling kernels for this machine ..."
 	@$(BIN)/python -m app.compile

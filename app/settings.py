@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from importlib.util import find_spec
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
@@ -32,6 +33,10 @@ def _is_installed(module: str) -> bool:
 
 def _lower(value: object) -> object:
     return value.strip().lower() if isinstance(value, str) else value
+
+
+def _format_of_stderr() -> Literal["json", "plain"]:
+    return "plain" if sys.stderr.isatty() else "json"
 
 
 def _words(value: object) -> object:
@@ -292,7 +297,14 @@ class Settings(BaseSettings):
     log_level: Annotated[
         Literal["debug", "info", "warning", "error", "critical"], BeforeValidator(_lower)
     ] = "info"
-    log_format: Annotated[Literal["json", "plain"], BeforeValidator(_lower)] = "json"
+    log_format: Annotated[
+        Literal["json", "plain"],
+        BeforeValidator(_lower),
+        Field(
+            default_factory=_format_of_stderr,
+            description="by default, `plain` on a terminal, else `json`",
+        ),
+    ]
     access_log: Annotated[bool, Field(description="log one line per request, without payload")] = (
         True
     )

@@ -8,7 +8,8 @@ as the prediction:
     objects     one class is removed from this scan. The classes of the other scan predict the
                 removed class. Metric: mean reciprocal rank (MRR), as expectation over ties
 
-Run as `python -m scripts.ceiling [FOLDER] [SOURCE]`.
+Run as `python -m scripts.ceiling [FOLDER] [SOURCE]`. `python -m training fetch` says what belongs
+into the folder.
 """
 
 from __future__ import annotations

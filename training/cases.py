@@ -7,7 +7,7 @@ therefore gets the same questions, whether the evaluation uses one data source o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 from zlib import crc32
 
 import numpy as np
@@ -22,6 +22,10 @@ from training.datasets.sources import meaning_of
 
 Triple: TypeAlias = tuple[int, int, int]
 
+MOST: Final = 12
+"""Largest number of instances that is told apart. It stands for larger numbers too."""
+
+_LISTED: Final = (0.25, 0.5, 0.75, 1.0)
 _VERTICAL = [CANONICAL.index("on-top"), CANONICAL.index("above")]
 
 
@@ -106,6 +110,41 @@ def told_pairs(
     plain = ~structure[encoded.instance_classes]
     triples = np.argwhere(encoded.instance_holds & told & plain[:, None] & plain).tolist()
     return ~told, [(int(a), int(x), int(y)) for a, x, y in triples]
+
+
+class Part(NamedTuple):
+    """A part of a scene that a robot could list.
+
+    Attributes:
+        classes: (n,) listed classes without structure, in ascending order.
+        listed: (n,) number of listed instances of each class, from 1 to `number`.
+        number: (n,) number of instances of each class in the scene, at most `MOST`.
+        room: index of the room type. -1 means that the room type is unknown.
+    """
+
+    classes: NDArray[np.int64]
+    listed: NDArray[np.int64]
+    number: NDArray[np.int64]
+    room: int
+
+
+def some_instances(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> Part:
+    """Draw a part of a scene to list.
+
+    The part contains 25, 50, 75 or 100 % of the classes. Half of the parts list one instance of
+    each class. The other parts list any number of instances with equal probability, from one to all
+    instances. Half of the parts state the room type.
+    """
+    plain = np.flatnonzero(~structure[encoded.evidence.classes])
+    share = _LISTED[rng.integers(len(_LISTED))]
+    kept = np.sort(rng.permutation(plain)[: max(1, int(share * len(plain) + 0.5))])
+    number = np.minimum(encoded.evidence.counts[kept], MOST)
+    one = rng.random() < 0.5
+    listed = np.ones_like(number) if one else rng.integers(1, number + 1)
+    room = encoded.room_type if rng.random() < 0.5 else -1
+    return Part(encoded.evidence.classes[kept], listed, number, room)
 
 
 def occupied_place(

@@ -7,12 +7,13 @@ command then continues the run.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import torch
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -35,20 +36,31 @@ from training.distributed import is_first, process_group
 from training.domain.command import example, fail, init
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
+from training.evaluation.tasks import in_words
+from training.example_scenes import read_examples
 from training.experiments.ablate import ablate
 from training.experiments.benchmark import benchmark
-from training.experiments.compare import Comparison, compare_command, show
-from training.experiments.gate import MARGIN, WorseError, judge, seat
+from training.experiments.compare import compare_command, show
+from training.experiments.gate import (
+    MARGIN,
+    RefusedError,
+    compare_with_served,
+    losses,
+    measure_usefulness,
+    seat,
+)
 from training.experiments.tune import tune
+from training.fetch import fetch
 from training.live import Display, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
-from training.publish import publish_run
+from training.publish import publish_run, refit
 from training.runs import FinishedRun, RunError, load_run, save_run
 from training.trainer import Trainer
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 app.command()(example)
 app.command()(init)
+app.command()(fetch)
 app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
@@ -60,7 +72,7 @@ Data = Annotated[
     typer.Option(
         "--data",
         help="folder with the scene files; default: the folder of your configuration file, or "
-        f"{DATA} for a shipped configuration",
+        f"{DATA} for a shipped configuration (`fetch` says what belongs there)",
     ),
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
@@ -121,7 +133,13 @@ def train(
 
 @app.command()
 def publish(
-    folder: Annotated[Path, typer.Argument(help="folder of a finished training run")],
+    folder: Annotated[
+        str,
+        typer.Argument(
+            help="folder of a finished training run; or name@version of a published model, whose "
+            "statistics are fitted again"
+        ),
+    ],
     version: Annotated[str, typer.Argument(help="number of the new version, such as 1.0.0")],
     data: Data = None,
     store: StorePath = _STORE,
@@ -131,7 +149,7 @@ def publish(
         typer.Option(
             "--promote",
             help="point the alias `default` (or --alias) at the new version, unless the new "
-            "version is worse than the served version",
+            "version is useless or worse than the served version",
         ),
     ] = False,
     margin: Annotated[
@@ -144,17 +162,25 @@ def publish(
         int, typer.Option(min=2, help="with --promote: number of scenes for the comparison")
     ] = 300,
 ) -> None:
-    """Calibrate, evaluate and publish a finished run.
+    """Calibrate, evaluate and publish a finished run, or refit the statistics of a version.
 
-    With --promote, the command first compares the new version with the version that the alias
-    serves. The comparison uses test scenes that neither version was trained on. The command refuses
-    the new version if a primary metric is worse by more than the margin. The loss counts as worse
-    if the whole 95 % interval of the paired difference exceeds the margin. The command also refuses
-    the new version if only the served version has results for relations. A refused version is not
-    published, and the exit code is 3.
+    With name@version, the command fits the offsets and the counts of instances again. The new
+    version keeps weights, calibration and metrics of the old version.
+
+    With --promote, the command first compares the new version with two baselines on the test scenes
+    of the run: it must rank missing objects better than popularity, and not worse than EASE
+    (co-occurrence). Then it compares the new version with the version that the alias serves, on
+    test scenes that neither version was trained on. The command refuses the new version if the
+    whole 95 % interval of the loss in a primary metric exceeds the margin, or if only the served
+    version has results for relations. A refused version is not published, and the exit code is 3.
     """
     try:
-        run = load_run(folder)
+        if "@" in folder and not Path(folder).is_dir():
+            if promote:
+                raise ConfigError("--promote compares training runs; use --alias with name@version")
+            _refit(folder, data or DATA, open_for_publisher(store), version, alias)
+            return
+        run = load_run(Path(folder))
         root = data or (Path(run.data) if run.data else DATA)
         scenes = _prepare(run.config, root)
         if promote:
@@ -162,8 +188,7 @@ def publish(
             _promote(run, scenes, root, open_for_publisher(store), version, gate)
         else:
             _publish(run, scenes, store, version, alias)
-    except WorseError as error:
-        show(error.comparison, console)
+    except RefusedError as error:
         console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
         console.print("nothing was published; --even-if-worse publishes and promotes it anyway")
         raise typer.Exit(3) from None
@@ -245,9 +270,10 @@ def list_command(store: StorePath = _STORE) -> None:
 def _prepare(config: Config, data: Path) -> SplitScenes:
     with console.status("reading and encoding scenes"):
         scenes = prepare(config, data)
+    examples = read_examples(config.examples, data, scenes.vocabulary)
     sizes = ", ".join(f"{len(some)} {part}" for part, some in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
-    return scenes
+    return replace(scenes, examples=examples)
 
 
 def _train(
@@ -297,6 +323,13 @@ def _publish(
     _published(artifact)
 
 
+def _refit(reference: str, root: Path, store: Store, version: str, alias: str | None) -> None:
+    artifact = store.load(*store.resolve(reference))
+    with console.status("publishing") as status:
+        artifact = refit(artifact, root, store, version, alias=alias, progress=status.update)
+    _published(artifact)
+
+
 def _published(artifact: Artifact) -> None:
     manifest = artifact.manifest
     console.print(f"published {manifest.name}@{manifest.version}, digest {artifact.digest[:12]}")
@@ -315,35 +348,33 @@ class _Gate:
 def _promote(
     run: FinishedRun, scenes: SplitScenes, root: Path, store: Store, version: str, gate: _Gate
 ) -> None:
-    """Publish the version and point the alias at it, unless the served version is better."""
+    """Publish the version and point the alias at it, unless the gate refuses the version."""
     before = seat(store, gate.alias)
-    found: list[Comparison] = []
     with console.status("publishing") as status:
 
         def judged(artifact: Artifact) -> None:
-            if before.holder is None:
-                return
-            try:
-                found.append(
-                    judge(
-                        *(run, scenes, artifact, before.holder, root),
-                        margin=gate.margin,
-                        limit=gate.limit,
-                        say=status.update,
+            limit, say = gate.limit, status.update
+            useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
+            for line in useful.lines():
+                console.print(line, highlight=False)
+            reasons = useful.objections()
+            if before.holder is not None and (gate.even_if_worse or not reasons):
+                try:
+                    comparison = compare_with_served(
+                        *(run, scenes, artifact, before.holder, root), limit=limit, say=say
                     )
-                )
-            except WorseError as error:
-                if not gate.even_if_worse:
-                    raise
-                found.append(error.comparison)
-            except ConfigError as error:
-                if not gate.even_if_worse:
-                    raise
-                console.print(f"the versions were not compared: {error}", soft_wrap=True)
+                    show(comparison, console)
+                    reasons += losses(comparison, gate.margin)
+                except ConfigError as error:
+                    if not gate.even_if_worse:
+                        raise
+                    console.print(f"the versions were not compared: {error}", soft_wrap=True)
+            if reasons and not gate.even_if_worse:
+                raise RefusedError(reasons)
+            for reason in reasons:
+                console.print(f"accepted by --even-if-worse: {reason}", soft_wrap=True)
 
         artifact = publish_run(run, scenes, store, version, judge=judged, progress=status.update)
-    for comparison in found:
-        show(comparison, console)
     if before.note:
         console.print(before.note, soft_wrap=True)
     _published(artifact)
@@ -355,14 +386,16 @@ def _promote(
 
 
 def _show(tables: dict[str, list[Row]]) -> None:
-    figures: dict[tuple[str, str, str], dict[str, str]] = {}
+    figures: dict[str, dict[tuple[str, str], dict[str, str]]] = {}
     for name, rows in tables.items():
         for row in rows:
-            key = (row.task, row.source, row.metric)
-            figures.setdefault(key, {})[name] = str(row.figure)
-    table = Table("task", "source", "metric", *tables)
-    for key, values in sorted(figures.items()):
-        table.add_row(*key, *(values.get(name, "") for name in tables))
+            lines = figures.setdefault(row.task, {})
+            lines.setdefault((row.metric, row.source), {})[name] = str(row.figure)
+    table = Table("task, metric", "source", *tables, box=box.SIMPLE_HEAD)
+    for task, lines in sorted(figures.items()):
+        table.add_row(f"[bold]{in_words(task)}[/bold]")
+        for (metric, source), values in lines.items():
+            table.add_row(f"  {metric}", source, *(values.get(name, "") for name in tables))
     console.print(table)
 
 

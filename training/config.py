@@ -197,6 +197,13 @@ class Config(_Section):
 
     name: str = Field(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")
     description: str = ""
+    # An empty value is left out of the dump, so that digests of earlier runs stay valid.
+    examples: str = Field(
+        default="",
+        exclude_if=lambda name: not name,
+        description="example scenes for the visual page: indoor, everyday, or a file in the data "
+        "folder that ends in .json; empty: none",
+    )
     data: DataConfig
     machine: MachineConfig
     objective: ObjectiveConfig

@@ -10,6 +10,7 @@ Without `torchrun`, there is one process, and all functions return their input u
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
@@ -37,6 +38,8 @@ def process_group() -> Iterator[None]:
     try:
         yield
     finally:
+        # A DistributedDataParallel module that outlives the group can abort the process at its end.
+        gc.collect()
         dist.destroy_process_group()
 
 

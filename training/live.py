@@ -29,7 +29,7 @@ _CURVES = (
 
 
 class Display:
-    """A progress bar with epoch, updates, loss, validation scores and remaining time.
+    """A progress bar with epoch, validation scores and remaining time.
 
     Args:
         trainer: the trainer of the run.
@@ -41,7 +41,7 @@ class Display:
         self._trainer = trainer
         self._bar = Progress(
             "[progress.description]{task.description}",
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=12),
             TextColumn("{task.fields[note]}"),
             TimeElapsedColumn(),
             "/",
@@ -72,9 +72,8 @@ class Display:
         """Show the progress after an update of the weights."""
         trainer = self._trainer
         total = trainer.config.training.epochs
-        note = f"epoch {epoch + 1}/{total}, update {trainer.updates:,}, objective {loss:.3f}"
-        if trainer.epochs:
-            note += f", {scores(trainer.epochs[-1])}"
+        state = scores(trainer.epochs[-1]) if trainer.epochs else f"objective {loss:.3f}"
+        note = f"epoch {epoch + 1}/{total}, {state}"
         self._bar.update(self._task, completed=epoch + done, note=note)
 
     def objects(self, done: float) -> None:
@@ -156,12 +155,16 @@ def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: C
         table.add_row(title, sparkline(values), *(f"{value:.3f}" for value in ends))
     console.print(table)
     updates = (result.best_epoch + 1) * trainer.steps_per_epoch
+    stopped = len(result.epochs) < trainer.config.training.epochs
+    idle = len(result.epochs) - 1 - result.best_epoch
     console.print(
         f"best epoch {result.best_epoch + 1} of {len(result.epochs)} (update {updates:,}) in "
         f"{result.seconds:.0f} s: {scores(best)}; curve in {folder / 'curve.png'}",
         soft_wrap=True,
     )
-    if advice := _advice(result):
+    if stopped:
+        console.print(f"stopped early: {idle} epochs without a better score on validation scenes")
+    elif advice := _advice(result):
         console.print(advice, soft_wrap=True)
     console.print(
         f"next: python -m training compare {folder}\n"

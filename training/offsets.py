@@ -155,7 +155,7 @@ def _pairs(seen: Seen) -> Pairs:
         return_inverse=True,
         return_counts=True,
     )
-    weight = _balance(seen) / size[group.reshape(-1)]
+    weight = source_weights(seen.source, seen.scene) / size[group.reshape(-1)]
     P, weights = len(found), weight[:, None]
     n = _sums(pair, weights, P)
     mean = _sums(pair, weights * seen.offset, P) / n
@@ -172,13 +172,16 @@ def _sums(group: Ints, values: Floats, groups: int) -> Floats:
     return found
 
 
-def _balance(seen: Seen) -> Floats:
-    """Return weights of the offsets, (offsets,), that balance large and small data sources."""
-    count = np.array(
-        [len(np.unique(seen.scene[seen.source == s])) for s in range(seen.source.max() + 1)]
-    )
+def source_weights(source: Ints, scene: Ints) -> Floats:
+    """Return weights of N items, (N,), that balance large and small data sources.
+
+    Args:
+        source: (N,) index of the data source of each item.
+        scene: (N,) index of the scene of each item.
+    """
+    count = np.array([len(np.unique(scene[source == s])) for s in range(source.max() + 1)])
     least = count[count >= _FEW].min(initial=count.max())
-    weight: Floats = np.minimum(1.0, least / np.maximum(count, 1))[seen.source]
+    weight: Floats = np.minimum(1.0, least / np.maximum(count, 1))[source]
     return weight
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from app.registry import Example
 from app.scene import CANONICAL, Vocabulary
 from training.batches import SceneTensors, scene_tensors
 from training.config import DATA, Config, ConfigError, DataConfig, is_file, is_sharded, source_name
@@ -30,6 +31,7 @@ from training.datasets import (
     split,
     with_typical_sizes,
 )
+from training.datasets.origins import WORDS, file_of
 from training.datasets.words import class_vectors, read_word_vectors
 from training.shards import Shards, read_shard, shard_files, shards_digest
 from training.trainer import TrainingData
@@ -47,6 +49,7 @@ class SplitScenes:
         shuffle: seed of the permutation of objects; None if the objects are not permuted.
         words: (V, D) unit word vectors of the classes; None without word vectors.
         shards: files of a sharded source, of which `parts` are a sample.
+        examples: example scenes for the artifact.
     """
 
     data: DataConfig
@@ -57,6 +60,7 @@ class SplitScenes:
     shuffle: int | None = None
     words: torch.Tensor | None = None
     shards: tuple[str, ...] = ()
+    examples: tuple[Example, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -132,6 +136,7 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
         ConfigError: a file is missing.
         DatasetError: a file is invalid.
     """
+    _require_files(data, root)
     scenes: dict[str, list[AnnotatedScene]] = {}
     for source in data.sources:
         name = source_name(source)
@@ -144,20 +149,38 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
         elif source == "rooms":
             found = generate_rooms(data.rooms, seed=data.split_seed)
         elif source == priors.SOURCE:
-            found = priors.read_prior_scenes(root / "extra" / f"{source}.tsv.gz")
+            found = priors.read_prior_scenes(file_of(source, root))
         else:
-            path = root / (source if is_file(source) else f"{source}.jsonl.gz")
-            extra = root / "extra" / path.name
-            if not is_file(source) and not path.is_file() and extra.is_file():
-                path = extra
-            if not path.is_file():
-                raise ConfigError(
-                    f"there is no {path.name} in {path.parent}: pass the folder of this file with "
-                    "--data"
-                )
+            path = _path(source, root)
             found = [replace(scene, source=name) for scene in read_scenes(path)]
         scenes[name] = found[: data.limit]
     return scenes
+
+
+def _path(source: str, root: Path) -> Path:
+    return root / source if is_file(source) else file_of(source, root)
+
+
+def _require_files(data: DataConfig, root: Path) -> None:
+    """Raise ConfigError if a file of a source, or the file of word vectors, is missing."""
+    paths = {
+        source: _path(source, root)
+        for source in data.sources
+        if source != "rooms" and not is_sharded(source)
+    }
+    if data.words:
+        paths[WORDS] = root / data.words
+    missing = {source: path for source, path in paths.items() if not path.is_file()}
+    if not missing:
+        return
+    names = ", ".join(path.relative_to(root).as_posix() for path in missing.values())
+    text = f"{len(missing)} of {len(paths)} files of scenes are missing in {root}: {names}. "
+    if not all(map(is_file, missing)):
+        text += (
+            "The repository does not contain the public data sets. `python -m training fetch` says "
+            "where each of them is to be had. "
+        )
+    raise ConfigError(f"{text}Pass the folder of the files with --data")
 
 
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
@@ -254,5 +277,10 @@ def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
 
 
 def prepare(config: Config, root: Path) -> SplitScenes:
-    """Read the scenes of a configuration from the folder `root`, split and encode them."""
+    """Read the scenes of a configuration from the folder `root`, split and encode them.
+
+    Raises:
+        ConfigError: a file is missing, or the vocabulary is invalid.
+        DatasetError: a file of scenes is invalid.
+    """
     return split_and_encode(config.data, read_sources(config.data, root), root=root)

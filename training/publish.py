@@ -1,10 +1,11 @@
-"""Publish a finished training run as a new model version in the store."""
+"""Publish a new model version: a finished training run, or a version with refitted statistics."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,22 +19,24 @@ from app.registry import (
     DataSource,
     Description,
     Metric,
-    Offsets,
     Store,
     VocabularyEntry,
 )
 from app.scene import Vocabulary
 from training.calibrate import calibrate
-from training.config import DataConfig
+from training.config import Config, DataConfig, load_config, shipped_configs
+from training.counts import fit_counts
 from training.datasets.sources import SOURCES
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
+from training.evaluation.tasks import STATISTICS
+from training.example_scenes import read_examples
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
 from training.offsets import fit_offsets
 from training.oracle.drawn import DrawnPosterior
-from training.pipeline import SplitScenes
-from training.runs import FinishedRun
+from training.pipeline import SplitScenes, read_sources, split_and_encode
+from training.runs import FinishedRun, RunError
 from training.trainer import TrainingData
 
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
@@ -50,7 +53,7 @@ def publish_run(
     judge: Callable[[Artifact], None] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Artifact:
-    """Calibrate on validation scenes, fit offsets to training scenes, evaluate, and publish.
+    """Calibrate on validation scenes, fit statistics to training scenes, evaluate, and publish.
 
     The store keeps weights in half precision. Calibration and evaluation use the same precision.
 
@@ -75,18 +78,17 @@ def publish_run(
     data = scenes.training_data()
     machine = as_stored(run.machine)
     progress("calibrating")
-    relations = machine.spec.A
-    offsets = fit_offsets(scenes.parts["train"], len(scenes.vocabulary))
     if measured is None:
-        calibrated = calibrated_draft(run, scenes.vocabulary, data, offsets)
-        asked, test = calibrated, data
+        calibrated = calibrated_draft(run, scenes.vocabulary, data)
+        asked = calibrated = with_statistics(calibrated, scenes)
+        test = data
     else:
         other, kept_back = measured
         other.require(kept_back.digest)
         test = kept_back.training_data()
         asked = calibrated_draft(other, kept_back.vocabulary, test)
-        calibrated = calibrated_draft(run, scenes.vocabulary, data, offsets, asked.calibration)
-    calibration = calibrated.calibration
+        calibrated = calibrated_draft(run, scenes.vocabulary, data, asked.calibration)
+        asked, calibrated = with_statistics(asked, kept_back), with_statistics(calibrated, scenes)
     if judge is not None:
         judge(calibrated)
     rows = _measure(asked, test, progress)
@@ -94,26 +96,112 @@ def publish_run(
     description = Description(
         name=run.config.name,
         version=version,
-        created=datetime.now(UTC).replace(microsecond=0),
+        created=_now(),
         spec=machine.spec.to_dict(),
-        vocabulary=VocabularyEntry.of(scenes.vocabulary, relations),
-        calibration=calibration,
+        vocabulary=VocabularyEntry.of(scenes.vocabulary, machine.spec.A),
+        calibration=calibrated.calibration,
         training=_training(run, measured),
         data=data_sources(scenes),
         metrics=metrics(rows),
         terms=terms(scenes),
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
+        examples=scenes.examples,
     )
-    tensors = {} if offsets is None else offsets.tensors()
-    state = machine.state_dict() | tensors
+    return _stored(store, description, calibrated, alias)
+
+
+def refit(
+    artifact: Artifact,
+    root: Path,
+    store: Store,
+    version: str,
+    *,
+    alias: str | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Artifact:
+    """Publish a new version of a published model with refitted statistics, without training.
+
+    The new version keeps weights, calibration and metrics. Only the statistics (offsets, counts),
+    their metrics and the example scenes are new. The examples are those of the shipped
+    configuration with the name of the model, otherwise those of its own configuration. The metrics
+    of weights that were trained on test scenes come from statistics that were not fitted to test
+    scenes.
+
+    Args:
+        artifact: the published model.
+        root: folder of the training scenes.
+
+    Raises:
+        RunError: the scenes in `root` are not the training scenes of the model.
+        ConfigError, DatasetError: the scenes cannot be read.
+        StoreError, ArtifactError: see `Store.publish`.
+    """
+    manifest = artifact.manifest
+    config = Config.model_validate(manifest.training["config"])
+    data, named = config.data, config.examples
+    if manifest.name in shipped_configs():
+        named = load_config(manifest.name).examples
+    examples = read_examples(named, root, artifact.vocabulary)
+    progress("reading scenes")
+    annotated = read_sources(data, root)
+    scenes = split_and_encode(data, annotated, artifact.vocabulary, root)
+    digests = {source.source: source.digest for source in manifest.data}
+    if changed := sorted(name for name, found in scenes.digests.items() if digests[name] != found):
+        raise RunError(
+            f"{root} does not contain the training scenes of {manifest.name}@{manifest.version}: "
+            f"the scenes of {', '.join(changed)} have changed"
+        )
+    kept_back = scenes
+    if "measured_split" in manifest.training:
+        split = {"split": manifest.training["measured_split"]}
+        kept_back = split_and_encode(
+            DataConfig.model_validate(data.model_dump() | split),
+            annotated,
+            artifact.vocabulary,
+            root,
+        )
+    progress("fitting statistics")
+    asked = with_statistics(artifact, kept_back)
+    rows = _measure(asked, kept_back.training_data(), progress, tuple(STATISTICS))
+    fields = {name: getattr(manifest, name) for name in Description.model_fields}
+    fields["metrics"] = (
+        *(metric for metric in manifest.metrics if metric.task not in STATISTICS),
+        *metrics(rows),
+    )
+    changes = {"version": version, "created": _now(), "examples": examples}
+    description = Description(**fields | changes)
+    return _stored(store, description, with_statistics(artifact, scenes), alias)
+
+
+def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
+    """Return the model with the offsets and counts of the scenes."""
+    train, vocabulary = scenes.parts["train"], scenes.vocabulary
+    return replace(
+        artifact,
+        offsets=fit_offsets(train, len(vocabulary)),
+        counts=fit_counts(train, scenes.parts["validation"], vocabulary),
+    )
+
+
+def _stored(
+    store: Store, description: Description, artifact: Artifact, alias: str | None
+) -> Artifact:
+    """Publish weights and statistics in half precision."""
+    state = dict(artifact.weights.arrays)
+    for statistics in (artifact.offsets, artifact.counts):
+        if statistics is not None:
+            state |= statistics.tensors()
     return store.publish(description, state, storage_dtype="float16", alias=alias)
+
+
+def _now() -> datetime:
+    return datetime.now(UTC).replace(microsecond=0)
 
 
 def calibrated_draft(
     run: FinishedRun,
     vocabulary: Vocabulary,
     data: TrainingData,
-    offsets: Offsets | None = None,
     chosen: Calibration | None = None,
 ) -> Artifact:
     """Return the calibrated model of a run, with weights rounded to half precision.
@@ -129,7 +217,7 @@ def calibrated_draft(
         run.config.training.seed,
         chosen,
     )
-    return draft_artifact(machine, vocabulary, calibration, offsets)
+    return draft_artifact(machine, vocabulary, calibration)
 
 
 @torch.no_grad()
@@ -145,7 +233,6 @@ def draft_artifact(
     machine: BoltzmannMachine,
     vocabulary: Vocabulary,
     calibration: Calibration | None = None,
-    offsets: Offsets | None = None,
 ) -> Artifact:
     """Return a model in memory, without files. The default calibration leaves log-odds as is."""
     return Artifact(
@@ -156,17 +243,24 @@ def draft_artifact(
         digest="",
         card="",
         path=Path(),
-        offsets=offsets,
         oracle=None if ClosedForm.fits(weights_of(machine)) else DrawnPosterior,
     )
 
 
-def _measure(artifact: Artifact, data: TrainingData, progress: Callable[[str], None]) -> list[Row]:
+def _measure(
+    artifact: Artifact,
+    data: TrainingData,
+    progress: Callable[[str], None],
+    tasks: Collection[str] | None = None,
+) -> list[Row]:
     """Return the metrics on test scenes, or an empty list if there are no test scenes."""
     if not len(data.test):
         return []
     return evaluate(
-        artifact, data.test, data.structure, data.train, everyday=EVERYDAY, progress=progress
+        *(artifact, data.test, data.structure, data.train),
+        everyday=EVERYDAY,
+        tasks=tasks,
+        progress=progress,
     )
 
 

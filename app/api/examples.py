@@ -140,6 +140,15 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         ],
         "relations": ["left", "front", "on-top", "above", "right", "behind", "under", "below"],
         "room_types": ["bedroom"],
+        "examples": [
+            {
+                "name": "A bedroom",
+                "scene": {
+                    "room_type": "bedroom",
+                    "objects": [{"label": "floor"}, {"label": "garbage bin"}],
+                },
+            }
+        ],
     },
     "show_contexts": {
         "model": _MODEL,

@@ -1,7 +1,8 @@
 """The four questions, as functions of a published model and a scene.
 
     relations   Which spatial relations hold between the objects of the scene?
-    missing     Which unlisted objects are probably in the scene, and where?
+    missing     Which unlisted objects are probably in the scene, and where? `more` adds the listed
+                classes with probably more instances than listed.
     outliers    Which objects do not belong to the scene, and which stated relations are wrong?
     generate    Which other scenes contain these objects and relations?
 
@@ -13,6 +14,7 @@ by its index in `Scene.objects`.
 from __future__ import annotations
 
 from app.questions.contexts import ContextUnit, contexts
+from app.questions.counts import More, more
 from app.questions.generate import GeneratedScene, generate
 from app.questions.missing import MissingAnswer, Offset, Placement, missing
 from app.questions.outliers import (
@@ -33,6 +35,7 @@ __all__ = [
     "GeneratedScene",
     "MisplacedAnswer",
     "MissingAnswer",
+    "More",
     "Offset",
     "OutlierAnswer",
     "OutliersFound",
@@ -43,6 +46,7 @@ __all__ = [
     "generate",
     "misplaced",
     "missing",
+    "more",
     "outliers",
     "relations",
 ]

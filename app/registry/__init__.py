@@ -1,6 +1,7 @@
 """Published models: their file format, the store of models, and loaded snapshots of the store."""
 
 from app.registry.artifact import Artifact, load_artifact, write_artifact
+from app.registry.counts import Counts
 from app.registry.description import (
     Calibration,
     CountSlope,
@@ -14,6 +15,7 @@ from app.registry.description import (
     VocabularyEntry,
 )
 from app.registry.errors import ArtifactError, RegistryError, StoreError
+from app.registry.examples import Example
 from app.registry.location import open_store
 from app.registry.manifest import Manifest
 from app.registry.models import ArtifactFailure, ModelSet, StoreFailure, load_model_set
@@ -28,9 +30,11 @@ __all__ = [
     "ArtifactFailure",
     "Calibration",
     "CountSlope",
+    "Counts",
     "DataSource",
     "Description",
     "EvidenceWeights",
+    "Example",
     "Manifest",
     "Metric",
     "ModelSet",

@@ -22,11 +22,14 @@ from app.inference.objects import ContextScorer
 from app.inference.posterior import ClosedForm
 from app.inference.weights import layout
 from app.registry.card import render_card
+from app.registry.counts import PREFIX as COUNTS
+from app.registry.counts import Counts
 from app.registry.description import Calibration, Description
 from app.registry.durable import sync_directory, write_file
 from app.registry.errors import ArtifactError
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
-from app.registry.offsets import PREFIX, Offsets
+from app.registry.offsets import PREFIX as OFFSETS
+from app.registry.offsets import Offsets
 from app.registry.slopes import RelationSlopes
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
 from app.registry.verified import MAX_WEIGHTS_BYTES, read_verified
@@ -55,6 +58,8 @@ class Artifact:
         path: directory of the artifact.
         offsets: vectors in metres between the centres of related objects. None means that the
             training scenes had no poses.
+        counts: statistics of the numbers of instances. None means that the training scenes do not
+            count instances.
         oracle: function that computes the posterior of a scene in place of the closed form. Only
             training sets an oracle.
     """
@@ -67,6 +72,7 @@ class Artifact:
     card: str
     path: Path
     offsets: Offsets | None = None
+    counts: Counts | None = None
     oracle: Callable[[Artifact, Scene], Any] | None = None
 
     @cached_property
@@ -132,7 +138,7 @@ def write_artifact(
         directory: the new directory. Its parent must exist.
         description: contents of the manifest without the entries about files.
         state: maps names to arrays. It contains the arrays of `layout`, and optionally those of
-            `Offsets.tensors()`.
+            `Offsets.tensors()` and of `Counts.tensors()`.
         storage_dtype: dtype of floating-point tensors with two or more axes; see `pack`.
 
     Raises:
@@ -179,7 +185,7 @@ def load_artifact(
         return previous
     manifest = files.manifest
     tensors = unpack(files.weights, manifest.tensors)
-    offsets = {name: tensors.pop(name) for name in list(tensors) if name.startswith(PREFIX)}
+    offsets, counts = _taken(tensors, OFFSETS), _taken(tensors, COUNTS)
     weights = _weights(manifest, tensors)
     return Artifact(
         manifest=manifest,
@@ -190,7 +196,15 @@ def load_artifact(
         card=files.card,
         path=directory,
         offsets=Offsets.from_tensors(offsets, weights.spec.A, weights.spec.V) if offsets else None,
+        counts=Counts.from_tensors(counts, weights.spec.V, len(manifest.vocabulary.room_types))
+        if counts
+        else None,
     )
+
+
+def _taken(tensors: dict[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Remove the tensors with a prefix from a dictionary, and return them."""
+    return {name: tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
 
 
 def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights:

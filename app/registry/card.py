@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from math import prod
 
+from app.registry.counts import PREFIX as COUNTS
 from app.registry.description import DataSource, Description
-from app.registry.manifest import TensorEntry
-from app.registry.offsets import PREFIX
+from app.registry.manifest import TensorEntry, of_machine
+from app.registry.offsets import PREFIX as OFFSETS
 
 _RESEARCH_WARNING = """\
 > **Research use.** These weights were trained on {sources}, whose terms allow research use. Ask
@@ -53,8 +54,8 @@ objects inside it. The distance is the distance of an object from the mean. It i
 distance from a mean that depends on the relation alone."""
 
 _LIMITS = """\
-- The model scores classes, not instances. It predicts whether a class belongs to a scene, but not
-  how many objects of the class belong there.
+- The model scores classes, not instances. The number of instances comes from separate statistics of
+  the training scenes. It is unknown for classes without such statistics.
 - Annotators list only a few relations of each scene. An unlisted relation counts as wrong in
   R-precision although it may be true.
 - Left and front refer to the viewer's axes. If a source has no viewer, training chose one. Both
@@ -78,10 +79,10 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
     """
     words, spec = description.vocabulary, description.spec
     proposed = sum(not entry.structure for entry in words.objects)
-    machine = {name: e for name, e in tensors.items() if not name.startswith(PREFIX)}
+    machine = of_machine(tensors)
     weights = sum(prod(e.shape) for e in machine.values() if e.dtype.startswith("float"))
     stored = ", ".join(sorted({entry.dtype for entry in machine.values()}))
-    pairs = prod(tensors[f"{PREFIX}pair"].shape) if f"{PREFIX}pair" in tensors else 0
+    pairs, counted = _size(tensors, f"{OFFSETS}pair"), _size(tensors, f"{COUNTS}classes")
     sections = [
         f"# {description.name} {description.version}",
         *_warning(description.data),
@@ -96,6 +97,7 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
                 ("Relations", ", ".join(words.relations)),
                 ("Room types", ", ".join(words.room_types) or "none"),
                 ("Offsets", f"in metres, of {pairs:,} pairs of classes" if pairs else "none"),
+                ("Counts", f"of instances, for {counted} classes" if counted else "none"),
                 ("Created", description.created.isoformat()),
             ],
         ),
@@ -117,6 +119,10 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
         or "not recorded",
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def _size(tensors: Mapping[str, TensorEntry], name: str) -> int:
+    return prod(tensors[name].shape) if name in tensors else 0
 
 
 def _warning(data: Sequence[DataSource]) -> Iterable[str]:

@@ -2,60 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from datetime import UTC, datetime
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    AfterValidator,
-    AwareDatetime,
-    BaseModel,
-    ConfigDict,
-    FailFast,
-    Field,
-    JsonValue,
-    PrivateAttr,
-    StringConstraints,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, JsonValue, PrivateAttr, field_validator, model_validator
 
+from app.registry.examples import Examples
+from app.registry.fields import Count, Frozen, Many, Sha256, Text, Timestamp, to_json
 from app.registry.references import ModelName, Version
 from app.scene.relations import CANONICAL
 from app.scene.vocabulary import Vocabulary
 
-Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
-Text = Annotated[str, StringConstraints(min_length=1)]
-Count = Annotated[int, Field(ge=0)]
 Floats = NDArray[np.floating[Any]]
-
-ItemT = TypeVar("ItemT")
-Many = Annotated[tuple[ItemT, ...], FailFast()]
-"""A tuple whose validation stops at the first invalid item. Otherwise, errors for a million invalid
-items would take gigabytes of memory."""
-
-
-def _in_utc(moment: datetime) -> datetime:
-    try:
-        return moment.astimezone(UTC)
-    except OverflowError:
-        raise ValueError("the time must be in the years 1 to 9999 in UTC") from None
-
-
-Timestamp = Annotated[AwareDatetime, AfterValidator(_in_utc)]
-
-
-def to_json(value: Any) -> str:
-    """Return a value as one line of JSON. Raise ValueError for NaN and infinity."""
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
-
-
-class Frozen(BaseModel):
-    """Base class of immutable pydantic models. They refuse unknown fields, NaN and infinity."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class CountSlope(Frozen):
@@ -312,6 +271,7 @@ class Description(Frozen):
         metrics: figures measured on scenes that training did not use.
         terms: terms of use of the weights.
         libraries: maps the name of each library used in training to its version.
+        examples: example scenes for the visual page. Artifacts of earlier releases have none.
     """
 
     name: ModelName
@@ -325,6 +285,8 @@ class Description(Frozen):
     metrics: Many[Metric]
     terms: Text
     libraries: dict[str, str]
+    # Left out of a manifest without examples, so that earlier releases can read it.
+    examples: Annotated[Examples, Field(exclude_if=lambda examples: not examples)] = ()
 
     @field_validator("spec", "training", "libraries", "terms")
     @classmethod
@@ -359,6 +321,8 @@ class Description(Frozen):
                 f"the vocabulary has {len(words.room_types)} room types, but the spec has "
                 f"C = {rooms}"
             )
+        for example in self.examples:
+            example.require_known(words.vocabulary())
         return self
 
     @property

@@ -27,9 +27,9 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from pydantic import AfterValidator, Field, ValidationError
 
-from app.registry.description import Frozen, Sha256
 from app.registry.durable import write_file
 from app.registry.errors import StoreError, cause
+from app.registry.fields import Frozen, Sha256
 from app.registry.references import AliasTarget, ModelName, check_name, check_version
 
 MAX_INDEX_BYTES: Final = 4 * 2**20

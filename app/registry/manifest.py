@@ -11,18 +11,21 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator
 
-from app.registry.description import Count, Description, Frozen, Many, Sha256, to_json
+from app.registry.counts import PREFIX as COUNTS
+from app.registry.description import Description
 from app.registry.errors import ArtifactError
-from app.registry.offsets import PREFIX
+from app.registry.fields import Count, Frozen, Many, Sha256, to_json
+from app.registry.offsets import PREFIX as OFFSETS
 
-FORMAT: Final = 2
-READABLE: Final = (1, FORMAT)
+FORMAT: Final = 3
+READABLE: Final = (1, 2, FORMAT)
 """Manifest formats that this release reads. Format 1 has no offsets between related objects. In
-format 2, offsets are optional."""
+format 2, offsets are optional. In format 3, counts of instances are optional too."""
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -38,6 +41,12 @@ class TensorEntry(Frozen):
     shape: Many[Count]
 
 
+def of_machine(tensors: Mapping[str, TensorEntry]) -> dict[str, TensorEntry]:
+    """Return the tensors of the machine, without offsets and counts."""
+    statistics = (OFFSETS, COUNTS)
+    return {name: entry for name, entry in tensors.items() if not name.startswith(statistics)}
+
+
 class FileEntry(Frozen):
     """Checksum and size of a file."""
 
@@ -48,14 +57,14 @@ class FileEntry(Frozen):
 class Manifest(Description):
     """The description of a model, its stored tensors and the checksums of its other files."""
 
-    format: Literal[1, 2] = FORMAT
+    format: Literal[1, 2, 3] = FORMAT
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
     files: dict[str, FileEntry]
 
     @property
     def weights(self) -> dict[str, TensorEntry]:
-        """The tensors of the machine, without the offsets."""
-        return {name: e for name, e in self.tensors.items() if not name.startswith(PREFIX)}
+        """The tensors of the machine, without offsets and counts."""
+        return of_machine(self.tensors)
 
     @field_validator("files")
     @classmethod
@@ -87,7 +96,7 @@ class Manifest(Description):
             )
         members = _parse(data, complete=trailer is not None)
         if not _is_known_format(members.get("format")):
-            known = " and ".join(map(str, READABLE))
+            known = f"{READABLE[0]} to {READABLE[-1]}"
             raise ArtifactError(
                 "unknown_format",
                 f"{MANIFEST} has an unknown format; this release reads only formats {known}",

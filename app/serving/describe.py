@@ -13,6 +13,7 @@ from app.serving.models import ServedModel, ServedModels
 from scene_client.schemas import (
     ContextsAnswer,
     ContextUnit,
+    ExampleScene,
     Metric,
     ModelList,
     ModelSummary,
@@ -91,6 +92,10 @@ def vocabulary(served: ServedModel) -> VocabularyAnswer:
         ],
         relations=[cast("RelationName", name) for name in names],
         room_types=list(served.vocabulary.room_types),
+        examples=[
+            ExampleScene(name=example.name, scene=example.request())
+            for example in served.artifact.manifest.examples
+        ],
     )
 
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Ask the service about a robot's detections, which arrive over rosbridge. ROS is not needed.
 
-    python clients/ros2/over_rosbridge.py ws://robot:9090 /detections_3d
+    python clients/ros2/over_rosbridge.py ws://robot:9090 /detections_3d --questions missing
 
 The program prints each answer as one line of JSON. While a question is in progress, only the newest
 message is kept. Errors, and the bridge's own errors and warnings, go to standard error. The exit
@@ -11,25 +11,16 @@ restart the program.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NoReturn
 
+from bridge import Advisor, advisor, answer, complain, options
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from scene_client import Client, ClientError, InvalidRequestError
-from scene_client.ros_fields import MessageError
-from scene_client.vision_msgs import from_message
-
 MAX_MESSAGE = 2**24  # bytes
-
-
-def complain(words: str) -> None:
-    """Write an error to standard error, as one line."""
-    print(" ".join(words.split()), file=sys.stderr, flush=True)
 
 
 def read(frame: str | bytes) -> dict[str, Any]:
@@ -71,10 +62,8 @@ def messages(socket: ClientConnection, topic: str) -> Iterator[Any]:
     raise end
 
 
-def answer_each(
-    bridge: str, topic: str, ask: Callable[..., Any], label_map: str | None, say: Callable[..., Any]
-) -> NoReturn:
-    """Ask about each newest message until the connection ends; report failed questions."""
+def answer_each(bridge: str, topic: str, asked: Advisor) -> NoReturn:
+    """Print the answers about each newest message until the connection ends."""
     try:
         socket = connect(bridge, max_size=MAX_MESSAGE)
     except (OSError, WebSocketException, ValueError) as error:
@@ -83,32 +72,20 @@ def answer_each(
     with socket:
         try:
             for message in messages(socket, topic):
-                try:
-                    fields = from_message(message, label_map)
-                    if fields["objects"]:
-                        say(ask(**fields).model_dump_json(exclude_none=True), flush=True)
-                except (ClientError, MessageError) as error:
-                    complain(f"{type(error).__name__}: {error}")
+                if (found := answer(asked, message)) is not None:
+                    print(found, flush=True)
         except ConnectionClosed as error:
             complain(f"the bridge at {bridge} is gone: {error}")
     sys.exit(1)
 
 
 def main() -> None:
-    arguments = argparse.ArgumentParser(description="Ask about detections from rosbridge.")
+    arguments = options("Ask about detections from rosbridge.")
     arguments.add_argument("bridge", help="ws://ROBOT:9090")
     arguments.add_argument("topic", help="vision_msgs/Detection3DArray or Detection2DArray")
-    arguments.add_argument("--service", default="http://127.0.0.1:8000")
-    arguments.add_argument("--question", default="missing", choices=["missing", "outliers"])
-    arguments.add_argument("--label-map", help="coco, if the class ids are COCO numbers")
     given = arguments.parse_args()
-    try:
-        client = Client(given.service, timeout=1.0)
-    except InvalidRequestError as error:
-        arguments.error(f"--service: {error}")
-    with client:
-        ask = getattr(client, given.question)
-        answer_each(given.bridge, given.topic, ask, given.label_map, print)
+    with advisor(arguments, given) as asked:
+        answer_each(given.bridge, given.topic, asked)
 
 
 if __name__ == "__main__":

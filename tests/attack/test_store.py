@@ -89,12 +89,19 @@ def many_tensors(root: Path) -> None:
     replace_file(hostile(root), "model.safetensors", len(header).to_bytes(8, "little") + header)
 
 
+def large_examples(root: Path) -> None:
+    scene = {"objects": [{"label": "bed", "id": f"{k:099}"} for k in range(64)]}
+    examples = [{"name": "a", "scene": scene}] * 8
+    rewrite_manifest(hostile(root), lambda members: members.update(examples=examples))
+
+
 SPOILED = [
     (extreme_date, "invalid_manifest"),
     (large_card, "too_large"),
     (large_weights, "too_large"),
     (large_manifest, "too_large"),
     (many_tensors, "too_large"),
+    (large_examples, "invalid_manifest"),
 ]
 
 
@@ -181,7 +188,8 @@ def test_a_header_of_a_million_tensors_is_not_parsed() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "place", ["data", "metrics", "vocabulary.objects", "calibration.relation", "training.x"]
+    "place",
+    ["data", "metrics", "vocabulary.objects", "calibration.relation", "examples", "training.x"],
 )
 def test_a_manifest_of_a_million_empty_objects_is_refused_in_little_memory(
     published: Path, place: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,11 @@ DESK = {
         },
     ],
 }
+
+EXAMPLES = json.loads(
+    (Path(__file__).parents[2] / "training" / "examples" / "indoor.json").read_text("utf-8")
+)
+"""Example scenes of the shipped vocabulary."""
 
 # Whatever a policy forbids is told to the page that tried it.
 _WITNESS = """
@@ -65,12 +71,14 @@ def open_board(chromium: Browser, shipped: LiveService) -> Iterator[Callable[...
         scene: dict[str, Any] | None = DESK,
         *,
         width: int = 1300,
+        height: int = 900,
+        examples: list[dict[str, Any]] | None = EXAMPLES,
         allow: tuple[str, ...] = (),
         home: str | None = None,
         url: str | None = None,
         **options: Any,
     ) -> Board:
-        size: ViewportSize = {"width": width, "height": 900}
+        size: ViewportSize = {"width": width, "height": height}
         context = chromium.new_context(viewport=size, **options)
         context.set_default_timeout(15_000)
         context.add_init_script(_WITNESS)
@@ -85,7 +93,13 @@ def open_board(chromium: Browser, shipped: LiveService) -> Iterator[Callable[...
                 wrong.append(f"asked for {address}")
                 route.abort()
 
+        def with_examples(route: Route) -> None:
+            response = route.fetch()
+            route.fulfill(response=response, json=response.json() | {"examples": examples})
+
         context.route("**/*", only_home)
+        if examples is not None:
+            context.route("**/vocabulary", with_examples)
         page = context.new_page()
         page.on("pageerror", lambda error: wrong.append(f"error: {error}"))
         page.on(

@@ -33,14 +33,14 @@ class Board:
 
     def put(self, text: str) -> None:
         """Import a scene."""
-        self.page.get_by_role("button", name="Import, export, share").click()
+        self.page.get_by_role("button", name="Import, export").click()
         self.page.get_by_label("Scene, JSON").fill(text)
         self.page.get_by_role("button", name="Put on the board").click()
         self.settle()
 
     def exported(self) -> dict[str, Any]:
         """The scene as the dialog shows it."""
-        self.page.get_by_role("button", name="Import, export, share").click()
+        self.page.get_by_role("button", name="Import, export").click()
         found: dict[str, Any] = json.loads(self.page.get_by_label("Scene, JSON").input_value())
         self.page.get_by_role("button", name="Close").click()
         return found
@@ -55,12 +55,6 @@ class Board:
     def tab(self, name: str) -> None:
         """Go to a question."""
         self.page.get_by_role("tab", name=name).click()
-        self.settle()
-
-    def slide(self, label: str, value: int) -> None:
-        """Move a slider."""
-        slider = self.page.get_by_role("slider", name=label)
-        slider.fill(str(value))
         self.settle()
 
     def drag(self, what: Locator, right: float, down: float) -> None:
@@ -95,14 +89,14 @@ class Board:
     def edges(self) -> list[tuple[str, str]]:
         """Kind and words of each edge."""
         return [
-            (edge.get_attribute("class") or "", edge.locator("text").text_content() or "")
+            (edge.get_attribute("class") or "", plain(edge.locator("text").text_content()))
             for edge in self.page.locator("#board .edges > g").all()
         ]
 
     @property
     def said(self) -> str:
         """What a screen reader was told last."""
-        return self.page.locator("#live").text_content() or ""
+        return plain(self.page.locator("#live").text_content())
 
     def column(self, question: str, number: int = 0) -> Locator:
         """The answers of one model to a question."""
@@ -111,7 +105,7 @@ class Board:
     def rows(self, question: str, number: int = 0) -> list[str]:
         """The entries of an answer, each in one line."""
         texts = self.column(question, number).locator("ol > li").all_inner_texts()
-        return [re.sub(r"\s+", " ", text).strip() for text in texts]
+        return [plain(text) for text in texts]
 
     def curl(self, question: str, number: int = 0) -> str:
         """The command that the page shows."""
@@ -145,6 +139,11 @@ def body_of(command: str) -> dict[str, Any]:
     words = shlex.split(command)
     found: dict[str, Any] = json.loads(words[words.index("-d") + 1])
     return found
+
+
+def plain(text: str | None) -> str:
+    """A text in one line, with usual blanks."""
+    return re.sub(r"\s+", " ", text or "").strip()
 
 
 def percent(probability: float) -> str:

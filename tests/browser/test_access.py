@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import httpx
@@ -31,14 +32,15 @@ def complaints(board: Board) -> list[str]:
 
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> None:
-    board = open_board(scene=None, color_scheme=scheme)
+    board = open_board(scene=None, color_scheme=scheme, allow=("422",))
     page = board.page
     found = {"example": complaints(board)}
     # Another model that knows all of the example's labels.
     references = [str(one.get_attribute("value")) for one in page.locator("#second option").all()]
     (second,) = [name for name in references if name.startswith("indoor-rbm@")]
-    page.get_by_label("versus").select_option(second)
+    page.get_by_label("compare with").select_option(second)
     page.locator("#list .name").first.click()
+    page.get_by_label("Positions count as evidence").check()
     board.settle()
     board.column("missing").get_by_text("Send this request from a program").click()
     found["two models, form, calls"] = complaints(board)
@@ -48,20 +50,20 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     for tab in ("Wrong", "Relations", "Generate"):
         board.tab(tab)
         found[tab] = complaints(board)
-    page.get_by_text("Contexts that stay on").click()
     page.get_by_role("button", name="Generate a scene").click()
-    page.wait_for_timeout(300)
     board.settle()
     found["drawn"] = complaints(board)
-    page.get_by_role("button", name="Back to my scene").click()
+    page.get_by_role("button", name="Discard").click()
     page.get_by_role("combobox", name="Add an object").fill("la")
     found["search"] = complaints(board)
     page.get_by_role("combobox", name="Add an object").press("Escape")
-    page.get_by_role("button", name="Import, export, share").click()
+    page.get_by_role("button", name="Import, export").click()
     found["dialog"] = complaints(board)
     page.get_by_role("button", name="Close").click()
-    page.get_by_role("button", name="Clear").click()
     board.tab("Missing")
+    board.put('{"objects": ["bed", "fridgee", "flux capacitor"], "room_type": "submarine"}')
+    found["unknown"] = complaints(board)
+    page.get_by_role("button", name="Clear").click()
     found["empty"] = complaints(board)
     assert {state: found[state] for state in found if found[state]} == {}
 
@@ -86,6 +88,8 @@ def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
     assert board.things == ["desk", "chair", "laptop"]
     # On the board: to the object, move it, turn it, ask from its menu.
     board.thing("laptop").focus()
+    press("ArrowUp")
+    board.settle()
     before = board.scene["objects"][-1]["position"]
     for key in ("ArrowUp", "ArrowLeft", "Shift+ArrowLeft", "Alt+ArrowDown", "r"):
         press(key)
@@ -152,27 +156,46 @@ def test_answers_and_movements_are_announced(open_board: OpenBoard, api: httpx.C
 
 def test_the_dialog_keeps_the_focus_and_gives_it_back(open_board: OpenBoard) -> None:
     board = open_board()
-    board.page.get_by_role("button", name="Import, export, share").click()
+    board.page.get_by_role("button", name="Import, export").click()
     assert board.page.evaluate("document.activeElement.id") == "json"
     board.page.keyboard.press("Escape")
     expect(board.page.locator("#file")).to_be_hidden()
-    assert focus(board) == "Import, export, share"
+    assert focus(board) == "Import, export"
 
 
-def test_colours_follow_the_system_unless_somebody_chooses(open_board: OpenBoard) -> None:
-    board = open_board(color_scheme="dark")
-    background = "getComputedStyle(document.body).backgroundColor"
-    dark = board.page.evaluate(background)
-    board.page.get_by_label("Colours").select_option("light")
-    light = board.page.evaluate(background)
-    assert light != dark
-    board.page.emulate_media(color_scheme="light")
-    board.page.get_by_label("Colours").select_option("")
-    assert board.page.evaluate(background) == light
-    board.page.get_by_label("Colours").select_option("dark")
-    board.page.reload()
-    board.settle()
-    assert board.page.evaluate(background) == dark
+@pytest.mark.parametrize("page_name", ["", "docs"])
+def test_colours_follow_the_system(
+    open_board: OpenBoard, api: httpx.Client, page_name: str
+) -> None:
+    page = open_board().page
+    page.goto(f"{api.base_url}/{page_name}")
+    expect(page.locator("main, .opblock").first).to_be_visible()
+    background = "getComputedStyle(document.querySelector('body > main, html')).backgroundColor"
+    if not page_name:
+        background = "getComputedStyle(document.body).backgroundColor"
+    light = page.evaluate(background)
+    page.emulate_media(color_scheme="dark")
+    page.wait_for_timeout(100)
+    dark = page.evaluate(background)
+    assert min(shades(light)) > 200 or light == "rgba(0, 0, 0, 0)"
+    assert max(shades(dark)) < 60
+
+
+def shades(colour: str) -> list[int]:
+    """Red, green and blue of a CSS colour."""
+    return [int(part) for part in re.findall(r"\d+", colour)[:3]]
+
+
+@pytest.mark.parametrize(("width", "height"), [(375, 812), (820, 1180), (1360, 820)])
+def test_board_and_first_answers_are_on_one_screen(
+    open_board: OpenBoard, width: int, height: int
+) -> None:
+    board = open_board(scene=None, width=width, height=height)
+    for what in ("#board", "#posed", "#search", "[data-question=missing] li:first-child"):
+        box = board.page.locator(what).bounding_box()
+        assert box is not None
+        assert box["y"] >= 0
+        assert box["y"] + box["height"] <= height, what
 
 
 @pytest.mark.slow

@@ -24,21 +24,6 @@ def place(board: Board, name: str, question: str = "missing") -> tuple[float, fl
     return tuple(found["position"][axis] for axis in "xyz")
 
 
-@pytest.mark.parametrize("example", ["bedroom", "kitchen", "desk"])
-def test_every_example_is_answered(open_board: OpenBoard, api: httpx.Client, example: str) -> None:
-    board = open_board(scene=None)
-    options = board.page.locator("#example option").all_text_contents()
-    (name,) = [text for text in options if example in text]
-    board.page.get_by_label("Example").select_option(name)
-    board.settle()
-    assert board.rows("missing")
-    vocabulary = api.get("/models/default/vocabulary").json()
-    known = {entry["label"] for entry in vocabulary["objects"]}
-    body = board.body("missing")
-    assert {thing["label"] for thing in body["objects"]} <= known
-    assert body["room_type"] in vocabulary["room_types"]
-
-
 def test_an_object_is_found_by_any_of_its_names(open_board: OpenBoard) -> None:
     board = open_board()
     box = board.page.get_by_role("combobox", name="Add an object")
@@ -53,13 +38,6 @@ def test_an_object_is_found_by_any_of_its_names(open_board: OpenBoard) -> None:
     assert board.things == ["desk", "chair", "garbage bin"]
     assert board.body("missing")["objects"][-1]["label"] == "garbage bin"
     assert box.get_attribute("aria-expanded") == "false"
-
-
-def test_a_word_that_no_model_knows_is_answered_where_it_was_typed(open_board: OpenBoard) -> None:
-    board = open_board()
-    board.add("flux capacitor")
-    expect(board.page.locator("#search-error")).to_contain_text("flux capacitor")
-    assert board.things == ["desk", "chair"]
 
 
 def test_a_second_one_of_a_class_has_a_name_of_its_own(open_board: OpenBoard) -> None:
@@ -110,46 +88,23 @@ def test_dragging_moves_and_snaps_and_can_be_undone(open_board: OpenBoard) -> No
     snapped = place(board, "chair", "outliers")
     assert snapped[0] < before[0]
     assert snapped[1] < before[1]
-    assert all(round(10 * value) == pytest.approx(10 * value) for value in snapped[:2])
-    board.page.get_by_label("snap to 10 cm").uncheck()
-    board.drag(board.thing("chair").locator(".box"), 33, 0)
-    free = place(board, "chair", "outliers")
-    assert round(100 * free[1]) % 10 or round(1000 * free[1]) % 10
-    board.page.get_by_role("button", name="Undo").click()
+    assert all(round(20 * value) == pytest.approx(20 * value) for value in snapped[:2])
     board.page.get_by_role("button", name="Undo").click()
     board.settle()
     assert place(board, "chair", "outliers") == before
-
-
-@pytest.mark.slow
-def test_handles_resize_and_turn(open_board: OpenBoard) -> None:
-    board = open_board()
-    board.tab("Wrong")
-    board.thing("desk").focus()
-    board.drag(board.page.locator(".handles .resize"), 30, 20)
-    (desk, _) = board.body("outliers")["objects"]
-    assert desk["size"]["x"] > 0.8
-    assert desk["size"]["y"] > 1.6
-    assert desk["size"]["z"] == 0.74
-    board.drag(board.page.locator(".handles .turn"), -300, 200)
-    (desk, _) = board.body("outliers")["objects"]
-    assert desk["orientation"]["w"] < 0.95
 
 
 def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
     board = open_board()
     board.page.get_by_role("button", name="chair", exact=False).first.click()
     form = board.page.locator("#properties")
-    form.get_by_label("Name").fill("my chair")
-    form.get_by_label("Name").press("Enter")
     form.get_by_label("ahead (x)").fill("1.25")
     form.get_by_label("height").fill("1.1")
-    form.get_by_label("Rotation, degrees").fill("90")
+    form.get_by_label("Rotation (°)").fill("90")
     form.get_by_label("Confidence").fill("0.8")
     form.get_by_label("Confidence").press("Enter")
     board.settle()
     (_, chair) = board.body("missing")["objects"]
-    assert chair["id"] == "my chair"
     assert chair["position"]["x"] == 1.25
     assert chair["position"]["z"] == pytest.approx(0.55)
     assert chair["size"]["z"] == 1.1
@@ -174,6 +129,9 @@ def test_sizes_that_nobody_gave_are_the_models(open_board: OpenBoard, api: httpx
     board.add("laptop")
     words = api.get("/models/default/vocabulary").json()["objects"]
     (typical,) = [entry["size"] for entry in words if entry["label"] == "laptop"]
+    board.thing("laptop").focus()
+    board.page.keyboard.press("ArrowUp")
+    board.settle()
     assert board.body("missing")["objects"][-1]["size"] == typical
     expect(board.page.locator("#size-source")).to_have_text("(typical)")
     shown = board.page.locator("#properties").get_by_label("along x").input_value()
@@ -191,7 +149,7 @@ def test_the_robot_can_stand_elsewhere(open_board: OpenBoard) -> None:
     assert viewpoint["yaw"] == pytest.approx(0.5236, abs=1e-3)
 
 
-def test_labels_and_relations_alone_are_laid_out(open_board: OpenBoard, api: httpx.Client) -> None:
+def test_labels_and_relations_alone_are_laid_out(open_board: OpenBoard) -> None:
     board = open_board()
     given = [
         {"subject": "lamp", "relation": "on-top", "object": "nightstand"},
@@ -200,14 +158,21 @@ def test_labels_and_relations_alone_are_laid_out(open_board: OpenBoard, api: htt
     ]
     objects = ["bed", "nightstand", "lamp", "rug"]
     board.put(json.dumps({"objects": objects, "relations": given}))
-    answer = api.post("/relations", json=board.scene).json()
-    # The service reads from the drawn positions what the scene said in words.
-    assert all(relation in answer["observed_relations"] for relation in given)
+    boxes = {name: board.thing(name).locator(".box").bounding_box() for name in objects}
+    x = {name: box["x"] + box["width"] / 2 for name, box in boxes.items() if box}
+    y = {name: box["y"] + box["height"] / 2 for name, box in boxes.items() if box}
+    assert abs(x["lamp"] - x["nightstand"]) < 2
+    assert abs(y["lamp"] - y["nightstand"]) < 2
+    assert x["nightstand"] < x["bed"]
+    assert y["rug"] > y["bed"]
 
 
 NO_SCENES = [
     ("{", "not JSON"),
-    ("[]", "A scene must be a JSON object"),
+    ('{"objects": ["bed"]}\n{"objects": ', "not JSON"),
+    ('{"detections": [null]}', "neither a scene nor a message"),
+    ('{"detections": []}', "no detection with a class"),
+    ("3", "A scene must be a JSON object"),
     ('{"objects": [{"label": "bed", "size": {"x": -1, "y": 1, "z": 1}}]}', "positive numbers"),
     ('{"objects": [{"id": "a", "label": "bed"}, {"id": "a", "label": "bed"}]}', "another object"),
     ('{"objects": [{"label": "bed", "position": {"x": 1e9, "y": 0, "z": 0}}]}', "100 000 km"),
@@ -232,7 +197,7 @@ def test_what_is_no_scene_is_refused_in_words(open_board: OpenBoard) -> None:
     board = open_board()
     page = board.page
     for text, words in NO_SCENES:
-        page.get_by_role("button", name="Import, export, share").click()
+        page.get_by_role("button", name="Import, export").click()
         page.get_by_label("Scene, JSON").fill(text)
         page.get_by_role("button", name="Put on the board").click()
         expect(page.locator("#json-error")).to_contain_text(words)
@@ -244,7 +209,7 @@ def test_what_is_no_scene_is_refused_in_words(open_board: OpenBoard) -> None:
 def test_a_link_holds_the_scene(open_board: OpenBoard) -> None:
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
     scene = board.exported()
-    board.page.get_by_role("button", name="Import, export, share").click()
+    board.page.get_by_role("button", name="Import, export").click()
     board.page.get_by_role("button", name="Copy a link").click()
     expect(board.page.locator("#share-done")).to_contain_text("copied")
     link = board.page.evaluate("navigator.clipboard.readText()")
@@ -283,19 +248,10 @@ def test_labels_that_javascript_knows_are_labels_like_others(open_board: OpenBoa
     scene = {"objects": [{"label": name} for name in ("constructor", "__proto__", "bed")]}
     board = open_board(scene, allow=("422",))
     assert board.things == ["constructor", "__proto__", "bed"]
-    board.page.locator("#list .name").nth(1).click()
-    expect(board.page.locator("#size-source")).to_have_text("(a guess)")
-
-
-def test_relations_that_positions_replace_are_told(open_board: OpenBoard) -> None:
-    board = open_board()
-    given = [{"subject": "chair", "relation": "left", "object": "desk"}]
-    board.put(json.dumps(board.exported() | {"relations": given}))
-    expect(board.page.locator("#note")).to_have_text(
-        "1 relation was ignored: requests of the board contain positions only."
-    )
-    board.page.get_by_role("button", name="Clear").click()
-    expect(board.page.locator("#note")).to_be_hidden()
+    errors = board.page.locator("#list .error").all_text_contents()
+    assert errors[0] == "constructor not known, left out"
+    assert errors[1].startswith("__proto__ ")
+    assert errors[2] == ""
 
 
 @pytest.mark.slow
@@ -303,25 +259,30 @@ def test_new_objects_leave_room_for_the_robot(open_board: OpenBoard) -> None:
     board = open_board()
     for _ in range(12):
         board.add("table")
-    for found in board.body("missing")["objects"][2:]:
-        x, y = (
-            max(0, abs(found["position"][axis]) - found["size"][axis] / 2) for axis in ("x", "y")
-        )
-        assert (x**2 + y**2) ** 0.5 >= 0.49
-        assert found["position"]["x"] > 0
+    robot = board.page.locator("#board .robot .body").bounding_box()
+    assert robot is not None
+    for found in board.page.locator("#board .object .box").all():
+        box = found.bounding_box()
+        assert box is not None
+        across = max(box["x"] - robot["x"] - robot["width"], robot["x"] - box["x"] - box["width"])
+        assert across > 0 or box["y"] + box["height"] < robot["y"]
 
 
 def test_long_names_leave_room_for_the_buttons(open_board: OpenBoard) -> None:
     board = open_board({"objects": [{"id": "b" * 120, "label": "bed"}]}, width=600)
-    section = board.page.locator("#things").bounding_box()
+    section = board.page.locator("#listing").bounding_box()
     remove = board.page.locator("#list").get_by_role("button", name="Remove").bounding_box()
     assert section is not None
     assert remove is not None
     assert remove["x"] + remove["width"] <= section["x"] + section["width"]
 
 
-def test_plurals_and_typos_are_found(open_board: OpenBoard) -> None:
-    board = open_board()
-    for typed, label in (("chairs", "chair"), ("trash cans", "garbage bin"), ("fridgde", "fridge")):
+def test_the_service_reads_other_spellings(open_board: OpenBoard) -> None:
+    board = open_board(allow=("422",))
+    words = ("chairs", "trash c", "fridgde", "flux capacitor")
+    for typed in words:
         board.add(typed)
-        assert board.body("missing")["objects"][-1]["label"] == label
+    assert board.things[2:] == ["chairs", "garbage bin", "fridgde", "flux capacitor"]
+    errors = board.page.locator("#list .error").all_text_contents()[2:]
+    assert errors[:3] == ["", "", "fridgde → fridge?"]
+    assert errors[3].startswith("flux capacitor not known, left out")

@@ -61,19 +61,19 @@ def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
     return [json.loads(line) for line in done.stdout.splitlines()], errors
 
 
-@pytest.mark.parametrize(("question", "part"), [("missing", "missing"), ("outliers", "outliers")])
+@pytest.mark.parametrize("questions", [["missing"], ["missing", "outliers"]])
 def test_a_published_message_is_answered(
-    repository: Path, live: LiveService, question: str, part: str
+    repository: Path, live: LiveService, questions: list[str]
 ) -> None:
     recorded = json.loads((repository / "clients/ros2/detections.json").read_text())
-    at = f"http://127.0.0.1:{live.port}"
     with bridge({"op": "status", "level": "info"}, recorded) as (url, heard):
         (answer,), errors = run(
-            repository, url, "/detections_3d", "--service", at, "--question", question
+            repository, url, "/detections_3d", "--service", live.url, "--questions", *questions
         )
     assert heard == [{"op": "subscribe", "topic": "/detections_3d", "queue_length": 1}]
     assert answer["frame_id"] == "base_link"
-    assert answer[part]
+    assert set(answer) == {"frame_id", "stamp", "notes", *questions}
+    assert all(answer[question][question] for question in questions)
     assert errors == []
 
 

@@ -26,6 +26,7 @@ from app.questions.calibration import (
     placed_logits,
     relation_probability,
 )
+from app.questions.counts import distribution
 from app.registry import Calibration
 from app.registry.description import CountSlope
 from tests.conftest import REPOSITORY
@@ -40,6 +41,7 @@ from tests.enumeration.small_machines import (
     small_machine,
 )
 from tests.enumeration.test_completions import exactly, machine_of
+from tests.questions.test_counts import CHAIR, COUNTS, DESK, LAMP, V, by_hand
 from tests.training.test_objectives import toy_batch, toy_machine
 from training.config import ObjectiveConfig
 from training.machines import BoltzmannMachine, MachineSpec, build
@@ -563,6 +565,19 @@ def placements() -> None:
             given = same(joint.v, v)
             exact = sigma(joint.log_odds(joint.r[:, k] > 0, given))
             assert exact == near(mean_of_sigmas(w, joint, given, k))
+
+
+@formula(
+    r"p(n) \propto s(n) \, n^{\eta} \, \rho^{n - k}, \quad \eta = a + b \log k"
+    r" + c u + d_t + \frac{1}{\sqrt{m}} \sum_j e_j"
+)
+def numbers_of_instances() -> None:
+    listed = {DESK: 2, CHAIR: 1, LAMP: 1}
+    order = np.array(sorted(listed))
+    which, p = distribution(COUNTS, V, order, np.array([listed[j] for j in order]), 1, 0.4)
+    for row, (at, found) in enumerate(zip(which, p, strict=True)):
+        assert COUNTS.classes[row] == order[at]
+        assert found == pytest.approx(by_hand(COUNTS, row, listed, 1, 0.4), abs=1e-6)
 
 
 @formula(r"p(\text{intruder}) = \sigma(\alpha + \beta \lambda_i + \gamma \log n)")

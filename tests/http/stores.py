@@ -10,8 +10,10 @@ import torch
 
 from app.registry import (
     Calibration,
+    Counts,
     DataSource,
     Description,
+    Example,
     Metric,
     Offsets,
     Store,
@@ -62,6 +64,19 @@ def random_machine(variant: str, seed: int = 0, classes: int = V) -> BoltzmannMa
     return machine.requires_grad_(False)
 
 
+EXAMPLES = (
+    Example.model_validate(
+        {
+            "name": "A bedroom",
+            "scene": {
+                "room_type": "bedroom",
+                "objects": ["bed", {"label": "lamp", "position": {"x": 1, "y": 0.5, "z": 1}}],
+            },
+        }
+    ),
+)
+
+
 def publish(
     root: Path,
     name: str,
@@ -72,6 +87,7 @@ def publish(
     classes: int = V,
     alias: str | None = None,
     offsets: Offsets | None = None,
+    counts: Counts | None = None,
 ) -> None:
     """Publish a machine with random weights for the first ``classes`` classes."""
     machine = random_machine(variant, seed, classes)
@@ -101,8 +117,11 @@ def publish(
             ),
             terms="public domain",
             libraries={"torch": torch.__version__},
+            examples=EXAMPLES if classes == V else (),
         ),
-        machine.state_dict() | ({} if offsets is None else offsets.tensors()),
+        machine.state_dict()
+        | ({} if offsets is None else offsets.tensors())
+        | ({} if counts is None else counts.tensors()),
         alias=alias,
     )
 

@@ -83,6 +83,9 @@ async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> Non
     assert words["room_types"] == list(VOCABULARY.room_types)
     assert len(set(words["relations"])) == 8
     assert words["model"]["version"] == "1.0.0"
+    (example,) = words["examples"]
+    assert example["name"] == "A bedroom"
+    assert (await client.post("/missing", json=example["scene"])).status_code == 200
 
 
 @pytest.mark.parametrize(("name", "layers"), [("home", {"h1": 6}), ("deep", {"h1": 6, "h2": 4})])

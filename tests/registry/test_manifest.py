@@ -119,10 +119,10 @@ def test_reads_back_as_written(change: dict[str, Any]) -> None:
     read = Manifest.from_bytes(data)
     assert read == written
     assert read.to_bytes() == data
-    assert json.loads(data)["format"] == 2
+    assert json.loads(data)["format"] == 3
 
 
-@pytest.mark.parametrize("value", [0, 3, 1.0, "1", None, True])
+@pytest.mark.parametrize("value", [0, 4, 1.0, "1", None, True])
 def test_refuses_an_unknown_format(value: object) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"]
@@ -204,6 +204,11 @@ def change_nested(members: dict[str, Any], path: str, value: object) -> None:
         ("metrics.0.n", 0),
         ("metrics.0.value", math.nan),
         ("terms", ""),
+        ("examples", [{"name": "a", "scene": {"objects": ["unicorn"]}}]),
+        ("examples", [{"name": "a", "scene": {"objects": ["bed"], "room_type": "cave"}}]),
+        ("examples", [{"name": "a", "scene": {"objects": ["bed", "bed"]}}]),
+        ("examples", [{"name": "a", "scene": {"objects": ["bed"], "model": "other"}}]),
+        ("examples", [{"name": "a", "scene": {"objects": ["bed"]}}] * 9),
         ("tensors.b.dtype", "object"),
         ("tensors.b.shape", [-1]),
         ("files", {}),
@@ -220,7 +225,7 @@ def test_refuses_a_field_that_does_not_fit(path: str, value: object) -> None:
     assert refused.value.code == "invalid_manifest"
 
 
-@pytest.mark.parametrize("missing", sorted(Description.model_fields))
+@pytest.mark.parametrize("missing", sorted({*Description.model_fields} - {"examples"}))
 def test_refuses_a_missing_field(missing: str) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"], members[missing]
@@ -228,6 +233,17 @@ def test_refuses_a_missing_field(missing: str) -> None:
         Manifest.from_bytes(resign(json.dumps(members).encode()))
     assert refused.value.code == "invalid_manifest"
     assert missing in refused.value.reason
+
+
+def test_examples_are_read_back_and_absent_ones_are_not_written() -> None:
+    example = {"name": "A room", "scene": {"objects": ["bed", {"label": "desk lamp", "id": "a"}]}}
+    described = manifest(examples=[example])
+    read = Manifest.from_bytes(described.to_bytes())
+    assert read == described
+    assert read.examples[0].request() == {
+        "objects": [{"label": "bed"}, {"label": "desk lamp", "id": "a"}]
+    }
+    assert b"examples" not in manifest().to_bytes()
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,14 @@ def test_the_training_configuration_is_stored(artifact):
     assert config.name in shipped_configs()
 
 
+def test_the_examples_of_its_configuration_fit_its_vocabulary(artifact):
+    from training.config import load_config
+    from training.example_scenes import read_examples
+
+    config = load_config(artifact.manifest.name)
+    assert read_examples(config.examples, Path(), artifact.vocabulary)
+
+
 @pytest.mark.parametrize("name", ["indoor-triway", "everyday-triway"])
 @pytest.mark.parametrize("relation", ["on-top", "above", "behind"])
 def test_the_best_at_a_place_are_the_first_of_all(models, name, relation):

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from training.cli import app
 from training.config import load_config
 from training.offsets import fit_offsets
 from training.pipeline import prepare
+from training.publish import refit
+from training.runs import RunError
 
 ROOT = Path(__file__).parents[2]
 
@@ -61,6 +64,23 @@ def same_offsets_as_training_alone_teaches(artifact, config) -> None:
     assert not np.array_equal(leaking.pair_scenes, artifact.offsets.pair_scenes)
 
 
+def same_weights_with_refitted_statistics(artifact, store) -> None:
+    """`publish NAME@VERSION` changes only what is fitted to the scenes without training."""
+    run("publish", "rooms-triway@1.0.1", "1.0.2", "--store", str(store))
+    again = Store(store).load("rooms-triway", "1.0.2")
+    for name, array in artifact.weights.arrays.items():
+        assert np.array_equal(again.weights[name], array), name
+    for name, tensor in artifact.counts.tensors().items():
+        assert np.array_equal(again.counts.tensors()[name], tensor), name
+    before, after = artifact.manifest, again.manifest
+    assert after.calibration == before.calibration
+    assert set(after.metrics) == set(before.metrics)
+    other = tuple(source.model_copy(update={"digest": "0" * 64}) for source in before.data)
+    changed = replace(artifact, manifest=before.model_copy(update={"data": other}))
+    with pytest.raises(RunError, match="the scenes of rooms have changed"):
+        refit(changed, Path(), Store(store), "1.0.3")
+
+
 def pinned(name: str) -> set[str]:
     """The packages of a lock file."""
     lines = (ROOT / name).read_text().splitlines()
@@ -100,9 +120,10 @@ def test_from_rooms_to_answers(tmp_path):
     assert again == pytest.approx(card, abs=1e-6)
     # Everyday facts are measured where their folder is.
     assert {task.split()[0] for task, _, _ in card} - {"Everyday"} == {
-        "T1", "T1a", "T1b", "T2", "T2-at", "T3", "T3b", "T4", "Calibration", "Offsets",
+        "T1", "T1a", "T1b", "T2", "T2-at", "T3", "T3b", "T4", "Calibration", "Offsets", "Counts",
     }  # fmt: skip
     same_offsets_as_training_alone_teaches(artifact, load_config(str(config)))
+    same_weights_with_refitted_statistics(artifact, tmp_path / "store")
     calibration = artifact.calibration
     assert calibration.outlier.slope < 0  # the likelier an object, the less an intruder
     limits = calibration.outlier_thresholds
@@ -121,8 +142,14 @@ def test_from_rooms_to_answers(tmp_path):
     ("arguments", "message"),
     [
         (("train", "nowhere.toml"), "no configuration"),
-        (("train", "indoor-triway", "--data", "nowhere"), "pass the folder of this file"),
+        (
+            ("train", "indoor-triway", "--data", "nowhere"),
+            "13 of 13 files of scenes are missing in nowhere: sunrgbd.jsonl.gz",
+        ),
+        (("train", "everyday-gbm", "--data", "nowhere"), "`python -m training fetch` says where"),
+        (("fetch", "nowhere"), "neither a source nor a shipped configuration"),
         (("publish", "nowhere", "1.0.0"), "no finished run"),
+        (("publish", "nowhere@1.0.0", "1.0.1", "--promote"), "use --alias with name@version"),
         (("evaluate", "nowhere", "--store", "nowhere"), "error"),
         (("compare", "nowhere"), "names neither the folder of a finished run nor a model"),
         (("compare", "baselines"), "choose a first model that was trained"),

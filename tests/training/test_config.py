@@ -89,7 +89,7 @@ def test_files_are_looked_for_beside_their_configuration(tmp_path) -> None:
         assert data_folder(reference, config) == folder
         assert data_folder(reference, config, tmp_path) == tmp_path
     assert data_folder("indoor-rbm", load_config("indoor-rbm")) == DATA
-    with pytest.raises(ConfigError, match=r"there is no day\.one\.jsonl\.gz in"):
+    with pytest.raises(ConfigError, match=r"missing in .*: \.\./day\.one\.jsonl\.gz, 3dssg"):
         prepare(config, folder)
 
 

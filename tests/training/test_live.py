@@ -66,7 +66,6 @@ def test_a_run_shows_its_scores_and_what_to_do_next(tmp_path) -> None:
     summarise(result, trainer, tmp_path, console)
     shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", console.file.getvalue())
     assert "epoch 4/4" in shown
-    assert f"update {trainer.updates}" in shown
     assert f"MRR {result.epochs[result.best_epoch].mrr_validation:.3f}" in shown
     assert f"best epoch {result.best_epoch + 1} of 4" in shown
     assert f"compare {tmp_path}" in shown

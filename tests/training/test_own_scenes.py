@@ -133,16 +133,23 @@ def test_the_same_again_is_not_worse_and_may_take_its_place(workplace) -> None:
 def test_a_worse_version_is_refused_unless_somebody_insists(workplace) -> None:
     text = (workplace.folder / "my-lab" / "my-lab.toml").read_text()
     hasty = workplace.folder / "my-lab" / "hasty.toml"
-    lines = ["epochs = 3" if line.startswith("epochs") else line for line in text.splitlines()]
+    changed = {
+        "epochs": "epochs = 1",
+        "updates": "updates = 0",
+        "learning_rate": "learning_rate = 1e-6",
+    }
+    lines = [changed.get(line.partition(" ")[0], line) for line in text.splitlines()]
     hasty.write_text("\n".join(lines))
     invoke("train", hasty, "--seed", 1, *workplace.places)
     run = workplace.run.with_name("seed-1")
     before, versions = workplace.served, workplace.versions
 
-    output = workplace.publish(run, "2.0.0", "--promote", code=3)
-    assert "refused: the new version is worse than" in output
-    assert "nothing was published" in output
-    assert (workplace.served, workplace.versions) == (before, versions)
+    for alias in ("default", "new-alias"):
+        output = workplace.publish(run, "2.0.0", "--promote", "--alias", alias, code=3)
+        assert "refused: the new version is not better than popularity" in output
+        assert "the new version is worse than EASE" in output
+        assert "nothing was published" in output
+        assert (workplace.served, workplace.versions) == (before, versions)
 
     _, comparison = workplace.compare(run, before)
     (missing,) = [
@@ -153,7 +160,7 @@ def test_a_worse_version_is_refused_unless_somebody_insists(workplace) -> None:
     assert missing["high"] < -0.02
 
     output = workplace.publish(run, "2.0.0", "--promote", "--even-if-worse")
-    assert "worse" in output
+    assert f"accepted by --even-if-worse: the new version is worse than {before}" in output
     assert f"promoted: default → my-lab@2.0.0, before {before}" in output
     assert workplace.served == "my-lab@2.0.0"
 

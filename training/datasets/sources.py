@@ -107,12 +107,14 @@ class Source:
         meaning: meaning of unlisted relations. None means `LISTS` for scenes with listed relations
             and `BOXES` for other scenes.
         predicates: maps predicates of the data source to relations of the service. The reader skips
-            other predicates, such as "inside" and "wear". None means that predicates are names of
-            relations, and another predicate is an error.
+            other predicates, such as "inside" and "wear". None means that another predicate is an
+            error. Names of relations are predicates of every source.
         left_out: labels that are ignored because their annotation is too incomplete.
         open_vocabulary: True if annotators used free words. An unlisted class is then absent.
             Otherwise annotators chose labels from a list, and a class outside the list is
             unobserved.
+        counts_movables: True if the source counts only movable objects. Other classes occur once
+            in each scene that lists them.
     """
 
     terms: str
@@ -121,6 +123,7 @@ class Source:
     predicates: Mapping[str, str] | None = None
     left_out: tuple[str, ...] = ()
     open_vocabulary: bool = False
+    counts_movables: bool = False
 
 
 _BEDROOMS: Final = Source(
@@ -185,6 +188,7 @@ SOURCES: Final[dict[str, Source]] = {
             on_top="unobserved", above="unobserved", lateral="unobserved", scenes_per_group=3.0
         ),
         predicates=_THE_EIGHT,
+        counts_movables=True,
     ),
     "bddl_goal": Source(
         "BEHAVIOR-1K (Li et al., CoRL 2022): end states of household activities; MIT",
@@ -232,7 +236,7 @@ def relation_of(source: str, predicate: str) -> str | None:
         ValueError: the predicate is unknown, and the data source has no table of predicates.
     """
     known = SOURCES.get(source)
-    if known is not None and known.predicates is not None:
+    if known is not None and known.predicates is not None and predicate not in RELATIONS:
         return known.predicates.get(predicate)
     if predicate not in RELATIONS:
         raise ValueError(f"unknown relation {predicate!r}: must be one of {', '.join(RELATIONS)}")

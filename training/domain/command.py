@@ -24,6 +24,7 @@ from training.datasets.readers import guess_format
 from training.datasets.rooms import DOMAINS
 from training.domain.proposal import Proposal, propose
 from training.domain.report import as_dict, show
+from training.example_scenes import examples_json
 
 # Maximum number of invalid lines that are printed. Further invalid lines are only counted.
 BAD_LINES = 20
@@ -55,13 +56,15 @@ def init(
 ) -> None:
     """Analyse your scenes, and propose a vocabulary and a training configuration.
 
-    The command writes <name>.toml and vocabulary.json into the output folder. You can edit both
-    files. The command overwrites existing files only with --force.
+    The command writes <name>.toml, vocabulary.json and examples.json (scenes for the visual page)
+    into the output folder. You can edit these files. The command overwrites existing files only
+    with --force.
     """
     folder = Path(name) if output is None else output
     try:
         _check_name(name)
-        targets = [folder / f"{name}.toml", folder / "vocabulary.json"]
+        names = (f"{name}.toml", "vocabulary.json", "examples.json")
+        targets = [folder / file for file in names]
         if not force and (there := [path for path in targets if path.exists()]):
             raise ConfigError(
                 f"{' and '.join(map(str, there))} would be overwritten: use --force, or choose "
@@ -86,6 +89,7 @@ def init(
         write_jsonl(some, path)
     _write(targets[0], proposal.toml())
     _write(targets[1], vocabulary_json(proposal.vocabulary))
+    _write(targets[2], examples_json(proposal.examples))
     if report is not None:
         _write(report, json.dumps(as_dict(proposal), indent=1, ensure_ascii=False) + "\n")
     show(proposal, console)

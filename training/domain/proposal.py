@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from app.registry import Example
 from app.scene import Vocabulary, label_key
 from training.config import Config, ConfigError, sections_toml
 from training.datasets import (
@@ -25,6 +26,8 @@ from training.datasets import (
 )
 from training.domain.labels import Label, Lookalike, count_labels, lookalikes
 from training.domain.look import Facts, look
+from training.evaluation.metrics import FEWEST_GROUPS
+from training.example_scenes import choose_examples
 
 # Possible minimum numbers of objects of a class, in order of preference. A class with few objects
 # is hardly trained. A small data set needs a small minimum, so that the vocabulary covers enough
@@ -32,6 +35,9 @@ from training.domain.look import Facts, look
 MINIMA: Final = (8, 5, 3, 2)
 COVERED: Final = 0.97
 _TABLE: Final = (2, 3, 5, 8, 16, 30)
+# docs/decisions/own-scenes.md gives the measurement behind these two numbers of scenes.
+FEWEST_SCENES: Final = 20
+FEW_SCENES: Final = 80
 # Maximum number of classes. docs/benchmarks.md gives the cost of larger vocabularies.
 _MOST_CLASSES: Final = 2000
 _SPLIT_SEEDS: Final = 50
@@ -54,6 +60,8 @@ class Proposal:
         values: maps each section of the configuration to its entries.
         reasons: maps "section.entry" to the reason for the value.
         parts: number of scenes in each part of the proposed split.
+        test_groups: number of groups of near-duplicates in the test part.
+        examples: example scenes for the visual page.
     """
 
     name: str
@@ -67,17 +75,32 @@ class Proposal:
     values: dict[str, Any]
     reasons: dict[str, str]
     parts: dict[str, int]
+    test_groups: int
+    examples: tuple[Example, ...]
 
     @property
     def config(self) -> Config:
         """Return the proposed configuration after validation."""
         return Config.model_validate(self.values)
 
+    @property
+    def warning(self) -> str:
+        """A warning if the scenes are few, or ""."""
+        if self.facts.scenes >= FEW_SCENES and self.test_groups >= FEWEST_GROUPS:
+            return ""
+        return (
+            f"{self.facts.scenes} scenes of {self.facts.groups} groups are few: the test part has "
+            f"{self.parts['test']} scenes of {self.test_groups} groups. `publish --promote` needs "
+            f"test scenes of {FEWEST_GROUPS} groups, which takes about {FEW_SCENES} scenes of "
+            f"{FEW_SCENES // 2} groups. Add scenes of other places, and run init again"
+        )
+
     def toml(self) -> str:
         """Return the configuration as TOML text. A comment above each entry gives the reason."""
         return (
             f"# Proposed by `python -m training init {self.name}`; you can change every entry.\n"
-            "# `python -m training tune` searches for better values on the validation scenes.\n\n"
+            "# `python -m training tune` searches for better values on the validation scenes.\n"
+            "# The published model contains the scenes of examples.json, for the visual page.\n\n"
             f"{sections_toml(self.values, self.reasons)}"
         )
 
@@ -98,7 +121,7 @@ def propose(
         terms: terms of use of the scenes.
 
     Raises:
-        ConfigError: the scenes are too few for training and testing.
+        ConfigError: there are fewer than `FEWEST_SCENES` scenes, or they cannot be split.
         ValueError: the list of scenes is empty, or the scenes contain no objects.
     """
     names = curated_names()
@@ -107,7 +130,13 @@ def propose(
     pairs = lookalikes(labels, scenes, names)
     minimum, covered = _minimum(scenes, pairs)
     vocabulary = _vocabulary(scenes, pairs, minimum)
-    seed, parts = _split(scenes)
+    if len(scenes) < FEWEST_SCENES:
+        raise ConfigError(
+            f"{len(scenes)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
+            "may learn no more than the frequency of each class. Provide at least "
+            f"{FEWEST_SCENES} scenes, better {FEW_SCENES} scenes of {FEW_SCENES // 2} places"
+        )
+    seed, parts, test_groups = _split(scenes)
     values, reasons = _configuration(facts, parts)
     reasons["data.vocabulary"] = (
         f"{len(vocabulary)} classes with at least {minimum} mentions; edit the file to change them"
@@ -130,6 +159,7 @@ def propose(
     values = {
         "name": name,
         "description": f"{values['machine']['variant'].capitalize()} machine over {name} scenes.",
+        "examples": "examples.json",
         "data": data,
     } | values
     return Proposal(
@@ -144,6 +174,8 @@ def propose(
         values=values,
         reasons=reasons,
         parts=parts,
+        test_groups=test_groups,
+        examples=choose_examples(scenes, vocabulary),
     )
 
 
@@ -212,20 +244,20 @@ def _dropped(
     ]
 
 
-def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int]]:
-    """Return a seed of the split, and the number of scenes in each part of the split.
+def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
+    """Return a seed of the split, the number of scenes in each part, and of test groups.
 
     The function returns the first seed whose parts are near their target shares. If there is no
     such seed, it returns the best of the tested seeds.
     """
-    best: tuple[float, int, dict[str, int]] | None = None
+    best: tuple[float, int, dict[str, int], int] | None = None
     for seed in range(_SPLIT_SEEDS):
         found = split(scenes, seed=seed, protocol="stable")
         parts: dict[str, int] = {part: len(some) for part, some in found.items()}
         shares = FRACTIONS["stable"]
         off = max(abs(parts[p] / (share * len(scenes)) - 1) for p, share in shares.items())
         if min(_telling(some) for some in found.values()) and (best is None or off < best[0]):
-            best = (off, seed, parts)
+            best = (off, seed, parts, len({scene.group for scene in found["test"]}))
         if best is not None and best[0] <= _TOLERANCE:
             break
     if best is None:
@@ -234,7 +266,7 @@ def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int]]:
             "split: every part needs scenes with at least three different objects. Provide more "
             "scenes or smaller groups"
         )
-    return best[1], best[2]
+    return best[1:]
 
 
 def _telling(scenes: Sequence[AnnotatedScene]) -> int:
@@ -245,9 +277,11 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
     n = parts["train"]
     related = facts.related
     H1 = _between(n, (200, 50), (2000, 200))
-    batch = 32 if n < 1500 else 64
+    # About eight updates an epoch or more: validation after each epoch takes longer than an update.
+    batch = max(4, min(32, n // 8)) if n < 1500 else 64
     updates = _between(n, (200, 600), (2500, 1800))
     epochs = max(15, math.ceil(updates / math.ceil(n / batch)))
+    patience = max(10, epochs // 4)
     machine: dict[str, Any] = {"variant": "triway" if related else "rbm", "form": "local"}
     machine |= {"H1": H1, "H2": 0, "initial_c1": -1.0, "N": 128 if n < 1500 else 512}
     if related:
@@ -268,6 +302,7 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         "optimiser": "adamw",
         "learning_rate": 0.01,
         "epochs": epochs,
+        "patience": patience,
         "batch_size": batch,
         "weight_decay": 0.06 if n < 3500 else 0.03,
         "relation_rate": 0.1,
@@ -279,7 +314,9 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         if related
         else "the scenes contain no relations or positions: the model learns objects only",
         "machine.H1": f"hidden units: many more would overfit the {n} training scenes",
-        "training.epochs": f"at least {updates} updates at {math.ceil(n / batch)} updates an epoch",
+        "training.epochs": f"at most {updates} updates, {math.ceil(n / batch)} updates an epoch",
+        "training.patience": f"training stops after {patience} epochs without a better score on "
+        "validation scenes, and keeps the best epoch",
         "training.weight_decay": "few scenes need a larger decay",
         "objective.unlisted": "an unlisted relation counts as false: /relations then predicts the "
         "relations that an annotator would list",

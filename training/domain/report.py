@@ -34,6 +34,8 @@ def as_dict(proposal: Proposal) -> dict[str, Any]:
         "configuration": proposal.values,
         "reasons": proposal.reasons,
         "parts": proposal.parts,
+        "test_groups": proposal.test_groups,
+        "warning": proposal.warning,
     }
 
 
@@ -45,6 +47,8 @@ def show(proposal: Proposal, console: Console) -> None:
     _coverage(proposal, console)
     _findings(proposal, console)
     _choices(proposal, console)
+    if proposal.warning:
+        console.print(f"[yellow]warning:[/yellow] {proposal.warning}", soft_wrap=True)
 
 
 def _facts(proposal: Proposal, console: Console) -> None:

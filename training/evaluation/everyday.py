@@ -24,7 +24,8 @@ from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.setting import Contender, Outcome, Setting
 
 EVERYDAY = DATA.parent / "everyday"
-"""Default folder of the facts."""
+"""Default folder of the facts, outside the repository: facts.json, which people wrote by hand.
+Without this file, the task is skipped."""
 
 SOURCE = "facts"
 

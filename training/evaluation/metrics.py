@@ -29,6 +29,10 @@ Flags = NDArray[np.bool_]
 
 RESAMPLES = 1000
 
+FEWEST_GROUPS = 6
+"""Minimum number of groups of near-duplicate scenes for a paired difference. A useless model is
+better in all of five groups with a probability of 1/32, which is more than 2.5 %."""
+
 
 @dataclass(frozen=True)
 class Figure:

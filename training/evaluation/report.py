@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
@@ -228,6 +228,7 @@ def evaluate(
     *,
     limit: int | None = None,
     everyday: Path | None = None,
+    tasks: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> list[Row]:
     """Measure the metrics of a model card on every data source.
@@ -243,11 +244,15 @@ def evaluate(
         limit: maximum number of scenes per data source in slow tasks, see `Setting`. None means 200
             scenes, or 20 scenes for a machine that computes its answers by sampling.
         everyday: folder of the everyday facts, see `Setting`.
+        tasks: names of the tasks to measure. None means all tasks of a model card.
     """
     if limit is None:
         limit = _LIMIT if artifact.oracle is None else _LIMIT_OF_DRAWS
     contender = artifact_contender(artifact, train)
-    single = [task for task, one in EVERY_TASK.items() if one.card and task not in WHOLE_SET]
+    wanted = [
+        task for task, one in EVERY_TASK.items() if one.card and (tasks is None or task in tasks)
+    ]
+    single = [task for task in wanted if task not in WHOLE_SET]
     sources = list(by_source(scenes))
     training = dict(by_source(train))
     rows: list[Row] = []
@@ -256,10 +261,11 @@ def evaluate(
         rows += _published(contender, setting, source, single, progress)
     together = sources[0][0] if len(sources) == 1 else "pooled"
     setting = Setting(scenes, structure, train, limit=limit)
-    whole = [task for task in WHOLE_SET if task not in ONCE]
+    whole = [task for task in wanted if task in WHOLE_SET and task not in ONCE]
     rows += _published(contender, setting, together, whole, progress)
     setting = Setting(scenes, structure, limit=limit, everyday=everyday)
-    return rows + _published(contender, setting, SOURCE, ONCE, progress)
+    once = [task for task in wanted if task in ONCE]
+    return rows + _published(contender, setting, SOURCE, once, progress)
 
 
 def _published(

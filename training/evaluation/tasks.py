@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+from training.evaluation import counts, offsets
 from training.evaluation.answers import QUESTIONS, calibration_task
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.density import density_task
@@ -28,7 +29,6 @@ from training.evaluation.missing import (
     partial_task,
     placed_task,
 )
-from training.evaluation.offsets import METRICS, offsets_task
 from training.evaluation.outliers import outliers_task, sensitivity_task, signature_task
 from training.evaluation.pairs import pairs_task
 from training.evaluation.relations import completion_task, placement_task, relations_task
@@ -45,6 +45,7 @@ class Task:
     """One task.
 
     Attributes:
+        words: name of the task in the tables of the command line.
         ask: function that takes the model (`Contender`) and the questions (`Setting`), and returns
             the metrics.
         shown: names of the metrics in Markdown tables. JSON files contain all metrics.
@@ -52,6 +53,7 @@ class Task:
         of_objects: True if the task uses only scenes with complete object lists.
     """
 
+    words: str
     ask: Callable[[Contender, Setting], Outcome | None]
     shown: tuple[str, ...] = ()
     card: tuple[str, ...] = ()
@@ -67,11 +69,12 @@ class Task:
 
 
 def _objects(
+    words: str,
     ask: Callable[[Contender, Setting], Outcome | None],
     shown: tuple[str, ...],
     card: tuple[str, ...] = (),
 ) -> Task:
-    return Task(ask, shown, card, of_objects=True)
+    return Task(words, ask, shown, card, of_objects=True)
 
 
 def _each(names: tuple[str, ...], kinds: tuple[str, ...]) -> tuple[str, ...]:
@@ -87,54 +90,77 @@ _BY_SENSITIVITY = tuple(
 
 TASKS: dict[str, Task] = {
     "T1a relations": Task(
+        "relations of a scene",
         relations_task,
         shown=("R-precision, distinct classes", "R-precision, instance counts"),
         card=("R-precision, distinct classes", "R-precision, instance counts"),
     ),
     "T1 pairs": Task(
+        "relation of two objects",
         pairs_task,
         shown=("accuracy", "log-loss", "accuracy, unseen pairs", "accuracy, rare classes"),
         card=("accuracy", "log-loss"),
     ),
     "T1 with evidence": Task(
+        "relations, with more evidence",
         relations_evidence_task,
         shown=_each(("change of R-precision",), KINDS[:2]),
         card=_each(("change of R-precision",), KINDS[:2]),
     ),
-    "T1b completion": Task(completion_task, shown=("R-precision",), card=("R-precision",)),
-    "T2 missing": _objects(missing_task, ("MRR", "top-1", "top-10"), ("MRR", "top-1", "top-10")),
+    "T1b completion": Task(
+        "remaining relations", completion_task, shown=("R-precision",), card=("R-precision",)
+    ),
+    "T2 missing": _objects(
+        "missing object", missing_task, ("MRR", "top-1", "top-10"), ("MRR", "top-1", "top-10")
+    ),
     "T2 missing, room type given": _objects(
-        missing_in_room_task, ("MRR", "MRR, room type withheld")
+        "missing object, room type known", missing_in_room_task, ("MRR", "MRR, room type withheld")
     ),
     "T2 partial": _objects(
+        "missing objects of a partial scene",
         partial_task,
         (*_each(("MRR",), tuple(SHARES)), "precision@5, 50 %", "change of MRR, 50 %"),
         ("MRR, 50 %", "precision@5, 50 %", "change of MRR, 50 %"),
     ),
     "T2 with evidence": _objects(
-        missing_evidence_task, _each(("change of MRR",), KINDS), _each(("change of MRR",), KINDS)
+        "missing object, with more evidence",
+        missing_evidence_task,
+        _each(("change of MRR",), KINDS),
+        _each(("change of MRR",), KINDS),
     ),
-    "T2-at missing at a place": _objects(placed_task, ("MRR", "MRR, on-top"), ("MRR",)),
+    "T2-at missing at a place": _objects(
+        "missing object at a place", placed_task, ("MRR", "MRR, on-top"), ("MRR",)
+    ),
     "T3 outliers, uniform": _objects(
+        "intruder",
         outliers_task,
         ("hit@1", "AUROC", "alarms in untouched scenes", "intruders caught"),
         ("hit@1", "AUROC", "alarms in untouched scenes"),
     ),
-    "T3 outliers, by popularity": _objects(partial(outliers_task, law=by_popularity), ("hit@1",)),
-    "T3 outliers, same room type": _objects(partial(outliers_task, law=by_room), ("hit@1",)),
+    "T3 outliers, by popularity": _objects(
+        "intruder of a frequent class", partial(outliers_task, law=by_popularity), ("hit@1",)
+    ),
+    "T3 outliers, same room type": _objects(
+        "intruder of the same room type", partial(outliers_task, law=by_room), ("hit@1",)
+    ),
     "T3 signature": _objects(
+        "intruder of another room type",
         signature_task,
         ("hit@1", "hit@1, log-odds alone", *_each(("caught",), SENSITIVITIES)),
         ("hit@1", "caught, medium"),
     ),
-    "T3 sensitivity": _objects(sensitivity_task, _BY_SENSITIVITY, _BY_SENSITIVITY),
+    "T3 sensitivity": _objects(
+        "intruder, by sensitivity", sensitivity_task, _BY_SENSITIVITY, _BY_SENSITIVITY
+    ),
     "T3 with evidence": _objects(
+        "intruder, with more evidence",
         outliers_evidence_task,
         _each(("change of hit@1",), KINDS),
         _each(("change of hit@1",), KINDS),
     ),
-    "T3b placement": Task(placement_task, shown=("hit@1",), card=("hit@1",)),
+    "T3b placement": Task("false relation", placement_task, shown=("hit@1",), card=("hit@1",)),
     "T4 generate": _objects(
+        "generated scenes",
         generation_task,
         (
             "MMD², free",
@@ -147,17 +173,21 @@ TASKS: dict[str, Task] = {
         ),
         ("MMD², free", "pair correlation, free"),
     ),
-    "Density": _objects(density_task, ("gain over independent classes, upper log Z",)),
+    "Density": _objects(
+        "density of scenes", density_task, ("gain over independent classes, upper log Z",)
+    ),
     "Calibration": Task(
+        "calibration",
         calibration_task,
         shown=_each(("ECE", "Brier skill"), tuple(QUESTIONS)),
         card=tuple(f"{figure}, {name}" for name in QUESTIONS for figure in ("ECE", "Brier skill")),
     ),
-    "Everyday": Task(everyday_task, shown=LINES, card=LINES),
+    "Everyday": Task("everyday facts", everyday_task, shown=LINES, card=LINES),
 }
 
 SEED_TASKS: dict[str, Task] = {
     "Seed T1": Task(
+        "relations, seed protocol",
         relations_switched_on,
         shown=(
             "labelled relations switched on",
@@ -166,6 +196,7 @@ SEED_TASKS: dict[str, Task] = {
         ),
     ),
     "Seed T2": Task(
+        "missing object, seed protocol",
         removed_switched_on,
         shown=(
             "removed objects switched on, relations left on",
@@ -173,14 +204,27 @@ SEED_TASKS: dict[str, Task] = {
         ),
     ),
     "Seed T3": Task(
-        reconstruction_after_addition, shown=("error measure", "error measure, doing nothing")
+        "intruder, seed protocol",
+        reconstruction_after_addition,
+        shown=("error measure", "error measure, doing nothing"),
     ),
 }
 """Tasks of the seed protocol (Bozcan et al., 2018). Their results have separate tables."""
 
-# The offsets depend only on the training scenes, not on the machine. They appear in model cards,
+# The statistics depend only on the training scenes, not on the machine. They appear in model cards,
 # but not in tables that compare machines.
-EVERY_TASK = TASKS | SEED_TASKS | {"Offsets": Task(offsets_task, card=METRICS)}
+STATISTICS: dict[str, Task] = {
+    "Offsets": Task("offsets of placements", offsets.offsets_task, card=offsets.METRICS),
+    "Counts": _objects("numbers of instances", counts.counts_task, (), counts.METRICS),
+}
+
+EVERY_TASK = TASKS | SEED_TASKS | STATISTICS
+
+
+def in_words(task: str) -> str:
+    """Return the name of a task in tables for people. JSON files and manifests use the key."""
+    return EVERY_TASK[task].words if task in EVERY_TASK else task
+
 
 ONCE = ("Everyday",)
 """Tasks that do not depend on the held-out scenes. They are measured once, not per data source."""

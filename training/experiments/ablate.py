@@ -106,8 +106,10 @@ def ablate(
     ]
     text = "\n\n".join(parts).rstrip() + "\n"
     write(place, results.to_dict() | {"failures": failures}, text)
-    console.print(text, markup=False, soft_wrap=True)
-    console.print(f"all results: {place / 'results.json'}")
+    console.print(*results.tables(PRIMARY))
+    for name, why in failures.items():
+        console.print(f"{name} could not be measured: {why}", markup=False, soft_wrap=True)
+    console.print(f"all results: {place / 'results.md'}, {place / 'results.json'}", soft_wrap=True)
 
 
 def _configs(

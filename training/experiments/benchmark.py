@@ -249,7 +249,11 @@ def benchmark(
                 compare_by_seed_protocol(domain, place / "seed-protocol", options)
             if shuffled:
                 compare_on_shuffled(domain, place / "shuffled", options)
-            console.print(f"all results: {place}/**/results.json, with plots beside them")
+            console.print(
+                f"all results: results.md and results.json in {place} and its subfolders, with "
+                "plots beside them",
+                soft_wrap=True,
+            )
 
 
 def default_configs() -> list[str]:
@@ -337,6 +341,7 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
     reports = _measured(plan, rows, options, domain.name)
     results = summarise(reports, domain.configs[0].name, parameters(folder, rows))
     _write(folder, scenes, results.to_dict(), f"# {domain.name}\n\n{results.markdown()}")
+    console.print(*results.tables())
     names = {config.name for config in domain.configs}
     write_plots(plan, [row for row in rows if row.name in names], reports, results)
     return results
@@ -358,6 +363,7 @@ def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> 
     # The seed protocol does not rank the machines, so the results contain no paired differences.
     results = replace(found, differences=())
     _write(folder, scenes, results.to_dict() | {"paper": PAPER}, _protocol_text(results))
+    console.print(*results.tables({name: task.shown for name, task in SEED_TASKS.items()}))
     return results
 
 
@@ -407,6 +413,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
             results[task] = summarise(some, yardstick, weights)
             text = shuffled_text(task, results[task])
             _write(folder / slug(task), scenes, results[task].to_dict(), text)
+            console.print("trained on shuffled scenes:", *results[task].tables({task: (metric,)}))
     return results
 
 
@@ -448,7 +455,6 @@ def _measured(plan: Plan, rows: Sequence[Row], options: Options, title: str) -> 
 def _write(folder: Path, scenes: SplitScenes, values: dict[str, Any], text: str) -> None:
     """Write the results and the sha256 of each data source."""
     write(folder, {"contents": dict(scenes.digests)} | values, text)
-    console.print(text, markup=False)
 
 
 def _protocol_text(results: Results) -> str:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
@@ -25,6 +26,7 @@ from training.datasets import AnnotatedScene, DatasetError, annotated_classes, e
 from training.evaluation.missing import ObjectScore, leave_one_out
 from training.evaluation.report import Progress, SourceReport, digest, run, silent
 from training.evaluation.setting import Setting
+from training.evaluation.tasks import TASKS, in_words
 from training.experiments.results import Difference, Results, only, summarise
 from training.experiments.sides import (
     BASELINE_SIDE,
@@ -190,17 +192,25 @@ def _root(given: Path | None, *sides: Side) -> Path:
 
 def show(comparison: Comparison, console: Console) -> None:
     """Print the metrics of a comparison as a table, with its notes and examples."""
-    title = f"{comparison.scenes} held-out scenes of {comparison.groups} groups"
-    table = Table(title=title, title_justify="left")
-    for name in ("task", "metric", comparison.a, comparison.b, "difference", ""):
-        table.add_column(name, overflow="fold")
+    console.print(
+        f"{comparison.scenes} held-out scenes of {comparison.groups} groups\n"
+        f"A: {comparison.a}\nB: {comparison.b}",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+    table = Table("task, metric", "A", "B", "A - B, 95 % interval", "A is", box=box.SIMPLE_HEAD)
+    for column in table.columns[1:]:
+        column.no_wrap = True
     cells = comparison.results.cells
     values = {(cell.row, cell.task, cell.metric): cell.figure.value for cell in cells}
     for row in comparison.results.differences:
         colour, figure = _COLOURS.get(row.verdict, "dim"), row.figure
-        task, metric = (row.task, row.metric) if is_primary(row) else ("", f"  {row.metric}")
+        name = f"  {row.metric}"
+        if is_primary(row):
+            name = f"{in_words(row.task)},\n{name}"
         table.add_row(
-            *(task, metric),
+            name,
             *(f"{values[x, row.task, row.metric]:.3f}" for x in (comparison.a, comparison.b)),
             f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]",
             f"[{colour}]{row.verdict}[/{colour}]",
@@ -208,7 +218,7 @@ def show(comparison: Comparison, console: Console) -> None:
     console.print(table)
     notes = list(comparison.notes)
     if comparison.unmeasured:
-        names = ", ".join(comparison.unmeasured)
+        names = ", ".join(map(in_words, comparison.unmeasured))
         notes.append(f"{comparison.a} was not measured in {names}: the scenes contain no relations")
     for note in notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
@@ -302,11 +312,12 @@ def side_by_side(
         ValueError: the scenes belong to fewer than two groups, so intervals are undefined.
     """
     setting = Setting(scenes, structure, limit=None)
-    groups = {
-        related: [scene.group for scene in setting.some(related).scenes]
-        for related in (False, True)
-    }
-    if len(set(groups[False])) < 2:
+
+    def groups(task: str) -> list[str]:
+        asked = setting.complete if TASKS[task].of_objects else setting
+        return [scene.group for scene in asked.some(task in _RELATED).scenes]
+
+    if len({scene.group for scene in scenes.scenes}) < 2:
         raise ValueError("the scenes belong to one group, but intervals need at least two groups")
     reports = {}
     for title, rival in zip(titles, rivals, strict=True):
@@ -316,7 +327,7 @@ def side_by_side(
                 pass
         reports[title, 0] = {"held out": only(report, COMPARED)}
     progress("resampling groups")
-    return summarise(reports, titles[0], groups=lambda task: groups[task in _RELATED])
+    return summarise(reports, titles[0], groups=groups)
 
 
 def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:

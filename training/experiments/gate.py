@@ -1,47 +1,143 @@
-"""Decide whether a new version may replace the version that an alias serves.
+"""Decide whether an alias may point at a new version.
 
-Both versions are compared on common held-out scenes (see compare.py). The new version is refused if
-a primary metric is lower by more than the margin, over the whole interval of the paired difference.
-Smaller or uncertain losses are accepted. The new version is also refused if the served version was
-measured on relation tasks and the comparison contains none.
+First, the new version must be useful. On the test scenes of its run, it must rank missing objects
+better than popularity (the class frequencies), and not worse than EASE (class co-occurrence).
+
+Then the new version is compared with the version that the alias serves, on common held-out scenes
+(see compare.py). It is refused if a primary metric is lower by more than the margin, over the whole
+interval of the paired difference. Smaller or uncertain losses are accepted. The new version is also
+refused if the served version was measured on relation tasks and the comparison contains none.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from app.registry import Artifact, ArtifactError, Store, StoreError
 from app.registry.references import AliasTarget
+from training.baselines import BASELINES
+from training.batches import subset
+from training.cases import some_scenes
+from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
+from training.evaluation.missing import MachineScore, ObjectScore, leave_one_out
+from training.evaluation.tasks import in_words
 from training.experiments.compare import Comparison, compare
 from training.experiments.sides import Say, Side, stored_side
+from training.machines.arrays import machine_of
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
+from training.trainer import TrainingData
 
 # Accepted loss of a primary metric when a new version replaces the served version.
 MARGIN = 0.02
 
+NEW = "the new version"
+POPULARITY, CO_OCCURRENCE = "popularity", "EASE"
 
-class WorseError(RuntimeError):
-    """The new version is refused: it is worse than the served version, or lacks relation metrics.
+
+class RefusedError(RuntimeError):
+    """The new version is refused. The text gives the reasons."""
+
+    def __init__(self, reasons: Sequence[str]) -> None:
+        super().__init__("; ".join(reasons))
+
+
+@dataclass(frozen=True)
+class Usefulness:
+    """A new version beside two baselines: MRR (mean reciprocal rank) of missing objects.
 
     Attributes:
-        comparison: comparison of the new version with the served version.
+        scenes, groups: number of test scenes, and of their groups of near-duplicates.
+        ours: MRR of the new version. None if no test scene can be used.
+        theirs: MRR of each baseline, by name.
+        differences: new version minus baseline, with the paired 95 % interval, by name.
     """
 
-    def __init__(self, comparison: Comparison, margin: float) -> None:
-        a, b, reasons = comparison.a, comparison.b, []
-        if rows := comparison.worse_by(margin):
-            names = ", ".join(f"{row.task} {row.metric} ({row.figure})" for row in rows)
-            reasons.append(f"{a} is worse than {b} by more than {margin}: {names}")
-        if comparison.unmeasured:
-            names = ", ".join(comparison.unmeasured)
+    scenes: int
+    groups: int
+    ours: float | None = None
+    theirs: Mapping[str, float] = field(default_factory=dict)
+    differences: Mapping[str, Figure] = field(default_factory=dict)
+
+    def lines(self) -> Iterator[str]:
+        """Generate the results as lines of at most 80 characters."""
+        if self.ours is None:
+            return
+        yield f"mean reciprocal rank of a missing object, {self._place()}:"
+        yield f"  {NEW:16} {self.ours:.3f}"
+        for name, value in self.theirs.items():
+            yield f"  {name:16} {value:.3f}  difference {_signed(self.differences[name])}"
+
+    def objections(self) -> list[str]:
+        """Return the reasons against the new version; an empty list if it is useful."""
+        if self.ours is None or self.groups < FEWEST_GROUPS:
+            return [
+                f"{NEW} cannot be compared with {POPULARITY}: {self._place()}, and a "
+                f"comparison needs test scenes of at least {FEWEST_GROUPS} groups with two or more "
+                "classes. Provide more scenes"
+            ]
+        reasons = []
+        gain, loss = self.differences[POPULARITY], self.differences[CO_OCCURRENCE]
+        if not gain.low > 0:
+            advice = "check the labels and the training"
+            if gain.value > 0:
+                advice = "the gain may be chance: provide more scenes, or train longer"
             reasons.append(
-                f"{b} was measured in {names}, but {a} was not, because the compared scenes "
-                "contain no relations"
+                f"{NEW} is not better than popularity, which only knows how frequent each class "
+                f"is: {_signed(gain)}, {self._place()}; {advice}"
             )
-        super().__init__("; ".join(reasons))
-        self.comparison = comparison
+        if loss.high < 0:
+            reasons.append(
+                f"{NEW} is worse than EASE, a plain model of co-occurrence: "
+                f"{_signed(loss)}, {self._place()}"
+            )
+        return reasons
+
+    def _place(self) -> str:
+        return f"{self.scenes} test scenes of {self.groups} groups"
+
+
+def _signed(figure: Figure) -> str:
+    return f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]"
+
+
+def measure_usefulness(
+    artifact: Artifact, data: TrainingData, *, limit: int | None, say: Say
+) -> Usefulness:
+    """Compare a new version with popularity and EASE on the test scenes of its run.
+
+    The baselines learn from the training scenes of the run. Scenes with incomplete object lists are
+    left out, unless all test scenes are such scenes.
+
+    Args:
+        limit: maximum number of test scenes.
+    """
+    complete = data.test.complete.nonzero().squeeze(1)
+    scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, limit)
+    groups = [scene.group for scene in scenes.scenes]
+    size = len(scenes), len(set(groups))
+    if len(set(groups)) < FEWEST_GROUPS:
+        return Usefulness(*size)
+
+    def mrr(score: ObjectScore) -> Ratio:
+        return leave_one_out(scenes, data.structure, score).mrr()
+
+    try:
+        ours = mrr(MachineScore(machine_of(artifact.weights)))
+        theirs = {}
+        for name in (POPULARITY, CO_OCCURRENCE):
+            say(f"fitting {name}")
+            fitted = BASELINES[name].fit(data.train, data.validation, data.structure)
+            theirs[name] = mrr(fitted.score)
+    except ValueError:  # no scene has two classes
+        return Usefulness(*size)
+    return Usefulness(
+        *(*size, ours.value),
+        {name: other.value for name, other in theirs.items()},
+        {name: paired_difference(ours, other, groups=groups) for name, other in theirs.items()},
+    )
 
 
 @dataclass(frozen=True)
@@ -69,7 +165,7 @@ def seat(store: Store, alias: str) -> Seat:
     """
     target = store.aliases().get(alias)
     if target is None:
-        return Seat(alias, None, None, f"no comparison: {alias} is a new alias and serves no model")
+        return Seat(alias, None, None, f"{alias} is a new alias, so there is no older version")
     try:
         return Seat(alias, target, stored_side(alias, store), "")
     except (ArtifactError, StoreError) as error:
@@ -77,14 +173,13 @@ def seat(store: Store, alias: str) -> Seat:
         return Seat(alias, target, None, note)
 
 
-def judge(
+def compare_with_served(
     run: FinishedRun,
     scenes: SplitScenes,
     artifact: Artifact,
     holder: Side,
     root: Path,
     *,
-    margin: float,
     limit: int | None,
     say: Say,
 ) -> Comparison:
@@ -94,15 +189,29 @@ def judge(
         artifact: the new version.
         holder: the served version.
         root: folder with the scene files of the run.
-        margin: accepted loss of a primary metric.
         limit: maximum number of scenes.
 
     Raises:
-        WorseError: the new version is worse, or it is not measured on relation tasks.
         ConfigError: the comparison is impossible, see `compare`.
     """
-    new = Side("the new version", run.config, scenes.digests, artifact, root)
-    comparison = compare(new, holder, root, limit=limit, examples=3, say=say)
-    if comparison.worse_by(margin) or comparison.unmeasured:
-        raise WorseError(comparison, margin)
-    return comparison
+    new = Side(NEW, run.config, scenes.digests, artifact, root)
+    return compare(new, holder, root, limit=limit, examples=3, say=say)
+
+
+def losses(comparison: Comparison, margin: float) -> list[str]:
+    """Return the reasons against the first model of a comparison.
+
+    Args:
+        margin: accepted loss of a primary metric.
+    """
+    a, b, reasons = comparison.a, comparison.b, []
+    if rows := comparison.worse_by(margin):
+        names = ", ".join(f"{in_words(row.task)}, {row.metric} {row.figure}" for row in rows)
+        reasons.append(f"{a} is worse than {b} by more than {margin}: {names}")
+    if comparison.unmeasured:
+        names = ", ".join(map(in_words, comparison.unmeasured))
+        reasons.append(
+            f"{b} was measured in {names}, but {a} was not, because the compared scenes contain "
+            "no relations"
+        )
+    return reasons

@@ -11,9 +11,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from rich import box
+from rich.table import Table
+
 from training.evaluation.metrics import Figure, MeanOverSeeds, Metric, paired_difference
 from training.evaluation.report import SourceReport, write_whole
-from training.evaluation.tasks import TASKS
+from training.evaluation.tasks import TASKS, in_words
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
 
@@ -154,6 +157,35 @@ class Results:
                 asked = [asked for asked in self.asked if asked.task == task]
                 parts += [*tables, *remarks(asked)]
         return "\n\n".join(parts) + "\n"
+
+    def tables(self, shown: Mapping[str, tuple[str, ...]] | None = None) -> Iterator[Table]:
+        """Generate one table per task for the terminal, with the pooled sources if there are any.
+
+        A star has the meaning of `markdown`.
+        """
+        if shown is None:
+            shown = {name: task.shown for name, task in TASKS.items()}
+        sources = list(dict.fromkeys(cell.source for cell in self.cells))
+        chosen = [source for source in sources if "pooled" in source] or sources
+        worse = {
+            (gap.row, gap.task, gap.source, gap.metric)
+            for gap in self.differences
+            if gap.verdict == "better"
+        }
+        for task, metrics in shown.items():
+            table = Table("metric, model", *chosen, title=in_words(task), box=box.SIMPLE_HEAD)
+            for metric in metrics:
+                texts: dict[str, dict[str, str]] = {}
+                for cell in self.cells:
+                    if (cell.task, cell.metric) == (task, metric) and cell.source in chosen:
+                        star = " *" if (cell.row, task, cell.source, metric) in worse else ""
+                        texts.setdefault(cell.row, {})[cell.source] = f"{cell.figure}{star}"
+                if texts:
+                    table.add_row(f"[bold]{metric}[/bold]")
+                for row, found in texts.items():
+                    table.add_row(f"  {row}", *(found.get(source, "") for source in chosen))
+            if table.row_count:
+                yield table
 
     def _table(self, task: str, metric: str, changes: bool) -> str:
         cells = [cell for cell in self.cells if (cell.task, cell.metric) == (task, metric)]

@@ -297,7 +297,7 @@ def _scenes_of(
             found += sources[name]
             continue
         try:
-            one = data.model_copy(update={"sources": (source,)})
+            one = data.model_copy(update={"sources": (source,), "words": ""})
             (read,) = read_sources(one, root).values()
         except (ConfigError, DatasetError):
             return None

@@ -45,6 +45,7 @@ from training.evaluation.missing import MachineScore
 from training.evaluation.relations import machine_score
 from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
 from training.evaluation.setting import Contender
+from training.evaluation.tasks import in_words
 from training.experiments.measure import resumable
 from training.pipeline import prepare
 from training.trainer import Trainer, TrainingData
@@ -380,7 +381,11 @@ class Search:
 
 def shown(settings: Mapping[str, Any]) -> str:
     """Format the changed settings of a trial in one line."""
-    return ", ".join(f"{name.partition('.')[2]} {v}" for name, v in settings.items()) or "as it is"
+    parts = (
+        f"{name.partition('.')[2]} {f'{value:.4g}' if isinstance(value, float) else value}"
+        for name, value in settings.items()
+    )
+    return ", ".join(parts) or "as it is"
 
 
 def _counted(study: Study) -> list[FrozenTrial]:
@@ -435,7 +440,8 @@ def _suggested(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str,
 
 def _table(study: Study, title: str) -> Table:
     """Return a table of the trials from best to worst. Trials without a metric come last."""
-    table = Table(*FIGURES, "state", "settings", title=title)
+    heads = (f"{in_words(task)}, {name}" for name, (task, _) in FIGURES.items())
+    table = Table(*heads, "state", "settings", title=title)
     trials = [trial for trial in study.trials if "settings" in trial.user_attrs]
     for trial in sorted(trials, key=lambda t: math.inf if t.value is None else -t.value):
         figures = trial.user_attrs.get("figures", {})

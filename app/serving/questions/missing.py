@@ -22,6 +22,7 @@ from app.serving.answers import (
     envelope,
     reasons,
     require_size,
+    rounded,
 )
 from app.serving.errors import Reason
 from app.serving.models import ServedModel
@@ -44,8 +45,8 @@ _LEAST_CHANGE: Final = math.log(3)  # substantial evidence: a Bayes factor of at
 async def missing(request: Request, asked: MissingRequest) -> Answer:
     """Rank the classes that the scene does not list, most probable first, with likely places.
 
-    The answer contains only classes that the scene does not list, because the models do not
-    estimate the number of instances of a class.
+    The list `more` contains listed classes that probably have further instances, such as a second
+    nightstand. It is empty for questions about a place.
     """
     model, reading = request.read(asked)
     faults = Faults()
@@ -72,8 +73,17 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         coverage=asked.coverage,
         details=asked.detail == "full",
     )
+    further: tuple[questions.More, ...] = ()
+    if asked.at is None:
+        further = questions.more(
+            model.artifact,
+            reading.scene,
+            top_k=asked.top_k,
+            candidates=candidates,
+            coverage=asked.coverage,
+        )
     found = tuple([_notable(entry, reading.scene) for entry in found])
-    require_size(_size(found), reading, request.limits.answer_bytes, "top_k")
+    require_size(_size(found, further), reading, request.limits.answer_bytes, "top_k")
     answer = envelope(asked, request.id, model.reference, reading)
     coverage = asked.coverage
     answer["coverage"] = model.artifact.calibration.coverage if coverage is None else coverage
@@ -96,6 +106,14 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
             **(_details(placements, because, ids, numbered) if asked.detail == "full" else {}),
         }
         for label, _, _, placements, because in found
+    ]
+    answer["more"] = [
+        entry._asdict()
+        | {
+            "expected_count": rounded(entry.expected_count),
+            "probability": rounded(entry.probability),
+        }
+        for entry in further
     ]
     return answer
 
@@ -155,14 +173,17 @@ def _axes(asked: MissingRequest) -> Axes | None:
     return viewer_axes(asked.frame_id, None if asked.viewpoint is None else asked.viewpoint.yaw)
 
 
-def _size(found: Sequence[questions.MissingAnswer]) -> Callable[[int], int]:
+def _size(
+    found: Sequence[questions.MissingAnswer], further: Sequence[questions.More]
+) -> Callable[[int], int]:
     places = causes = 0
     for entry in found:
         places += len(entry.placements)
         causes += len(entry.because)
     fixed = places * (RELATION_BYTES + _OFFSET_BYTES) + causes * CAUSE_BYTES
-    fixed += len(found) * OBJECT_BYTES
-    return lambda name: fixed + (places + causes + len(found)) * name
+    names = len(found) + len(further)
+    fixed += names * OBJECT_BYTES
+    return lambda name: fixed + (places + causes + names) * name
 
 
 def _placement(place: questions.Placement, ids: Sequence[str], numbered: Iterator[float]) -> Answer:
@@ -182,7 +203,9 @@ def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
         questions.missing(artifact, bare, at=("on-top", 0))
         questions.missing(artifact, related, at=("under", 0))
     numbers = [number for entry in found for number in (entry.probability, entry.log_odds)]
-    return numbers + [cause.log_odds_change for entry in found for cause in entry.because]
+    numbers += [cause.log_odds_change for entry in found for cause in entry.because]
+    counted = [entry for scene in scenes for entry in questions.more(artifact, scene)]
+    return numbers + [number for e in counted for number in (e.expected_count, e.probability)]
 
 
 _EXAMPLES: Final = {
@@ -233,6 +256,16 @@ _EXAMPLE_ANSWER: Final = {
                 {"object": "bed", "log_odds_change": 1.7},
                 {"object": "lamp_1", "log_odds_change": -0.2},
             ],
+        }
+    ],
+    "more": [
+        {
+            "label": "nightstand",
+            "listed_count": 1,
+            "expected_count": 1.7,
+            "low": 1,
+            "high": 2,
+            "probability": 0.6,
         }
     ],
 }

@@ -8,7 +8,7 @@ import { SPOKEN } from './words.js';
 
 /** Id of the robot, which moves like an object. Ids of objects are printable, so they differ from it. */
 export const ROBOT = '\u0000robot';
-const GRID = 0.1; // metres
+const GRID = 0.05; // metres; objects that are dragged snap to it
 
 /** A position in words, for screen readers. */
 export function whereabouts(x, y, viewer = { x: 0, y: 0, yaw: 0 }) {
@@ -22,7 +22,7 @@ export function whereabouts(x, y, viewer = { x: 0, y: 0, yaw: 0 }) {
 export function createActions(store, say, menu) {
   const sized = () => sizer(sizesOf(store.get(), store.get().models[0]));
   const find = (id) => store.get().things.find((thing) => thing.id === id);
-  const snapped = (value) => (store.get().snap ? round(Math.round(value / GRID) * GRID) : round(value));
+  const snapped = (value) => round(Math.round(value / GRID) * GRID);
 
   function select(id) {
     if (store.get().selected !== id) store.set({ selected: id });
@@ -36,7 +36,7 @@ export function createActions(store, say, menu) {
       return;
     }
     const id = freshId(things, label);
-    const thing = { id, label, x: 0, y: 0, z: 0, size: null, yaw: 0, confidence: 1 };
+    const thing = { id, label, x: 0, y: 0, z: 0, size: null, yaw: 0, confidence: 1, placed: Boolean(at) };
     const boxes = things.map(sized());
     const box = sized()(thing);
     const place = at ? { x: snapped(at.x), y: snapped(at.y) } : freePlace(boxes, box.size, viewer);
@@ -46,10 +46,11 @@ export function createActions(store, say, menu) {
   }
 
   function remove(id) {
-    const { things, at, selected } = store.get();
+    const { things, relations, at, selected } = store.get();
     refocus(things.findIndex((thing) => thing.id === id));
     store.edit({
       things: things.filter((thing) => thing.id !== id),
+      relations: relations.filter(({ subject, object }) => subject !== id && object !== id),
       selected: selected === id ? null : selected,
       at: at?.object === id ? null : at,
     });
@@ -77,10 +78,8 @@ export function createActions(store, say, menu) {
     else store.edit(change);
   }
 
-  function change(id, fields, again = false) {
-    const things = store.get().things.map((thing) => (thing.id === id ? { ...thing, ...fields } : thing));
-    if (again) store.set({ things });
-    else store.edit({ things });
+  function change(id, fields) {
+    store.edit({ things: store.get().things.map((thing) => (thing.id === id ? { ...thing, ...fields } : thing)) });
   }
 
   function turn(id, degrees) {
@@ -139,5 +138,5 @@ export function createActions(store, say, menu) {
     ], `Actions for ${id}`);
   }
 
-  return { select, add, remove, place, change, turn, keys, ask, open, find, sized, snapped };
+  return { select, add, remove, place, change, keys, open, find, sized };
 }

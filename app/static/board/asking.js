@@ -4,7 +4,7 @@
  */
 
 import { call, ProblemError, UnreachableError } from './api.js';
-import { bodyOf, DEPENDS, QUESTIONS } from './questions.js';
+import { bodyOf, DEPENDS, QUESTIONS, refusedBy } from './questions.js';
 import { changed } from './store.js';
 
 const STILL = 120; // ms
@@ -39,11 +39,12 @@ export function startAsking(store) {
       put(column, question, { status: 'answered', answer, problem: null, body });
     } catch (error) {
       if (controller.signal.aborted) return;
-      fail(column, question, error, place);
+      fail(column, question, error, place, body);
     }
   }
 
-  function fail(column, question, error, place) {
+  function fail(column, question, error, place, body) {
+    if (error instanceof ProblemError && learn(error.problem, body)) return;
     if (error instanceof UnreachableError) {
       put(column, question, { status: 'down', problem: null });
       store.set({ down: true });
@@ -58,6 +59,22 @@ export function startAsking(store) {
     } else {
       throw error;
     }
+  }
+
+  /** Remembers the names that a model refused. The next request to this model leaves them out. */
+  function learn({ type, errors = [] }, body) {
+    if (!type?.endsWith('/unknown-labels')) return false;
+    const state = store.get();
+    const known = refusedBy(state, body.model);
+    const found = { objects: new Map(known.objects), rooms: new Map(known.rooms) };
+    for (const { pointer, suggestions = [] } of errors) {
+      const place = /^#\/objects\/(\d+)/.exec(pointer);
+      if (place) found.objects.set(body.objects[place[1]].label, suggestions);
+      else if (pointer === '#/room_type') found.rooms.set(body.room_type, suggestions);
+    }
+    const learnt = found.objects.size > known.objects.size || found.rooms.size > known.rooms.size;
+    if (learnt) store.set({ refused: { ...state.refused, [body.model]: found } });
+    return learnt;
   }
 
   function askAll() {

@@ -4,17 +4,16 @@ import { ROBOT, whereabouts } from './actions.js';
 import { drawEdges } from './edge_drawing.js';
 import { edgesOf } from './edges.js';
 import { drawGhosts } from './ghost_drawing.js';
-import { ghostsOf } from './ghosts.js';
-import { handles } from './handles.js';
+import { ghostsOf, ROBOT_SIDE } from './ghosts.js';
 import { labelPlaces, LINE, Places, widthOf } from './labels.js';
-import { sizesOf } from './questions.js';
+import { reading, refusedBy, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { fit, gridStep, onScreen } from './view.js';
 
 const FONT = '500 13px system-ui, sans-serif';
 const SEEN = [
-  'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'own', 'observed', 'at', 'models',
+  'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'at', 'models', 'posed', 'refused',
 ];
 
 /** Outlier entries of the shown model, by object id. */
@@ -30,7 +29,6 @@ export function createBoard(node, store, actions, takeGhost) {
   edges.attr('aria-hidden', 'true');
   labels.attr('aria-hidden', 'true');
   grid.attr('aria-hidden', 'true');
-  const spreads = svg.insert('g', '.objects').attr('class', 'spreads').attr('aria-hidden', 'true');
   let view = null;
   let dragging = false;
   let size = { width: 0, height: 0 };
@@ -54,8 +52,6 @@ export function createBoard(node, store, actions, takeGhost) {
       draw(store.get());
     });
 
-  const turnAndResize = handles(store, actions, () => view, (now) => (dragging = now));
-
   function drawGrid() {
     const lines = [];
     const step = gridStep(Math.max(view.width, view.height) / view.scale);
@@ -75,13 +71,14 @@ export function createBoard(node, store, actions, takeGhost) {
 
   function drawRobot(state) {
     const { x, y, yaw } = state.viewer;
+    const size = Math.min(34, Math.max(14, ROBOT_SIDE * view.scale)) / 26;
     const g = robot.selectAll('g').data([{ id: ROBOT, x, y }]).join((enter) => {
       const added = enter.append('g').attr('tabindex', 0).attr('role', 'button');
       added.append('path').attr('class', 'sight').attr('d', 'M0,0 L-52,-90 A104,104 0 0 1 52,-90 Z');
-      added.append('path').attr('class', 'body').attr('d', 'M0,-13 L10,10 L0,5 L-10,10 Z');
+      added.append('path').attr('class', 'body').attr('d', 'M0,-13 L10,13 L0,8 L-10,13 Z');
       return added.call(drag).on('keydown', (event) => actions.keys(event, ROBOT));
     });
-    g.attr('transform', `translate(${view.across(y)},${view.down(x)}) rotate(${(-yaw * 180) / Math.PI})`)
+    g.attr('transform', `translate(${view.across(y)},${view.down(x)}) rotate(${(-yaw * 180) / Math.PI}) scale(${size})`)
       .attr('aria-label', `Robot at x ${x}, y ${y}, rotated by ${Math.round((yaw * 180) / Math.PI)} degrees`);
   }
 
@@ -91,7 +88,6 @@ export function createBoard(node, store, actions, takeGhost) {
     const each = objects.selectAll('g.object').data(ordered, (box) => box.id).join((enter) => {
       const g = enter.append('g').attr('class', 'object').attr('tabindex', 0).attr('role', 'button');
       g.append('rect').attr('class', 'box');
-      g.append('line').attr('class', 'nose');
       g.append('title');
       g.on('focus', (_, box) => actions.select(box.id))
         .on('keydown', (event, box) => (event.key === 'Enter' ? openAt(event, box) : actions.keys(event, box.id)))
@@ -102,22 +98,19 @@ export function createBoard(node, store, actions, takeGhost) {
     each
       .classed('selected', (box) => box.id === state.selected)
       .classed('outlier', (box) => !state.draft && Boolean(wrong.get(box.id)?.is_outlier))
+      .classed('unknown', (box) => !state.draft && refusedBy(state, state.models[state.shown]).objects.has(box.label))
       .classed('new', (box) => Boolean(state.draft?.fresh.has(box.id)))
       .classed('anchor', (box) => state.at?.object === box.id)
+      .classed('loose', (box) => !state.draft && state.posed && !box.placed)
       .attr('transform', (box) => `translate(${view.across(box.y)},${view.down(box.x)}) rotate(${-box.yaw})`)
       .attr('aria-pressed', (box) => String(box.id === state.selected))
       .attr('aria-haspopup', 'menu')
       .attr('aria-label', (box) => described(box, state, boxes, wrong));
-    each.style('--wrong', (box) => (state.tab === 'outliers' && !state.draft ? (wrong.get(box.id)?.probability ?? 0) : 0));
     each.select('rect.box')
       .attr('width', (box) => box.size.y * view.scale).attr('height', (box) => box.size.x * view.scale)
       .attr('x', (box) => (-box.size.y / 2) * view.scale).attr('y', (box) => (-box.size.x / 2) * view.scale)
       .attr('rx', (box) => Math.min(5, (Math.min(box.size.x, box.size.y) * view.scale) / 4));
-    each.select('line.nose')
-      .attr('x1', (box) => (-box.size.y / 5) * view.scale).attr('x2', (box) => (box.size.y / 5) * view.scale)
-      .attr('y1', (box) => (-box.size.x / 2) * view.scale + 3).attr('y2', (box) => (-box.size.x / 2) * view.scale + 3);
     each.select('title').text((box) => described(box, state, boxes, wrong));
-    turnAndResize(objects, state.draft ? null : boxes.find((box) => box.id === state.selected));
     if (focused && focused !== document.activeElement && focused.isConnected) focused.focus();
   }
 
@@ -130,16 +123,21 @@ export function createBoard(node, store, actions, takeGhost) {
   /** Draws labels inside their boxes if they fit, else beside them. Upper objects take precedence. */
   function drawLabels(state, boxes, places, wrong) {
     const texts = [];
+    const left = refusedBy(state, state.models[state.shown]).objects;
+    const half = ROBOT_SIDE / 2;
+    const { x, y } = state.viewer;
+    places.reserve({ left: view.across(y + half), right: view.across(y - half), top: view.down(x + half), bottom: view.down(x - half) });
     for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
-      const width = widthOf(box.id, FONT) + 6;
+      const words = (!state.draft && !left.has(box.label) && reading(state, state.shown, 'objects', box.label)) || box.id;
+      const width = widthOf(words, FONT) + 6;
       const rect = onScreen(box, view);
       const at = places.take(width, LINE, labelPlaces(rect, width));
-      if (at) texts.push({ id: box.id, ...at, wrong: !state.draft && wrong.get(box.id)?.is_outlier });
+      if (at) texts.push({ id: box.id, words, ...at, wrong: !state.draft && wrong.get(box.id)?.is_outlier });
       if (box.z > 0.05) places.reserve(rect);
     }
     labels.selectAll('text.name').data(texts, (text) => text.id).join('text')
       .attr('class', 'name').attr('x', (text) => text.x).attr('y', (text) => text.y)
-      .classed('outlier', (text) => Boolean(text.wrong)).text((text) => text.id);
+      .classed('outlier', (text) => Boolean(text.wrong)).text((text) => text.words);
     const marks = boxes.filter((box) => !state.draft && wrong.get(box.id)?.is_outlier);
     const each = labels.selectAll('g.mark').data(marks, (box) => box.id).join((enter) => {
       const g = enter.append('g').attr('class', 'mark');
@@ -163,8 +161,9 @@ export function createBoard(node, store, actions, takeGhost) {
     drawGrid();
     drawRobot(state);
     drawObjects(state, boxes, wrong);
+    for (const ghost of shown) places.reserve(onScreen(ghost, view));
     drawLabels(state, boxes, places, wrong);
-    drawGhosts(ghosts, spreads, shown, view, places, takeGhost);
+    drawGhosts(ghosts, shown, boxes, view, places, takeGhost);
     drawEdges(edges, edgesOf(state), boxes, view, places);
   }
 

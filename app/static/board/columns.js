@@ -1,97 +1,98 @@
 /** The answers as text: one column per question and model. */
 
-import { listed } from './edges.js';
-import { accept, ghostsOf } from './ghosts.js';
-import { bar, copy, el, redraw } from './dom.js';
 import { curl, python } from './calls.js';
-import { complaint, placeOf } from './list.js';
-import { QUESTIONS } from './questions.js';
+import { bar, copy, el, redraw } from './dom.js';
+import { wrongIn } from './edges.js';
+import { accept, ghostsOf } from './ghosts.js';
+import { common, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
 import { percent, SPOKEN } from './words.js';
 
-const SEEN = ['answers', 'shown', 'selected', 'own', 'models', 'things', 'tab', 'draft', 'words', 'at'];
-const signed = (value) => (value > 0 ? `+${value.toFixed(1)}` : value.toFixed(1).replace('-', '−'));
+const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'refused', 'posed', 'relations', 'room'];
 
-const reasons = (because) =>
-  because.map(({ object, log_odds_change: change }) => `${object} ${signed(change)}`).join(', ');
+const PLACES = 2; // listed places of a missing object: first the one on the board, then the likeliest
 
-/** The evidence on an object: against it if it is an outlier, else for it. */
-const support = ({ is_outlier: out, because, usually_with: company = [] }) =>
-  [
-    because.length ? `${out ? 'against' : 'for'}: ${reasons(because)}` : '',
-    company.length ? `usually with: ${company.join(', ')}` : '',
-  ].filter(Boolean).join(' · ');
+const spoken = ({ subject, relation, object }) => `${subject} ${SPOKEN[relation]} ${object}`;
 
-/** Notes of an answer on the scene: ignored labels, mapped labels and warnings. */
-const notes = ({ ignored = [], mapped = [], warnings = [] }) =>
-  [
-    ignored.length ? `Ignored: ${ignored.join(', ')}.` : '',
-    mapped.length ? `Mapped to the nearest class: ${mapped.map((one) => `${one.label} → ${one.class}`).join(', ')}.` : '',
+/** Reasons in words: "bed, lamp speak for it; oven speaks against it". */
+function reasons(because, company = []) {
+  const speak = (side, objects) =>
+    objects.length ? `${objects.join(', ')} ${objects.length > 1 ? 'speak' : 'speaks'} ${side} it` : '';
+  const named = (sign) => because.filter((one) => sign * one.log_odds_change > 0).map(({ object }) => object);
+  const words = [
+    company.length ? `usually seen with ${company.join(', ')}` : '',
+    speak('for', named(1)), speak('against', named(-1)),
+  ].filter(Boolean).join('; ');
+  return words ? el('p', { class: 'quiet reasons' }, words) : null;
+}
+
+/** What a model did with unknown names, and the warnings of its answer. */
+function notes({ warnings = [] }, state, column) {
+  const names = [...new Set(state.things.map(({ label }) => label))].map((label) => reading(state, column, 'objects', label));
+  return [
+    ...[...names, reading(state, column, 'rooms', state.room)].filter(Boolean).map((words) => (words.endsWith('?') ? words : `${words}.`)),
     ...warnings.map((one) => `Check ${one.objects.join(', ')}: ${one.message}.`),
-  ].filter(Boolean).join(' ');
+  ].join(' ');
+}
+
+const row = (kind, words, probability, flag, ...more) =>
+  el('li', { class: flag.kind ?? '' },
+    el('div', { class: 'headline' }, words, flag.words ? el('span', { class: 'flag' }, flag.words) : null,
+      el('span', {}, percent(probability)), flag.button ?? null),
+    bar(probability, kind), ...more);
 
 const ROWS = {
   missing(answer, state, store, column) {
     const ghosts = new Map(column === state.shown ? ghostsOf(state).map((ghost) => [ghost.label, ghost]) : []);
     return answer.missing.map(({ label, probability, placements, because = [] }) => {
-      const places = placements.map((one) => `${SPOKEN[one.relation]} ${one.object} ${percent(one.probability)}`);
       const ghost = ghosts.get(label);
-      return el('li', {},
-        el('div', { class: 'headline' }, el('b', {}, label), el('span', {}, percent(probability)),
-          ghost ? el('button', {
-            type: 'button', class: 'icon', 'data-key': `add-${label}`,
-            'aria-label': `Put ${label} ${SPOKEN[ghost.placement.relation]} ${ghost.placement.object}`,
-            onclick: () => accept(store, ghost),
-          }, '+') : null),
-        bar(probability, 'missing'),
-        places.length ? el('p', { class: 'quiet' }, places.join(' · ')) : null,
-        because.length ? el('p', { class: 'quiet reasons' }, `because of ${reasons(because)}`) : null);
+      const places = placements.slice().sort((a, b) => (b === ghost?.placement) - (a === ghost?.placement)).slice(0, PLACES)
+        .map((one) => `${SPOKEN[one.relation]} ${one.object} ${percent(one.probability)}`);
+      if (!ghost && column === state.shown) places.push('no free place on the board');
+      const button = ghost && el('button', {
+        type: 'button', class: 'icon', 'data-key': `add-${label}`,
+        'aria-label': `Put ${label} ${SPOKEN[ghost.placement.relation]} ${ghost.placement.object}`,
+        onclick: () => accept(store, ghost),
+      }, '+');
+      return row('missing', el('b', {}, label), probability, { button },
+        places.length ? el('p', { class: 'quiet' }, places.join(' · ')) : null, reasons(because));
     });
   },
 
   outliers(answer, state, store) {
-    const rows = answer.outliers.map((one) =>
-      el('li', { class: one.is_outlier ? 'alarm' : '' },
-        el('div', { class: 'headline' },
-          el('button', {
-            type: 'button', class: 'link', 'data-key': `of-${one.object}`,
-            onclick: () => store.set({ selected: one.object }),
-          }, one.object),
-          one.is_outlier ? el('span', { class: 'flag' }, 'does not belong') : null,
-          el('span', {}, percent(one.probability))),
-        bar(one.probability, 'outliers'),
-        support(one) ? el('p', { class: 'quiet reasons' }, support(one)) : null));
-    const misplaced = answer.misplaced.filter((one, index) => index < 12 || one.is_misplaced).map((one) =>
-      el('li', { class: one.is_misplaced ? 'alarm' : '' },
-        el('div', { class: 'headline' }, el('span', { class: 'grow' }, `${one.subject} ${SPOKEN[one.relation]} ${one.object}`),
-          el('span', {}, percent(one.probability))),
-        bar(one.probability, 'outliers')));
-    if (!misplaced.length) return rows;
-    return [...rows, el('li', { class: 'heading' }, el('h4', {}, 'In the wrong place?')), ...misplaced];
+    const objects = answer.outliers.map((one) =>
+      row('outliers', el('button', {
+        type: 'button', class: 'link', 'data-key': `of-${one.object}`,
+        onclick: () => store.set({ selected: one.object }),
+      }, one.object), one.probability, one.is_outlier ? { kind: 'alarm', words: 'does not belong' } : {},
+      reasons(one.because, one.usually_with)));
+    const misplaced = wrongIn(answer).misplaced.map((one) =>
+      row('outliers', el('b', {}, spoken(one)), one.probability, { kind: 'alarm', words: 'in the wrong place' }));
+    const stated = state.posed || state.relations.length;
+    const alarms = wrongIn(answer).outliers.length; // the first ones, because the least fitting objects come first
+    return [
+      ...objects.slice(0, alarms), ...misplaced, ...objects.slice(alarms),
+      stated ? null : el('li', { class: 'quiet' }, 'Places are not judged, because positions do not count as evidence.'),
+    ].filter(Boolean);
   },
 
-  relations(answer, state) {
-    const odd = listed(state, answer.disagreements).map((one) =>
+  relations: ({ disagreements, relations }) => [
+    ...disagreements.map((one) =>
       el('li', { class: 'disagrees' },
         el('div', { class: 'headline' },
-          el('span', { class: 'grow' }, `${one.subject} ${one.observed.map((name) => SPOKEN[name]).join(', ')} ${one.object}`),
+          el('b', {}, `${one.subject} ${one.observed.map((name) => SPOKEN[name]).join(', ')} ${one.object}`),
           el('span', {}, percent(one.observed_probability))),
-        el('p', {}, `expected: ${SPOKEN[one.expected]}, ${percent(one.probability)}`)));
-    const rows = listed(state, answer.relations).map((one) =>
-      el('li', { class: one.observed ? 'holds' : 'expected' },
-        el('div', { class: 'headline' },
-          el('span', { class: 'grow' }, `${one.subject} ${SPOKEN[one.relation]} ${one.object}`),
-          one.observed ? el('span', { class: 'flag' }, 'observed') : null,
-          el('span', {}, percent(one.probability))),
-        bar(one.probability, 'relations')));
-    return [...odd, ...rows];
-  },
+        el('p', {}, `expected: ${SPOKEN[one.expected]}, ${percent(one.probability)}`))),
+    ...relations.map((one) =>
+      row('relations', el('b', {}, spoken(one)), one.probability,
+        one.observed ? { kind: 'holds', words: 'observed' } : { kind: 'expected' })),
+  ],
 };
 
 const NOTHING = {
   missing: 'The model suggests no object.',
-  outliers: 'The model knows none of the objects.',
-  relations: 'No relation reaches the minimum probability.',
+  outliers: '',
+  relations: 'No relation between these objects is likely.',
 };
 
 /** A collapsible section with the commands that send a request; `show` fills it. */
@@ -124,9 +125,9 @@ export function calls() {
 
 /** A problem document as text. Each error names its object of the request. */
 export function problemWords(problem, body) {
-  const errors = (problem.errors ?? []).map((error) => {
-    const about = body?.objects[placeOf(error)]?.id;
-    return el('li', {}, about ? `${about}: ${complaint(error)}` : complaint(error));
+  const errors = (problem.errors ?? []).map(({ pointer, message, suggestions = [] }) => {
+    const about = body?.objects[/^#\/objects\/(\d+)/.exec(pointer)?.[1]]?.id;
+    return el('li', {}, `${about ? `${about}: ` : ''}${message}${suggestions.length ? ` (${suggestions.join(', ')}?)` : ''}`);
   });
   return [
     el('b', {}, problem.title), el('p', {}, problem.detail ?? ''),
@@ -143,7 +144,7 @@ export function createColumns(store, parents, askKey) {
         title: el('h3'), problem: el('div', { class: 'problem', role: 'alert', hidden: true }), rows: el('ol'),
         note: el('p', { class: 'quiet' }), calls: calls(),
       };
-      own.show = el('button', { type: 'button', onclick: () => store.set({ shown: column }) }, 'show on the board');
+      own.show = el('button', { type: 'button', onclick: () => store.set({ shown: column }) }, 'on the board');
       own.node = el('article', {}, el('header', {}, own.title, own.show), own.problem, own.note, own.rows, own.calls.node);
       parents(question).append(own.node);
       made.set(`${column}/${question}`, own);
@@ -157,8 +158,8 @@ export function createColumns(store, parents, askKey) {
     if (!model) return;
     const entry = state.answers[column][question] ?? {};
     const { answer, problem, status } = entry;
+    own.title.parentElement.hidden = !state.models[1];
     own.title.textContent = answer ? `${answer.model.name} ${answer.model.version}` : model;
-    own.show.hidden = !state.models[1];
     own.show.setAttribute('aria-pressed', String(state.shown === column));
     own.problem.hidden = !problem;
     if (problem && own.told !== problem) {
@@ -167,9 +168,12 @@ export function createColumns(store, parents, askKey) {
     own.told = problem;
     const rows = answer ? ROWS[question](answer, state, store, column) : [];
     redraw(own.rows, rows);
-    const said = answer ? notes(answer) : '';
-    const waiting = status === 'down' ? 'Waiting for the service.' : !state.things.length ? 'Put an object on the board first.' : '';
-    own.note.textContent = `${said} ${rows.length ? '' : answer ? NOTHING[question] : waiting}`.trim();
+    const waiting = status === 'down' ? 'Waiting for the service.' : whyNot(state, question, model);
+    const shared = question === 'missing' && column === 0 && common(state);
+    own.note.textContent = [
+      shared ? `Both models answer about their ${shared.length} common classes.` : '',
+      notes(answer ?? {}, state, column), rows.length ? '' : answer ? NOTHING[question] : waiting,
+    ].filter(Boolean).join(' ');
     own.calls.show(question, entry.body);
   }
 

@@ -6,10 +6,9 @@ import { search } from './words.js';
  * @param {HTMLInputElement} input
  * @param {HTMLUListElement} list
  * @param {() => import('./words.js').Entry[]} entries
- * @param {(label: string) => void} choose
- * @param {(text: string) => void} complain shows an error text; '' clears it
+ * @param {(label: string) => void} choose gets a label of the list, or another text that the user typed
  */
-export function combobox(input, list, entries, choose, complain) {
+export function combobox(input, list, entries, choose) {
   let found = [];
   let active = -1;
   let pressing = false;
@@ -32,7 +31,6 @@ export function combobox(input, list, entries, choose, complain) {
   }
 
   function refresh() {
-    complain('');
     found = search(entries(), input.value);
     list.replaceChildren(
       ...found.map(({ label, alias }, index) => {
@@ -63,9 +61,9 @@ export function combobox(input, list, entries, choose, complain) {
   }
 
   function enter() {
-    const best = found[active] ?? (input.value.trim() ? search(entries(), input.value)[0] : null);
-    if (best) take(best.label);
-    else if (input.value.trim()) complain(`The model does not know an object called “${input.value.trim()}”.`);
+    const text = input.value.trim();
+    if (text) take((found[active] ?? search(entries(), text)[0])?.label ?? text);
+    else if (found[active]) take(found[active].label);
   }
 
   const keys = {

@@ -1,29 +1,47 @@
 /** The dialog with the scene as text, to copy it, store it in a file or share it as a link. */
 
 import { copy } from './dom.js';
+import { scenesIn } from './importing.js';
 import { sizesOf } from './questions.js';
 import { SceneError, toScene } from './scene.js';
 import { toHash } from './share.js';
 
-/** @param {(scene: object) => string} put puts a scene on the board and returns a note; throws SceneError */
+/** @param {(scene: object) => void} put puts a scene on the board; throws SceneError */
 export function fileDialog(store, put, say) {
   const get = (id) => document.getElementById(id);
-  const [dialog, area, error, done] = ['file', 'json', 'json-error', 'share-done'].map(get);
+  const [dialog, area, error, done, which] = ['file', 'json', 'json-error', 'share-done', 'which'].map(get);
   const scene = () => toScene(store.get(), sizesOf(store.get(), store.get().models[0]));
 
+  /** Lets the user choose a scene if the text has several, one a line. */
+  function count() {
+    let scenes = [];
+    try {
+      scenes = scenesIn(area.value);
+    } catch {
+      // The button “Put on the board” shows the error.
+    }
+    which.max = scenes.length;
+    which.value = 1;
+    which.parentElement.hidden = scenes.length < 2;
+    get('scenes').textContent = `of ${scenes.length}`;
+  }
+
+  area.addEventListener('input', count);
   get('open-file').addEventListener('click', () => {
     area.value = JSON.stringify(scene(), null, 1);
     error.textContent = '';
     done.textContent = '';
+    count();
     dialog.showModal();
     area.focus();
   });
   get('close-file').addEventListener('click', () => dialog.close());
   get('import').addEventListener('click', () => {
     try {
-      const left = put(JSON.parse(area.value));
+      const scenes = scenesIn(area.value);
+      put(scenes[Math.min(scenes.length, Math.max(1, Number(which.value))) - 1]);
       dialog.close();
-      say(`The scene is on the board. ${left}`);
+      say('The scene is on the board.');
     } catch (problem) {
       if (!(problem instanceof SceneError || problem instanceof SyntaxError)) throw problem;
       error.textContent = problem instanceof SyntaxError ? `This is not JSON: ${problem.message}.` : problem.message;
@@ -39,6 +57,7 @@ export function fileDialog(store, put, say) {
   get('upload').addEventListener('change', async ({ target }) => {
     if (target.files[0]) area.value = await target.files[0].text();
     target.value = '';
+    count();
   });
   get('share').addEventListener('click', async () => {
     history.replaceState(null, '', await toHash(scene()));

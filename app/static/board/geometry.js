@@ -18,7 +18,7 @@ export function halves(box) {
   return { x: (box.size.x * c + box.size.y * s) / 2, y: (box.size.x * s + box.size.y * c) / 2 };
 }
 
-export function covers(box, x, y) {
+function covers(box, x, y) {
   const a = radians(box.yaw);
   const [dx, dy] = [x - box.x, y - box.y];
   const along = dx * Math.cos(a) + dy * Math.sin(a);
@@ -26,9 +26,40 @@ export function covers(box, x, y) {
   return Math.abs(along) <= box.size.x / 2 && Math.abs(across) <= box.size.y / 2;
 }
 
+/** The centre and the half extents of a box in the axes of another box. */
+function local(box, other) {
+  const a = radians(other.yaw);
+  const [dx, dy] = [box.x - other.x, box.y - other.y];
+  return {
+    x: Math.abs(dx * Math.cos(a) + dy * Math.sin(a)), y: Math.abs(dy * Math.cos(a) - dx * Math.sin(a)),
+    half: halves({ size: box.size, yaw: box.yaw - other.yaw }),
+  };
+}
+
+/** Whether two footprints overlap: neither box has an axis that separates them. */
 export function overlap(a, b) {
-  const [p, q] = [halves(a), halves(b)];
-  return Math.abs(a.x - b.x) < p.x + q.x && Math.abs(a.y - b.y) < p.y + q.y;
+  return [[a, b], [b, a]].every(([box, other]) => {
+    const { x, y, half } = local(box, other);
+    return x < half.x + other.size.x / 2 && y < half.y + other.size.y / 2;
+  });
+}
+
+/** Whether the footprint of a box lies inside that of another box. */
+export function inside(box, other) {
+  const { x, y, half } = local(box, other);
+  return x + half.x <= other.size.x / 2 && y + half.y <= other.size.y / 2;
+}
+
+/** Distance between two separate footprints in metres: that of a corner to the other footprint. */
+export function gap(a, b) {
+  const distances = [[a, b], [b, a]].flatMap(([box, other]) => [[1, 1], [1, -1], [-1, 1], [-1, -1]].map(([p, q]) => {
+    const [c, s] = [Math.cos(radians(box.yaw)), Math.sin(radians(box.yaw))];
+    const [u, v] = [(p * box.size.x) / 2, (q * box.size.y) / 2];
+    const corner = { x: box.x + u * c - v * s, y: box.y + u * s + v * c, size: { x: 0, y: 0 }, yaw: 0 };
+    const { x, y } = local(corner, other);
+    return Math.hypot(Math.max(0, x - other.size.x / 2), Math.max(0, y - other.size.y / 2));
+  }));
+  return Math.min(...distances);
 }
 
 const area = (box) => box.size.x * box.size.y;
@@ -76,6 +107,7 @@ export function moved(things, id, x, y, sized) {
     thing.id === id || carried.has(thing.id)
       ? {
           ...thing,
+          placed: thing.placed || thing.id === id,
           x: round(thing.x + shift.x),
           y: round(thing.y + shift.y),
           z: round(thing.z + shift.z),

@@ -1,5 +1,6 @@
-/** Suggestions as dashed boxes ("ghosts") with their probability and spread. */
+/** Suggestions as dashed boxes ("ghosts") with their probability. */
 
+import { overlap } from './geometry.js';
 import { labelPlaces, widthOf } from './labels.js';
 import { onScreen } from './view.js';
 import { percent, SPOKEN } from './words.js';
@@ -9,21 +10,17 @@ const FONT = '500 12px system-ui, sans-serif';
 const spokenGhost = ({ label, probability, placement }) =>
   `${label}, ${percent(probability)}, ${SPOKEN[placement.relation]} ${placement.object}`;
 
-export function drawGhosts(layer, spreads, ghosts, view, places, take) {
+export function drawGhosts(layer, ghosts, boxes, view, places, take) {
   const words = (ghost) => `${ghost.label} ${percent(ghost.probability)}`;
   const texts = new Map();
+  for (const box of boxes) if (!ghosts.some((ghost) => overlap(ghost, box))) places.reserve(onScreen(box, view));
   for (const ghost of ghosts) {
-    const width = widthOf(words(ghost), FONT) + 8;
+    const width = widthOf(ghost.label, FONT) + 8;
     texts.set(ghost.id, places.take(width, 16, labelPlaces(onScreen(ghost, view), width)));
   }
-  spreads.selectAll('ellipse').data(ghosts.filter((ghost) => ghost.spread), (ghost) => ghost.id).join('ellipse')
-    .attr('rx', ({ spread }) => Math.max(2, spread.ry * view.scale))
-    .attr('ry', ({ spread }) => Math.max(2, spread.rx * view.scale))
-    .attr('cx', ({ spread }) => view.across(spread.y))
-    .attr('cy', ({ spread }) => view.down(spread.x));
   const each = layer.selectAll('g.ghost').data(ghosts, (ghost) => ghost.id).join((enter) => {
     const g = enter.append('g').attr('class', 'ghost').attr('tabindex', 0).attr('role', 'button');
-    g.append('rect');
+    g.append('rect').attr('rx', 4);
     g.append('text');
     g.append('title');
     return g.on('click', (_, ghost) => take(ghost)).on('keydown', (event, ghost) => {
@@ -33,14 +30,12 @@ export function drawGhosts(layer, spreads, ghosts, view, places, take) {
     });
   });
   each.attr('aria-label', (ghost) => `Suggested: ${spokenGhost(ghost)}. Put it there`);
-  each.style('--sure', (ghost) => Math.sqrt(ghost.probability));
   each.select('title').text((ghost) => `${spokenGhost(ghost)}: click to put it there`);
   each.select('rect')
     .attr('width', (ghost) => ghost.size.y * view.scale).attr('height', (ghost) => ghost.size.x * view.scale)
     .attr('x', (ghost) => view.across(ghost.y) - (ghost.size.y / 2) * view.scale)
-    .attr('y', (ghost) => view.down(ghost.x) - (ghost.size.x / 2) * view.scale)
-    .attr('rx', 4);
+    .attr('y', (ghost) => view.down(ghost.x) - (ghost.size.x / 2) * view.scale);
   each.select('text')
     .attr('x', (ghost) => texts.get(ghost.id)?.x ?? 0).attr('y', (ghost) => texts.get(ghost.id)?.y ?? 0)
-    .text((ghost) => (texts.get(ghost.id) ? words(ghost) : ''));
+    .text((ghost) => (texts.get(ghost.id) ? ghost.label : ''));
 }

@@ -1,21 +1,26 @@
-/** The probable places of missing objects, seen from above. */
+/** Places on the board for missing objects ("ghosts"). */
 
-import { halves, overlap, round, UNKNOWN_SIZE } from './geometry.js';
+import { gap, halves, inside, overlap, round, UNKNOWN_SIZE } from './geometry.js';
 import { sizesOf } from './questions.js';
 import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
 
 /** Direction from the anchor to the subject of a relation, in the robot's axes: [ahead, left]. */
 const DIRECTION = { left: [0, 1], right: [0, -1], front: [-1, 0], behind: [1, 0] };
 const ABOVE = ['on-top', 'above'];
-const VERTICAL = [...ABOVE, 'under', 'below'];
+const BENEATH = ['under', 'below'];
 /** Distances in metres by the service's rules: minimum gap of "above", maximum gap of neighbours (nearly). */
 const CLEAR = 0.1;
 const NEIGHBOURS = 0.9;
 const THIN = 0.03;
-const PARTS = [-1, -0.75, -0.5, -0.25, 0, 0.25, 0.5, 0.75, 1]; // candidate positions, as shares of the free extent
-/** Standard deviations that contain 80 % of the objects in the plane, according to the API. */
-const FOUR_OF_FIVE = 1.8;
+const OVERHANG = 1.25;
 const GAP = 0.15; // metres between neighbours without a learnt offset
+const MARGINS = [0.3, 0.05]; // metres that stay free between two ghosts, preferred first
+/** Suggestions may overlap lower and higher boxes, such as floors, rugs and ceilings. */
+const FLOOR = 0.1;
+const CEILING = 2.2;
+/** Side of the square that stays free around the robot, in metres. */
+export const ROBOT_SIDE = 0.5;
+const PARTS = Array.from({ length: 17 }, (_, index) => index / 8 - 1); // candidate positions, as shares of the free extent
 
 /**
  * @typedef {object} Ghost
@@ -26,45 +31,86 @@ const GAP = 0.15; // metres between neighbours without a learnt offset
  * @property {number} y
  * @property {number} z of its bottom
  * @property {import('./store.js').Extents} size
- * @property {{x: number, y: number, rx: number, ry: number} | null} spread ellipse of the learnt offset
  */
 
 let last = { keys: [], ghosts: [] };
 
-/** The shown suggestions, each at its most probable free place. @returns {Ghost[]} */
+/** The shown suggestions. @returns {Ghost[]} */
 export function ghostsOf(state) {
   const answer = state.answers[state.shown].missing?.answer;
   const model = state.models[state.shown];
   const keys = [answer, state.things, state.viewer, state.tab, state.words, state.draft, model, state.at];
   if (last.keys.every((key, index) => key === keys[index]) && last.keys.length) return last.ghosts;
+  const sizes = sizesOf(state, state.models[0]);
   const shown = answer && state.tab === 'missing' && !state.draft;
-  last = { keys, ghosts: shown ? suggest(state, answer, sizesOf(state, state.models[0])) : [] };
+  last = { keys, ghosts: shown ? standing(answer.missing, state.things.map(sizer(sizes)), state.viewer, sizes, state.at) : [] };
   return last.ghosts;
 }
 
-function suggest(state, answer, sizes) {
-  const boxes = state.things.map(sizer(sizes));
+/**
+ * Missing objects at the first of their placements with free space, or at the place `at` of the question.
+ * A ghost overlaps neither the robot nor another ghost nor a box, except those it stands on or under.
+ * Missing objects without a free place have no ghost.
+ * @returns {Ghost[]}
+ */
+export function standing(missing, boxes, viewer, sizes, at = null) {
+  const robot = { x: viewer.x, y: viewer.y, z: 0, yaw: 0, size: { x: ROBOT_SIDE, y: ROBOT_SIDE, z: 1 } };
   const ghosts = [];
-  for (const { label, probability, placements } of answer.missing) {
+  for (const { label, probability, placements } of missing) {
     const size = sizes.get(label) ?? UNKNOWN_SIZE;
-    const asked = placements.find(
-      (one) => state.at?.relation === one.relation && state.at?.object === one.object,
-    );
-    const anchorOf = (one) => boxes.find((box) => box.id === one?.object);
-    const likeliest = placements.find((one) => hasRoom(anchorOf(one), one.relation, size));
-    const wanted = asked ?? (state.at ? { ...state.at, probability: null } : likeliest);
-    const anchor = anchorOf(wanted);
-    if (anchor && !state.things.some((thing) => thing.label === label)) {
-      const place = stand(anchor, wanted, size, state.viewer, boxes, ghosts);
-      ghosts.push({ id: label, label, probability, placement: wanted, size, yaw: 0, ...place });
+    const asked = at && placements.filter((one) => one.relation === at.relation && one.object === at.object);
+    for (const placement of asked ? [...asked, { ...at, probability: null }].slice(0, 1) : placements) {
+      const anchor = boxes.find((box) => box.id === placement.object);
+      const place = anchor && freeAt(anchor, placement, size, viewer, [...boxes, robot], ghosts);
+      if (place) {
+        ghosts.push({ id: label, label, probability, placement, size, yaw: 0, ...place });
+        break;
+      }
     }
   }
   return ghosts;
 }
 
-/** Whether a place exists: "under" and "below" need free height below the anchor. */
-const hasRoom = (anchor, relation, size) =>
-  anchor && (!['under', 'below'].includes(relation) || anchor.z >= size.z);
+/** The free place nearest to the learnt offset where the relation to the anchor holds, or undefined. */
+function freeAt(anchor, { relation, offset }, size, viewer, boxes, ghosts) {
+  // An object stands only on a larger one, and "under" and "below" need free height below the anchor.
+  if (relation === 'on-top' && !fits(size, anchor)) return undefined;
+  if (BENEATH.includes(relation) && anchor.z + THIN < size.z) return undefined;
+  const learnt = offset && { x: anchor.x + offset.mean.x, y: anchor.y + offset.mean.y };
+  const centre = offset && anchor.z + anchor.size.z / 2 + offset.mean.z;
+  const z = height(anchor, relation, size, offset ? Math.max(0, centre - size.z / 2) : null);
+  const vertical = !DIRECTION[relation];
+  const others = boxes.filter((box) => box !== anchor);
+  const near = others.filter((box) => overlap(box, anchor));
+  const supports = near.filter((box) => box.z + box.size.z <= anchor.z + THIN);
+  const carried = near.filter((box) => box.z >= anchor.z + anchor.size.z - THIN);
+  // An object on the anchor is also above its supports, and one below the anchor is also below its load.
+  const passed = ABOVE.includes(relation) ? supports : BENEATH.includes(relation) ? carried : [];
+  const obstacles = [...others.filter((box) => !passed.includes(box)), ...(vertical ? [] : [anchor])]
+    .filter((box) => box.z + box.size.z > FLOOR && box.z < CEILING);
+  const places = (vertical ? over(anchor, relation, size, learnt) : beside(anchor, relation, size, viewer, learnt))
+    .map(([x, y]) => ({ x: round(x), y: round(y), size, yaw: 0 }));
+  // An object beside the anchor may stand on the anchor's support.
+  const supportOf = (place) => (vertical ? undefined : supports.find((box) => inside(place, box)));
+  const free = places.filter((place) => {
+    const support = supportOf(place);
+    return obstacles.every((box) => box === support || !overlap(place, box));
+  });
+  for (const margin of MARGINS) {
+    const place = free.find((one) => !ghosts.some((ghost) => overlap(wider(one, margin), ghost)));
+    const support = place && supportOf(place);
+    if (place) return { x: place.x, y: place.y, z: round(support ? support.z + support.size.z : z) };
+  }
+  return undefined;
+}
+
+/** Whether an object can stand on the anchor, with an overhang of at most a quarter. */
+function fits(size, anchor) {
+  const half = halves({ size, yaw: -anchor.yaw });
+  return half.x <= OVERHANG * (anchor.size.x / 2) && half.y <= OVERHANG * (anchor.size.y / 2);
+}
+
+const wider = (box, by) => ({ ...box, size: { ...box.size, x: box.size.x + 2 * by, y: box.size.y + 2 * by } });
 
 /** Rotates a vector (ahead, left) of the viewer to the axes of the board; `within` is the inverse. */
 function turned(viewer, ahead, left) {
@@ -72,32 +118,6 @@ function turned(viewer, ahead, left) {
   return [ahead * c - left * s, ahead * s + left * c];
 }
 const within = ({ yaw }, x, y) => turned({ yaw: -yaw }, x, y);
-
-/**
- * The place of a suggestion, by the rules with which the service derives relations from positions.
- * Candidates near the learnt offset come first. The first choice is a place without objects and other
- * suggestions, the second a place without collisions.
- */
-function stand(anchor, placement, size, viewer, boxes, ghosts) {
-  const { relation, offset } = placement;
-  const others = [...boxes.filter((box) => box !== anchor), ...ghosts];
-  const learnt = offset && { x: anchor.x + offset.mean.x, y: anchor.y + offset.mean.y };
-  const spread = learnt && { ...learnt, rx: FOUR_OF_FIVE * offset.std.x, ry: FOUR_OF_FIVE * offset.std.y };
-  const centre = offset && anchor.z + anchor.size.z / 2 + offset.mean.z;
-  const bottom = offset ? Math.max(0, centre - size.z / 2) : null;
-  const z = round(height(anchor, relation, size, bottom));
-  const find = VERTICAL.includes(relation) ? over : beside;
-  const places = [...find(anchor, relation, size, viewer, learnt)].map(([x, y]) => ({ x: round(x), y: round(y), z }));
-  const free = (place) => !others.some((other) => meet({ ...place, size, yaw: 0 }, other));
-  const apart = (place) => !ghosts.some((ghost) => overlap({ ...place, size, yaw: 0 }, ghost));
-  const place = places.find((one) => free(one) && apart(one)) ?? places.find(free) ?? places[0];
-  return { ...place, spread };
-}
-
-/** Whether two boxes intersect. Boxes that only touch, or are as thin as a rug, do not. */
-function meet(a, b) {
-  return overlap(a, b) && a.z + a.size.z > b.z + THIN && b.z + b.size.z > a.z + THIN;
-}
 
 /** The height of the bottom of a suggestion; at least 0, the floor. */
 function height(anchor, relation, size, learnt) {
@@ -112,7 +132,7 @@ function height(anchor, relation, size, learnt) {
 }
 
 /** Places on, above or below the anchor, with overlapping footprints; nearest to the learnt offset first. */
-function* over(anchor, relation, size, viewer, learnt) {
+function over(anchor, relation, size, learnt) {
   const half = halves({ size, yaw: -anchor.yaw });
   const room = (axis) => anchor.size[axis] / 2 - half[axis];
   // An object below may be larger: its footprint then contains that of the anchor.
@@ -122,14 +142,14 @@ function* over(anchor, relation, size, viewer, learnt) {
   const begin = [clamp(x, limit('x')), clamp(y, limit('y'))];
   const all = [begin];
   for (const p of PARTS) for (const q of PARTS) all.push([p * limit('x'), q * limit('y')]);
-  for (const [p, q] of nearest(all, begin)) {
+  return nearest(all, begin).map(([p, q]) => {
     const [dx, dy] = turned(along, p, q);
-    yield [anchor.x + dx, anchor.y + dy];
-  }
+    return [anchor.x + dx, anchor.y + dy];
+  });
 }
 
 /** Places along the axis of a horizontal relation, with separate footprints and the larger offset on this axis. */
-function* beside(anchor, relation, size, viewer, learnt) {
+function beside(anchor, relation, size, viewer, learnt) {
   const [ahead, left] = DIRECTION[relation];
   const [axis, other] = ahead ? ['x', 'y'] : ['y', 'x'];
   const turn = (viewer.yaw * 180) / Math.PI;
@@ -143,15 +163,13 @@ function* beside(anchor, relation, size, viewer, learnt) {
   const furthest = Math.max(least, touching + NEIGHBOURS);
   const begin = [Math.min(Math.max(out, least), furthest), aside];
   const all = [begin];
-  for (let more = 0; more <= furthest - least; more += 0.25) {
-    for (let by = -1.5; by <= 1.5; by += 0.25) all.push([least + more, aside + by]);
+  for (let more = 0; more <= furthest - least; more += 0.15) {
+    for (let by = -1.5; by <= 1.5; by += 0.15) all.push([least + more, aside + by]);
   }
-  const told = all.map(([far, by]) => [far, clamp(by, far - THIN)])
-    .filter(([far, by]) => Math.hypot(far - touching, Math.max(0, Math.abs(by) - flush)) <= furthest - touching);
-  for (const [far, by] of nearest(told, begin)) {
+  return nearest(all.map(([far, by]) => [far, clamp(by, far - THIN)]), begin).map(([far, by]) => {
     const [dx, dy] = ahead ? turned(viewer, ahead * far, by) : turned(viewer, by, left * far);
-    yield [anchor.x + dx, anchor.y + dy];
-  }
+    return [anchor.x + dx, anchor.y + dy];
+  }).filter(([x, y]) => gap({ x, y, size, yaw: 0 }, anchor) <= NEIGHBOURS);
 }
 
 const clamp = (value, limit) => Math.min(limit, Math.max(-limit, value));
@@ -159,18 +177,14 @@ const nearest = (places, [x, y]) =>
   places.map((place) => [Math.hypot(place[0] - x, place[1] - y), place]).sort((a, b) => a[0] - b[0]).map(([, place]) => place);
 
 /** Puts a suggestion on the board. @returns {string | null} its id; null if the scene is full */
-export function accept(store, ghost) {
+export function accept(store, { label, x, y, z }) {
   const { things } = store.get();
   if (things.length >= MOST_OBJECTS) {
     store.set({ complaint: FULL });
     return null;
   }
-  const id = freshId(things, ghost.label);
-  const { label, x, y, z } = ghost;
-  store.edit({
-    things: [...things, { id, label, x, y, z, size: null, yaw: 0, confidence: 1 }],
-    selected: id,
-    at: null,
-  });
+  const id = freshId(things, label);
+  const thing = { id, label, x, y, z, size: null, yaw: 0, confidence: 1, placed: false };
+  store.edit({ things: [...things, thing], selected: id, at: null });
   return id;
 }

@@ -17,34 +17,33 @@ export function widthOf(text, font) {
 }
 
 export class Places {
-  #taken = [];
+  #texts = [];
+  #boxes = [];
 
   constructor(width, height) {
     this.width = width;
     this.height = height;
   }
 
-  /** Keeps a rectangle free of texts. */
+  /** Keeps a rectangle free of texts, if they have another place. */
   reserve(box) {
-    this.#taken.push(box);
+    this.#boxes.push(box);
   }
 
   /**
-   * Takes the first centre with free space for a text of this size, or null.
+   * Takes the first centre where a text of this size meets neither a text nor a reserved rectangle,
+   * else the first where it meets no text, else null.
    * @param {{x: number, y: number}[]} centres
    */
   take(width, height, centres) {
-    for (const centre of centres) {
-      const box = {
-        left: centre.x - width / 2, right: centre.x + width / 2,
-        top: centre.y - height / 2, bottom: centre.y + height / 2,
-      };
-      if (this.#inside(box) && !this.#taken.some((other) => meet(box, other))) {
-        this.#taken.push(box);
-        return centre;
-      }
-    }
-    return null;
+    const around = ({ x, y }) => ({
+      left: x - width / 2, right: x + width / 2, top: y - height / 2, bottom: y + height / 2,
+    });
+    const clear = (centre) => this.#inside(around(centre)) && !this.#texts.some((other) => meet(around(centre), other));
+    const free = centres.filter(clear);
+    const centre = free.find((one) => !this.#boxes.some((other) => meet(around(one), other))) ?? free[0] ?? null;
+    if (centre) this.#texts.push(around(centre));
+    return centre;
   }
 
   #inside(box) {

@@ -85,7 +85,7 @@ export function layOut(fixed, free, relations, viewer) {
   d3.forceSimulation(nodes)
     .alphaDecay(1 - 0.002 ** (1 / TICKS))
     .force('beside', beside(triples, nodes))
-    .force('apart', d3.forceCollide((node) => Math.hypot(node.half.x, node.half.y) * 0.85 + GAP / 2).iterations(2))
+    .force('apart', d3.forceCollide((node) => Math.hypot(node.half.x, node.half.y) + GAP / 2).iterations(2))
     .force('x', d3.forceX(middle.x).strength(0.02))
     .force('y', d3.forceY(middle.y).strength(0.02))
     .stop()

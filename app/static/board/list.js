@@ -3,9 +3,10 @@
 import { whereabouts } from './actions.js';
 import { outliersOf } from './board.js';
 import { el } from './dom.js';
+import { readings } from './questions.js';
 import { changed } from './store.js';
 
-const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft'];
+const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft', 'refused', 'models', 'posed'];
 
 export function createList(list, empty, count, actions) {
   function row(thing) {
@@ -29,55 +30,30 @@ export function createList(list, empty, count, actions) {
     return el('li', {}, name, more, remove, el('p', { class: 'error' }));
   }
 
+  /** What the list says about an object besides its name. */
+  function about(thing, state, out) {
+    const where = !state.posed ? null
+      : thing.placed ? whereabouts(thing.x, thing.y, state.viewer) : 'position not given: move it to give one';
+    return [thing.id === thing.label ? null : thing.label, where, out ? 'does not belong here' : null]
+      .filter(Boolean).join(' · ');
+  }
+
   function draw(state) {
     const wrong = outliersOf(state);
-    const errors = errorsByObject(state);
     const rows = d3.select(list).selectAll('li').data(state.things, (thing) => thing.id)
       .join((enter) => enter.append(row));
-    rows.each(function update(thing, index) {
-      const out = wrong.get(thing.id)?.is_outlier;
+    rows.each(function update(thing) {
+      const out = Boolean(wrong.get(thing.id)?.is_outlier);
       const chosen = thing.id === state.selected;
       this.classList.toggle('selected', chosen);
+      this.classList.toggle('outlier', out);
       this.querySelector('.name').setAttribute('aria-current', String(chosen));
-      const words = [
-        thing.id === thing.label ? null : thing.label, whereabouts(thing.x, thing.y, state.viewer),
-        out ? 'does not belong here' : null,
-      ];
-      this.querySelector('.name span').textContent = words.filter(Boolean).join(' · ');
-      this.classList.toggle('outlier', Boolean(out));
-      this.querySelector('.error').textContent = errors.get(index) ?? '';
+      this.querySelector('.name span').textContent = about(thing, state, out);
+      this.querySelector('.error').textContent = readings(state, 'objects', thing.label);
     });
     empty.hidden = state.things.length > 0;
     count.textContent = state.things.length ? `(${state.things.length})` : '';
   }
 
   return (state, previous) => changed(state, previous, ...SEEN) && draw(state);
-}
-
-/** The error messages of the service, by index of the object. */
-function errorsByObject(state) {
-  const found = new Map();
-  for (const { error, words } of complaints(state)) {
-    const place = placeOf(error);
-    if (place !== null) found.set(place, [found.get(place), words].filter(Boolean).join(' '));
-  }
-  return found;
-}
-
-/** The error messages of all answers; with two models, each begins with the name of its model. */
-export function complaints(state) {
-  return state.answers.flatMap((own, column) =>
-    (own.missing?.problem?.errors ?? []).map((error) => ({
-      error, words: state.models[1] ? `${state.models[column]}: ${complaint(error)}.` : complaint(error),
-    })));
-}
-
-/** The index of the object of an error, or null. */
-export function placeOf({ pointer }) {
-  const place = /^#\/objects\/(\d+)/.exec(pointer);
-  return place ? Number(place[1]) : null;
-}
-
-export function complaint({ message, suggestions = [] }) {
-  return suggestions.length ? `${message} (${suggestions.join(', ')}?)` : message;
 }

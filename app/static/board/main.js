@@ -7,7 +7,6 @@ import { createBoard } from './board.js';
 import { createColumns } from './columns.js';
 import { combobox } from './combobox.js';
 import { el } from './dom.js';
-import { EXAMPLES } from './examples.js';
 import { fileDialog } from './file.js';
 import { createGeneration } from './generation.js';
 import { accept } from './ghosts.js';
@@ -20,47 +19,63 @@ import { watchService } from './recovery.js';
 import { fromScene, SceneError, sizer } from './scene.js';
 import { settings } from './settings.js';
 import { fromHash } from './share.js';
-import { createStore } from './store.js';
+import { changed, createStore } from './store.js';
 import { summary } from './summary.js';
 import { tabs } from './tabs.js';
-import { theme } from './theme.js';
 
 const get = (id) => document.getElementById(id);
 const say = (words) => (get('live').textContent = words);
 
 const store = createStore({
-  things: [], viewer: { x: 0, y: 0, yaw: 0 }, room: '', models: ['default', ''], shown: 0, tab: 'missing',
-  selected: null, snap: true, at: null, suggestions: 5, coverage: null, sensitivity: 'medium', threshold: null, least: 0.25, most: 12, own: false,
-  observed: false, unknown: 'error', answers: [{}, {}], draft: null, words: {}, contexts: {}, down: false,
-  complaint: '', epoch: 0, canUndo: false,
+  things: [], relations: [], posed: false, viewer: { x: 0, y: 0, yaw: 0 }, room: '', models: ['default', ''], shown: 0,
+  tab: 'missing', selected: null, at: null, sensitivity: 'medium', refused: {}, answers: [{}, {}], draft: null, words: {},
+  down: false, complaint: '', epoch: 0, canUndo: false,
 });
 
-/**
- * Puts a scene of the API on the board.
- * @returns {string} a note about ignored relations, or ''
- * @throws {SceneError}
- */
-function put(scene) {
+const OPENING = 4; // labels that the board shows for a model without examples
+
+/** Puts a scene of the API on the board. Objects without a position are laid out by their relations. @throws {SceneError} */
+function put(scene, change = {}) {
   const sizes = sizesOf(store.get(), store.get().models[0]);
-  const { things, viewer, room, relations } = fromScene(scene, sizes);
-  const sized = sizer(sizes);
-  const loose = things.filter((thing) => !thing.placed).map((thing) => ({ ...sized(thing), x: undefined, y: undefined }));
-  const fixed = things.filter((thing) => thing.placed).map(sized);
-  const places = new Map(layOut(fixed, loose, relations, viewer).map((box) => [box.id, box]));
+  const { things, viewer, room, relations, optical } = fromScene(scene, sizes);
+  const boxes = things.map(sizer(sizes));
+  const loose = boxes.filter(({ placed }) => !placed).map((box) => ({ ...box, x: undefined, y: undefined }));
+  const places = new Map(layOut(boxes.filter(({ placed }) => placed), loose, relations, viewer).map((box) => [box.id, box]));
   store.edit({
-    things: things.map(({ placed, ...thing }) => {
-      const { x, y, z } = placed ? thing : places.get(thing.id);
+    things: things.map((thing) => {
+      const { x, y, z } = places.get(thing.id) ?? thing;
       return { ...thing, x, y, z };
     }),
-    viewer, room, selected: null, at: null, draft: null,
+    // As in the service, stated relations take precedence over positions.
+    relations, posed: !relations.length && things.some(({ placed }) => placed),
+    viewer, room, selected: null, at: null, draft: null, ...change,
   });
-  const unplaced = new Set(loose.map((thing) => thing.id));
-  const unused = relations.filter((one) => !unplaced.has(one.subject) && !unplaced.has(one.object)).length;
-  const words = unused
-    ? `${unused} ${unused === 1 ? 'relation was' : 'relations were'} ignored: requests of the board contain positions only.` : '';
+  note(optical ? 'The board leaves out positions in the optical frame of a camera.' : '');
+}
+
+function note(words) {
   get('note').textContent = words;
   get('note').hidden = !words;
-  return words;
+}
+
+/** Opens with the first example of the model, or with some of its labels. Positions of examples do not count. */
+function openModel() {
+  const { examples = [], proposed = [] } = store.get().words[store.get().models[0]] ?? {};
+  if (examples.length) {
+    put(examples[0].scene, { posed: false });
+  } else if (proposed.length) {
+    put({ objects: proposed.slice(0, OPENING) });
+    note('This model has no example scenes. The board shows its first labels: replace them by your own objects.');
+  }
+}
+
+/** Loads the models after a failure. A board that is still untouched opens with a scene. */
+async function reload() {
+  await models.load();
+  const { things, canUndo } = store.get();
+  if (things.length || canUndo) return;
+  openModel();
+  store.set({ canUndo: false });
 }
 
 function tell(error) {
@@ -82,7 +97,7 @@ function askKey() {
       event.preventDefault();
       useKey(input.value);
       get('banner').hidden = true;
-      void models.load();
+      void reload();
       store.set({ epoch: store.get().epoch + 1 });
     },
   }, el('label', {}, 'API key ', input), el('button', {}, 'Use it'));
@@ -100,11 +115,12 @@ const models = createModels(store, get('model'), get('second'), tell);
 const views = [
   board.render,
   createList(get('list'), get('empty'), get('count'), actions),
-  createProperties(get('properties'), store, actions, say),
+  createProperties(get('properties'), store, actions),
   createColumns(store, (question) => document.querySelector(`.columns[data-question=${question}]`), askKey),
   createGeneration(get('generate'), get('drawn'), store, say),
   tabs(document.querySelector('[role=tablist]'), store),
   settings(store),
+  listExamples,
 ];
 
 // Views draw at most once per frame, even if the state changes more often.
@@ -127,20 +143,26 @@ store.subscribe((state, previous) => {
 });
 
 combobox(get('search'), get('found'), () => store.get().words[store.get().models[0]]?.objects ?? [],
-  (label) => actions.add(label), (words) => store.set({ complaint: words }));
+  (label) => actions.add(label));
 fileDialog(store, put, say);
-theme(get('theme'));
-watchService(store, get('banner'), () => void models.load());
+watchService(store, get('banner'), () => void reload());
 
-for (const name of Object.keys(EXAMPLES)) get('example').append(el('option', { value: name }, name));
+/** Lists the examples of the first model. */
+function listExamples(state, previous) {
+  if (!changed(state, previous, 'words', 'models')) return;
+  const { examples = [] } = state.words[state.models[0]] ?? {};
+  get('example').replaceChildren(el('option', { value: '' }, 'Examples…'),
+    ...examples.map(({ name }, index) => el('option', { value: index }, name)));
+  get('example').hidden = !examples.length;
+}
 get('example').addEventListener('change', ({ target }) => {
-  if (target.value) put(EXAMPLES[target.value]);
+  put(store.get().words[store.get().models[0]].examples[target.value].scene, { posed: false });
   target.value = '';
 });
 get('undo').addEventListener('click', () => store.undo());
 get('clear').addEventListener('click', () => {
-  get('note').hidden = true;
-  store.edit({ things: [], selected: null, at: null, draft: null });
+  note('');
+  store.edit({ things: [], relations: [], room: '', selected: null, at: null, draft: null });
 });
 document.addEventListener('keydown', (event) => {
   const typing = event.target.closest('input, textarea, select');
@@ -165,7 +187,7 @@ async function open() {
 addEventListener('hashchange', () => void open());
 // The vocabulary has the typical sizes, which the layout of scenes without positions needs.
 await models.load();
-if (!(await open())) put(Object.values(EXAMPLES)[0]);
+if (!(await open())) openModel();
 store.set({ canUndo: false });
 startAsking(store);
 document.querySelector('main').removeAttribute('aria-busy');

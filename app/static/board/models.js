@@ -17,14 +17,15 @@ function choices({ models, aliases }) {
   return [...named, ...versions];
 }
 
-function words({ objects, room_types: rooms }) {
+function words({ objects, room_types: rooms, examples = [] }) {
   const names = new Map();
   for (const { label, aliases } of objects) {
     for (const alias of aliases) names.set(plain(alias), label);
   }
   for (const { label } of objects) names.set(plain(label), label);
   return {
-    objects, rooms,
+    objects, rooms, examples,
+    proposed: objects.filter(({ structure }) => !structure).map(({ label }) => label),
     // A Map, because a label such as “constructor” would clash with a property of plain objects.
     sizes: new Map(objects.filter(({ size }) => size).map(({ label, size }) => [label, size])),
     canonical: (label) => names.get(plain(label)) ?? label,
@@ -32,19 +33,21 @@ function words({ objects, room_types: rooms }) {
 }
 
 export function createModels(store, first, second, tell) {
-  const asked = new Set();
+  const asked = new Map(); // model → promise of its vocabulary
 
-  async function learn(model, key, path, read) {
-    const place = `${key}/${model}`;
-    if (!model || asked.has(place)) return;
-    asked.add(place);
+  async function learn(model) {
     try {
-      const found = read(await call(`models/${encodeURIComponent(model)}/${path}`));
-      store.set({ [key]: { ...store.get()[key], [model]: found } });
+      const found = words(await call(`models/${encodeURIComponent(model)}/vocabulary`));
+      store.set({ words: { ...store.get().words, [model]: found } });
     } catch (error) {
-      asked.delete(place);
+      asked.delete(model);
       tell(error);
     }
+  }
+
+  function learnAll({ models }) {
+    for (const model of models) if (model && !asked.has(model)) asked.set(model, learn(model));
+    return Promise.all(models.map((model) => asked.get(model)));
   }
 
   const options = (found) => found.map(({ value, words: text }) => el('option', { value }, text));
@@ -52,21 +55,17 @@ export function createModels(store, first, second, tell) {
   async function load() {
     try {
       const found = choices(await call('models'));
+      const [model, other] = store.get().models;
+      asked.clear();
+      // A store without the alias "default" opens with its first model.
+      if (!found.some(({ value }) => value === model)) store.set({ models: [found[0]?.value ?? '', other] });
       first.replaceChildren(...options(found));
-      second.replaceChildren(el('option', { value: '' }, 'none'), ...options(found));
+      second.replaceChildren(el('option', { value: '' }, 'no other model'), ...options(found));
       [first.value, second.value] = store.get().models;
       await learnAll(store.get());
     } catch (error) {
       tell(error);
     }
-  }
-
-  function learnAll(state) {
-    const contexts = state.tab === 'generate';
-    return Promise.all(state.models.flatMap((model) => [
-      learn(model, 'words', 'vocabulary', words),
-      contexts && learn(model, 'contexts', 'contexts', ({ layers }) => layers),
-    ]));
   }
 
   const choose = () => {
@@ -81,6 +80,6 @@ export function createModels(store, first, second, tell) {
   };
   first.addEventListener('change', choose);
   second.addEventListener('change', choose);
-  store.subscribe((state, previous) => changed(state, previous, 'models', 'tab') && void learnAll(state));
+  store.subscribe((state, previous) => changed(state, previous, 'models') && void learnAll(state));
   return { load };
 }

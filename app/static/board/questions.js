@@ -6,33 +6,79 @@ export const QUESTIONS = ['missing', 'outliers', 'relations'];
 
 /** The parts of the state that the answers depend on. */
 export const DEPENDS = [
-  'things', 'viewer', 'room', 'models', 'at', 'coverage', 'sensitivity', 'threshold', 'suggestions', 'least', 'most', 'unknown',
-  'words', 'epoch',
+  'things', 'relations', 'posed', 'viewer', 'room', 'models', 'at', 'sensitivity', 'refused', 'words', 'epoch',
 ];
+
+const SUGGESTIONS = 5;
+const MOST_RELATIONS = 12;
+const LEAST_PROBABILITY = 0.25;
 
 /** Typical sizes of a model's classes, by label. */
 export const sizesOf = (state, model) => state.words[model]?.sizes ?? new Map();
 
+/** The labels and room types that a model refused. @returns {{objects: Map, rooms: Map}} name → similar names */
+export const refusedBy = (state, model) => state.refused[model] ?? { objects: new Map(), rooms: new Map() };
+
+/** The objects of the board that a model knows, or may know. */
+export const knownTo = (state, model) =>
+  state.things.filter((thing) => !refusedBy(state, model).objects.has(thing.label));
+
+/** The classes that both models can propose; null with one model or with equal vocabularies. */
+export function common(state) {
+  const [first, second] = state.models.map((model) => state.words[model]);
+  if (!first || !second) return null;
+  const others = new Set(second.proposed);
+  const shared = first.proposed.filter((label) => others.has(label));
+  return shared.length === first.proposed.length && shared.length === others.size ? null : shared;
+}
+
 const OWN = {
-  missing: (state) => ({
-    top_k: state.suggestions,
-    ...(state.coverage !== null && { coverage: state.coverage }),
-    ...(state.at && { at: state.at }),
-  }),
-  outliers: (state) => ({
-    ...(state.sensitivity !== 'medium' && { sensitivity: state.sensitivity }),
-    ...(state.threshold !== null && { threshold: state.threshold }),
-  }),
-  relations: (state) => ({ top_k: state.most, min_probability: state.least }),
+  missing(state) {
+    const candidates = common(state);
+    return { top_k: SUGGESTIONS, ...(state.at && { at: state.at }), ...(candidates && { candidates }) };
+  },
+  outliers: ({ sensitivity }) => (sensitivity === 'medium' ? {} : { sensitivity }),
+  relations: () => ({ top_k: MOST_RELATIONS, min_probability: LEAST_PROBABILITY }),
 };
 
-/** @returns {object | null} null for an empty scene or without a model */
-export function bodyOf(state, question, model) {
-  if (!state.things.length || !model) return null;
-  return {
-    ...toScene(state, sizesOf(state, state.models[0])),
-    model,
-    ...(state.unknown !== 'error' && { unknown_labels: state.unknown }),
-    ...OWN[question](state),
-  };
+/** The scene as a model gets it, without the labels and the room type that it refused. */
+export function sceneFor(state, model) {
+  const room = refusedBy(state, model).rooms.has(state.room) ? '' : state.room;
+  return toScene({ ...state, room, things: knownTo(state, model) }, sizesOf(state, state.models[0]));
 }
+
+/** @returns {object | null} null if there is nothing to ask; `whyNot` gives the reason */
+export function bodyOf(state, question, model) {
+  if (whyNot(state, question, model)) return null;
+  return { ...sceneFor(state, model), model, unknown_labels: 'nearest', ...OWN[question](state) };
+}
+
+/** The reason why the page does not ask this question, or ''. */
+export function whyNot(state, question, model) {
+  if (!model) return 'Choose a model first.';
+  if (!state.things.length) return 'Put an object on the board first.';
+  const known = knownTo(state, model);
+  if (!known.length) return 'The model knows none of the objects.';
+  if (question !== 'missing') return '';
+  if (state.at && !known.some(({ id }) => id === state.at.object)) return `The model does not know ${state.at.object}.`;
+  return common(state)?.length === 0 ? 'The two models have no class in common.' : '';
+}
+
+/**
+ * How a model reads an unknown name: "fridgee → fridge?", "flux not known, left out", or ''.
+ * @param {'objects' | 'rooms'} kind
+ */
+export function reading(state, column, kind, name) {
+  const similar = refusedBy(state, state.models[column])[kind].get(name);
+  if (similar) return `${name} not known, left out${similar.length ? ` (${similar.join(', ')}?)` : ''}`;
+  const mapped = QUESTIONS.flatMap((question) => state.answers[column][question]?.answer?.mapped ?? []);
+  const found = mapped.find(({ label }) => label === name);
+  return found ? `${name} → ${found.class}?` : '';
+}
+
+/** The readings of all models; with two models, each begins with the name of its model. */
+export const readings = (state, kind, name) =>
+  state.models.flatMap((model, column) => {
+    const words = model && reading(state, column, kind, name);
+    return words ? [state.models[1] ? `${model}: ${words}` : words] : [];
+  }).join('. ');

@@ -20,30 +20,35 @@ export function freshId(things, label) {
 }
 
 /**
- * The scene for a request. It includes typical and guessed sizes, so that all models get the same scene.
- * @param {{things: Thing[], viewer: object, room: string}} board
+ * The scene for a request: labels and stated relations, or with `posed` the positions in their place.
+ * Positions that the page chose are left out. Typical and guessed sizes are included, so that all
+ * models get the same boxes.
+ * @param {{things: Thing[], relations: object[], posed: boolean, viewer: object, room: string}} board
  */
-export function toScene({ things, viewer, room }, sizes) {
-  const sized = sizer(sizes);
-  const objects = things.map((thing) => {
-    const { size } = sized(thing);
-    const half = radians(thing.yaw) / 2;
-    return {
+export function toScene({ things, relations, posed, viewer, room }, sizes) {
+  const ids = new Set(things.map(({ id }) => id));
+  const stated = relations.filter(({ subject, object }) => ids.has(subject) && ids.has(object));
+  return {
+    objects: things.map((thing) => ({
       id: thing.id,
       label: thing.label,
       ...(thing.confidence < 1 && { confidence: thing.confidence }),
-      position: { x: round(thing.x), y: round(thing.y), z: round(thing.z + size.z / 2) },
-      size,
-      ...(thing.yaw && {
-        orientation: { x: 0, y: 0, z: round(Math.sin(half), 6), w: round(Math.cos(half), 6) },
-      }),
-    };
-  });
-  return {
-    objects,
+      ...(posed && thing.placed && poseOf(sizer(sizes)(thing))),
+    })),
+    ...(!posed && stated.length && { relations: stated }),
     ...(room && { room_type: room }),
-    frame_id: 'map',
-    viewpoint: { x: round(viewer.x), y: round(viewer.y), yaw: round(viewer.yaw, 4) },
+    ...(posed && {
+      frame_id: 'map', viewpoint: { x: round(viewer.x), y: round(viewer.y), yaw: round(viewer.yaw, 4) },
+    }),
+  };
+}
+
+function poseOf({ x, y, z, yaw, size }) {
+  const half = radians(yaw) / 2;
+  return {
+    position: { x: round(x), y: round(y), z: round(z + size.z / 2) },
+    size,
+    ...(yaw && { orientation: { x: 0, y: 0, z: round(Math.sin(half), 6), w: round(Math.cos(half), 6) } }),
   };
 }
 
@@ -67,17 +72,19 @@ const isPlace = (value) => isNumber(value) && Math.abs(value) <= FARTHEST;
 const isExtent = (value) => isNumber(value) && value > 0 && value <= LARGEST;
 
 /**
- * Reads a scene of the API. Objects without a position get `placed`: false.
- * @returns {{things: (Thing & {placed: boolean})[], viewer: object, room: string, relations: object[]}}
+ * Reads a scene of the API.
+ * @returns {{things: Thing[], viewer: object, room: string, relations: object[], optical: boolean}}
  * @throws {SceneError}
  */
 export function fromScene(scene, sizes) {
   fail(!scene || typeof scene !== 'object' || Array.isArray(scene), 'A scene must be a JSON object: {"objects": [...]}.');
   fail(!Array.isArray(scene.objects), 'A scene must have a list "objects".');
   fail(scene.objects.length > MOST_OBJECTS, `A scene can have at most ${MOST_OBJECTS} objects.`);
-  fail(/_optical(_frame)?$/.test(scene.frame_id ?? ''), 'The board cannot show positions in the optical frame of a camera.');
   const things = [];
   scene.objects.forEach((entry, index) => things.push(readThing(entry, index, things, sizes)));
+  const optical = /_optical(_frame)?$/.test(scene.frame_id ?? '');
+  // In the optical frame of a camera, x and y have other directions than on the board.
+  if (optical) for (const thing of things) thing.placed = false;
   const { x = 0, y = 0, yaw = 0 } = scene.viewpoint ?? {};
   fail(!(isPlace(x) && isPlace(y)), 'The viewpoint needs numbers x and y within ±100 000 km.');
   fail(!(isNumber(yaw) && Math.abs(yaw) <= MOST_TURNED), 'The viewpoint needs a yaw within ±1000 radians.');
@@ -85,7 +92,7 @@ export function fromScene(scene, sizes) {
   fail(!Array.isArray(relations), '"relations" must be a list.');
   const room = scene.room_type ?? '';
   fail(typeof room !== 'string', 'The room type must be a text.');
-  return { things, viewer: { x, y, yaw }, room, relations: relations.map(readRelation(things)) };
+  return { things, viewer: { x, y, yaw }, room, relations: relations.map(readRelation(things)), optical };
 }
 
 /** Reads relations, whose ends are ids or labels. */

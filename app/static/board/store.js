@@ -12,6 +12,7 @@
  * @property {Extents | null} size along its own axes; null: typical of its class
  * @property {number} yaw degrees, from x towards y
  * @property {number} confidence
+ * @property {boolean} placed whether its position comes from the scene or the user, not from the page
  */
 
 /**
@@ -32,7 +33,8 @@ export function createStore(initial) {
     },
     /** Changes the board, so that `undo` can restore its previous state. */
     edit(change) {
-      past.push({ things: state.things, viewer: state.viewer, room: state.room });
+      const { things, relations, posed, viewer, room } = state;
+      past.push({ things, relations, posed, viewer, room });
       if (past.length > 200) past.shift();
       this.set({ complaint: '', ...change, canUndo: true });
     },

@@ -61,7 +61,7 @@ def relations(answer: RelationsAnswer) -> RenderableType:
 
 
 def missing(answer: MissingAnswer) -> RenderableType:
-    """Return a table of missing objects, most probable first, with likely places and reasons."""
+    """Return a table of missing objects with places and reasons, and a table of counts."""
     rows = [
         (
             entry.label,
@@ -72,7 +72,20 @@ def missing(answer: MissingAnswer) -> RenderableType:
         )
         for entry in answer.missing
     ]
-    return _table("missing", "probability", "log-odds", "where", "because", rows=rows)
+    found = _table("missing", "probability", "log-odds", "where", "because", rows=rows)
+    if not answer.more:
+        return found
+    further = [
+        (
+            entry.label,
+            str(entry.listed_count),
+            f"{entry.expected_count:.1f} ({entry.low} to {entry.high})",
+            _share(entry.probability),
+        )
+        for entry in answer.more
+    ]
+    columns = ("more of", "listed", "expected", "probability")
+    return Group(found, _table(*columns, rows=further))
 
 
 def outliers(answer: OutliersAnswer) -> RenderableType:

@@ -181,7 +181,7 @@ def test_sources_by_name_are_found_in_the_folder_extra(
     (scene,) = read_sources(DataConfig(sources=("nr3d",)), tmp_path)["nr3d"]
     assert scene.source == "nr3d"
     for source in ("vsr", "nr3d.jsonl.gz"):
-        with pytest.raises(ConfigError, match="there is no"):
+        with pytest.raises(ConfigError, match="1 of 1 files of scenes are missing"):
             read_sources(DataConfig(sources=(source,)), tmp_path)
 
 

@@ -51,6 +51,9 @@ def test_what_is_proposed_can_be_trained_on(file, tmp_path) -> None:
     )
     assert values["facts"]["shares"]["positions"] == 1.0
     assert all("." in name for name in values["reasons"])
+    assert values["warning"] == ""
+    assert values["test_groups"] >= 6
+    assert 10 <= config.training.patience < config.training.epochs
 
 
 def test_an_edited_vocabulary_is_used(file, tmp_path) -> None:
@@ -119,10 +122,16 @@ def test_what_cannot_be_is_refused(file, tmp_path, arguments, message) -> None:
 
 def test_too_few_scenes_are_told(tmp_path) -> None:
     path = tmp_path / "scenes.jsonl"
-    write_jsonl(SCENES[:3], path)
+    write_jsonl(SCENES[:19], path)
+    output = invoke("init", "lab", path, "--output", tmp_path / "o", code=1)
+    assert "19 scenes are too few: from fewer than 20" in output
+    write_jsonl([replace(scene, group="one place") for scene in SCENES], path)
     assert "cannot be split" in invoke("init", "lab", path, "--output", tmp_path / "o", code=1)
     path.write_text("")
     assert "contains no scene" in invoke("init", "lab", path, "--output", tmp_path / "o", code=1)
+    write_jsonl(SCENES[:40], path)
+    output = invoke("init", "lab", path, "--output", tmp_path / "o")
+    assert "warning: 40 scenes of 22 groups are few" in output
 
 
 def test_a_name_that_tells_no_format_is_copied_as_one_that_does(tmp_path) -> None:

@@ -176,8 +176,8 @@ def test_publishing_measures_the_tasks_of_a_card_on_every_source():
     rows = evaluate(ARTIFACT, two_sources(DATA), NO_STRUCTURE, two_sources(TRAIN))
     found = {(row.task, row.source, row.metric) for row in rows}
     assert len(found) == len(rows)
-    # These scenes have no poses, no offsets, no typical classes and no facts.
-    absent = {"T3 signature", "Offsets", "Everyday"}
+    # These scenes have no poses, offsets, counts, typical classes or facts.
+    absent = {"T3 signature", "Offsets", "Counts", "Everyday"}
     card = {
         (task, source, metric)
         for task, one in EVERY_TASK.items()

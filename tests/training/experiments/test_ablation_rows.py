@@ -25,7 +25,7 @@ def test_shipped_rows_learn_from_the_scenes_of_the_full_model(name):
 
 def settings(config):
     """Every entry by its name, as in "machine.G"."""
-    dumped = config.model_dump(exclude={"name", "description", "data"})
+    dumped = config.model_dump(exclude={"name", "description", "examples", "data"})
     return {f"{part}.{name}": x for part, some in dumped.items() for name, x in some.items()}
 
 

@@ -53,7 +53,7 @@ epochs = {epochs}
 BASELINES = ("--baseline", "popularity", "--baseline", "EASE")
 # In this process, where tests can look on; workers have a test of their own.
 HERE = ("--workers", "1")
-MACHINES = {"rooms-triway", "rooms-gbm", "rooms-rbm"}
+MACHINES = {"rooms-triway", "rooms-rbm"}
 REFERENCES = {"independent classes", "held-out scenes (floor)"}
 
 
@@ -74,7 +74,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("benchmark")
     where = folder / "reports"
     arguments = (
-        *(write(folder, variant=variant) for variant in ("triway", "gbm", "rbm")),
+        *(write(folder, variant=variant) for variant in ("triway", "rbm")),
         "--folder", str(where), "--quick",
         "--seed-protocol", "--shuffled", *HERE,
     )  # fmt: skip

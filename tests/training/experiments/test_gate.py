@@ -1,20 +1,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from app.registry import Store
 from tests.http.stores import corrupt, make_store
+from training.batches import subset
+from training.config import Config
 from training.evaluation.metrics import Figure
-from training.experiments import gate
 from training.experiments.compare import RELATIONAL, Comparison, unmeasured
-from training.experiments.gate import WorseError, seat
+from training.experiments.gate import Usefulness, losses, measure_usefulness, seat
 from training.experiments.results import Difference, Results
 from training.experiments.sides import Side
+from training.pipeline import SplitScenes, prepare
+from training.publish import as_stored, draft_artifact
+from training.trainer import Trainer
 
 
 def difference(task: str, metric: str, low: float, high: float) -> Difference:
@@ -49,12 +54,12 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
         ("T3 outliers, uniform", "hit@1", -0.3, -0.1),
         ("T1b completion", "R-precision", 0, 1),
     )
-    text = str(WorseError(found, 0.02))
-    assert "MRR (-0.250" in text
+    (text,) = losses(found, 0.02)
+    assert "missing object, MRR -0.250" in text
     assert "hit@1" in text
     assert "R-precision" not in text
     assert found.to_dict()["differences"][0]["verdict"] == "worse"
-    assert comparison().worse_by(0) == []
+    assert losses(comparison(), 0) == []
 
 
 @pytest.mark.parametrize(
@@ -66,28 +71,90 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
     ],
 )
 def test_what_was_measured_at_relations_gives_way_to_nothing_that_was_not(
-    measured, task, expected, monkeypatch
+    measured, task, expected
 ) -> None:
     manifest = SimpleNamespace(metrics=[SimpleNamespace(task=name) for name in measured])
     holder = Side("old", None, {}, SimpleNamespace(manifest=manifest))  # type: ignore[arg-type]
-    row = difference(task, "MRR", -0.1, 0.1)
-    names = unmeasured([row], holder)
+    names = unmeasured([difference(task, "MRR", -0.1, 0.1)], holder)
     assert len(names) == expected
     assert set(names) < set(RELATIONAL)
+    reasons = losses(replace(comparison(("T2 missing", "MRR", -0.1, 0.1)), unmeasured=names), 0.02)
+    assert len(reasons) == bool(names)
+    for text in reasons:
+        assert "old was measured in relations of a scene, false relation, but new was not" in text
+        assert "worse" not in text
 
-    found = replace(comparison(("T2 missing", "MRR", -0.1, 0.1)), unmeasured=names)
-    monkeypatch.setattr(gate, "compare", lambda *_, **__: found)
-    run, scenes = SimpleNamespace(config=None), SimpleNamespace(digests={})
-    ask = partial(
-        *(gate.judge, run, scenes, None, holder, Path()), margin=0.02, limit=None, say=print
+
+# ---------------------------------------------------------------------- against the baselines
+
+
+def small(**training: float) -> Config:
+    return Config.model_validate(
+        {
+            "name": "small",
+            "data": {"sources": ["rooms"], "rooms": 240, "vocabulary": "rooms", "split": "stable"},
+            "machine": {"variant": "rbm", "form": "local", "H1": 16, "H2": 0, "K": 0},
+            "objective": {"name": "composite"},
+            "training": {"epochs": 12, "batch_size": 16, "learning_rate": 0.05} | training,
+        }
     )
-    if not names:
-        assert ask() is found
-        return
-    with pytest.raises(WorseError) as refused:
-        ask()
-    assert "old was measured in T1a relations, T3b placement, but new was not" in str(refused.value)
-    assert "worse" not in str(refused.value)
+
+
+@cache
+def rooms() -> SplitScenes:
+    return prepare(small(), Path())
+
+
+def usefulness(scenes: SplitScenes, config: Config) -> Usefulness:
+    """Of a model that learnt from these scenes, on the real ones."""
+    machine = as_stored(Trainer(config, scenes.training_data()).run().machine)
+    artifact = draft_artifact(machine, scenes.vocabulary)
+    return measure_usefulness(artifact, rooms().training_data(), limit=300, say=lambda _: None)
+
+
+def test_a_trained_model_is_better_than_popularity() -> None:
+    found = usefulness(rooms(), small())
+    assert found.objections() == []
+    assert found.differences["popularity"].low > 0.1
+    assert all(len(line) <= 80 for line in found.lines())
+
+
+@pytest.mark.parametrize("how", ["hardly trained", "labels shuffled between scenes"])
+def test_a_useless_model_is_refused_with_its_figures(how: str) -> None:
+    if how == "hardly trained":
+        found = usefulness(rooms(), small(epochs=1, learning_rate=1e-6))
+    else:
+        found = usefulness(rooms().shuffled(0), small())
+    popularity, ease = found.objections()
+    assert "not better than popularity" in popularity
+    assert "worse than EASE" in ease
+    assert f"{found.differences['popularity'].value:+.3f}" in popularity
+    assert f"{found.scenes} test scenes" in popularity
+
+
+def test_photographs_with_incomplete_lists_are_used_where_there_are_no_others() -> None:
+    data = rooms().training_data()
+    flags = [replace(scene, complete=False) for scene in data.test.scenes]
+    machine = as_stored(Trainer(small(epochs=1), data).run().machine)
+    artifact = draft_artifact(machine, rooms().vocabulary)
+    incomplete = replace(data, test=replace(data.test, scenes=flags))
+    found = measure_usefulness(artifact, incomplete, limit=300, say=lambda _: None)
+    assert found.ours is not None
+    assert found.scenes == len(flags)
+
+
+def test_too_few_test_scenes_decide_nothing_and_are_refused() -> None:
+    data = rooms().training_data()
+    few = replace(data, test=subset(data.test, torch.arange(4)))
+    artifact = draft_artifact(
+        as_stored(Trainer(small(epochs=1), data).run().machine), rooms().vocabulary
+    )
+    found = measure_usefulness(artifact, few, limit=300, say=lambda _: None)
+    assert list(found.lines()) == []
+    assert "at least 6 groups" in found.objections()[0]
+
+
+# ------------------------------------------------------------------------------- what is served
 
 
 def test_an_alias_serves_a_model_or_nothing_that_can_be_compared_with(tmp_path) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from training.cli import app
@@ -165,3 +167,25 @@ def test_a_row_is_compared_by_scene_where_the_reference_row_has_the_metric():
     assert gap.figure.value == pytest.approx(0.25)
     assert gap.figure.low == pytest.approx(-0.25)
     assert gap.figure.high == pytest.approx(0.5)
+
+
+def test_tables_for_terminals_name_tasks_in_words_and_fit_80_columns():
+    cells = tuple(
+        Cell(row, "T1a relations", source, metric, figure(0.5), (0.5,))
+        for row in ("indoor-triway-deep", "frequency table, completing")
+        for source in ("validation pooled", "test pooled", "sunrgbd")
+        for metric in ("R-precision, distinct classes", "R-precision, instance counts")
+    )
+    gaps = (
+        Difference("indoor-triway-deep", "T1a relations", "test pooled", cells[0].metric,
+                   figure(0.1)),
+    )  # fmt: skip
+    console = Console(width=80, file=io.StringIO())
+    console.print(*Results("ours", cells, gaps).tables())
+    shown = console.file.getvalue()
+    assert "relations of a scene" in shown
+    assert "T1a" not in shown
+    assert "sunrgbd" not in shown  # where there are pooled figures, the file has the others
+    assert shown.count("0.500 [0.500, 0.500]") == 8
+    assert shown.count("*") == 1
+    assert "…" not in shown

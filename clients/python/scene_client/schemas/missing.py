@@ -49,7 +49,8 @@ class MissingOptions(Request):
         Field(
             min_length=1,
             max_length=4096,
-            description="limit the answer to classes with these labels",
+            description="limit the answer to classes with these labels. The list `more` then "
+            "contains them at any probability",
         ),
     ] = None
     at: Annotated[
@@ -135,6 +136,27 @@ class MissingObject(Reply):
     ] = []
 
 
+class MoreInstances(Reply):
+    """A class that the request lists, and that probably has more instances in the scene.
+
+    The statistics are those of training scenes. Listed objects count as present, whatever their
+    confidence.
+    """
+
+    label: str
+    listed_count: Annotated[int, Field(ge=1, description="number of listed objects of the class")]
+    expected_count: Annotated[
+        Finite,
+        Field(description="expected number of objects of the class, including the listed objects"),
+    ]
+    low: Annotated[int, Field(ge=1, description="lower limit of an 80 % interval of the number")]
+    high: Annotated[int, Field(ge=1, description="upper limit of the interval")]
+    probability: Annotated[
+        Probability,
+        Field(description="probability that the scene has more than the listed objects"),
+    ]
+
+
 class MissingAnswer(Answer):
     """Unlisted classes, most probable first. Their probabilities do not sum to one."""
 
@@ -143,6 +165,14 @@ class MissingAnswer(Answer):
         Field(description="value of `coverage` that the service has used"),
     ] = None
     missing: list[MissingObject]
+    more: Annotated[
+        list[MoreInstances],
+        Field(
+            description="listed classes with probably more instances than listed, most probable "
+            "first. Without `candidates`, their probability is at least 0.5. The list is empty "
+            "with `at`, and for models without statistics of counts"
+        ),
+    ] = []
 
 
 class MissingFields(SceneFields, total=False):

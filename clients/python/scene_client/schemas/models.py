@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -97,6 +97,19 @@ class VocabularyEntry(Reply):
     ] = None
 
 
+class ExampleScene(Reply):
+    """An example scene of the model, for `client.missing(example.scene)`."""
+
+    name: str
+    scene: Annotated[
+        dict[str, Any],
+        Field(
+            description="fields of a request: objects and optionally relations, room_type, "
+            "frame_id and viewpoint"
+        ),
+    ]
+
+
 class VocabularyAnswer(Reply):
     """The vocabulary of a model. Letter case, separators and plurals of labels do not matter."""
 
@@ -104,6 +117,9 @@ class VocabularyAnswer(Reply):
     objects: list[VocabularyEntry]
     relations: list[RelationName]
     room_types: list[str]
+    examples: Annotated[
+        list[ExampleScene], Field(description="example scenes; older models have none")
+    ] = []
 
 
 class WeightedLabel(Reply):

@@ -1,0 +1,158 @@
+"""The numbers of instances of the listed classes: are there more chairs, or a second nightstand?
+
+The models score classes. This module adds statistics of counts. Let n be the number of instances of
+a class in the scene, of which the request lists k. Then, for n from k to M,
+
+    p(n) ∝ s(n) n^η ρ^(n - k)
+    η = a + b log k + c u + d_t + (1/√m) Σ_j e_j
+
+s(n) is the share of training scenes with n instances. u is 1 if the request lists another class
+several times, and 0 otherwise. The sum goes over the m other listed classes j, without structure.
+a, b, c, d (for the room type t) and e are weights of the class. A request that states a coverage
+above the model's coverage lowers ρ from 1 to (1 - coverage) / (1 - model's coverage).
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Collection
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.questions.posterior import present
+from app.registry.artifact import Artifact
+from app.registry.counts import INTERCEPT, LISTED, ROOM, SEVERAL, Counts
+from app.scene.scene import Scene
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LIKELY: Final = 0.5
+"""Minimum probability of further instances at which an answer contains a class."""
+
+_TAIL: Final = 0.1  # probability of a count below `low`, and of a count above `high`
+
+
+class More(NamedTuple):
+    """A listed class that probably has more instances than the scene lists.
+
+    Attributes:
+        label: canonical label of the class.
+        listed_count: number of listed objects of the class.
+        expected_count: expected number of instances in the scene, including the listed ones.
+        low, high: limits of the number of instances; the number is in this interval with a
+            probability of at least 0.8.
+        probability: probability that the scene has more instances than the request lists.
+    """
+
+    label: str
+    listed_count: int
+    expected_count: float
+    low: int
+    high: int
+    probability: float
+
+
+def more(
+    artifact: Artifact,
+    scene: Scene,
+    *,
+    top_k: int = 10,
+    candidates: Collection[int] | None = None,
+    coverage: float | None = None,
+) -> tuple[More, ...]:
+    """Return the listed classes with probably more instances than listed, likeliest first.
+
+    Listed objects count as present, whatever their confidence. The answer never contains structural
+    classes, or classes without statistics.
+
+    Args:
+        artifact: the model.
+        scene: the listed objects and the room type.
+        top_k: maximum number of classes in the answer.
+        candidates: indices of classes. The answer then contains these classes at any probability,
+            and no others. None means all classes with a probability of at least `LIKELY`.
+        coverage: probability that the request lists an object of the scene. Only values above the
+            model's coverage change the answer. At 1, the scene has no further instances.
+
+    Raises:
+        ValueError: the machine does not know the class of an object or the room type.
+    """
+    if artifact.counts is None:
+        return ()
+    found = present(scene, artifact.spec)
+    plain = ~artifact.vocabulary.structure[found.classes]
+    classes, listed = found.classes[plain], found.counts[plain]
+    usual = artifact.calibration.coverage
+    unlisted = 1.0
+    if coverage is not None and coverage > usual:
+        unlisted = (1 - coverage) / (1 - usual)
+    which, p = distribution(
+        artifact.counts, artifact.spec.V, classes, listed, scene.room_type, unlisted
+    )
+    if not len(which):
+        return ()
+    k, chosen = listed[which], classes[which]
+    number, below = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
+    beyond = 1 - p[np.arange(len(which)), k - 1]
+    usable = beyond >= LIKELY if candidates is None else np.isin(chosen, list(candidates))
+    order = np.flatnonzero(usable)
+    order = order[np.argsort(-beyond[order], kind="stable")][:top_k]
+    return tuple(
+        More(
+            artifact.vocabulary.labels[chosen[row]],
+            int(k[row]),
+            float(p[row] @ number),
+            int((below[row] < _TAIL).sum()) + 1,
+            int((below[row] < 1 - _TAIL).sum()) + 1,
+            float(beyond[row]),
+        )
+        for row in order.tolist()
+    )
+
+
+def distribution(
+    counts: Counts,
+    V: int,
+    classes: Ints,
+    listed: Ints,
+    room: int | None = None,
+    unlisted: float = 1.0,
+) -> tuple[Ints, Floats]:
+    """Return the distributions of the numbers of instances of the listed classes.
+
+    Args:
+        counts: statistics of the model.
+        V: number of classes of the model.
+        classes: (n,) indices of the listed classes, without structure, in ascending order.
+        listed: (n,) number of listed objects of each class.
+        room: index of the room type, or None.
+        unlisted: ρ of the formula.
+
+    Returns:
+        Indices into `classes` of the k classes with statistics and with fewer than M listed
+        objects, (k,). Then the probability of 1, 2, ... M instances, (k, M).
+    """
+    M = counts.log_share.shape[1]
+    row = np.searchsorted(counts.classes, classes)
+    row[row == len(counts.classes)] = 0
+    which = np.flatnonzero((counts.classes[row] == classes) & (listed < M))
+    row, number, k = row[which], np.arange(1, M + 1), listed[which, None]
+    exponent = counts.weights[row, INTERCEPT].astype(np.float64)
+    exponent += counts.weights[row, LISTED] * np.log(listed[which])
+    several = listed > 1
+    exponent += counts.weights[row, SEVERAL] * (several.sum() > several[which])
+    if room is not None:
+        exponent += counts.weights[row, ROOM + room]
+    if (others := len(classes) - 1) > 0:
+        # The effect of a class on itself is 0, so the sum over all listed classes is correct.
+        effects = counts.weights[row[:, None], counts.weights.shape[1] - V + classes]
+        exponent += effects.sum(axis=1, dtype=np.float64) / math.sqrt(others)
+    logits = counts.log_share[row] + exponent[:, None] * np.log(number)
+    logits += (number - k) * math.log(max(unlisted, sys.float_info.min))
+    logits[number < k] = -np.inf
+    p = np.exp(logits - logits.max(axis=1, keepdims=True, initial=-np.inf))
+    return which, p / p.sum(axis=1, keepdims=True)

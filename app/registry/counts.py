@@ -1,0 +1,90 @@
+"""Statistics of the number of instances of a class in a scene, such as the chairs of a kitchen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.registry.errors import ArtifactError
+
+Table = NDArray[np.float32]
+
+PREFIX: Final = "counts."
+"""Prefix of the names of count tensors. They are in the same file as the machine's tensors."""
+
+INTERCEPT, LISTED, SEVERAL, ROOM = 0, 1, 2, 3
+"""Columns of `Counts.weights`: intercept, log of the listed number, 1 if another class is listed
+several times, and the first of C room types. The last V columns are those of the other classes."""
+
+_LARGEST: Final = 64.0
+_MOST: Final = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """Counts of K of a model's V classes. `app.questions.counts` has the formula.
+
+    Attributes:
+        classes: (K,) indices of the classes with statistics, in ascending order.
+        log_share: (K, M) log of the share of scenes with 1, 2, ... instances, of the scenes with
+            the class. The last column stands for M or more instances.
+        weights: (K, 3 + C + V) effects of the scene on the exponent of the number of instances. A
+            class has no effect on itself.
+    """
+
+    classes: NDArray[np.integer[Any]]
+    log_share: Table
+    weights: Table
+
+    def tensors(self) -> dict[str, NDArray[Any]]:
+        """Return a mapping of tensor names in an artifact to the arrays."""
+        return {f"{PREFIX}{field.name}": getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], V: int, C: int) -> Self:
+        """Build the counts of a model with V classes and C room types from stored tensors.
+
+        Args:
+            tensors: result of `tensors()`, read from an artifact.
+
+        Raises:
+            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
+                `invalid_tensor` if a value is invalid.
+        """
+        K = len(np.atleast_1d(tensors.get(f"{PREFIX}classes", ())))
+        M = np.atleast_1d(tensors.get(f"{PREFIX}log_share", ())).shape[-1]
+        shapes = {"classes": (K,), "log_share": (K, M), "weights": (K, ROOM + C + V)}
+        for name in sorted(tensors.keys() | {f"{PREFIX}{name}" for name in shapes}):
+            shape = shapes.get(name.removeprefix(PREFIX))
+            found = tensors[name].shape if name in tensors else None
+            if found != shape:
+                raise ArtifactError(
+                    "wrong_shape",
+                    f"tensor '{name}' has the shape {found}, but the shape must be {shape} (None "
+                    "means that the tensor does not exist)",
+                )
+        counts = cls(**{name: tensors[f"{PREFIX}{name}"] for name in shapes})
+        if complaint := counts._complaint(V, C):
+            raise ArtifactError("invalid_tensor", f"the count tensors are invalid: {complaint}")
+        return counts
+
+    def _complaint(self, V: int, C: int) -> str | None:
+        if not np.issubdtype(self.classes.dtype, np.integer):
+            return "classes must be integers"
+        if not len(self.classes) or self.classes[0] < 0 or (np.diff(self.classes) <= 0).any():
+            return "classes must be non-negative, in ascending order, and at least one"
+        if (self.classes[-1:] >= V).any():
+            return "the tensor 'classes' has a class that the model does not have"
+        if not 2 <= self.log_share.shape[1] <= _MOST:
+            return f"log_share must have 2 to {_MOST} columns"
+        if (self.log_share > 0).any() or (self.log_share < -_LARGEST).any():
+            return f"log_share must be between -{_LARGEST:g} and 0"
+        if (np.abs(self.weights) > _LARGEST).any():
+            return f"weights must be between -{_LARGEST:g} and {_LARGEST:g}"
+        if self.weights[np.arange(len(self.classes)), ROOM + C + self.classes].any():
+            return "the weight of a class on itself must be 0"
+        return None

@@ -1,0 +1,85 @@
+"""Which parts of the board count as evidence: labels, stated relations, and positions on demand."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import httpx
+import pytest
+from playwright.sync_api import expect
+
+from tests.browser.driving import Board
+
+pytestmark = pytest.mark.system
+
+OpenBoard = Callable[..., Board]
+SWITCH = "Positions count as evidence"
+
+
+def placed(board: Board) -> list[str]:
+    """Objects whose position the request contains."""
+    return [thing["id"] for thing in board.scene["objects"] if "position" in thing]
+
+
+def test_positions_count_only_when_switched_on(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board(scene=None)
+    says = board.page.locator("#evidence")
+    expect(says).to_contain_text("The answers use labels only.")
+    assert placed(board) == []
+    labels = {"objects": [thing["label"] for thing in board.scene["objects"]]}
+    alone = api.post("/missing", json=labels | {"room_type": "bedroom", "top_k": 5}).json()
+    assert [row.split(" ")[0] for row in board.rows("missing")] == [
+        one["label"] for one in alone["missing"]
+    ]
+    board.page.get_by_label(SWITCH).check()
+    board.settle()
+    assert placed(board) == board.things
+    expect(says).to_contain_text("positions of 5 of 5 objects")
+    assert api.post("/relations", json=board.scene).json()["observed_relations"]
+
+
+def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> None:
+    board = open_board()
+    assert board.page.get_by_label(SWITCH).is_checked()
+    board.add("lamp")
+    board.page.locator("#board .ghost").first.press("Enter")
+    board.settle()
+    expect(board.page.locator("#board .object.loose")).to_have_count(2)
+    assert placed(board) == ["desk", "chair"]
+    expect(board.page.locator("#evidence")).to_contain_text("positions of 2 of 4 objects")
+    expect(board.page.locator("#list li").nth(2)).to_contain_text("position not given")
+    board.thing("lamp").focus()
+    board.page.keyboard.press("ArrowUp")
+    board.settle()
+    assert placed(board) == ["desk", "chair", "lamp"]
+
+
+def test_stated_relations_are_evidence_in_place_of_positions(open_board: OpenBoard) -> None:
+    board = open_board()
+    given = [{"subject": "chair", "relation": "left", "object": "desk"}]
+    board.put(json.dumps(board.exported() | {"relations": given}))
+    assert not board.page.get_by_label(SWITCH).is_checked()
+    assert board.scene["relations"] == given
+    expect(board.page.locator("#evidence")).to_contain_text("labels and 1 stated relation only")
+    board.page.get_by_label(SWITCH).check()
+    board.settle()
+    assert "relations" not in board.scene
+    assert placed(board) == ["desk", "chair"]
+    board.page.get_by_role("button", name="Undo").click()
+    board.settle()
+    assert board.scene["relations"] == given
+
+
+def test_clear_empties_the_board_and_the_room(open_board: OpenBoard) -> None:
+    board = open_board(scene=None)
+    room = board.page.get_by_label("Room")
+    expect(room).to_have_value("bedroom")
+    board.page.get_by_role("button", name="Clear").click()
+    board.settle()
+    expect(room).to_have_value("")
+    assert board.things == []
+    board.page.get_by_role("button", name="Undo").click()
+    board.settle()
+    expect(room).to_have_value("bedroom")
+    assert len(board.things) == 5

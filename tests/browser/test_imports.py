@@ -1,0 +1,83 @@
+"""The page reads what the command `scene` and the training read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import expect
+
+from scene_client.vision_msgs import from_message
+from tests.browser.driving import Board
+
+pytestmark = pytest.mark.system
+
+OpenBoard = Callable[..., Board]
+
+
+def rounded(value: Any) -> Any:
+    """A scene with numbers rounded to centimetres."""
+    if isinstance(value, dict):
+        return {name: rounded(part) for name, part in value.items()}
+    return round(value, 2) if isinstance(value, float) else value
+
+
+def test_detections_are_read_as_the_client_reads_them(
+    open_board: OpenBoard, repository: Path
+) -> None:
+    file = repository / "clients" / "ros2" / "detections.json"
+    fields = from_message(json.loads(file.read_text("utf-8")))
+    board = open_board()
+    page = board.page
+    page.get_by_role("button", name="Import, export").click()
+    page.get_by_label("Open a file").set_input_files(file)
+    expect(page.get_by_label("Scene, JSON")).to_have_value(file.read_text("utf-8"))
+    page.get_by_role("button", name="Put on the board").click()
+    board.settle()
+    shown = {thing["id"]: thing for thing in board.scene["objects"]}
+    assert list(shown) == [thing["id"] for thing in fields["objects"]]
+    for thing in fields["objects"]:
+        for name in ("label", "confidence", "position"):
+            assert rounded(shown[thing["id"]].get(name)) == rounded(thing.get(name))
+        if "size" in thing:
+            assert rounded(shown[thing["id"]]["size"]) == rounded(thing["size"])
+    assert page.get_by_label("Positions count as evidence").is_checked()
+
+
+def test_labels_and_flat_detections_are_read(open_board: OpenBoard) -> None:
+    board = open_board()
+    board.put('["bed", "lamp", "lamp"]')
+    assert board.things == ["bed", "lamp", "lamp_2"]
+    seen = {"results": [{"hypothesis": {"class_id": "mug", "score": 0.5}}], "bbox": {"size_x": 9}}
+    board.put(json.dumps({"detections": [seen, seen]}))
+    assert board.scene["objects"] == [
+        {"id": f"mug_{number}", "label": "mug", "confidence": 0.5} for number in (1, 2)
+    ]
+
+
+def test_one_of_several_scenes_is_chosen(open_board: OpenBoard) -> None:
+    request = {"objects": ["desk", "monitor"], "room_type": "office"}
+    annotated = {
+        "scene_id": "bench-3",
+        "objects": [
+            {"id": 0, "label": "table", "position": [2.0, 0.5, 0.4], "size": [1.6, 0.8, 0.8]},
+            {"id": 1, "label": "mug"},
+        ],
+        "relations": [[1, "on-top", 0]],
+    }
+    lines = "\n".join(json.dumps(scene) for scene in (request, annotated))
+    board = open_board()
+    board.put(lines)
+    assert board.things == ["desk", "monitor"]
+    board.page.get_by_role("button", name="Import, export").click()
+    board.page.get_by_label("Scene, JSON").fill(lines)
+    expect(board.page.locator("#scenes")).to_have_text("of 2")
+    board.page.locator("#which").fill("2")
+    board.page.get_by_role("button", name="Put on the board").click()
+    board.settle()
+    (table, mug) = board.scene["objects"]
+    assert table["position"] == {"x": 2, "y": 0.5, "z": 0.4}
+    assert mug == {"id": "mug", "label": "mug"}

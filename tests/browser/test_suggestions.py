@@ -1,0 +1,242 @@
+"""Suggestions stand at free places where their placements say."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.scene.footprints import overlap_and_gap
+from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
+from app.scene.relations import CANONICAL, OPPOSITES
+from tests.browser.driving import Board
+
+pytestmark = pytest.mark.system
+
+OpenBoard = Callable[..., Board]
+Box = dict[str, Any]
+
+RELATIONS = ("on-top", "on-top", "above", "under", "below", "left", "right", "front", "behind")
+ROBOT = 0.5
+"""Side of the square that stays free around the robot, in metres."""
+FLOOR, CEILING = 0.1, 2.2
+"""Suggestions may overlap lower and higher boxes, such as rugs and ceilings."""
+
+STANDING = """async (cases) => {
+  const { standing } = await import('./static/board/ghosts.js');
+  return cases.map(({ missing, boxes, viewer, sizes, at }) =>
+    standing(missing, boxes, viewer, new Map(Object.entries(sizes)), at));
+}"""
+
+
+def box(name: str, x: float, y: float, z: float, size: tuple[float, float, float]) -> Box:
+    return {
+        "id": name,
+        "label": name,
+        "x": x,
+        "y": y,
+        "z": z,
+        "yaw": 0.0,
+        "size": dict(zip("xyz", size, strict=True)),
+    }
+
+
+def room(random: Random) -> dict[str, Any]:
+    """A room with walls, furniture, objects on furniture, and answers with random placements."""
+    boxes = [box("wall", 4.5, 0, 0, (0.1, 7, 2.5)), box("rug", 2, 0, 0, (2, 2, 0.02))]
+    for number in range(random.randint(3, 9)):
+        size = (random.uniform(0.4, 2), random.uniform(0.4, 2), random.uniform(0.4, 1.2))
+        made = box(f"furniture {number}", random.uniform(0.8, 4), random.uniform(-3, 3), 0.0, size)
+        made["yaw"] = random.choice([0.0, 0.0, 90.0, 30.0, -75.0])
+        boxes.append(made)
+        if random.random() < 0.6:
+            top = made["z"] + size[2]
+            boxes.append(box(f"item {number}", made["x"], made["y"], top, (0.15, 0.2, 0.2)))
+    labels = [f"class {number}" for number in range(8)]
+    sizes = {
+        label: {
+            axis: random.uniform(0.1, limit)
+            for axis, limit in zip("xyz", (0.9, 0.9, 1), strict=True)
+        }
+        for label in labels
+    }
+    return {
+        "boxes": boxes,
+        "missing": [
+            {
+                "label": label,
+                "probability": 0.5,
+                "placements": [placement(random, random.choice(boxes[2:])) for _ in range(3)],
+            }
+            for label in labels
+        ],
+        "viewer": {"x": 0.0, "y": 0.0, "yaw": random.choice([0.0, 0.4, -0.4])},
+        "sizes": sizes,
+        "at": None,
+    }
+
+
+def placement(random: Random, anchor: Box) -> dict[str, Any]:
+    found = {"relation": random.choice(RELATIONS), "object": anchor["id"], "probability": 0.5}
+    if random.random() < 0.5:
+        spread = {axis: random.uniform(-0.6, 0.6) for axis in "xyz"}
+        found["offset"] = {"mean": spread, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
+    return found
+
+
+def share(a: Box, b: Box) -> float:
+    """Common area of two footprints, divided by the smaller area."""
+    parts = [
+        part
+        for one in (a, b)
+        for part in (
+            np.array([[one["x"], one["y"]]]),
+            np.array([[one["size"]["x"], one["size"]["y"]]]),
+            np.array([math.radians(one["yaw"])]),
+        )
+    ]
+    return float(overlap_and_gap(*parts)[0][0])
+
+
+def top(one: Box) -> float:
+    return float(one["z"] + one["size"]["z"])
+
+
+def passed(ghost: Box, anchor: Box, boxes: list[Box]) -> list[str]:
+    """The boxes that a ghost may overlap: those above which or below which it stands."""
+    relation = ghost["placement"]["relation"]
+    near = [one for one in boxes if share(one, anchor) > 0 and one is not anchor]
+    supports = [one["id"] for one in near if top(one) <= anchor["z"] + 0.03]
+    if relation in ("on-top", "above"):
+        return [anchor["id"], *supports]
+    if relation in ("under", "below"):
+        return [anchor["id"], *(one["id"] for one in near if one["z"] >= top(anchor) - 0.03)]
+    return supports
+
+
+def wrong_with(ghost: Box, ghosts: list[Box], case: dict[str, Any]) -> list[str]:
+    """The objections to the place of a ghost, in words."""
+    boxes, viewer = case["boxes"], case["viewer"]
+    (anchor,) = [one for one in boxes if one["id"] == ghost["placement"]["object"]]
+    robot = box("robot", viewer["x"], viewer["y"], 0, (ROBOT, ROBOT, 1))
+    others = [one for one in ghosts if one is not ghost]
+    solid = [one for one in boxes if top(one) > FLOOR and one["z"] < CEILING]
+    allowed = passed(ghost, anchor, boxes)
+    found = [
+        f"{ghost['label']} overlaps {one['id']}"
+        for one in [robot, *others, *solid]
+        if share(ghost, one) > 1e-6 and one["id"] not in allowed
+    ]
+    relation = ghost["placement"]["relation"]
+    if relation not in seen(ghost, anchor, viewer):
+        found.append(f"{ghost['label']} is not {relation} {anchor['id']}")
+    if relation == "on-top" and share(ghost, anchor) < 0.6:
+        found.append(f"{ghost['label']} hangs over {anchor['id']}")
+    return found
+
+
+def seen(ghost: Box, anchor: Box, viewer: dict[str, float]) -> set[str]:
+    """The relations of a ghost to its anchor by the rules of the service."""
+    pair = [ghost, anchor]
+    centres = [[one["x"], one["y"], one["z"] + one["size"]["z"] / 2] for one in pair]
+    yaws = [math.radians(one["yaw"]) for one in pair]
+    points, turns = to_viewer_frame(centres, Viewpoint(**viewer), yaws)
+    sizes = [[one["size"][axis] for axis in "xyz"] for one in pair]
+    holds = derive_relations(points, sizes, turns).holds
+    return {
+        name if subject == 0 else OPPOSITES[name]
+        for index, name in enumerate(CANONICAL)
+        for subject in (0, 1)
+        if holds[index, subject, 1 - subject]
+    }
+
+
+def test_suggestions_of_random_rooms_have_free_places(open_board: OpenBoard) -> None:
+    random = Random(11)
+    cases = [room(random) for _ in range(60)]
+    board = open_board()
+    answers = board.page.evaluate(STANDING, cases)
+    wrong = [
+        f"room {number}: {words}"
+        for number, (case, ghosts) in enumerate(zip(cases, answers, strict=True))
+        for ghost in ghosts
+        for words in wrong_with(ghost, ghosts, case)
+    ]
+    assert wrong == []
+    count = sum(map(len, answers))
+    # Most suggestions have a place; crowded rooms also have suggestions without one.
+    assert 0.6 * 8 * len(cases) < count < 8 * len(cases)
+
+
+def test_a_pillow_stands_on_the_bed_or_nowhere(open_board: OpenBoard) -> None:
+    bed = box("bed", 2.5, 0, 0, (2, 1.6, 0.6))
+    bed["yaw"] = 30.0
+    pillow = {
+        "label": "pillow",
+        "probability": 0.4,
+        "placements": [
+            {
+                "relation": "on-top",
+                "object": "bed",
+                "probability": 0.9,
+                "offset": {"mean": {"x": 1.4, "y": 0.2, "z": 0.4}},
+            }
+        ],
+    }
+    case = {
+        "missing": [pillow],
+        "boxes": [bed],
+        "viewer": {"x": 0, "y": 0, "yaw": 0},
+        "sizes": {"pillow": {"x": 0.4, "y": 0.6, "z": 0.2}},
+        "at": None,
+    }
+    covered = case | {"boxes": [bed, box("blanket", 2.5, 0, 0.6, (3, 3, 0.2))]}
+    ((ghost,), none) = open_board().page.evaluate(STANDING, [case, covered])
+    assert share(ghost, bed) == pytest.approx(1)
+    assert ghost["z"] == pytest.approx(0.6)
+    assert none == []
+
+
+@pytest.mark.parametrize("example", range(1, 4))
+def test_suggestions_of_the_examples_have_free_places(open_board: OpenBoard, example: int) -> None:
+    board = open_board(scene=None)
+    board.page.get_by_label("Example").select_option(index=example)
+    board.settle()
+    assert len(board.ghosts) >= 3
+    ghosts = [one.bounding_box() for one in board.page.locator("#board .ghost rect").all()]
+    robot = board.page.locator("#board .robot .body").bounding_box()
+    # A box has the width of its outline around it.
+    areas = [
+        (one["x"] + 2, one["y"] + 2, one["x"] + one["width"] - 2, one["y"] + one["height"] - 2)
+        for one in [*ghosts, robot]
+        if one
+    ]
+    assert len(areas) == len(ghosts) + 1
+    for number, a in enumerate(areas):
+        for b in areas[:number]:
+            assert a[0] >= b[2] or b[0] >= a[2] or a[1] >= b[3] or b[1] >= a[3]
+
+
+def test_a_suggestion_without_a_place_says_so(open_board: OpenBoard) -> None:
+    def crowded(route: Any) -> None:
+        response = route.fetch()
+        answer = response.json()
+        answer["missing"] = answer["missing"][:1]
+        answer["missing"][0]["placements"] = [
+            {"relation": "under", "object": "desk", "probability": 0.9}
+        ]
+        route.fulfill(response=response, json=answer)
+
+    board = open_board()
+    board.page.route("**/missing", crowded)
+    board.add("laptop")
+    assert board.ghosts == []
+    assert "no free place on the board" in board.rows("missing")[0]
+    expect_no_button = board.column("missing").get_by_role("button", name="Put ")
+    assert expect_no_button.count() == 0
+    assert json.dumps(board.body("missing")["objects"])

@@ -1,0 +1,120 @@
+"""The page opens with any model, and says what a model does with names that it does not know."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import expect
+
+from tests.browser.driving import Board
+from tests.services import LiveService, launch
+
+pytestmark = pytest.mark.system
+
+OpenBoard = Callable[..., Board]
+
+
+def notes(board: Board, place: int) -> str:
+    return board.page.locator("#list li").nth(place).locator(".error").text_content() or ""
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Callable[[str, int], LiveService]:
+    """Start a service with one model that knows so many classes; with all 16 it has examples."""
+    from tests.http.stores import publish
+
+    def start(alias: str, classes: int) -> LiveService:
+        publish(tmp_path / "store", "lab", "1.0.0", classes=classes, alias=alias)
+        return launch(tmp_path / "store", tmp_path / "log")
+
+    return start
+
+
+@pytest.mark.parametrize("alias", ["default", "mine"])
+def test_a_model_of_one_s_own_opens_without_errors(
+    open_board: OpenBoard, own: Callable[[str, int], LiveService], alias: str
+) -> None:
+    with own(alias, 6) as service:
+        board = open_board(scene=None, home=service.url, examples=None)
+        labels = [
+            one["label"] for one in service.client.get("/models/lab/vocabulary").json()["objects"]
+        ]
+        assert board.things == labels[:4]
+        assert board.rows("missing")
+        expect(board.page.locator("#note")).to_contain_text("no example scenes")
+        expect(board.page.locator("#example")).to_be_hidden()
+        expect(board.page.locator(".problem:visible, .error:visible")).to_have_count(0)
+
+
+def test_the_page_opens_with_the_first_example_of_the_model(
+    open_board: OpenBoard, own: Callable[[str, int], LiveService]
+) -> None:
+    with own("default", 16) as service:
+        board = open_board(scene=None, home=service.url, examples=None)
+        examples = service.client.get("/models/lab/vocabulary").json()["examples"]
+        first = examples[0]["scene"]["objects"]
+        assert board.things == [one.get("id", one["label"]) for one in first]
+        names = board.page.locator("#example option").all_text_contents()
+        assert names == ["Examples…", *(one["name"] for one in examples)]
+        expect(board.page.locator("#note")).to_be_hidden()
+
+
+def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> None:
+    scene = {"objects": ["bed", "fridgee", "flux capacitor"], "room_type": "bedrom"}
+    board = open_board(scene, allow=("422",))
+    assert notes(board, 0) == ""
+    assert notes(board, 1) == "fridgee → fridge?"
+    assert notes(board, 2).startswith("flux capacitor not known, left out")
+    expect(board.page.locator("#room-error")).to_have_text("bedrom → bedroom?")
+    names = board.page.locator("#board .labels text.name").all_text_contents()
+    assert {"fridgee → fridge?", "flux capacitor"} < set(names)
+    expect(board.thing("flux capacitor")).to_have_class(re.compile("unknown"))
+    expect(board.page.locator("#legend .unknown")).to_have_text("not known to the model, left out")
+    assert [thing["label"] for thing in board.scene["objects"]] == ["bed", "fridgee"]
+    assert board.rows("missing")
+    expect(board.column("missing")).to_contain_text("fridgee → fridge? flux capacitor not known")
+    board.page.locator("#room").select_option("bedroom")
+    board.page.get_by_role("button", name="Remove flux capacitor").click()
+    board.page.get_by_role("button", name="Remove fridgee").click()
+    board.settle()
+    expect(board.page.locator("#room-error")).to_be_empty()
+    expect(board.column("missing").locator("header + .problem + p")).to_be_empty()
+
+
+def test_an_unknown_room_is_left_out_visibly(open_board: OpenBoard) -> None:
+    board = open_board({"objects": ["bed"], "room_type": "submarine"}, allow=("422",))
+    expect(board.page.locator("#room-error")).to_contain_text("submarine not known, left out")
+    assert "room_type" not in board.scene
+    assert board.rows("missing")
+
+
+def test_two_models_answer_about_their_common_classes(
+    open_board: OpenBoard, api: httpx.Client
+) -> None:
+    scene = {"objects": ["bed", "lamp", "wardrobe"], "room_type": "bedroom"}
+    board = open_board(scene, allow=("422",))
+    models = [one["name"] for one in api.get("/models").json()["models"]]
+    (second,) = [f"{name}@1.3.0" for name in models if name == "everyday-triway"]
+    board.page.get_by_label("compare with").select_option(second)
+    board.settle()
+    assert notes(board, 2) == f"{second}: wardrobe not known, left out"
+    labels = [[thing["label"] for thing in board.body("missing", n)["objects"]] for n in (0, 1)]
+    assert labels == [["bed", "lamp", "wardrobe"], ["bed", "lamp"]]
+    known = [
+        {one["label"] for one in api.get(f"/models/{name}/vocabulary").json()["objects"]}
+        for name in ("default", "everyday-triway")
+    ]
+    shared = board.body("missing")["candidates"]
+    said = f"Both models answer about their {len(shared)} common classes."
+    expect(board.column("missing")).to_contain_text(said)
+    for number in (0, 1):
+        rows = board.rows("missing", number)
+        assert len(rows) == 5
+        answer = api.post("/missing", json=board.body("missing", number)).json()
+        found = [one["label"] for one in answer["missing"]]
+        assert set(found) <= known[0] & known[1]
+        assert all(row.startswith(label) for row, label in zip(rows, found, strict=True))

@@ -1,0 +1,160 @@
+"""The bridge without rclpy: its messages are those of ROS 2, and it answers over a real DDS."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.client.ros_messages import blank, to_json
+from tests.deploy.ros import STORE, from_json
+from tests.services import LiveService
+
+pytest.importorskip("cyclonedds", reason="there is no wheel for this processor")
+
+from benchmarks.dds import Robot, bridge, measure, ros
+from scene_client import Client
+
+ARRAY = "vision_msgs/msg/Detection3DArray"
+
+
+@pytest.fixture
+def recorded(repository: Path) -> Any:
+    envelope = json.loads((repository / "clients/ros2/detections.json").read_text())
+    return from_json(ARRAY, envelope["msg"])
+
+
+def written(message: Any) -> bytes:
+    """The bytes on the wire, according to the parser of ROS's own message definitions."""
+    return bytes(STORE.serialize_cdr(message, message.__msgtype__))
+
+
+# ---------------------------------------------------------------------------------- the messages
+
+
+def test_the_definitions_are_those_of_ros() -> None:
+    names = {ros.Detection3DArray: ARRAY, ros.String: "std_msgs/msg/String"}
+    assert {kind: STORE.hash_rihs01(name) for kind, name in names.items()} == ros.TYPE_HASHES
+
+
+def filled(name: str, numbers: Iterator[int], length: int) -> Any:
+    """A message in which every field has another value, and every list this length."""
+    fields: dict[str, Any] = {}
+    for field, (kind, detail) in STORE.fielddefs[name][1]:
+        if int(kind) == 2:
+            fields[field] = filled(detail, numbers, length)
+        elif int(kind) == 3:
+            fields[field] = np.array([next(numbers) / 8 for _ in range(detail[1])])
+        elif int(kind) == 4:
+            fields[field] = [filled(detail[0][1], numbers, length) for _ in range(length)]
+        else:
+            number = next(numbers)
+            values = {"string": "é" * (number % 7), "float64": number / 8}
+            fields[field] = values.get(detail[0], number)
+    return STORE.types[name](**fields)
+
+
+@pytest.mark.parametrize("length", [0, 1, 3])
+def test_every_field_has_the_bytes_of_ros(length: int) -> None:
+    message = filled(ARRAY, iter(range(1, 10_000)), length)
+    read = ros.Detection3DArray.deserialize(written(message))
+    assert dataclasses.asdict(read) == to_json(message)
+    assert read.serialize() == written(message)
+    answer = STORE.types["std_msgs/msg/String"](data='{"é": 1}')
+    assert ros.String(answer.data).serialize() == written(answer)
+
+
+# ------------------------------------------------------------------------------------ the bridge
+
+
+@pytest.fixture(scope="module")
+def errors(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the bridge writes to standard error."""
+    return tmp_path_factory.mktemp("bridge") / "errors"
+
+
+@pytest.fixture(scope="module")
+def robot(live: LiveService, errors: Path) -> Iterator[Robot]:
+    """A robot beside a running bridge. All traffic stays on the loopback interface."""
+    topic = f"detections_{os.getpid()}"
+    with errors.open("w") as stream, bridge(topic, live.url, stream):
+        yield Robot(topic)
+
+
+def send(robot: Robot, message: Any, second: int = 0, *, reliable: bool = True) -> None:
+    message.header.stamp.sec = second
+    robot.send(ros.Detection3DArray.deserialize(written(message)), reliable=reliable)
+
+
+def hear(robot: Robot) -> Any:
+    """The next answer, read by ROS's own definition of a String."""
+    raw = robot.hear().serialize()
+    return json.loads(STORE.deserialize_cdr(raw, "std_msgs/msg/String").data)
+
+
+def wait_for(error: str, errors: Path) -> None:
+    until = time.monotonic() + 30
+    while error not in errors.read_text():
+        assert time.monotonic() < until, errors.read_text()
+        time.sleep(0.01)
+
+
+@pytest.mark.system
+def test_detections_are_answered_as_by_the_node(robot: Robot, recorded: Any) -> None:
+    send(robot, recorded, 5)
+    answer = hear(robot)
+    assert (answer["frame_id"], answer["stamp"]["sec"]) == ("base_link", 5)
+    assert answer["missing"]["missing"]
+    assert {entry["object"] for entry in answer["outliers"]["outliers"]} >= {"track_3", "toilet_1"}
+    assert [note["reason"] for note in answer["notes"]] == ["no-hypothesis"]
+
+
+@pytest.mark.system
+@pytest.mark.slow
+def test_none_of_a_thousand_messages_is_lost(robot: Robot, recorded: Any) -> None:
+    for number in range(1000):
+        send(robot, recorded, number, reliable=number % 2 == 0)
+        assert hear(robot)["stamp"]["sec"] == number
+
+
+@pytest.mark.system
+def test_the_benchmark_times_every_message(robot: Robot, live: LiveService) -> None:
+    with Client(live.url, timeout=30) as client:
+        seconds = measure(robot, client, 3, objects=4)
+    assert [len(times) for times in seconds.values()] == [3, 3]
+    assert all(0 < time < 30 for times in seconds.values() for time in times)
+
+
+@pytest.mark.system
+def test_of_many_messages_the_newest_is_answered(robot: Robot, recorded: Any) -> None:
+    for number in range(100):
+        send(robot, recorded, number)
+    answered = [-1]
+    while answered[-1] < 99:
+        answered.append(hear(robot)["stamp"]["sec"])
+    assert answered == sorted(set(answered))
+    assert len(answered) < 100
+
+
+@pytest.mark.system
+def test_messages_that_cannot_be_asked_about_are_reported(
+    robot: Robot, recorded: Any, errors: Path
+) -> None:
+    latin = ros.Detection3DArray.deserialize(written(recorded))
+    latin.serialize = lambda **_: written(recorded).replace(b"desk", b"d\xffsk")
+    robot.send(latin)
+    wait_for("'utf-8' codec can't decode byte", errors)
+    for detection in recorded.detections:
+        for result in detection.results:
+            result.hypothesis.class_id = "7"
+    send(robot, recorded)
+    wait_for("MessageError: the class ids are numbers", errors)
+    send(robot, blank(STORE, ARRAY), 3)
+    assert hear(robot) == {"frame_id": None, "stamp": {"sec": 3, "nanosec": 0}, "notes": []}

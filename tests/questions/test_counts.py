@@ -1,0 +1,140 @@
+"""`more`: the numbers of instances follow the formula, and only sensible classes are proposed."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.questions import more
+from app.questions.counts import LIKELY, distribution
+from app.registry import Counts
+from app.scene import Scene
+from tests.questions.artifacts import LARGER, calibration, larger_artifact, scene_of
+
+SPEC = LARGER["triway-local"]
+V, C, M = SPEC.V, SPEC.C, 5
+LAMP, DESK, CHAIR, SHELF, WALL = 1, 2, 3, 6, 8
+
+
+def counts(scale: float = 0.6, seed: int = 0) -> Counts:
+    """Random statistics of four classes. Wall is structure."""
+    rng = np.random.default_rng(seed)
+    classes = np.array([LAMP, CHAIR, SHELF, WALL])
+    weights = rng.normal(0, scale, (4, 3 + C + V))
+    weights[np.arange(4), 3 + C + classes] = 0
+    share = rng.dirichlet(np.ones(M), 4)
+    return Counts(classes, np.log(share).astype("f4"), weights.astype("f4"))
+
+
+COUNTS = counts(seed=4)
+ARTIFACT = replace(larger_artifact("triway-local"), counts=COUNTS)
+SCENE = scene_of([DESK, CHAIR, LAMP, CHAIR, WALL, WALL], room=1)
+EVERY = list(range(V))
+
+
+def by_hand(
+    found: Counts, row: int, listed: dict[int, int], room: int | None, rho: float = 1.0
+) -> list[float]:
+    """The formula of `app.questions.counts`, term by term."""
+    own = int(found.classes[row])
+    a, b, c, *rest = found.weights[row].tolist()
+    d, e = rest[:C], rest[C:]
+    k, others = listed[own], [j for j in listed if j != own]
+    m = len(others)
+    eta = a + b * math.log(k) + (0.0 if room is None else d[room])
+    if m:
+        eta += c * any(listed[j] > 1 for j in others)
+        eta += sum(e[j] for j in others) / math.sqrt(m)
+    s = [math.exp(x) for x in found.log_share[row].tolist()]
+    weight = [s[n - 1] * n**eta * rho ** (n - k) if n >= k else 0.0 for n in range(1, M + 1)]
+    return [w / sum(weight) for w in weight]
+
+
+@given(
+    st.dictionaries(st.sampled_from(range(WALL)), st.integers(1, M - 1), min_size=1),
+    st.sampled_from([None, 0, 1]),
+    st.sampled_from([1.0, 0.3, 0.0]),
+    st.integers(0, 5),
+)
+def test_the_distribution_is_the_formula(listed, room, unlisted, seed):
+    known = counts(seed=seed)
+    classes = np.array(sorted(listed))
+    numbers = np.array([listed[index] for index in classes.tolist()])
+    which, p = distribution(known, V, classes, numbers, room, unlisted)
+    expected = [k for k, index in enumerate(classes.tolist()) if index in known.classes]
+    assert which.tolist() == expected
+    for k, found in zip(which.tolist(), p, strict=True):
+        row = known.classes.tolist().index(classes[k])
+        assert found == pytest.approx(by_hand(known, row, listed, room, unlisted), abs=1e-6)
+
+
+@pytest.mark.parametrize("coverage", [None, 0.2, 0.5, 0.9])
+def test_answers_are_the_moments_of_the_distribution(coverage):
+    """A coverage up to the model's own, 0.5, changes nothing."""
+    rho = 0.2 if coverage == 0.9 else 1.0
+    found = {e.label: e for e in more(ARTIFACT, SCENE, candidates=EVERY, coverage=coverage)}
+    assert found.keys() == {"lamp", "chair"}
+    for row, label in ((0, "lamp"), (1, "chair")):
+        p = np.array(by_hand(COUNTS, row, {DESK: 1, CHAIR: 2, LAMP: 1}, 1, rho))
+        entry = found[label]
+        numbers = np.arange(1, M + 1)
+        assert entry.listed_count == (2 if label == "chair" else 1)
+        assert entry.expected_count == pytest.approx(p @ numbers, abs=1e-5)
+        assert entry.probability == pytest.approx(p[entry.listed_count :].sum(), abs=1e-5)
+        inside = (numbers >= entry.low) & (numbers <= entry.high)
+        assert p[inside].sum() >= 0.8
+        assert p[numbers < entry.low].sum() < 0.1
+        assert p[numbers > entry.high].sum() <= 0.1 + 1e-9
+
+
+def test_only_probable_classes_are_proposed_likeliest_first():
+    every = more(ARTIFACT, SCENE, candidates=EVERY)
+    found = more(ARTIFACT, SCENE)
+    likely = [entry for entry in every if entry.probability >= LIKELY]
+    assert found == tuple(sorted(likely, key=lambda entry: -entry.probability))
+    assert 0 < len(found) < len(every)
+    assert more(ARTIFACT, SCENE, top_k=1) == found[:1]
+    assert more(ARTIFACT, SCENE, candidates=[DESK]) == ()
+
+
+def test_at_full_coverage_nothing_more_is_there():
+    assert more(ARTIFACT, SCENE, coverage=1.0) == ()
+    for entry in more(ARTIFACT, SCENE, coverage=1.0, candidates=EVERY):
+        assert entry.expected_count == pytest.approx(entry.listed_count)
+        assert entry.probability == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_class_with_as_many_objects_as_are_told_apart_is_left_out():
+    scene = scene_of([CHAIR] * M + [LAMP])
+    assert [entry.label for entry in more(ARTIFACT, scene, candidates=EVERY)] == ["lamp"]
+
+
+def test_structure_and_models_without_counts_propose_nothing():
+    assert more(ARTIFACT, scene_of([WALL, WALL]), candidates=EVERY) == ()
+    assert more(replace(ARTIFACT, counts=None), SCENE, candidates=EVERY) == ()
+    assert more(ARTIFACT, Scene(()), candidates=EVERY) == ()
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_largest_weights_that_a_store_may_hold_give_numbers(sign):
+    huge = counts()
+    weights = np.where(huge.weights == 0, 0, sign * 64).astype("f4")
+    shares = np.full_like(huge.log_share, -64)
+    shares[:, 0] = 0
+    artifact = replace(
+        larger_artifact("triway-local", coverage=1.0),
+        counts=Counts(huge.classes, shares, weights),
+    )
+    objects = [index for index in range(WALL) for _ in range(M - 1)]
+    assert Counter(objects)[CHAIR] == M - 1
+    for coverage in (None, 0.0, 1.0):
+        for entry in more(artifact, scene_of(objects), candidates=EVERY, coverage=coverage):
+            assert math.isfinite(entry.expected_count)
+            assert 0 <= entry.probability <= 1
+    assert calibration(1).coverage == 0.5

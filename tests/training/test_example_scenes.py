@@ -1,0 +1,71 @@
+"""Example scenes: their choice from a user's scenes, and their file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from app.registry import Example
+from app.scene import ObjectClass, Vocabulary
+from scene_client.schemas import SceneRequest
+from training.config import ConfigError
+from training.datasets import generate_rooms, source_vocabulary
+from training.datasets.rooms import WORKPLACES
+from training.example_scenes import choose_examples, examples_json, read_examples
+
+SCENES = generate_rooms(60, 0, WORKPLACES)
+WORDS = source_vocabulary(SCENES, minimum=2)
+
+
+def test_chosen_scenes_are_requests_in_the_models_words_and_read_back(tmp_path) -> None:
+    chosen = choose_examples(SCENES, WORDS)
+    assert len(chosen) == len({example.scene.room_type for example in chosen}) == 3
+    for example in chosen:
+        request = SceneRequest.model_validate(example.request())
+        assert request.viewpoint is not None
+        assert len({thing.label for thing in request.objects}) >= 3
+        assert all(thing.label in WORDS.labels and thing.position for thing in request.objects)
+    (tmp_path / "examples.json").write_text(examples_json(chosen))
+    assert read_examples("examples.json", tmp_path, WORDS) == chosen
+
+
+def test_supports_become_relations_where_there_are_no_positions() -> None:
+    flat = [
+        replace(
+            scene,
+            objects=tuple(replace(thing, position=None, size=None) for thing in scene.objects),
+        )
+        for scene in SCENES
+    ]
+    chosen = choose_examples(flat, WORDS)
+    assert any(relation.relation == "on-top" for one in chosen for relation in one.scene.relations)
+
+
+def test_research_only_scenes_are_never_chosen() -> None:
+    copied = [replace(scene, source="sunrgbd") for scene in SCENES]
+    assert choose_examples(copied, WORDS) == ()
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (None, "cannot be used"),
+        ("{", "Invalid JSON"),
+        ([{"name": "a", "scene": {"objects": ["bed", "unicorn"]}}], "no class 'unicorn'"),
+        ([{"name": "a", "scene": {"objects": ["bed"], "room_type": "cave"}}], "room type 'cave'"),
+        ([{"name": "a", "scene": {"objects": ["bed"]}}] * 9, "at most 8 items"),
+    ],
+)
+def test_an_unusable_file_is_named_with_the_reason(tmp_path, content, reason) -> None:
+    if content is not None:
+        text = content if isinstance(content, str) else json.dumps(content)
+        (tmp_path / "mine.json").write_text(text)
+    with pytest.raises(ConfigError, match=rf"mine\.json.*{reason}"):
+        read_examples("mine.json", tmp_path, Vocabulary([ObjectClass("bed")], ["bedroom"]))
+
+
+def test_a_label_alone_is_an_object() -> None:
+    example = Example.model_validate({"name": "a", "scene": {"objects": ["bed", "lamp"]}})
+    assert example.request() == {"objects": [{"label": "bed"}, {"label": "lamp"}]}

@@ -1,0 +1,280 @@
+"""Fit statistics of the numbers of instances of a class, such as the chairs of a kitchen.
+
+`app.questions.counts` has the formula. s(n) is a weighted share of the training scenes with n
+instances, shrunk towards the shares over all classes. The weights maximise the penalised likelihood
+of the numbers in partly listed scenes (`some_instances`). A weight is the sum of a term of the
+class and a term that all classes share. `docs/decisions/counts.md` describes the alternatives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.optimize import minimize
+
+from app.questions.counts import distribution
+from app.registry.counts import INTERCEPT, LISTED, ROOM, SEVERAL, Counts
+from app.scene import Vocabulary
+from training.cases import MOST, Part, scene_rng, some_instances
+from training.datasets import EncodedScene
+from training.datasets.sources import SOURCES
+from training.offsets import source_weights
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Share of the classes of a scene that must occur several times. Other sources list each label once.
+_COUNTING: Final = 0.05
+# Maximum number of scenes of a group. Scenes of a group are near-duplicates.
+_OF_GROUP: Final = 8
+_DRAWS: Final = 2  # listings of each training and validation scene
+# Weight of the shares over all classes in s(n), in scenes.
+_PRIOR: Final = 8.0
+# Penalties on the squares of the terms of a class and of the shared terms.
+_OWN, _SHARED = 0.3, 0.15
+_ITERATIONS: Final = 100
+# A class needs this many training scenes, groups in which it occurs several times, and validation
+# cases.
+_SCENES, _GROUPS, _CASES = 20, 10, 10
+
+
+def fit_counts(
+    train: Sequence[EncodedScene], validation: Sequence[EncodedScene], vocabulary: Vocabulary
+) -> Counts | None:
+    """Fit the statistics of counts. Return None if no class has enough data.
+
+    All data sources that count instances have the same total weight. A class gets statistics only
+    if the expected number is closer to the truth than the class mean on validation scenes.
+    """
+    counting = counted_classes(train, vocabulary)
+    known = [scene for scene in train if scene.source in counting]
+    classes = _frequent(known, counting, vocabulary)
+    if not len(classes):
+        return None
+    cases = _Cases.of(_few_of_group(known), counting, vocabulary, _DRAWS)
+    share = _shares(cases, len(vocabulary))
+    weights = _weights(cases, share, len(vocabulary))
+    # The exponent -1 stands for the listed number, which is uniform from 1 to n.
+    weights[:, INTERCEPT] -= 1.0
+    itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))
+    weights[np.arange(len(vocabulary)), itself] = 0.0
+    counts = Counts(classes, _stored(share[classes]), _stored(weights[classes]))
+    some = [scene for scene in validation if scene.source in counting]
+    kept = _better(counts, _few_of_group(some), counting, vocabulary)
+    if not kept.any():
+        return None
+    return Counts(classes[kept], counts.log_share[kept], counts.weights[kept])
+
+
+def counted_classes(
+    scenes: Sequence[EncodedScene], vocabulary: Vocabulary
+) -> dict[str, NDArray[np.bool_]]:
+    """Return the classes whose instances a data source counts, as masks (V,) by source name.
+
+    A source counts instances if its object lists are complete and if at least 5 % of the entries
+    (scene, class) have several instances.
+    """
+    plain = ~vocabulary.structure
+    entries, several = Counter[str](), Counter[str]()
+    repeated: dict[str, NDArray[np.bool_]] = {}
+    for scene in scenes:
+        if not scene.complete:
+            continue
+        evidence = scene.evidence
+        usable = plain[evidence.classes]
+        entries[scene.source] += int(usable.sum())
+        several[scene.source] += int((evidence.counts[usable] > 1).sum())
+        often = repeated.setdefault(scene.source, np.zeros(len(vocabulary), dtype=np.bool_))
+        often[evidence.classes[evidence.counts > 1]] = True
+    counting = [source for source in repeated if several[source] > _COUNTING * entries[source]]
+    partly = {name for name, source in SOURCES.items() if source.counts_movables}
+    return {source: plain & repeated[source] if source in partly else plain for source in counting}
+
+
+def listed_cases(
+    scene: EncodedScene, counted: NDArray[np.bool_], structure: NDArray[np.bool_], seed: int
+) -> tuple[Part, NDArray[np.intp]]:
+    """Return a listed part of a scene, and the places of its classes that the source counts."""
+    part = some_instances(scene, structure, scene_rng(scene, seed))
+    return part, np.flatnonzero(counted[part.classes])
+
+
+def _few_of_group(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
+    """Return at most `_OF_GROUP` scenes of each group."""
+    found, seen = [], Counter[tuple[str, str]]()
+    for scene in scenes:
+        seen[scene.source, scene.group] += 1
+        if seen[scene.source, scene.group] <= _OF_GROUP:
+            found.append(scene)
+    return found
+
+
+def _frequent(
+    scenes: Sequence[EncodedScene], counting: dict[str, NDArray[np.bool_]], vocabulary: Vocabulary
+) -> Ints:
+    """Return the classes with enough scenes, and enough groups with several instances."""
+    times = np.zeros(len(vocabulary), dtype=np.int64)
+    groups: set[tuple[int, str, str]] = set()
+    for scene in scenes:
+        classes, counts = scene.evidence.classes, scene.evidence.counts
+        usable = counting[scene.source][classes]
+        times[classes[usable]] += 1
+        several = classes[usable & (counts > 1)].tolist()
+        groups |= {(index, scene.source, scene.group) for index in several}
+    of = np.bincount([index for index, _, _ in groups], minlength=len(vocabulary))
+    return np.flatnonzero((times >= _SCENES) & (of >= _GROUPS))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cases:
+    """N cases: a class of a partly listed scene.
+
+    Attributes:
+        index: (N,) the class.
+        listed: (N,) number of listed instances, from 1 to `number`.
+        number: (N,) number of instances in the scene.
+        features: (N, 3 + C + V) features of the rest of the scene, in the columns of
+            `Counts.weights`.
+        weight: (N,) weight that balances the data sources.
+    """
+
+    index: Ints
+    listed: Ints
+    number: Ints
+    features: sparse.csr_matrix
+    weight: Floats
+
+    @classmethod
+    def of(
+        cls,
+        scenes: Sequence[EncodedScene],
+        counting: dict[str, NDArray[np.bool_]],
+        vocabulary: Vocabulary,
+        draws: int,
+    ) -> _Cases:
+        """List each scene in part, `draws` times."""
+        names, start = sorted(counting), ROOM + len(vocabulary.room_types)
+        rows: list[tuple[Ints, Floats]] = []
+        cases: list[tuple[int, ...]] = []
+        for place, scene in enumerate(scenes):
+            counted, source = counting[scene.source], names.index(scene.source)
+            for seed in range(draws):
+                part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
+                rows += [_features(part, k, start) for k in asked.tolist()]
+                numbers = np.stack([part.classes, part.listed, part.number])[:, asked]
+                cases += [(*case, place, source) for case in numbers.T.tolist()]
+        index, listed, number, places, sources = np.array(cases, dtype=np.int64).T
+        columns, values = (np.concatenate(some) for some in zip(*rows, strict=True))
+        bounds = np.cumsum([0, *(len(row) for row, _ in rows)])
+        shape = (len(cases), start + len(vocabulary))
+        features = sparse.csr_matrix((values, columns, bounds), shape=shape)
+        return cls(index, listed, number, features, source_weights(sources, places) / draws)
+
+
+def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
+    """Return columns of `Counts.weights` and their values for the k-th class of a part.
+
+    Args:
+        start: first column of the other classes.
+    """
+    others, listed = np.delete(part.classes, k), np.delete(part.listed, k)
+    columns = [INTERCEPT, LISTED, SEVERAL, *(start + others).tolist()]
+    values = [1.0, math.log(part.listed[k]), float((listed > 1).any())]
+    values += [1 / math.sqrt(max(len(others), 1))] * len(others)
+    if part.room >= 0:
+        columns.append(ROOM + part.room)
+        values.append(1.0)
+    return np.array(columns, dtype=np.int64), np.array(values)
+
+
+def _shares(cases: _Cases, V: int) -> Floats:
+    """Return the log of the share of each number of instances, (V, M)."""
+    table = np.zeros((V, MOST))
+    np.add.at(table, (cases.index, cases.number - 1), cases.weight)
+    # Each number needs a positive share, because the fitted scene may favour it.
+    overall = 0.999 * table.sum(axis=0) / table.sum() + 0.001 / MOST
+    table += _PRIOR * overall
+    share: Floats = np.log(table / table.sum(axis=1, keepdims=True))
+    return share
+
+
+def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
+    """Return the weights of each class, (V, 3 + C + V), by maximum penalised likelihood."""
+    features, (N, width) = cases.features, cases.features.shape
+    # The terms of a class act only on cases of this class.
+    entries = features.tocoo()
+    own = sparse.csr_matrix(
+        (entries.data, (entries.row, cases.index[entries.row] * width + entries.col)),
+        shape=(N, V * width),
+    )
+    used = np.unique(own.indices)
+    both = sparse.hstack([own[:, used], features]).tocsr()
+    penalty = np.repeat([_OWN, _SHARED], [len(used), width])
+    numbers = np.arange(1, MOST + 1)
+    logs, rows, place = np.log(numbers), np.arange(N), cases.number - 1
+    base = share[cases.index] - logs
+    base[numbers < cases.listed[:, None]] = -np.inf
+
+    def loss(terms: Floats) -> tuple[float, Floats]:
+        logits = base + (both @ terms)[:, None] * logs
+        logits -= logits.max(axis=1, keepdims=True)
+        p = np.exp(logits)
+        total = p.sum(axis=1)
+        fit = cases.weight @ (logits[rows, place] - np.log(total))
+        error = cases.weight * (p @ logs / total - logs[place])
+        return 0.5 * penalty @ terms**2 - fit, both.T @ error + penalty * terms
+
+    options = {"maxiter": _ITERATIONS}
+    terms = minimize(loss, np.zeros(both.shape[1]), jac=True, method="L-BFGS-B", options=options).x
+    weights = np.zeros(V * width)
+    weights[used] = terms[: len(used)]
+    return weights.reshape(V, width) + terms[len(used) :]
+
+
+def _better(
+    counts: Counts,
+    scenes: Sequence[EncodedScene],
+    counting: dict[str, NDArray[np.bool_]],
+    vocabulary: Vocabulary,
+) -> NDArray[np.bool_]:
+    """Return the classes (K,) whose expected number is closer than the class mean."""
+    V, K = len(vocabulary), len(counts.classes)
+    gain, cases = np.zeros(K), np.zeros(K, dtype=np.int64)
+    for scene in scenes:
+        for seed in range(_DRAWS):
+            part, asked = listed_cases(scene, counting[scene.source], vocabulary.structure, seed)
+            room = part.room if part.room >= 0 else None
+            which, p = distribution(counts, V, part.classes, part.listed, room)
+            usable = np.isin(which, asked)
+            which, expected = which[usable], p[usable] @ np.arange(1, MOST + 1)
+            row = np.searchsorted(counts.classes, part.classes[which])
+            mean = class_mean(counts, row, part.listed[which])
+            number = part.number[which]
+            gain[row] += np.abs(mean - number) - np.abs(expected - number)
+            cases[row] += 1
+    return (cases >= _CASES) & (gain > 0)
+
+
+def class_mean(counts: Counts, row: Ints, listed: Ints) -> Floats:
+    """Return the mean number in training scenes with at least the listed number, (k,).
+
+    Args:
+        row: (k,) rows of the classes in `counts`.
+        listed: (k,) number of listed instances of each class.
+    """
+    numbers = np.arange(1, counts.log_share.shape[1] + 1)
+    p = np.exp(counts.log_share[row].astype(np.float64)) * (numbers >= listed[:, None])
+    mean: Floats = p @ numbers / p.sum(axis=1)
+    return mean
+
+
+def _stored(table: Floats) -> NDArray[np.float32]:
+    """Round a table to half precision, the precision of the model file."""
+    return table.astype(np.float16).astype(np.float32)
