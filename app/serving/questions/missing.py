@@ -87,26 +87,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
     answer = envelope(asked, request.id, model.reference, reading)
     coverage = asked.coverage
     answer["coverage"] = model.artifact.calibration.coverage if coverage is None else coverage
-    ids = reading.ids
-    numbers: list[float] = []
-    for _, probability, log_odds, placements, because in found:
-        numbers += probability, log_odds
-        for _, _, share, offset in placements:
-            numbers.append(share)
-            if offset is not None:
-                numbers += offset[0]
-                numbers += offset[1]
-        numbers += [change for _, change in because]
-    numbered = iter(significant(numbers))
-    answer["missing"] = [
-        {
-            "label": label,
-            "probability": next(numbered),
-            "log_odds": next(numbered),
-            **(_details(placements, because, ids, numbered) if asked.detail == "full" else {}),
-        }
-        for label, _, _, placements, because in found
-    ]
+    answer["missing"] = _entries(found, reading.ids, full=asked.detail == "full")
     answer["more"] = [
         entry._asdict()
         | {
@@ -130,16 +111,28 @@ def _notable(entry: questions.MissingAnswer, scene: Scene) -> questions.MissingA
     return entry._replace(placements=tuple(likely), because=tuple(because))
 
 
-def _details(
-    placements: Sequence[questions.Placement],
-    because: Sequence[questions.Because],
-    ids: Sequence[str],
-    numbered: Iterator[float],
-) -> Answer:
-    return {
-        "placements": [_placement(place, ids, numbered) for place in placements],
-        "because": reasons(because, ids, numbered),
-    }
+def _entries(
+    found: Sequence[questions.MissingAnswer], ids: Sequence[str], *, full: bool
+) -> list[Answer]:
+    """Return the entries of the list `missing`, with rounded numbers."""
+    numbers: list[float] = []
+    for _, probability, log_odds, placements, because in found:
+        numbers += probability, log_odds
+        for _, _, share, offset in placements:
+            numbers.append(share)
+            if offset is not None:
+                numbers += offset[0]
+                numbers += offset[1]
+        numbers += [change for _, change in because]
+    numbered = iter(significant(numbers))
+    entries: list[Answer] = []
+    for label, _, _, placements, because in found:
+        entry = {"label": label, "probability": next(numbered), "log_odds": next(numbered)}
+        if full:
+            entry["placements"] = [_placement(place, ids, numbered) for place in placements]
+            entry["because"] = reasons(because, ids, numbered)
+        entries.append(entry)
+    return entries
 
 
 def _candidates(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Final
 
 from app import questions
@@ -57,17 +57,19 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
         numbers += [change for _, change in entry.because]
     numbers += [entry.probability for entry in found.misplaced]
     numbered = iter(significant(numbers))
-    answer["outliers"] = [
-        {
+    answer["outliers"] = []
+    for place, label, _, _, is_outlier, because, usually_with in found.outliers:
+        judged = {
             "object": ids[place],
             "label": label,
             "probability": next(numbered),
             "log_odds": next(numbered),
             "is_outlier": is_outlier,
-            **(_details(because, usually_with, ids, numbered) if asked.detail == "full" else {}),
         }
-        for place, label, _, _, is_outlier, because, usually_with in found.outliers
-    ]
+        if asked.detail == "full":
+            judged["because"] = reasons(because, ids, numbered)
+            judged["usually_with"] = list(usually_with)
+        answer["outliers"].append(judged)
     answer["misplaced"] = [
         {
             **_spelled(entry.subject, entry.relation, entry.object, reading),
@@ -77,15 +79,6 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
         for entry in found.misplaced
     ]
     return answer
-
-
-def _details(
-    because: Sequence[questions.Because],
-    usually_with: Sequence[str],
-    ids: Sequence[str],
-    numbered: Iterator[float],
-) -> Answer:
-    return {"because": reasons(because, ids, numbered), "usually_with": list(usually_with)}
 
 
 def _size(found: questions.OutliersFound) -> Callable[[int], int]:
