@@ -65,7 +65,7 @@ async def _answer_each(
                 results.append(b'{"status":200,"result":%b}' % answer)
                 count(SUCCESS)
             except Exception as error:  # noqa: BLE001 — any error fails only this scene
-                outcome, failed = _failed(error, place, request.id)
+                outcome, failed = _failed(error, place, scene, request.id)
                 count(outcome)
                 results.append(failed)
             left = max(0, left - len(results[-1]))
@@ -74,13 +74,13 @@ async def _answer_each(
     return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
 
 
-def _failed(error: Exception, place: int, request_id: str) -> tuple[str, bytes]:
+def _failed(error: Exception, place: int, scene: Any, request_id: str) -> tuple[str, bytes]:
     """Return the outcome for the metrics and the answer's entry of a failed scene.
 
     This is a separate function, because an error refers to the frame of `_answer_each`. A local
     variable of that frame must not refer to the error, to avoid a reference cycle.
     """
-    failure = from_exception(error, at=("scenes", place))
+    failure = from_exception(error, at=("scenes", place), body=scene)
     problem = failure.describe(request_id)
     if problem.status == 500:
         report_defect(error, request_id)
@@ -100,7 +100,7 @@ def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
     except ValidationError as error:
         # The client caused this validation error. Any later validation error is a defect of the
         # service.
-        raise unfit(error, scene, at=("scenes", place)) from None
+        raise unfit(error, scene, kind, at=("scenes", place)) from None
 
 
 def _answering(question: Question[Any]) -> Callable[..., Awaitable[bytes]]:

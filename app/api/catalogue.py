@@ -34,7 +34,8 @@ NOT_JSON: Final = ProblemType(
     "The body is not acceptable JSON",
     "The body must be one JSON value in UTF-8 without a byte order mark. The service refuses NaN, "
     "Infinity, lone surrogates, duplicate member names in an object and nesting deeper than 200. "
-    "JSON parsers read such texts in different ways.",
+    "JSON parsers read such texts in different ways. In a body of at most 64 KiB, `errors` points "
+    "at each NaN and Infinity.",
 )
 BAD_REQUEST: Final = ProblemType(
     "bad-request",

@@ -25,7 +25,9 @@ _UNKNOWN: Final = {
     "type": "/problems/unknown-labels",
     "title": "The model does not know some of the labels",
     "status": 422,
-    "detail": "The request has 1 error, listed in `errors`.",
+    "detail": "The request has 1 error, listed in `errors`. GET /models/{name}/vocabulary lists "
+    "the known labels. With `unknown_labels` set to `ignore`, the service leaves unknown labels "
+    "out.",
     "instance": f"/problems/unknown-labels#{_ID}",
     "request_id": _ID,
     "errors": [

@@ -20,7 +20,7 @@ _REFERENCE: Final = "#/components/schemas/{model}"
 _REQUEST_ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
 _ERRORS: Final = {
     catalogue.INVALID_REQUEST: [
-        FieldError(pointer="#/objects/1/confidence", message="Input should be greater than 0")
+        FieldError(pointer="#/objects/1/confidence", message="must be greater than 0")
     ],
     catalogue.UNKNOWN_LABELS: [
         FieldError(

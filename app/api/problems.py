@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any, Final
 
 from fastapi import FastAPI
-from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection, Request
@@ -38,6 +38,7 @@ from app.serving.errors import (
     UnknownModelError,
 )
 from scene_client.schemas import Failure, FieldError, Problem
+from scene_client.schemas import Request as Form
 from scene_client.validation import MAX_ERRORS, field_errors, pointer
 
 MEDIA_TYPE: Final = "application/problem+json"
@@ -97,23 +98,22 @@ class ProblemError(HTTPException):
         )
 
 
-def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
+def from_exception(error: Exception, *, at: Location = (), body: Any = None) -> ProblemError:
     """Return the problem for an exception, or an internal error for an unexpected exception.
 
     Args:
         error: the raised exception.
         at: location of the scene in the body of a batch request. It is empty for other requests.
+        body: the scene as the client sent it, for the pointers of errors; see `pointer`.
     """
     match error:
         case ProblemError():
             return error
-        case RequestValidationError():
-            return unfit(error, error.body)
         case RequestError():
             kind = _OF_REASON[error.reason]
             errors = [
                 FieldError(
-                    pointer=pointer((*at, *fault.location)),
+                    pointer=pointer(at) + pointer(fault.location, body)[1:],
                     message=fault.message,
                     suggestions=list(fault.suggestions),
                 )
@@ -146,8 +146,11 @@ def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
             detail = "The service still serves the previous versions. `failures` gives the reasons."
             return ProblemError(catalogue.REFRESH_REFUSED, detail, failures=error.failures)
         case HTTPException() if error.status_code in _OF_STATUS:
-            kind = _OF_STATUS[error.status_code]
-            return ProblemError(kind, kind.title + ".", headers=error.headers)
+            kind, headers = _OF_STATUS[error.status_code], error.headers or {}
+            detail = f"{kind.title}."
+            if "Allow" in headers:
+                detail = f"This route accepts only {headers['Allow']}."
+            return ProblemError(kind, detail, headers=headers)
         case _:
             return ProblemError(
                 catalogue.INTERNAL_ERROR, "The service failed. Its log contains the error."
@@ -155,25 +158,28 @@ def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
 
 
 def _faulty(kind: ProblemType, errors: list[FieldError], count: int) -> ProblemError:
-    faults = f"{count} error{'' if count == 1 else 's'}"
-    return ProblemError(kind, f"The request has {faults}, listed in `errors`.", errors=errors)
+    detail = f"The request has {count} error{'' if count == 1 else 's'}, listed in `errors`."
+    if kind is catalogue.UNKNOWN_LABELS:
+        detail += (
+            " GET /models/{name}/vocabulary lists the known labels. With `unknown_labels` set to "
+            "`ignore`, the service leaves unknown labels out."
+        )
+    return ProblemError(kind, detail, errors=errors)
 
 
 def unfit(
-    error: RequestValidationError | ValidationError, body: Any, *, at: Location = ()
+    error: ValidationError, body: Any, form: type[Form], *, at: Location = ()
 ) -> ProblemError:
     """Return the problem for a body that does not match its schema.
 
     Args:
         error: the validation error.
         body: the value that does not match the schema.
+        form: the schema.
         at: location of ``body`` in a batch request. It is empty for other requests.
     """
-    faults = error.errors()
-    # FastAPI puts "body" in front of the location of each error.
-    skip = 1 if isinstance(error, RequestValidationError) else 0
-    errors = field_errors(faults, body, at=at, skip=skip)
-    return _faulty(catalogue.INVALID_REQUEST, errors, len(faults))
+    errors = field_errors(error, body, form, at=at)
+    return _faulty(catalogue.INVALID_REQUEST, errors, error.error_count())
 
 
 def report_defect(error: Exception, request_id: str) -> None:
@@ -211,7 +217,13 @@ async def answer(problem: ProblemError, scope: Scope, receive: Receive, send: Se
 
 
 async def _handle(request: Request, error: Exception) -> Response:
-    return respond(request, from_exception(error))
+    problem = from_exception(error)
+    if problem is not error and problem.kind is catalogue.NOT_FOUND:
+        paths = [route.path for route in request.app.routes if hasattr(route, "path")]
+        similar = get_close_matches(request.scope["path"][:64].lower(), paths)
+        if similar:
+            problem.detail += f" Similar paths: {', '.join(similar)}."
+    return respond(request, problem)
 
 
 Handler = Callable[[Request, Exception], Any]
@@ -223,5 +235,5 @@ def install(app: FastAPI) -> None:
     `app.api.gateway.Gateway` answers unexpected exceptions. FastAPI would answer an unexpected
     exception and then raise the exception again. The server would then close the connection.
     """
-    for kind in (HTTPException, RequestValidationError, ServingError):
+    for kind in (HTTPException, ServingError):
         app.add_exception_handler(kind, _handle)

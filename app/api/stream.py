@@ -36,6 +36,7 @@ from scene_client.stream_messages import (
     SceneMessage,
     StreamLimits,
 )
+from scene_client.validation import listed
 
 PATH: Final = "/stream"
 READING_SHARE: Final = 0.2
@@ -168,12 +169,12 @@ class _Conversation:
 
     async def _hear(self, event: Mapping[str, Any]) -> None:
         """Process one message. If the message is not acceptable, send a problem."""
-        kind, seq, outcome = "-", None, SUCCESS
+        value, kind, seq, outcome = None, "-", None, SUCCESS
         try:
             value, kind, seq = _parsed(event)
             await self._obey(_command(kind, value))
         except (ProblemError, ServingError) as error:
-            problem = from_exception(error)
+            problem = from_exception(error, body=value)
             outcome = problem.kind.slug
             described = problem.describe(self._request_id)
             await self._send_model(ProblemMessage(seq=seq, problem=described))
@@ -277,11 +278,11 @@ def _parsed(event: Mapping[str, Any]) -> tuple[Any, str, int | None]:
 def _command(kind: str, value: Any) -> Command:
     form = COMMANDS.get(kind)
     if form is None:
-        raise _unfit("`type` must be one of " + ", ".join(COMMANDS))
+        raise _unfit(f"must be {listed(COMMANDS, 'or')}")
     try:
         return form.model_validate(value)
     except ValidationError as error:
-        raise unfit(error, value) from None
+        raise unfit(error, value, form) from None
 
 
 def _unfit(message: str, field: str = "type") -> ProblemError:

@@ -57,7 +57,7 @@ def version(models: ServedModels, reference: str, number: str) -> VersionDetails
     """
     name = _name(models, reference)
     if number not in models.store.versions[name]:
-        raise UnknownModelError("The model does not have this version.")
+        raise models.unknown(f"{name}@{number}")
     summary = _version_summary(models, name, number)
     served = models.served.get((name, number))
     if served is None:
@@ -145,7 +145,7 @@ def _name(models: ServedModels, reference: str) -> str:
     if target is not None:
         name = target.name
     if name not in models.store.versions:
-        raise UnknownModelError("No model or alias has this name.")
+        raise models.unknown(reference)
     return name
 
 

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Final
 
 from scene_client.schemas import Failure
 
 Location = tuple[str | int, ...]
 """Path to a value in a request: field names and list indices, from the root of the request."""
+
+MOST_NAMED: Final = 50
+"""Maximum number of known names in the message of an error."""
+
+
+def some_of(names: Iterable[str]) -> str:
+    """Return the first `MOST_NAMED` names in alphabetical order, as text for a message."""
+    found = sorted(names)
+    text = ", ".join(found[:MOST_NAMED]) or "none"
+    return f"{text} and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else text
 
 
 @dataclass(frozen=True, slots=True)

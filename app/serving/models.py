@@ -19,7 +19,12 @@ from app import questions
 from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import WorkQueue
-from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
+from app.serving.errors import (
+    ModelUnavailableError,
+    NotReadyError,
+    UnknownModelError,
+    some_of,
+)
 from scene_client.schemas import Failure, ModelReference
 
 DEFAULT = "default"
@@ -114,8 +119,22 @@ class ServedModels:
             if reference == DEFAULT:
                 raise NotReadyError("The default model is not usable.") from None
             if isinstance(error, StoreError) and error.code in _UNKNOWN:
-                raise UnknownModelError("This alias, model or version does not exist.") from None
+                raise self.unknown(reference) from None
             raise ModelUnavailableError("The service refused to load this model.") from None
+
+    def unknown(self, reference: str) -> UnknownModelError:
+        """Return the error for a reference to nothing. The error lists the known names."""
+        name = reference.partition("@")[0]
+        target = self.store.aliases.get(name)
+        versions = self.store.versions.get(name if target is None else target.name)
+        if versions:
+            return UnknownModelError(
+                f"This model has no such version. Its versions: {some_of(versions)}."
+            )
+        aliases, models = some_of(self.store.aliases), some_of(self.store.versions)
+        return UnknownModelError(
+            f"No model or alias has this name. Aliases: {aliases}. Models: {models}."
+        )
 
     def with_alias(self, alias: str, target: AliasTarget) -> ServedModels:
         """Return a copy of the snapshot in which an alias has another target."""

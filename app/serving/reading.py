@@ -22,7 +22,7 @@ from app.scene.observe import observe
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
-from app.serving.errors import Fault, Location, Reason, RequestError
+from app.serving.errors import Fault, Location, Reason, RequestError, some_of
 from app.serving.warnings import scene_warnings
 from scene_client.schemas import (
     Detection,
@@ -167,9 +167,9 @@ class Unknown:
             return found
         message = "the model does not know this label"
         if is_room:
-            message = "the model does not know this room type"
-            if not known:
-                message = "this model does not have room types"
+            message = "this model does not have room types"
+            if known:
+                message = f"the model does not know this room type; it knows {some_of(known)}"
         if self.treatment == "nearest" and (label, is_room) not in self._looked_up:
             message += (
                 f"; the service maps at most {MAX_SUGGESTED} unknown labels per scene and "
@@ -299,10 +299,13 @@ class Names:
         if len(places) == 1:
             return places[0]
         if places:
-            message = f"{len(places)} objects have this label; use the id of one of them"
+            message = (
+                f"{len(places)} objects have this label; use the id of one of them. The service "
+                "numbers objects without an id, such as chair_1 and chair_2"
+            )
             faults.add(Reason.INVALID, location, message)
         else:
-            faults.add(Reason.INVALID, location, "no object of the scene has this id or label")
+            faults.add(Reason.INVALID, location, "no entry of `objects` has this id or label")
         return None
 
     def is_ignored(self, name: str) -> bool:

@@ -22,6 +22,7 @@
 #include <nlohmann/json.hpp>
 #include <optional>
 #include <random>
+#include <sstream>
 #include <stdexcept>
 #include <string>
 #include <thread>
@@ -68,7 +69,8 @@ struct FieldError {
   std::vector<std::string> suggestions;  // nearest known names, best first
 };
 
-// The service answered with a problem (RFC 9457).
+// The service answered with a problem (RFC 9457). `what()` contains the title, the detail and the
+// first errors with their pointers.
 struct ProblemError : Error {
   std::string type = "about:blank";  // identifies the problem: /problems/unknown-labels
   int status = 0;
@@ -160,7 +162,7 @@ class Client {
     int status = 0;
     httplib::Headers headers{};
     std::string body{};
-    std::string reason{};
+    std::string reason{};  // the reason phrase of the response, or the error of the connection
   };
 
 #ifndef _WIN32
@@ -224,6 +226,7 @@ class Client {
   static constexpr double kFirstPause = 0.05;
   static constexpr double kLongestPause = 2.0;
   static constexpr std::size_t kMaxAnswer = std::size_t{256} << 20;  // bytes
+  static constexpr std::size_t kMostShown = 10;  // errors in the text of a ProblemError
 
   static Address split(const std::string& url) {
     const auto scheme = url.find("://");
@@ -257,28 +260,33 @@ class Client {
     if (!(timeout.count() >= 1e-3 && timeout.count() <= kMaxTimeout))
       throw InvalidRequestError("the timeout must be from 0.001 to 600 seconds");
     const auto ends = Clock::now() + std::chrono::duration_cast<Clock::duration>(timeout);
+    const auto late = [&] {
+      std::ostringstream what;
+      what << address_.server << path << " did not answer within " << timeout.count() << " s";
+      return what.str();
+    };
     for (int attempt = 0;; ++attempt) {
       const Seconds left = ends - Clock::now();
-      if (left.count() <= 0) throw DeadlineError("no answer in time");
+      if (left.count() <= 0) throw DeadlineError(late());
       auto outcome = send(method, path, body, ends, left);
       // A valid answer after the deadline is an error, too: the caller relies on the deadline.
       const bool fine = outcome.kind == Outcome::Received && outcome.status == 200;
       if (outcome.kind == Outcome::Late || (fine && Clock::now() >= ends))
-        throw DeadlineError("no answer in time");
+        throw DeadlineError(late());
       if (fine) return outcome;
 
       Seconds pause = pause_after(attempt);
       std::optional<ProblemError> problem;
       if (outcome.kind == Outcome::Received) {
         problem = problem_of(outcome);
-        if (problem->status == 504) throw DeadlineError(problem->what());
+        if (problem->status == 504) throw DeadlineError(late() + ": " + problem->detail);
         if (problem->status != 429 && problem->status != 503) throw *problem;
         // The random pause comes on top of Retry-After, so that clients do not retry all at once.
         if (problem->retry_after) pause += *problem->retry_after;
       }
       if (attempt >= retries || pause >= ends - Clock::now()) {
         if (problem) throw *problem;
-        throw UnreachableError("no service: " + address_.server + ": " + outcome.reason);
+        throw UnreachableError("cannot reach " + address_.server + ": " + outcome.reason);
       }
       std::this_thread::sleep_for(pause);
     }
@@ -318,12 +326,22 @@ class Client {
       // Less than 1 ms before the deadline counts as late: it is too short for a retry.
       const bool late = Clock::now() + std::chrono::milliseconds(1) >= ends;
       outcome.kind = late ? Outcome::Late : Outcome::Lost;
-      outcome.reason = httplib::to_string(result.error());
+      outcome.reason = worded(result.error());
       return outcome;
     }
     outcome.status = result->status;
+    outcome.reason = result->reason;
     outcome.headers = result->headers;
     return outcome;
+  }
+
+  static std::string worded(httplib::Error error) {
+    switch (error) {
+      case httplib::Error::Connection: return "connection refused, or unknown host";
+      case httplib::Error::Read: return "the connection broke before the answer was complete";
+      case httplib::Error::Write: return "the connection broke before the request was complete";
+      default: return httplib::to_string(error);
+    }
   }
 
   // Random pause; its maximum doubles with each attempt, up to kLongestPause seconds.
@@ -347,13 +365,23 @@ class Client {
     return found != document.end() && found->is_string() ? found->get<std::string>() : "";
   }
 
+  static std::string shown(const FieldError& error) {
+    std::string line = "\n  " + error.pointer + ": " + error.message;
+    for (std::size_t k = 0; k < error.suggestions.size(); ++k)
+      line += (k == 0 ? " (did you mean " : ", ") + error.suggestions[k];
+    return error.suggestions.empty() ? line : line + "?)";
+  }
+
   static ProblemError problem_of(const Outcome& outcome) {
     // A proxy or another server may send a body that is not a problem document.
     auto document = json::parse(outcome.body, nullptr, /*allow_exceptions=*/false);
-    if (!document.is_object()) document = json::object();
+    if (!document.is_object() || text(document, "type").empty())
+      document = {{"type", "about:blank"},
+                  {"title", outcome.reason},
+                  {"detail", "The answer comes from another server, for example from a proxy."}};
     std::vector<FieldError> errors;
-    std::string what = std::to_string(outcome.status) + " " + text(document, "type") + ": " +
-                       text(document, "detail");
+    std::string what = std::to_string(outcome.status) + " " + text(document, "title") + " (" +
+                       text(document, "type") + "): " + text(document, "detail");
     if (const auto found = document.find("errors"); found != document.end() && found->is_array()) {
       for (const auto& entry : *found) {
         if (!entry.is_object()) continue;
@@ -361,13 +389,14 @@ class Client {
         if (const auto names = entry.find("suggestions"); names != entry.end() && names->is_array())
           for (const auto& name : *names)
             if (name.is_string()) error.suggestions.push_back(name.get<std::string>());
-        what += "\n  " + error.pointer + ": " + error.message;
-        if (!error.suggestions.empty()) what += " (did you mean " + error.suggestions[0] + "?)";
+        if (errors.size() < kMostShown) what += shown(error);
         errors.push_back(std::move(error));
       }
     }
+    if (errors.size() > kMostShown)
+      what += "\n  and " + std::to_string(errors.size() - kMostShown) + " more errors";
     ProblemError problem(what);
-    if (const auto type = text(document, "type"); !type.empty()) problem.type = type;
+    problem.type = text(document, "type");
     problem.status = outcome.status;
     problem.title = text(document, "title");
     problem.detail = text(document, "detail");

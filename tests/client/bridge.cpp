@@ -16,7 +16,8 @@ static json told(const scene::ProblemError& problem) {
   json told = {{"outcome", "problem"},      {"type", problem.type},
                {"status", problem.status},  {"title", problem.title},
                {"detail", problem.detail},  {"errors", errors},
-               {"request_id", problem.request_id}};
+               {"request_id", problem.request_id},
+               {"text", problem.what()}};
   told["retry_after"] = problem.retry_after ? json(problem.retry_after->count()) : json();
   return told;
 }

@@ -37,7 +37,7 @@ class Caller(Protocol):
 
 def _plain(answer: Any) -> Any:
     if isinstance(answer, BaseModel):
-        return json.loads(answer.model_dump_json(exclude_none=True))
+        return json.loads(answer.model_dump_json(exclude_unset=True))
     return answer
 
 
@@ -142,7 +142,9 @@ def cpp_caller(
                 return said["answer"]
             case "problem":
                 errors = [FieldError.model_validate(error) for error in said.pop("errors")]
-                raise ProblemError(**said, errors=errors)
+                text, problem = said.pop("text"), ProblemError(**said, errors=errors)
+                assert text == str(problem)
+                raise problem
             case "deadline":
                 raise DeadlineError(said["message"])
             case "unreachable":

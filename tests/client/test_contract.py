@@ -104,13 +104,25 @@ def test_an_unknown_label_is_a_problem_with_suggestions(caller: Caller) -> None:
     assert problem.title
     assert "1 error" in problem.detail
     assert problem.retry_after is None
+    assert problem.title in str(problem)
+    assert "#/objects/1: the model does not know this label (did you mean night" in str(problem)
+
+
+@every_client
+def test_the_text_of_a_problem_has_the_first_errors(caller: Caller) -> None:
+    with pytest.raises(ProblemError) as raised:
+        caller("missing", {"objects": [f"nonsuch {number}" for number in range(12)]})
+    assert "#/objects/9: " in str(raised.value)
+    assert "#/objects/10: " not in str(raised.value)
+    assert str(raised.value).endswith("\n  and 2 more errors")
+    assert len(raised.value.errors) == 12
 
 
 @every_client
 def test_who_cannot_wait_is_told_so_and_may_ask_again(caller: Caller) -> None:
     long = {"objects": [], "count": 64, "steps": 2000, "temperature": 5.0}
     for timeout in (0.001, 0.02):
-        with pytest.raises(DeadlineError):
+        with pytest.raises(DeadlineError, match=f"within {timeout:g} s"):
             caller("generate", long, timeout=timeout)
     assert caller("missing", {"objects": ["bed"]})["missing"]
 

@@ -86,7 +86,7 @@ def test_the_cpp_example_is_made_and_asks_all_four_questions(
         assert heading in done.stdout
     done = run("http://127.0.0.1:9")
     assert (done.returncode, done.stdout) == (2, "Missing:\n")
-    assert done.stderr.startswith("no service: ")
+    assert done.stderr.startswith("cannot reach http://127.0.0.1:9: connection refused")
     # What was mistyped is said, and ends nothing by force.
     done = run("robot:8000")
     assert (done.returncode, done.stderr) == (2, "the URL must begin with http://\n")

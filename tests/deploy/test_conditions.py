@@ -151,6 +151,6 @@ def test_a_service_that_does_not_answer_fails_the_condition(program: Path) -> No
     with silent() as url:
         (late,) = tick(program, url, "SceneComplete", scene, timeout=0.2)
     assert (late["status"], late["waited"]) == ("FAILURE", True)
-    assert late["because"] == "no answer in time"
+    assert late["because"] == f"{url}/missing did not answer within 0.2 s"
     (refused,) = tick(program, "http://127.0.0.1:9", "SceneComplete", scene)
     assert (refused["status"], refused["waited"]) == ("FAILURE", True)

@@ -249,6 +249,8 @@ async def test_unknown_labels_are_named_with_suggestions(
     assert errors["#/objects/0"][0] == "nightstand"
     assert errors["#/objects/2/label"] == []
     assert errors["#/room_type"] == ["bedroom"]
+    known = [error["message"] for error in document["errors"] if "room" in error["pointer"]]
+    assert "bathroom, bedroom, office" in known[0]
 
 
 async def test_a_field_of_another_part_is_no_suggestion_for_itself(
@@ -258,6 +260,69 @@ async def test_a_field_of_another_part_is_no_suggestion_for_itself(
     (error,) = problem(response, 422, "invalid-request")["errors"]
     assert error["pointer"] == "#/x"
     assert "x" not in error.get("suggestions", [])
+
+
+ON_TOP = {"subject": "lamp", "relation": "on_top", "object": "bed"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "pointer", "words", "suggestions"),
+    [
+        ({"objects": "bed"}, "objects", "a JSON array, not a string", []),
+        ({"objects": [["bed"]]}, "objects/0", "JSON object with the field `label`, not an arr", []),
+        ({"objects": [{"name": "bed"}]}, "objects/0/name", "`label`, `confidence`", []),
+        ({"object": ["bed"]}, "object", "unknown field", ["objects"]),
+        (
+            {"objects": [BED | {"position": [1, 2, 3]}]},
+            "objects/0/position",
+            "`y` and `z`, not",
+            [],
+        ),
+        ({"objects": [BED | {"confidence": 92}]}, "objects/0/confidence", "at most 1", []),
+        ({"top_k": 2.0}, "top_k", "a whole number, not a decimal number", []),
+        ({"relations": [ON_TOP]}, "relations/0/relation", "`on-top`, `under`", ["on-top"]),
+        ({"relations": [["lamp", "on top", "bed"]]}, "relations/0/1", "must be", ["on-top"]),
+        ({"at": ["ontop", "bed"]}, "at/0", "must be", ["on-top"]),
+        ({"at": {"relation": "in front of", "object": "bed"}}, "at/relation", "must", ["front"]),
+        ({"relations": [["lamp", "left"]]}, "relations/0", "or an array of these 3 values", []),
+        ({"relations": [["lamp", "left", "sofa"]]}, "relations/0/2", "no entry of `objects`", []),
+        ({"at": ["on-top", "desk"]}, "at/1", "no entry of `objects`", []),
+    ],
+    ids=str,
+)
+async def test_an_error_says_what_is_expected_instead(
+    client: httpx.AsyncClient,
+    changes: dict[str, Any],
+    pointer: str,
+    words: str,
+    suggestions: list[str],
+) -> None:
+    body = {"objects": ["bed", "lamp"]} | changes
+    single = (await client.post("/missing", json=body)).json()
+    batch = (await client.post("/missing/batch", json={"scenes": [body]})).json()
+    for root, document in (("#", single), ("#/scenes/0", batch["results"][0]["problem"])):
+        errors = {error["pointer"]: error for error in document["errors"]}
+        assert words in errors[f"{root}/{pointer}"]["message"]
+        assert errors[f"{root}/{pointer}"].get("suggestions", []) == suggestions
+
+
+async def test_numbers_that_are_not_json_are_pointed_at(client: httpx.AsyncClient) -> None:
+    place = '{"x": %s, "y": %s, "z": 0}'
+    things = [f'{{"label": "bed", "position": {place % pair}}}' for pair in
+              (("0", "1"), ("NaN", "0"), ("-Infinity", "Infinity"))]  # fmt: skip
+    body = f'{{"objects": [{", ".join(things)}], "top_k": %s}}'
+    document = problem(await post(client, body % 3, "/missing"), 400, "not-json")
+    assert [(error["pointer"], error["message"]) for error in document["errors"]] == [
+        ("#/objects/1/position/x", "must be a finite number, not NaN"),
+        ("#/objects/2/position/x", "must be a finite number, not -Infinity"),
+        ("#/objects/2/position/y", "must be a finite number, not Infinity"),
+    ]
+    # With a second mistake, the text cannot be read, and the first mistake has a line and a column.
+    document = problem(await post(client, body % "True", "/missing"), 400, "not-json")
+    assert "line 1 column" in document["detail"]
+    many = '{"objects": [' + ", ".join(["NaN"] * 1000) + "]}"
+    document = problem(await post(client, many), 400, "not-json")
+    assert len(document["errors"]) == 100
 
 
 async def test_misspelt_fields_are_pointed_at_with_suggestions(client: httpx.AsyncClient) -> None:
@@ -293,7 +358,9 @@ async def test_at_most_100_faults_are_listed(client: httpx.AsyncClient) -> None:
 @pytest.mark.parametrize("model", ["nobody", "home@9.9.9", "home@", "@", "../x", "home@1", "HOME"])
 async def test_unknown_models_are_not_found(client: httpx.AsyncClient, model: str) -> None:
     body = {"objects": ["bed"], "model": model}
-    problem(await client.post("/missing", json=body), 404, "model-not-found")
+    document = problem(await client.post("/missing", json=body), 404, "model-not-found")
+    named = "1.0.0, 1.1.0" if model.startswith("home@") else "Models: deep, home, plain."
+    assert named in document["detail"]
 
 
 @pytest.mark.parametrize(
@@ -319,6 +386,12 @@ async def test_unknown_routes_are_not_found(client: httpx.AsyncClient, path: str
     problem(await client.get(path), 404, "not-found")
 
 
+async def test_a_misspelt_path_is_answered_with_similar_paths(client: httpx.AsyncClient) -> None:
+    for path in ("/mising", "/Missing", "/missing/", "/api/missing"):
+        document = problem(await client.post(path, json={"objects": ["bed"]}), 404, "not-found")
+        assert "/missing, /missing/batch" in document["detail"]
+
+
 @pytest.mark.parametrize(
     ("method", "path", "allowed"),
     [
@@ -334,7 +407,8 @@ async def test_other_methods_are_not_allowed(
     client: httpx.AsyncClient, method: str, path: str, allowed: set[str]
 ) -> None:
     response = await client.request(method, path)
-    problem(response, 405, "method-not-allowed")
+    document = problem(response, 405, "method-not-allowed")
+    assert response.headers["allow"] in document["detail"]
     assert set(response.headers["allow"].split(", ")) == allowed
 
 

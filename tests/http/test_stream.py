@@ -6,6 +6,7 @@ import asyncio
 import json
 import random
 import re
+import socket
 import threading
 import time
 from pathlib import Path
@@ -16,7 +17,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from app.api.catalogue import PROBLEM_TYPES
-from scene_client import StreamClient, StreamClosedError, StreamProblemError
+from scene_client import (
+    InvalidRequestError,
+    StreamClient,
+    StreamClosedError,
+    StreamProblemError,
+    UnreachableError,
+)
 from tests.conftest import REPOSITORY
 from tests.http.stores import make_store, publish
 from tests.http.streams import (
@@ -317,7 +324,7 @@ def test_a_fault_is_pointed_at_in_the_message_or_the_kept_scene(live: LiveServic
     cases: list[tuple[dict[str, Any], str]] = [
         ({"objects": ["bad"]}, "#/objects/0"),
         ({"objects": [{"id": "a", "label": "bad"}]}, "#/objects/0/label"),
-        ({"objects": ["bed", "bed"]}, "#/objects/1/id"),
+        ({"objects": ["bed", "bed"]}, "#/objects/1"),
         ({"remove": ["bed", "nobody"]}, "#/remove/1"),
         ({"room_type": "cellar"}, "#/room_type"),
         ({"relations": [pair | {"relation": "left", "object": "sofa"}]}, "#/relations/0/object"),
@@ -366,6 +373,9 @@ async def test_a_client_is_told_and_goes_on(live: LiveService) -> None:
             await anext(stream)
         assert told.value.seq == refused
         assert told.value.problem.type == "/problems/unknown-labels"
+        assert "#/objects/0: the model does not know this label" in str(told.value)
+        with pytest.raises(InvalidRequestError, match=r"#/relations/0/1: must be .*mean on-top"):
+            await stream.update(relations=[("bed", "on_top", "bed")])
         sent = await stream.replace(["bed", "desk"])
         async for answer in stream:
             assert answer.seq == sent
@@ -376,6 +386,16 @@ async def test_a_client_is_told_and_goes_on(live: LiveService) -> None:
         await stream.ping()
     with pytest.raises(StreamClosedError):
         await stream.update(["bed"])
+
+
+@pytest.mark.anyio
+async def test_a_service_that_does_not_open_the_stream_is_unreachable() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        address = rf"ws://127.0.0.1:{port}/stream: no answer within 0.1 s"
+        with pytest.raises(UnreachableError, match=address):
+            async with StreamClient(f"http://user:secret@127.0.0.1:{port}", timeout=0.1):
+                pass
 
 
 @pytest.mark.slow
@@ -425,6 +445,7 @@ async def test_a_client_gives_up_after_a_while(tmp_path: Path) -> None:
         with pytest.raises(StreamClosedError) as ended:
             await anext(stream)
         assert ended.value.code in {1001, 1012}
+        assert f"within 1 s: ws://127.0.0.1:{service.port}/stream: " in str(ended.value)
         with pytest.raises(StreamClosedError):
             await stream.update(["bed"])
 

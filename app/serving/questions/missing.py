@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final
@@ -37,6 +38,8 @@ from app.serving.request import Request
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
 _OFFSET_BYTES = 250
+_LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
+_LEAST_CHANGE: Final = math.log(3)  # substantial evidence: a Bayes factor of at least 3
 
 
 async def missing(request: Request, asked: MissingRequest) -> Answer:
@@ -68,6 +71,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         at=at,
         axes=_axes(asked),
         coverage=asked.coverage,
+        details=asked.detail == "full",
     )
     further: tuple[questions.More, ...] = ()
     if asked.at is None:
@@ -78,11 +82,39 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
             candidates=candidates,
             coverage=asked.coverage,
         )
+    found = tuple([_notable(entry, reading.scene) for entry in found])
     require_size(_size(found, further), reading, request.limits.answer_bytes, "top_k")
     answer = envelope(asked, request.id, model.reference, reading)
     coverage = asked.coverage
     answer["coverage"] = model.artifact.calibration.coverage if coverage is None else coverage
-    ids = reading.ids
+    answer["missing"] = _entries(found, reading.ids, full=asked.detail == "full")
+    answer["more"] = [
+        entry._asdict()
+        | {
+            "expected_count": rounded(entry.expected_count),
+            "probability": rounded(entry.probability),
+        }
+        for entry in further
+    ]
+    return answer
+
+
+def _notable(entry: questions.MissingAnswer, scene: Scene) -> questions.MissingAnswer:
+    """Leave out less likely places, weak reasons, and offsets from objects without a position."""
+    places = [
+        place if scene.objects[place.object].position is not None else place._replace(offset=None)
+        for place in entry.placements
+    ]
+    least = _LEAST_SHARE * places[0].probability if places else 0.0
+    likely = [place for place in places if place.probability >= least]
+    because = [one for one in entry.because if abs(one.log_odds_change) >= _LEAST_CHANGE]
+    return entry._replace(placements=tuple(likely), because=tuple(because))
+
+
+def _entries(
+    found: Sequence[questions.MissingAnswer], ids: Sequence[str], *, full: bool
+) -> list[Answer]:
+    """Return the entries of the list `missing`, with rounded numbers."""
     numbers: list[float] = []
     for _, probability, log_odds, placements, because in found:
         numbers += probability, log_odds
@@ -93,25 +125,14 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
                 numbers += offset[1]
         numbers += [change for _, change in because]
     numbered = iter(significant(numbers))
-    answer["missing"] = [
-        {
-            "label": label,
-            "probability": next(numbered),
-            "log_odds": next(numbered),
-            "placements": [_placement(place, ids, numbered) for place in placements],
-            "because": reasons(because, ids, numbered),
-        }
-        for label, _, _, placements, because in found
-    ]
-    answer["more"] = [
-        entry._asdict()
-        | {
-            "expected_count": rounded(entry.expected_count),
-            "probability": rounded(entry.probability),
-        }
-        for entry in further
-    ]
-    return answer
+    entries: list[Answer] = []
+    for label, _, _, placements, because in found:
+        entry = {"label": label, "probability": next(numbered), "log_odds": next(numbered)}
+        if full:
+            entry["placements"] = [_placement(place, ids, numbered) for place in placements]
+            entry["because"] = reasons(because, ids, numbered)
+        entries.append(entry)
+    return entries
 
 
 def _candidates(
@@ -193,6 +214,10 @@ _EXAMPLES: Final = {
     "candidates": Example(
         "only these candidates",
         {**LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3},
+    ),
+    "scores": Example(
+        "probabilities only, for a fast and short answer",
+        {**LABELS, "detail": "scores"},
     ),
     **REFUSED,
     "invalid-request": Example(

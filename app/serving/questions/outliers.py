@@ -45,6 +45,7 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
         reading.scene,
         sensitivity=asked.sensitivity,
         threshold=asked.threshold,
+        details=asked.detail == "full",
     )
     require_size(_size(found), reading, request.limits.answer_bytes, "objects")
     answer = envelope(asked, request.id, model.reference, reading)
@@ -56,18 +57,19 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
         numbers += [change for _, change in entry.because]
     numbers += [entry.probability for entry in found.misplaced]
     numbered = iter(significant(numbers))
-    answer["outliers"] = [
-        {
+    answer["outliers"] = []
+    for place, label, _, _, is_outlier, because, usually_with in found.outliers:
+        judged = {
             "object": ids[place],
             "label": label,
             "probability": next(numbered),
             "log_odds": next(numbered),
             "is_outlier": is_outlier,
-            "because": reasons(because, ids, numbered),
-            "usually_with": list(usually_with),
         }
-        for place, label, _, _, is_outlier, because, usually_with in found.outliers
-    ]
+        if asked.detail == "full":
+            judged["because"] = reasons(because, ids, numbered)
+            judged["usually_with"] = list(usually_with)
+        answer["outliers"].append(judged)
     answer["misplaced"] = [
         {
             **_spelled(entry.subject, entry.relation, entry.object, reading),
@@ -109,13 +111,10 @@ _EXAMPLES: Final = {
     "intruder": Example("a toilet in a bedroom", WITH_TOILET),
     **SCENES,
     "misplaced": Example(
-        "relations that the request states and that may be wrong",
+        "relations that the request states, as arrays, and that may be wrong",
         {
             "objects": ["bed", "pillow", "nightstand"],
-            "relations": [
-                {"subject": "pillow", "relation": "on-top", "object": "bed"},
-                {"subject": "bed", "relation": "on-top", "object": "nightstand"},
-            ],
+            "relations": [["pillow", "on-top", "bed"], ["bed", "on-top", "nightstand"]],
         },
     ),
     "sensitivity": Example(
@@ -125,6 +124,10 @@ _EXAMPLES: Final = {
     "threshold": Example(
         "a threshold set by the client",
         {**WITH_TOILET, "threshold": 0.5},
+    ),
+    "scores": Example(
+        "probabilities only, for a fast and short answer",
+        {**WITH_TOILET, "detail": "scores"},
     ),
     **REFUSED,
 }

@@ -28,6 +28,7 @@ from scene_client.schemas import (
     Body,
     Detection,
     FieldError,
+    Request,
     SceneRequest,
 )
 from scene_client.validation import field_errors
@@ -48,6 +49,7 @@ Objects: TypeAlias = Iterable[str | Detection | Body]
 T = TypeVar("T", bound=BaseModel)
 AnswerT = TypeVar("AnswerT", bound=Answer)
 RequestT = TypeVar("RequestT", bound=SceneRequest)
+FormT = TypeVar("FormT", bound=Request)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +186,7 @@ def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
         "PUT",
         f"/models/aliases/{segment(alias)}",
         AliasAnswer,
-        _json(_validated(AliasRequest, dict(fields))),
+        _json(validated(AliasRequest, dict(fields))),
         administers=True,
         # If the first attempt has changed the alias, a second attempt with `expected` would fail.
         repeatable=False,
@@ -213,33 +215,14 @@ def _request(
         given = {"objects": scene, **fields}
     if model is not None:
         given.setdefault("model", model)
-    spelt_out = {name: _spelt_out(name, value) for name, value in given.items()}
-    return _validated(kind, spelt_out, at)
+    return validated(kind, {name: _listed(value) for name, value in given.items()}, at)
 
 
-# Short forms. Maps a field of a request to the members of its objects. In such a field, a tuple of
-# the members' values may replace the object.
-_TUPLES: Final = {
-    "relations": ("subject", "relation", "object"),
-    "pairs": ("subject", "object"),
-    "at": ("relation", "object"),
-}
-
-
-def _spelt_out(name: str, value: Any) -> Any:
-    """Return the value of a field with each tuple replaced by an object."""
-    members = _TUPLES.get(name, ())
-    if name == "at":
-        return _member(value, members)
+def _listed(value: Any) -> Any:
+    """Return the value of a field as a dictionary, a list or a single value."""
     if isinstance(value, str | BaseModel | Mapping) or not isinstance(value, Iterable):
         return _plain(value)
-    return [_member(entry, members) for entry in value]
-
-
-def _member(value: Any, members: tuple[str, ...]) -> Any:
-    if members and isinstance(value, tuple) and len(value) == len(members):
-        return dict(zip(members, value, strict=True))
-    return _plain(value)
+    return [_plain(entry) for entry in value]
 
 
 def _plain(value: Any) -> Any:
@@ -248,8 +231,18 @@ def _plain(value: Any) -> Any:
     return dict(value) if isinstance(value, Mapping) else value
 
 
-def _validated(kind: type[T], given: dict[str, Any], at: tuple[str | int, ...] = ()) -> T:
+def validated(kind: type[FormT], given: dict[str, Any], at: tuple[str | int, ...] = ()) -> FormT:
+    """Return the request, or a part of it, that the dictionary ``given`` describes.
+
+    Args:
+        kind: class of the request.
+        given: fields of the request.
+        at: location of ``given`` in the body.
+
+    Raises:
+        InvalidRequestError: the request is invalid.
+    """
     try:
         return kind.model_validate(given)
     except ValidationError as error:
-        raise InvalidRequestError(field_errors(error.errors(), given, at=at)) from None
+        raise InvalidRequestError(field_errors(error, given, kind, at=at)) from None

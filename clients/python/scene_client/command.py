@@ -39,7 +39,7 @@ from scene_client.errors import (
 )
 from scene_client.offline import OfflineClient
 from scene_client.ros_fields import MessageError
-from scene_client.schemas import RelationName, Sensitivity, UnknownLabels
+from scene_client.schemas import Detail, RelationName, Sensitivity, UnknownLabels
 from scene_client.sync import Client
 from scene_client.vision_msgs import from_message, is_message
 
@@ -115,7 +115,7 @@ class Asked:
         """Ask a question, and print the answer as JSON or as a table."""
         answer = self.ask(question)
         if self.as_json:
-            print(answer.model_dump_json(exclude_none=True))
+            print(answer.model_dump_json(exclude_unset=True))
             return answer
         console = Console(markup=False, highlight=False, emoji=False)
         if not console.is_terminal:
@@ -176,20 +176,17 @@ Things = Annotated[
 Stated = Annotated[
     list[str] | None,
     typer.Option(
-        "--relation", help='A relation that holds, such as "lamp on-top desk"; repeatable.'
+        "--relations", help='A relation that holds, such as "lamp on-top desk"; repeatable.'
     ),
 ]
-Room = Annotated[str | None, typer.Option("--room", help="Type of the room.")]
-TopK = Annotated[int | None, typer.Option("--top-k", help="Maximum number of results.")]
+RoomType = Annotated[str | None, typer.Option(help="Type of the room.")]
+TopK = Annotated[int | None, typer.Option(help="Maximum number of results.")]
 Unknown = Annotated[
-    bool, typer.Option("--ignore-unknown", help="Leave out labels that the model does not know.")
-]
-UnknownChoice = Annotated[
     UnknownLabels | None,
-    typer.Option(
-        "--unknown-labels",
-        help="Unknown labels: refuse them, ignore them, or use the nearest class.",
-    ),
+    typer.Option(help="Unknown labels: refuse them, ignore them, or use the nearest class."),
+]
+HowMuch = Annotated[
+    Detail | None, typer.Option(help="Only the scores, or also places and reasons.")
 ]
 
 
@@ -197,24 +194,23 @@ UnknownChoice = Annotated[
 def relations(
     context: typer.Context,
     things: Things = None,
-    relation: Stated = None,
-    room: Room = None,
+    relations: Stated = None,
+    room_type: RoomType = None,
     top_k: TopK = None,
     min_probability: Annotated[
         float | None, typer.Option(help="Leave out relations with a lower probability.")
     ] = None,
-    opposites: Annotated[
-        bool, typer.Option("--opposites", help="Also list right, behind, under and below.")
+    include_opposites: Annotated[
+        bool, typer.Option("--include-opposites", help="Also list right, behind, under and below.")
     ] = False,
-    ignore_unknown: Unknown = False,
-    unknown_labels: UnknownChoice = None,
+    unknown_labels: Unknown = None,
 ) -> None:
     """List the likely spatial relations between the objects."""
-    scene = _scene(things, relation, room, ignore_unknown, unknown_labels)
+    scene = _scene(things, relations, room_type, unknown_labels)
     request = scene | _named(
         top_k=top_k,
         min_probability=min_probability,
-        include_opposites=opposites or None,
+        include_opposites=include_opposites or None,
     )
     asked: Asked = context.obj
     asked.show(lambda client: client.relations(request), tables.relations)
@@ -231,22 +227,23 @@ def missing(
     at: Annotated[
         str | None, typer.Option(help='Answer only about this place, such as "on-top desk".')
     ] = None,
-    candidate: Annotated[
+    candidates: Annotated[
         list[str] | None, typer.Option(help="Consider only this class; repeatable.")
     ] = None,
-    relation: Stated = None,
-    room: Room = None,
+    relations: Stated = None,
+    room_type: RoomType = None,
     top_k: TopK = None,
-    ignore_unknown: Unknown = False,
-    unknown_labels: UnknownChoice = None,
+    unknown_labels: Unknown = None,
+    detail: HowMuch = None,
 ) -> None:
     """List objects that the scene probably lacks, and their likely places."""
-    scene = _scene(things, relation, room, ignore_unknown, unknown_labels)
+    scene = _scene(things, relations, room_type, unknown_labels)
     request = scene | _named(
         top_k=top_k,
         coverage=coverage,
         at=None if at is None else _anchor(at),
-        candidates=candidate or None,
+        candidates=candidates or None,
+        detail=detail,
     )
     asked: Asked = context.obj
     asked.show(lambda client: client.missing(request), tables.missing)
@@ -262,16 +259,17 @@ def outliers(
     threshold: Annotated[
         float | None, typer.Option(help="Minimum probability of an outlier.")
     ] = None,
-    relation: Stated = None,
-    room: Room = None,
-    ignore_unknown: Unknown = False,
-    unknown_labels: UnknownChoice = None,
+    relations: Stated = None,
+    room_type: RoomType = None,
+    unknown_labels: Unknown = None,
+    detail: HowMuch = None,
 ) -> None:
     """List objects that do not fit the scene, and relations that are probably false."""
-    scene = _scene(things, relation, room, ignore_unknown, unknown_labels)
+    scene = _scene(things, relations, room_type, unknown_labels)
     request = scene | _named(
         sensitivity=sensitivity,
         threshold=threshold,
+        detail=detail,
     )
     asked: Asked = context.obj
     asked.show(lambda client: client.outliers(request), tables.outliers)
@@ -296,16 +294,15 @@ def generate(
             help="Draw the scenes as a picture into this file (.png, .svg or .pdf).", dir_okay=False
         ),
     ] = None,
-    relation: Stated = None,
-    room: Room = None,
-    ignore_unknown: Unknown = False,
-    unknown_labels: UnknownChoice = None,
+    relations: Stated = None,
+    room_type: RoomType = None,
+    unknown_labels: Unknown = None,
 ) -> None:
     """Sample scenes that contain the given objects."""
     asked: Asked = context.obj
     if plot is not None and find_spec("matplotlib") is None:
         _fail("the option --plot needs matplotlib: run pip install matplotlib", MEANINGLESS)
-    scene = _scene(things or [], relation, room, ignore_unknown, unknown_labels)
+    scene = _scene(things or [], relations, room_type, unknown_labels)
     request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
     answer = asked.show(lambda client: client.generate(request), tables.generate)
     if plot is not None:
@@ -354,13 +351,10 @@ def ready(context: typer.Context) -> None:
 def _scene(
     things: list[str] | None,
     stated: list[str] | None,
-    room: str | None,
-    ignore_unknown: bool,
+    room_type: str | None,
     unknown_labels: UnknownLabels | None,
 ) -> dict[str, Any]:
     """Return the fields of the request from files and options. Options override files."""
-    if ignore_unknown and unknown_labels not in (None, "ignore"):
-        _fail("use either --ignore-unknown or --unknown-labels, not both", MEANINGLESS)
     if things is None:
         _fail(
             "the objects are missing: give labels, a file that ends in .json, or - for stdin",
@@ -372,8 +366,8 @@ def _scene(
     scene = _read(files[0]) if files else {"objects": things}
     return scene | _named(
         relations=[_relation(text) for text in stated] if stated else None,
-        room_type=room,
-        unknown_labels="ignore" if ignore_unknown else unknown_labels,
+        room_type=room_type,
+        unknown_labels=unknown_labels,
     )
 
 
@@ -441,7 +435,7 @@ def _relation(text: str) -> dict[str, str]:
     if place is None:
         names = ", ".join(_RELATIONS)
         _fail(
-            f'--relation must be a subject, a relation and an object, as in "lamp on-top desk"; '
+            f'--relations must be a subject, a relation and an object, as in "lamp on-top desk"; '
             f"relations: {names}",
             MEANINGLESS,
         )

@@ -7,7 +7,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from http import HTTPStatus
-from typing import Any
+from typing import Any, Final
 
 from pydantic import ValidationError
 
@@ -35,8 +35,14 @@ class InvalidRequestError(ClientError, ValueError):
         self.errors = list(errors)
 
 
+MOST_SHOWN: Final = 10
+"""Maximum number of errors in the text of an exception."""
+
+
 class ProblemError(ClientError):
     """The service answered with a problem (RFC 9457).
+
+    The text of the exception contains the title, the detail and the first errors.
 
     Attributes:
             type: path of the page about the problem type, such as ``/problems/unknown-labels``. The
@@ -65,8 +71,7 @@ class ProblemError(ClientError):
         request_id: str = "",
         retry_after: float | None = None,
     ) -> None:
-        faults = "".join(f"\n  {error.pointer}: {_worded(error)}" for error in errors)
-        super().__init__(f"{status} {type}: {detail or title}{faults}")
+        super().__init__(problem_text(type, status, title, detail, errors))
         self.type = type
         self.status = status
         self.title = title
@@ -96,6 +101,21 @@ class DeadlineError(ClientError):
 
 class AnswerError(ClientError):
     """The client cannot read the answer of the service."""
+
+
+def problem_text(
+    type: str,  # noqa: A002 — the name in RFC 9457
+    status: int,
+    title: str,
+    detail: str,
+    errors: Sequence[FieldError],
+) -> str:
+    """Return the text of an exception for a problem; see `ProblemError`."""
+    lines = [f"{status} {title} ({type}): {detail}"]
+    lines += [f"{error.pointer}: {_worded(error)}" for error in errors[:MOST_SHOWN]]
+    if len(errors) > MOST_SHOWN:
+        lines.append(f"and {len(errors) - MOST_SHOWN} more errors")
+    return "\n  ".join(lines)
 
 
 def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemError:
@@ -129,7 +149,7 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
         "about:blank",
         status,
         title,
-        "The answer does not come from the service, but for example from a proxy.",
+        "The answer comes from another server, for example from a proxy.",
         request_id=headers.get("x-request-id", ""),
         retry_after=retry_after,
     )

@@ -15,8 +15,15 @@ from pydantic import BaseModel
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
-from scene_client.errors import ClientError, ProblemError, UnreachableError, problem_of
-from scene_client.schemas import Detection, Problem
+from scene_client.calls import FormT, validated
+from scene_client.errors import (
+    ClientError,
+    ProblemError,
+    UnreachableError,
+    problem_of,
+    problem_text,
+)
+from scene_client.schemas import Detection
 from scene_client.stream_messages import (
     EVENTS,
     AnswerMessage,
@@ -38,6 +45,15 @@ _MAX_EVENT: Final = 64 * 2**20
 # Close codes after which the client reconnects: the connection broke, or the service stopped or
 # failed. After any other code, the service would close a new connection, too.
 _TRANSIENT: Final = frozenset({1001, 1006, 1011, 1012, 1013})
+_CAUSES: Final = {
+    1000: "the program has closed the stream",
+    1001: "the service shuts down",
+    1006: "the connection broke",
+    1007: "a message was not UTF-8",
+    1009: "a message was too long",
+    1011: "the service failed, or the client did not answer its pings",
+    1012: "the service has shut down",
+}
 _FIRST_PAUSE: Final = 0.1
 _LONGEST_PAUSE: Final = 5.0
 
@@ -51,8 +67,12 @@ class StreamProblemError(ClientError):
     """
 
     def __init__(self, message: ProblemMessage) -> None:
-        super().__init__(f"{message.problem.title}: {message.problem.detail}")
-        self.problem: Problem = message.problem
+        problem = self.problem = message.problem
+        super().__init__(
+            problem_text(
+                problem.type, problem.status, problem.title, problem.detail, problem.errors or ()
+            )
+        )
         self.seq = message.seq
 
 
@@ -64,8 +84,9 @@ class StreamClosedError(ClientError):
         reason: reason that the service gave, such as `draining` or `stream-idle`, or "".
     """
 
-    def __init__(self, code: int, reason: str) -> None:
-        super().__init__(f"the stream has ended with close code {code} {reason}".rstrip())
+    def __init__(self, code: int, reason: str, note: str = "") -> None:
+        cause = reason or _CAUSES.get(code, "")
+        super().__init__(f"the stream has ended with close code {code}: {cause}{note}")
         self.code = code
         self.reason = reason
 
@@ -113,7 +134,7 @@ class StreamClient:
         self._headers = {} if api_key is None else {"X-API-Key": api_key}
         self._timeout = timeout
         self._patience = reconnect
-        self._opening = Open(type="open", **fields)
+        self._opening = validated(Open, {"type": "open", **fields})
         self._scene = MergedScene().after(self._opening)
         self._unanswered: dict[int, Update | Whole] = {}
         self._connection: ClientConnection | None = None
@@ -157,22 +178,20 @@ class StreamClient:
             **fields: other fields of the scene, such as `relations`, `room_type` or `stamp`.
 
         Raises:
-            pydantic.ValidationError: the message is invalid. The client has not sent it.
+            InvalidRequestError: the message is invalid. The client has not sent it.
             StreamClosedError: the stream has ended.
         """
         if remove:
             fields["remove"] = list(remove)
-        things: list[Any] = list(objects)
-        return await self._next(Update(type="update", seq=self.seq + 1, objects=things, **fields))
+        return await self._next(_message(Update, "update", self.seq + 1, objects, fields))
 
     async def replace(self, objects: Objects, **fields: Any) -> int:
         """Send a whole scene in place of the previous one. Return the message's sequence number.
 
         Raises:
-            pydantic.ValidationError, StreamClosedError: see `update`.
+            InvalidRequestError, StreamClosedError: see `update`.
         """
-        things: list[Any] = list(objects)
-        return await self._next(Whole(type="scene", seq=self.seq + 1, objects=things, **fields))
+        return await self._next(_message(Whole, "scene", self.seq + 1, objects, fields))
 
     async def ping(self) -> None:
         """Send a ping message, so that the service does not close an idle stream.
@@ -248,21 +267,26 @@ class StreamClient:
     async def _reconnect(self, closed: StreamClosedError) -> None:
         """Connect again and send the whole scene. The pauses between attempts grow."""
         self._lost_at = self._lost_at or monotonic()
+        failure: ClientError | None = None
         while self._ended is None:
             late = monotonic() + self._pause > self._lost_at + self._patience
             if late or closed.code not in _TRANSIENT:
+                if failure is not None:
+                    note = f"; no new connection within {self._patience:g} s: {failure}"
+                    closed = StreamClosedError(closed.code, closed.reason, note)
                 self._ended = closed
-                raise closed
+                raise closed from failure
             # The pause is random, so that many robots do not reconnect at the same time.
             await asyncio.sleep(self._pause * random.uniform(0.5, 1.0))  # noqa: S311 # nosec B311
             self._pause = min(2 * self._pause, _LONGEST_PAUSE)
             try:
                 await self._connect()
-            except (UnreachableError, StreamClosedError):
-                continue
+            except (UnreachableError, StreamClosedError) as error:
+                failure = error
             except ProblemError as refused:
                 if refused.status not in {429, 503}:
                     raise
+                failure = refused
             else:
                 return
         if self._ended.code != 1000:
@@ -272,8 +296,9 @@ class StreamClient:
     async def _connect(self) -> None:
         connection = await self._connected()
         try:
-            await connection.send(_text(self._opening))
-            opened = _event(await connection.recv())
+            async with asyncio.timeout(self._timeout):
+                await connection.send(_text(self._opening))
+                opened = _event(await connection.recv())
             if isinstance(opened, ProblemMessage):
                 raise StreamProblemError(opened)
             if not isinstance(opened, Opened):
@@ -291,6 +316,8 @@ class StreamClient:
             await connection.close()
             if isinstance(error, ConnectionClosed):
                 raise _closed(error) from None
+            if isinstance(error, TimeoutError):
+                raise self._unreachable(f"no answer within {self._timeout:g} s") from None
             raise
         self.limits = opened.limits
         self._connection = connection
@@ -312,8 +339,22 @@ class StreamClient:
             answer = refused.response
             headers = {name.lower(): value for name, value in answer.headers.raw_items()}
             raise problem_of(answer.status_code, headers, bytes(answer.body or b"")) from None
+        except TimeoutError:
+            raise self._unreachable(f"no answer within {self._timeout:g} s") from None
         except (OSError, InvalidHandshake) as error:
-            raise UnreachableError(f"cannot open a stream at {self._address}: {error}") from error
+            raise self._unreachable(str(error)) from error
+
+    def _unreachable(self, reason: str) -> UnreachableError:
+        parts = urlsplit(self._address)
+        # The message must not contain the user name and the password of the URL.
+        host = parts.netloc.rpartition("@")[2]
+        return UnreachableError(f"{parts.scheme}://{host}{parts.path}: {reason}")
+
+
+def _message(
+    kind: type[FormT], name: str, seq: int, objects: Objects, fields: dict[str, Any]
+) -> FormT:
+    return validated(kind, {"type": name, "seq": seq, "objects": list(objects), **fields})
 
 
 def _text(message: BaseModel) -> str:

@@ -47,6 +47,10 @@ The answer to a batch of 256 scenes with 4,096 relations each is smaller.
 """
 
 
+def _late(limit: float) -> str:
+    return f"The answer did not arrive within {limit:g} s."
+
+
 class Client:
     """A client of the scene-reasoning service.
 
@@ -282,6 +286,8 @@ class Client:
                 answer = self._attempt(call, left)
             except (TimeoutError, httpx.TimeoutException):
                 break
+            except DeadlineError as error:
+                raise DeadlineError(f"{_late(limit)} {error}", error.request_id) from None
             except (ProblemError, UnreachableError) as error:
                 pause = call.retry_pause(error, attempt)
                 if pause is None or attempt == retries or pause >= ends - monotonic():
@@ -292,7 +298,7 @@ class Client:
                 # If the client has read the answer only after the deadline, the call fails.
                 if monotonic() < ends:
                     return answer
-        raise DeadlineError(f"The answer did not arrive within {limit:g} s.")
+        raise DeadlineError(_late(limit))
 
     def _attempt(self, call: Call[T], left: float) -> T:
         """Send a call once and return the answer. The attempt takes at most `left` seconds."""

@@ -192,15 +192,17 @@ def vocabulary(answer: VocabularyAnswer) -> RenderableType:
     return _table("object", "also", "", rows=rows, title=title)
 
 
-def _table(*columns: str, rows: Iterable[Sequence[str]], title: str | None = None) -> Table:
+def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = None) -> Table:
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
-    for column in columns:
+    # Answers with `detail: scores` have no places and no reasons.
+    shown = [n for n in range(len(columns)) if not rows or any(row[n] for row in rows)]
+    for column in [columns[n] for n in shown]:
         numbers = column.startswith("probability") or column in {"log-odds", "log score"}
         # Only cells with the objects of a scene can be long. Other cells have short lines.
         width = 60 if column == "objects" else None
         table.add_column(column, justify="right" if numbers else "left", max_width=width)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*[row[n] for n in shown])
     return table
 
 

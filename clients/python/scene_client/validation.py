@@ -1,80 +1,89 @@
 """Conversion of pydantic's errors to messages with JSON pointers, for the service and its clients.
 
-Pointers are URI fragments (RFC 6901, section 6).
+Pointers are URI fragments (RFC 6901, section 6). The messages describe JSON values instead of
+Python types.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from difflib import get_close_matches
-from typing import Any, Final
+from typing import Any, Final, get_args
 from urllib.parse import quote
 
+from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from scene_client import schemas
-from scene_client.schemas import OBJECT_TAGS, FieldError
+from scene_client.schemas import OBJECT_TAGS, FieldError, OrArray, Request
 
 MAX_ERRORS: Final = 100
 """Maximum number of errors that the answer to a request lists."""
 
-_FIELDS: Final = sorted(
-    {
-        name
-        for value in vars(schemas).values()
-        if isinstance(value, type) and issubclass(value, schemas.Request)
-        for name in value.model_fields
-    }
-)
-# These messages replace pydantic's messages, which mention Python types.
+# Messages for pydantic's types of errors. The names in braces are members of pydantic's context.
 _MESSAGES: Final = {
-    "extra_forbidden": "unknown field",
-    "missing": "required",
-    "model_attributes_type": "must be an object",
-    "model_type": "must be an object",
-    "dict_type": "must be an object",
-    "list_type": "must be an array",
+    "missing": "this field is required",
+    "too_long": "must have at most {max_length} entries",
+    "too_short": "must not be empty",
+    "string_too_long": "must have at most {max_length} characters",
+    "string_too_short": "must not be empty",
+    "greater_than": "must be greater than {gt}",
+    "greater_than_equal": "must be at least {ge}",
+    "less_than_equal": "must be at most {le}",
+    "finite_number": "must be a finite number",
+}
+# Messages for values of a wrong type. A description of the value follows the message.
+_WRONG_TYPES: Final = {
+    "bool_type": "must be true or false",
+    "dict_type": "must be a JSON object",
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "list_type": "must be a JSON array",
+    "model_type": "must be a JSON object",
+    "object_kind": "must be a label or a JSON object with the field `label`",
+    "string_type": "must be a string",
+}
+_KINDS: Final = {
+    type(None): "null",
+    bool: "a boolean",
+    int: "a number",
+    float: "a decimal number",
+    str: "a string",
+    list: "an array",
+    tuple: "an array",
+    dict: "an object",
 }
 # A pointer contains a member name of the request only if this pattern matches the name. Otherwise
 # the pointer ends at the parent. So a request cannot put arbitrary text into an error.
-_PLAIN: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
+PLAIN: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _MARKS: Final = frozenset({*OBJECT_TAGS, "[key]"})
+# Indices of the members if an array replaces a relation, a pair or a place; see `OrArray`.
+_INDICES: Final = {"subject": 0, "relation": -2, "object": -1}
 
 
 def field_errors(
-    errors: Sequence[ErrorDetails],
+    error: ValidationError,
     body: Any,
+    form: type[Request],
     *,
     at: tuple[str | int, ...] = (),
-    skip: int = 0,
 ) -> list[FieldError]:
-    """Return the first `MAX_ERRORS` of pydantic's errors.
+    """Return the first `MAX_ERRORS` errors of a request.
 
     Args:
-        errors: validation errors in the format of pydantic.
+        error: the validation error of pydantic.
         body: the value that pydantic has validated.
+        form: the schema that ``body`` does not match.
         at: location of ``body`` in the request.
-        skip: number of names and indices to remove from the start of each error's location.
     """
     found = []
     # The limit also bounds the time, because suggestions for 100,000 unknown members take a minute.
-    for error in errors[:MAX_ERRORS]:
-        location = error["loc"][skip:]
-        unknown = str(location[-1]) if error["type"] == "extra_forbidden" else ""
-        found.append(
-            FieldError(
-                pointer=pointer(at) + pointer(location, body)[1:],
-                message=_MESSAGES.get(error["type"], error["msg"]),
-                suggestions=_like(unknown) if unknown else [],
-            )
-        )
+    for fault in error.errors(include_url=False)[:MAX_ERRORS]:
+        location = fault["loc"]
+        message, suggestions = _worded(fault, form)
+        where = pointer(at) + pointer(location, body)[1:]
+        found.append(FieldError(pointer=where, message=message, suggestions=suggestions))
     return found
-
-
-def _like(unknown: str) -> list[str]:
-    """Return names of fields of requests that are similar to an unknown name."""
-    return [name for name in get_close_matches(unknown[:64], _FIELDS) if name != unknown]
 
 
 def pointer(location: tuple[str | int, ...], body: Any = None) -> str:
@@ -84,20 +93,107 @@ def pointer(location: tuple[str | int, ...], body: Any = None) -> str:
         location: field names and list indices from the root. It may contain pydantic's marks for
             members of unions and for keys.
         body: the parsed request, or None. With this value, the pointer ends at an object that is
-            only a label, because a label has no members.
+            only a label, because a label has no members. In an array that replaces an object, the
+            pointer contains indices.
     """
     steps: list[str] = []
     value = body
     for step in location:
         if step in _MARKS:
             continue
-        if isinstance(value, str) or not _PLAIN.fullmatch(str(step)):
+        if value and isinstance(value, list | tuple) and step in _INDICES:
+            step = _INDICES[str(step)] % len(value)
+        if isinstance(value, str) or not PLAIN.fullmatch(str(step)):
             break
         steps.append(quote(str(step)))
         if isinstance(value, dict):
             value = value.get(step)
-        elif isinstance(value, list) and isinstance(step, int) and step < len(value):
+        elif isinstance(value, list | tuple) and isinstance(step, int) and step < len(value):
             value = value[step]
         else:
             value = None
     return "#" + "".join(f"/{step}" for step in steps)
+
+
+def listed(names: Iterable[str], last: str = "and") -> str:
+    """Return names as text, such as "`x`, `y` and `z`"."""
+    *others, final = [f"`{name}`" for name in names]
+    return f"{', '.join(others)} {last} {final}" if others else final
+
+
+def _worded(fault: ErrorDetails, form: type[Request]) -> tuple[str, list[str]]:
+    """Return the message for an error of pydantic, and similar known names."""
+    kind, value = fault["type"], fault["input"]
+    if kind == "extra_forbidden":
+        return _unknown_field(fault["loc"], form)
+    if kind == "literal_error":
+        choices = re.findall(r"'([^']*)'", fault["ctx"]["expected"])
+        return f"must be {listed(choices, 'or')}", _like(value, choices)
+    if (wanted := _WRONG_TYPES.get(kind)) is not None:
+        found = _KINDS.get(type(value)) or f"a {type(value).__name__}"
+        if kind == "model_type":
+            return f"{wanted}{_members(fault['loc'], form)}, not {found}", []
+        return f"{wanted}, not {found}", []
+    if (template := _MESSAGES.get(kind)) is not None:
+        context = fault.get("ctx", {})
+        return template.format(**{name: _plainly(bound) for name, bound in context.items()}), []
+    return fault["msg"], []
+
+
+def _unknown_field(location: Sequence[str | int], form: type[Request]) -> tuple[str, list[str]]:
+    part, _ = _part(location[:-1], form)
+    names = list(part.model_fields) if part is not None else []
+    similar = get_close_matches(str(location[-1])[:64], names)
+    if similar or not names:
+        return "unknown field", similar
+    return f"unknown field; this object has the fields {listed(names)}", []
+
+
+def _like(value: Any, choices: Sequence[str]) -> list[str]:
+    """Return the choices that share a word with a text, or that have a similar spelling."""
+    if not isinstance(value, str):
+        return []
+    text = value[:64].lower()
+    words = set(re.findall("[a-z]+", text))
+    shared = [choice for choice in choices if words & set(choice.split("-"))]
+    return shared[:3] or get_close_matches(text, choices, cutoff=0.7)
+
+
+def _members(location: Sequence[str | int], form: type[Request]) -> str:
+    """Return the required fields of the object at a location, as the end of a message."""
+    part, or_array = _part(location, form)
+    fields = {} if part is None else part.model_fields
+    required = [name for name, field in fields.items() if field.is_required()]
+    if not required:
+        return ""
+    text = f" with the field{'s' * (len(required) > 1)} {listed(required)}"
+    return f"{text} or an array of these {len(required)} values" if or_array else text
+
+
+def _part(location: Sequence[str | int], form: type[Request]) -> tuple[type[Request] | None, bool]:
+    """Return the schema of the object at a location, and whether an array may replace the object.
+
+    The schema is None if the value at the location is not an object with a schema.
+    """
+    part: type[Request] | None = form
+    or_array = False
+    for step in location:
+        # Other steps are indices, pydantic's marks and keys of dictionaries.
+        if part is not None and step in part.model_fields:
+            inner = list(_within(part.model_fields[str(step)].annotation))
+            or_array = any(isinstance(one, OrArray) for one in inner)
+            schemas = (one for one in inner if isinstance(one, type) and issubclass(one, Request))
+            part = next(schemas, None)
+    return part, or_array
+
+
+def _within(annotation: Any) -> Iterator[Any]:
+    """Yield an annotation and all annotations that it contains."""
+    yield annotation
+    for inner in get_args(annotation):
+        yield from _within(inner)
+
+
+def _plainly(bound: Any) -> Any:
+    """Return a bound without the decimal places of a whole number."""
+    return int(bound) if isinstance(bound, float) and bound.is_integer() else bound

@@ -11,9 +11,11 @@ from pydantic import Field
 from scene_client.schemas.answers import Answer, Because, Reply
 from scene_client.schemas.requests import (
     Body,
+    Detail,
     Finite,
     Label,
     Name,
+    OrArray,
     Probability,
     RelationName,
     Request,
@@ -52,8 +54,12 @@ class MissingOptions(Request):
         ),
     ] = None
     at: Annotated[
-        Anchor | None, Field(description="limit the answer to objects missing at this place")
+        Annotated[Anchor, OrArray()] | None,
+        Field(description="limit the answer to objects missing at this place"),
     ] = None
+    detail: Annotated[
+        Detail, Field(description="`scores` leaves `placements` and `because` out of the answer")
+    ] = "full"
 
 
 class MissingRequest(MissingOptions, SceneRequest):
@@ -97,9 +103,9 @@ class Placement(Reply):
     offset: Annotated[
         Offset | None,
         Field(
-            description="offset from `object` in metres. The offset is absent if the training "
-            "scenes have no poses. It is also absent for left, right, front and behind in a map, "
-            "odom or world frame without a viewpoint"
+            description="offset from `object` in metres. The offset is absent if `object` has no "
+            "position, or if the training scenes have no poses. It is also absent for left, right, "
+            "front and behind in a map, odom or world frame without a viewpoint"
         ),
     ] = None
 
@@ -114,14 +120,20 @@ class MissingObject(Reply):
     label: str
     probability: Probability
     log_odds: Finite
-    placements: list[Placement]
+    placements: Annotated[
+        list[Placement],
+        Field(
+            description="the likeliest place, and at most 2 further places that are at least 3/4 "
+            "as probable. With `at`, this place comes first"
+        ),
+    ] = []
     because: Annotated[
         list[Because],
         Field(
-            description="the objects that change the log-odds most, largest change first, at most "
-            "3. Only the first 32 classes of the answer have this list"
+            description="objects that change the odds by a factor of at least 3, largest change "
+            "first, at most 3. Only the first 32 classes of the answer have reasons"
         ),
-    ]
+    ] = []
 
 
 class MoreInstances(Reply):
@@ -170,3 +182,4 @@ class MissingFields(SceneFields, total=False):
     top_k: int
     candidates: Iterable[str]
     at: Anchor | Body | tuple[RelationName, str]
+    detail: Detail

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from scene_client.schemas.answers import Answer, Because, Reply, ScoredRelation
 from scene_client.schemas.requests import (
+    Detail,
     Finite,
     Probability,
     Request,
@@ -37,6 +38,9 @@ class OutliersOptions(Request):
             "`sensitivity`",
         ),
     ] = None
+    detail: Annotated[
+        Detail, Field(description="`scores` leaves `because` and `usually_with` out of the answer")
+    ] = "full"
 
 
 class OutliersRequest(OutliersOptions, SceneRequest):
@@ -64,7 +68,7 @@ class Outlier(Reply):
             description="other objects that explain `is_outlier`, largest effect first, at most "
             "3. For an outlier, they lower its log-odds. Otherwise, they raise its log-odds"
         ),
-    ]
+    ] = []
     usually_with: Annotated[
         list[str],
         Field(description="for an outlier: absent classes that would make it likely, at most 3"),
@@ -99,3 +103,4 @@ class OutliersFields(SceneFields, total=False):
 
     sensitivity: Sensitivity
     threshold: float
+    detail: Detail

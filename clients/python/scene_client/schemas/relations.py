@@ -12,6 +12,7 @@ from scene_client.schemas.answers import Answer, ScoredRelation
 from scene_client.schemas.requests import (
     Body,
     Name,
+    OrArray,
     Probability,
     RelationName,
     Request,
@@ -36,7 +37,7 @@ class RelationsOptions(Request):
         Probability, Field(description="minimum probability of the relations in the answer")
     ] = 0.0
     pairs: Annotated[
-        list[Pair] | None,
+        list[Annotated[Pair, OrArray()]] | None,
         Field(
             min_length=1,
             max_length=4096,

@@ -17,11 +17,15 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
     Tag,
     WrapValidator,
     model_validator,
 )
+from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import PydanticCustomError
+from pydantic_core.core_schema import CoreSchema, no_info_before_validator_function
 
 MAX_BATCH = 256
 MAX_SEED = 2**63 - 1
@@ -32,6 +36,7 @@ The validation of a million invalid relations would take seconds.
 """
 
 UnknownLabels = Literal["error", "ignore", "nearest"]
+Detail = Literal["scores", "full"]
 RelationName = Literal["left", "right", "front", "behind", "on-top", "under", "above", "below"]
 
 
@@ -59,6 +64,41 @@ class Request(BaseModel):
     """Base class of all parts of a request. Validation refuses unknown fields and wrong types."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+
+class OrArray:
+    """Annotation of an object that a request may also state as an array of its values.
+
+    For example, `["lamp", "on-top", "desk"]` stands for a `Relation`.
+    """
+
+    def __get_pydantic_core_schema__(
+        self, source: type[BaseModel], handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Return a schema that converts an array of the values to an object."""
+        names = tuple(source.model_fields)
+
+        def spelt_out(value: Any) -> Any:
+            if isinstance(value, list | tuple) and len(value) == len(names):
+                return dict(zip(names, value, strict=True))
+            return value
+
+        return no_info_before_validator_function(spelt_out, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """Return a JSON schema with both forms."""
+        spelt_out = handler(schema)
+        members = handler.resolve_ref_schema(spelt_out)["properties"]
+        array = {
+            "type": "array",
+            "description": ", ".join(members),
+            "prefixItems": list(members.values()),
+            "minItems": len(members),
+            "maxItems": len(members),
+        }
+        return {"anyOf": [spelt_out, array]}
 
 
 # ------------------------------------------------------------------------------------ a scene
@@ -93,7 +133,10 @@ class Quaternion(Request):
         # tf2 allows the same deviation from length 1. A ROS message whose orientation is unset has
         # an all-zero quaternion.
         if abs(math.hypot(self.x, self.y, self.z, self.w) - 1) > 0.01:
-            raise PydanticCustomError("unit_quaternion", "must be a unit quaternion (length 1)")
+            raise PydanticCustomError(
+                "unit_quaternion",
+                "must be a unit quaternion (length 1). Leave an unknown orientation out",
+            )
         return self
 
 
@@ -159,7 +202,7 @@ SceneObject = Annotated[
     Discriminator(
         _kind_of_object,
         custom_error_type="object_kind",
-        custom_error_message="must be a label or an object with a label",
+        custom_error_message="must be a label or a JSON object with the field `label`",
     ),
 ]
 
@@ -183,7 +226,7 @@ class SceneRequest(Request):
         Field(max_length=256, description="labels or detections, at most 256"),
     ]
     relations: Annotated[
-        list[Relation] | None,
+        list[Annotated[Relation, OrArray()]] | None,
         Field(
             max_length=MAX_RELATIONS,
             # Validation stops at the first invalid relation. A list of all errors would need a
