@@ -37,7 +37,7 @@ from training.domain.command import example, fail, init
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.evaluation.tasks import in_words
-from training.example_scenes import read_examples
+from training.example_scenes import known_examples, read_examples
 from training.experiments.ablate import ablate
 from training.experiments.benchmark import benchmark
 from training.experiments.compare import compare_command, show
@@ -270,9 +270,11 @@ def list_command(store: StorePath = _STORE) -> None:
 def _prepare(config: Config, data: Path) -> SplitScenes:
     with console.status("reading and encoding scenes"):
         scenes = prepare(config, data)
-    examples = read_examples(config.examples, data, scenes.vocabulary)
+    examples, reasons = known_examples(read_examples(config.examples, data), scenes.vocabulary)
     sizes = ", ".join(f"{len(some)} {part}" for part, some in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
+    for reason in reasons:
+        console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
     return replace(scenes, examples=examples)
 
 

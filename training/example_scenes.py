@@ -33,18 +33,16 @@ _MOST_RELATIONS: Final = 32
 _FEWEST_CLASSES: Final = 3
 
 
-def read_examples(reference: str, root: Path, vocabulary: Vocabulary) -> tuple[Example, ...]:
+def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
     """Read the examples of a configuration.
 
     Args:
         reference: entry `examples` of the configuration: the name of a shipped file, or a file in
             `root` that ends in .json. An empty text means no examples.
         root: data folder of the configuration.
-        vocabulary: vocabulary of the model.
 
     Raises:
-        ConfigError: the file is missing or invalid, or an example has a label or a room type that
-            the vocabulary lacks.
+        ConfigError: the file is missing or invalid.
     """
     if not reference:
         return ()
@@ -52,18 +50,33 @@ def read_examples(reference: str, root: Path, vocabulary: Vocabulary) -> tuple[E
     path = root / reference if is_file else _SHIPPED / f"{reference}.json"
     try:
         examples: tuple[Example, ...] = _READER.validate_json(path.read_bytes())
-        for example in examples:
-            example.require_known(vocabulary)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
         raise ConfigError(f"{path}, {place}: {first['msg']}") from error
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise ConfigError(
-            f"{path} cannot be used: {error}. Edit this file, or remove the entry `examples` of "
-            "the configuration"
+            f"{path} cannot be read: {error}. Remove the entry `examples` of the configuration, or "
+            "provide the file"
         ) from error
     return examples
+
+
+def known_examples(
+    examples: Sequence[Example], vocabulary: Vocabulary
+) -> tuple[tuple[Example, ...], list[str]]:
+    """Return the examples whose labels and room type are in a vocabulary.
+
+    Also return the reason for each example that is left out.
+    """
+    kept, reasons = [], []
+    for example in examples:
+        try:
+            example.require_known(vocabulary)
+            kept.append(example)
+        except ValueError as error:
+            reasons.append(str(error))
+    return tuple(kept), reasons
 
 
 def examples_json(examples: Sequence[Example]) -> str:

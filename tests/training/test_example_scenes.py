@@ -13,7 +13,12 @@ from scene_client.schemas import SceneRequest
 from training.config import ConfigError
 from training.datasets import generate_rooms, source_vocabulary
 from training.datasets.rooms import WORKPLACES
-from training.example_scenes import choose_examples, examples_json, read_examples
+from training.example_scenes import (
+    choose_examples,
+    examples_json,
+    known_examples,
+    read_examples,
+)
 
 SCENES = generate_rooms(60, 0, WORKPLACES)
 WORDS = source_vocabulary(SCENES, minimum=2)
@@ -28,7 +33,7 @@ def test_chosen_scenes_are_requests_in_the_models_words_and_read_back(tmp_path) 
         assert len({thing.label for thing in request.objects}) >= 3
         assert all(thing.label in WORDS.labels and thing.position for thing in request.objects)
     (tmp_path / "examples.json").write_text(examples_json(chosen))
-    assert read_examples("examples.json", tmp_path, WORDS) == chosen
+    assert read_examples("examples.json", tmp_path) == chosen
 
 
 def test_supports_become_relations_where_there_are_no_positions() -> None:
@@ -51,10 +56,9 @@ def test_research_only_scenes_are_never_chosen() -> None:
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (None, "cannot be used"),
+        (None, "cannot be read"),
         ("{", "Invalid JSON"),
-        ([{"name": "a", "scene": {"objects": ["bed", "unicorn"]}}], "no class 'unicorn'"),
-        ([{"name": "a", "scene": {"objects": ["bed"], "room_type": "cave"}}], "room type 'cave'"),
+        ([{"name": "a", "scene": {"objects": [{"id": "bed"}]}}], "label: Field required"),
         ([{"name": "a", "scene": {"objects": ["bed"]}}] * 9, "at most 8 items"),
     ],
 )
@@ -63,7 +67,19 @@ def test_an_unusable_file_is_named_with_the_reason(tmp_path, content, reason) ->
         text = content if isinstance(content, str) else json.dumps(content)
         (tmp_path / "mine.json").write_text(text)
     with pytest.raises(ConfigError, match=rf"mine\.json.*{reason}"):
-        read_examples("mine.json", tmp_path, Vocabulary([ObjectClass("bed")], ["bedroom"]))
+        read_examples("mine.json", tmp_path)
+
+
+def test_examples_beyond_an_edited_vocabulary_are_left_out_with_the_reason() -> None:
+    scenes = (
+        {"objects": ["bed"], "room_type": "bedroom"},
+        {"objects": ["bed", "unicorn"]},
+        {"objects": ["bed"], "room_type": "cave"},
+    )
+    examples = [Example.model_validate({"name": "a", "scene": scene}) for scene in scenes]
+    kept, reasons = known_examples(examples, Vocabulary([ObjectClass("bed")], ["bedroom"]))
+    assert kept == (examples[0],)
+    assert ["'unicorn'" in reasons[0], "'cave'" in reasons[1]] == [True, True]
 
 
 def test_a_label_alone_is_an_object() -> None:
