@@ -40,7 +40,7 @@ from tests.docs.conftest import Workplace
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 BLOCKS = {page.relative_to(REPOSITORY).as_posix(): list(blocks(page)) for page in PAGES}
 EVERY = [block for found in BLOCKS.values() for block in found]
-RUN_BY = {"docs/training.md": "tests/training/test_own_scenes.py"}
+RUN_BY = {"docs/training.md": "scripts/walk.py"}
 """Pages whose code takes minutes, or a place of its own, and the tests that run it there."""
 WITH_CODE = [
     name
