@@ -30,7 +30,7 @@ from training.datasets.sources import SOURCES
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.evaluation.tasks import STATISTICS
-from training.example_scenes import read_examples
+from training.example_scenes import known_examples, read_examples
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
 from training.offsets import fit_offsets
@@ -141,7 +141,9 @@ def refit(
     data, named = config.data, config.examples
     if manifest.name in shipped_configs():
         named = load_config(manifest.name).examples
-    examples = read_examples(named, root, artifact.vocabulary)
+    examples, reasons = known_examples(read_examples(named, root), artifact.vocabulary)
+    for reason in reasons:
+        progress(reason)
     progress("reading scenes")
     annotated = read_sources(data, root)
     scenes = split_and_encode(data, annotated, artifact.vocabulary, root)

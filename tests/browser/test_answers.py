@@ -69,6 +69,17 @@ def test_missing_objects_are_listed_with_their_places(bedroom: Board, api: httpx
     assert set(bedroom.ghosts) <= {one["label"] for one in answer["missing"]}
 
 
+def test_further_instances_are_listed_after_the_missing_objects(
+    open_board: OpenBoard, api: httpx.Client
+) -> None:
+    board = open_board(
+        {"objects": ["table", "chair", "chair", "whiteboard"], "room_type": "office"}
+    )
+    (more,) = ask(api, "missing", board.scene)["more"]
+    expected = f"2 listed, about {more['expected_count']:.0f} expected"
+    assert board.rows("missing")[5:] == [f"another chair {percent(more['probability'])} {expected}"]
+
+
 def test_a_ghost_becomes_an_object_where_it_was_drawn(bedroom: Board) -> None:
     ghost = bedroom.page.locator("#board .ghost").first
     label = ghost.locator("text").text_content() or ""

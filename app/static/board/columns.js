@@ -44,7 +44,7 @@ const row = (kind, words, probability, flag, ...more) =>
 const ROWS = {
   missing(answer, state, store, column) {
     const ghosts = new Map(column === state.shown ? ghostsOf(state).map((ghost) => [ghost.label, ghost]) : []);
-    return answer.missing.map(({ label, probability, placements, because = [] }) => {
+    const rows = answer.missing.map(({ label, probability, placements, because = [] }) => {
       const ghost = ghosts.get(label);
       const places = placements.slice().sort((a, b) => (b === ghost?.placement) - (a === ghost?.placement)).slice(0, PLACES)
         .map((one) => `${SPOKEN[one.relation]} ${one.object} ${percent(one.probability)}`);
@@ -57,6 +57,11 @@ const ROWS = {
       return row('missing', el('b', {}, label), probability, { button },
         places.length ? el('p', { class: 'quiet' }, places.join(' · ')) : null, reasons(because));
     });
+    // An answer about chosen classes also has improbable instances.
+    const further = answer.more.filter((one) => one.probability >= 0.5).map((one) =>
+      row('missing', el('b', {}, `another ${one.label}`), one.probability, {},
+        el('p', { class: 'quiet' }, `${one.listed_count} listed, about ${Math.round(one.expected_count)} expected`)));
+    return [...rows, ...further];
   },
 
   outliers(answer, state, store) {
