@@ -38,7 +38,7 @@ SETTLED = 1200  # milliseconds until the page shows all answers
 
 
 class WalkError(Exception):
-    """A step of the walk did not do what it should."""
+    """A step of the walk failed."""
 
 
 def require(condition: object, reason: str) -> None:
@@ -98,7 +98,7 @@ class Walk:
         """Take all steps.
 
         Raises:
-            WalkError: a step did not do what it should.
+            WalkError: a step failed.
         """
         self.first_answer()
         self.own_model()

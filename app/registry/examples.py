@@ -122,7 +122,7 @@ class ExampleScene(Frozen):
         for relation in self.relations:
             for name in (relation.subject, relation.object):
                 if name not in names:
-                    raise ValueError(f"a relation names {name!r}, which is no object of the scene")
+                    raise ValueError(f"a relation names {name!r}, but the scene has no such object")
         return self
 
 
