@@ -32,7 +32,7 @@ from typing import Any
 from playwright.sync_api import Browser, Page, sync_playwright
 
 ROOT = Path(__file__).resolve().parent.parent
-ADMIN_KEY = "the-key-of-this-walk"
+FOLLOWS = 8.0  # seconds in which a service follows a change of its store
 START_TIMEOUT = 900.0
 SETTLED = 1200  # milliseconds until the page shows all answers
 
@@ -172,8 +172,8 @@ class Walk:
         )
         require(self._served() == "my-lab@1.1.0", "the second version is not promoted")
         with self._service(["python", "-m", "app"], "my-store") as url:
-            target = {"model": "my-lab@1.0.0", "expected": "my-lab@1.1.0"}
-            self._ask(url, "models/aliases/default", target, method="PUT")
+            self._command("python -m app.registry alias default my-lab@1.0.0 --store my-store")
+            time.sleep(FOLLOWS)
             answer = self._ask(url, "missing", {"objects": ["multimeter"], "top_k": 1})
             require(answer["model"]["version"] == "1.0.0", "the first version is not served")
 
@@ -211,7 +211,7 @@ class Walk:
     def _service(self, command: list[str], store: str | None = None) -> Iterator[str]:
         """Run the service; yield its URL when it is ready."""
         port = _free_port()
-        variables = {"SCENE_PORT": str(port), "PORT": str(port), "SCENE_ADMIN_KEY": ADMIN_KEY}
+        variables = {"SCENE_PORT": str(port), "PORT": str(port)}
         if store is not None:
             variables["SCENE_STORE"] = str(self._work / store)
         if command[0] == "python":
@@ -243,12 +243,12 @@ class Walk:
             process.wait(60)
 
     def _ask(
-        self, url: str, path: str, body: dict[str, Any], *, status: int = 200, method: str = "POST"
+        self, url: str, path: str, body: dict[str, Any], *, status: int = 200
     ) -> dict[str, Any]:
         """Send a request as curl does, and return the answer."""
         text = json.dumps(body)
-        headers = {"Content-Type": "application/json", "X-Admin-Key": ADMIN_KEY}
-        request = urllib.request.Request(f"{url}/{path}", text.encode(), headers, method=method)
+        headers = {"Content-Type": "application/json"}
+        request = urllib.request.Request(f"{url}/{path}", text.encode(), headers)
         started = time.monotonic()
         try:
             with urllib.request.urlopen(request, timeout=30) as response:
@@ -257,7 +257,7 @@ class Walk:
             found, content = error.code, error.read()
         answer: dict[str, Any] = json.loads(content)
         shown = json.dumps(answer, indent=1, ensure_ascii=False)
-        self._record.block(f"{method} /{path} {text}", shown, time.monotonic() - started)
+        self._record.block(f"POST /{path} {text}", shown, time.monotonic() - started)
         require(found == status, f"/{path} has status {found}: {shown}")
         return answer
 

@@ -167,8 +167,8 @@ def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: C
     elif advice := _advice(result):
         console.print(advice, soft_wrap=True)
     console.print(
-        f"next: python -m training compare {folder}\n"
-        f"      python -m training publish {folder} 1.0.0 --promote",
+        f"next: python -m training compare {folder} --store my-store\n"
+        f"      python -m training publish {folder} 1.0.0 --store my-store --promote",
         soft_wrap=True,
         highlight=False,
     )

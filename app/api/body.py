@@ -130,7 +130,7 @@ def parse(body: bytes) -> Any:
             # The message of the parser contains the reason and the position, but never the input.
             detail = (
                 f"The body is not valid JSON: {error}. Strings and names need double quotes. "
-                "Comments, trailing commas, None and True are not JSON."
+                "Comments, trailing commas, NaN, None and True are not JSON."
             )
         raise ProblemError(catalogue.NOT_JSON, detail, errors=errors) from None
 

@@ -1,4 +1,4 @@
-"""``python -m app.registry``: publish to a remote store, move its aliases, revoke versions.
+"""``python -m app.registry``: move aliases of a store, publish to a remote store, revoke versions.
 
 SCENE_STORE replaces --store. SCENE_SIGNING_KEY is the PEM file of the signing key, and
 SCENE_TRUSTED_KEYS lists public keys. A publisher trusts its own key.
@@ -27,38 +27,38 @@ def main(arguments: list[str] | None = None) -> int:
         if asked.command == "key":
             _say(f"public key for SCENE_TRUSTED_KEYS: {Signer.create(Path(asked.file)).public}")
             return 0
-        _run(asked, _remote(asked.store))
+        _run(asked, open_for_publisher(asked.store or os.environ.get("SCENE_STORE", "")))
     except RegistryError as error:
         sys.stderr.write(f"{error.reason}\n")
         return 1
     return 0
 
 
-def _run(asked: argparse.Namespace, remote: RemoteStore) -> None:
+def _run(asked: argparse.Namespace, store: Store) -> None:
     if asked.command == "upload":
-        local = Store(asked.source)
+        remote, local = _remote(store), Store(asked.source)
         for reference in asked.references:
             artifact = local.load(*local.resolve(reference))
             remote.upload(artifact, asked.alias)
             _say(f"{artifact.manifest.name}@{artifact.manifest.version} is published")
     elif asked.command == "alias":
-        remote.set_alias(asked.alias, _target(asked.target))
+        store.set_alias(asked.alias, _target(asked.target))
         _say(f"alias '{asked.alias}' points at {asked.target}")
     elif asked.command == "remove-alias":
-        remote.remove_alias(asked.alias)
+        store.remove_alias(asked.alias)
         _say(f"alias '{asked.alias}' is removed")
     elif asked.command == "revoke":
         target = _target(asked.reference)
         if target.version is None:
             raise StoreError("invalid_reference", "give the version to revoke as name@version")
-        remote.revoke(target.name, target.version, asked.reason)
+        _remote(store).revoke(target.name, target.version, asked.reason)
         _say(f"{asked.reference} is revoked")
     else:
-        _list(remote)
+        _list(store)
 
 
-def _list(remote: RemoteStore) -> None:
-    models = load_model_set(remote)
+def _list(store: Store) -> None:
+    models = load_model_set(store)
     for name, version in models.entries:
         failure = models.failures.get((name, version))
         state = "" if failure is None else f"  refused: {failure.code}: {failure.reason}"
@@ -67,8 +67,7 @@ def _list(remote: RemoteStore) -> None:
         _say(f"{alias} -> {target}")
 
 
-def _remote(location: str | None) -> RemoteStore:
-    store = open_for_publisher(location or os.environ.get("SCENE_STORE", ""))
+def _remote(store: Store) -> RemoteStore:
     if not isinstance(store, RemoteStore):
         raise StoreError("invalid_reference", "--store must be a URL: s3://, gs:// or az://")
     return store
@@ -88,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     key = commands.add_parser("key", help="create a signing key and print its public key")
     key.add_argument("file", help="new PEM file")
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--store", help="URL of the remote store")
+    common.add_argument("--store", help="folder or URL of the store")
 
     def add(name: str, text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, parents=[common])

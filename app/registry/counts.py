@@ -75,7 +75,11 @@ class Counts:
     def _complaint(self, V: int, C: int) -> str | None:
         if not np.issubdtype(self.classes.dtype, np.integer):
             return "classes must be integers"
-        if not len(self.classes) or self.classes[0] < 0 or (np.diff(self.classes) <= 0).any():
+        for name in ("log_share", "weights"):
+            if not np.issubdtype(getattr(self, name).dtype, np.floating):
+                return f"{name} must be floating-point numbers"
+        ascending = (self.classes[1:] > self.classes[:-1]).all()
+        if not len(self.classes) or self.classes[0] < 0 or not ascending:
             return "classes must be non-negative, in ascending order, and at least one"
         if (self.classes[-1:] >= V).any():
             return "the tensor 'classes' has a class that the model does not have"

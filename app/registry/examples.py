@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Annotated, Any, Final, Self
 
 from pydantic import AfterValidator, Field, StringConstraints, field_validator, model_validator
@@ -110,7 +109,7 @@ class ExampleScene(Frozen):
     @field_validator("objects", mode="before")
     @classmethod
     def _labels_are_objects(cls, values: Any) -> Any:
-        if not isinstance(values, Sequence) or len(values) > MAX_OBJECTS:
+        if not isinstance(values, list | tuple) or len(values) > MAX_OBJECTS:
             return values
         return [{"label": value} if isinstance(value, str) else value for value in values]
 
@@ -120,6 +119,8 @@ class ExampleScene(Frozen):
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two objects are called {twice[0]!r}: give each an id of its own")
         for relation in self.relations:
+            if relation.subject == relation.object:
+                raise ValueError(f"a relation has {relation.subject!r} at both ends")
             for name in (relation.subject, relation.object):
                 if name not in names:
                     raise ValueError(f"a relation names {name!r}, but the scene has no such object")

@@ -335,6 +335,11 @@ class Runtime:
 
     def _serve(self, models: ServedModels) -> None:
         unchanged = self._models is not None and self._models.served == models.served
+        if self._models is not None:
+            before = self._models.store.aliases
+            for alias, target in models.store.aliases.items():
+                if before.get(alias) != target:
+                    _logger.info("the alias %s names %s now", alias, target)
         self._models = models
         self.metrics.serving(models)
         if not unchanged:

@@ -63,7 +63,7 @@ def main() -> None:
     arguments = bridge.options("Answer questions about detections over DDS.")
     arguments.add_argument("detections", help="topic of a vision_msgs/Detection3DArray")
     arguments.add_argument("--answers", default="/scene/answers", help="topic of the answers")
-    arguments.add_argument("--domain", type=int, default=os.environ.get("ROS_DOMAIN_ID", "0"))
+    arguments.add_argument("--domain", type=int, default=os.environ.get("ROS_DOMAIN_ID") or 0)
     given = arguments.parse_args()
     try:
         participant = DomainParticipant(given.domain)

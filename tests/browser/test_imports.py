@@ -50,7 +50,9 @@ def test_detections_are_read_as_the_client_reads_them(
 def test_labels_and_flat_detections_are_read(open_board: OpenBoard) -> None:
     board = open_board()
     board.put('["bed", "lamp", "lamp"]')
-    assert board.things == ["bed", "lamp", "lamp_2"]
+    assert board.things == ["bed", "lamp_1", "lamp_2"]
+    board.put('{"objects": ["desk", "lamp"], "relations": [["lamp", "on-top", "desk"]]}')
+    assert board.scene["relations"] == [{"subject": "lamp", "relation": "on-top", "object": "desk"}]
     seen = {"results": [{"hypothesis": {"class_id": "mug", "score": 0.5}}], "bbox": {"size_x": 9}}
     board.put(json.dumps({"detections": [seen, seen]}))
     assert board.scene["objects"] == [

@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from app.scene import label_key
 from training.domain.proposal import Proposal
 
 # Maximum number of rows of a printed table. The JSON report contains all rows.
@@ -75,6 +76,11 @@ def _labels(proposal: Proposal, console: Console) -> None:
         spellings = ", ".join(label.spellings[:4])
         table.add_row(label.name, str(label.mentions), str(label.scenes), spellings)
     console.print(table)
+    renamed = [label for label in labels if label_key(label.name) != label_key(label.spellings[0])]
+    if renamed:
+        console.print("renamed by built-in synonyms; vocabulary.json contains the names:")
+        for label in renamed[:ROWS]:
+            console.print(f"  {label.spellings[0]} → {label.name}", markup=False)
     varied = [label for label in labels if len(label.spellings) > 1]
     if varied:
         console.print(f"{len(varied)} labels have several spellings; each counts as one label:")

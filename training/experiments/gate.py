@@ -114,6 +114,9 @@ def measure_usefulness(
     """
     complete = data.test.complete.nonzero().squeeze(1)
     scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, limit)
+    # A question hides one class and lists at least one other class.
+    usable = ((scenes.v > 0) & ~data.structure).sum(1) > 1
+    scenes = subset(scenes, usable.nonzero().squeeze(1))
     groups = [scene.group for scene in scenes.scenes]
     size = len(scenes), len(set(groups))
     if len(set(groups)) < FEWEST_GROUPS:
@@ -122,15 +125,12 @@ def measure_usefulness(
     def mrr(score: ObjectScore) -> Ratio:
         return leave_one_out(scenes, data.structure, score).mrr()
 
-    try:
-        ours = mrr(MachineScore(machine_of(artifact.weights)))
-        theirs = {}
-        for name in (POPULARITY, CO_OCCURRENCE):
-            say(f"fitting {name}")
-            fitted = BASELINES[name].fit(data.train, data.validation, data.structure)
-            theirs[name] = mrr(fitted.score)
-    except ValueError:  # no scene has two classes
-        return Usefulness(*size)
+    ours = mrr(MachineScore(machine_of(artifact.weights)))
+    theirs = {}
+    for name in (POPULARITY, CO_OCCURRENCE):
+        say(f"fitting {name}")
+        fitted = BASELINES[name].fit(data.train, data.validation, data.structure)
+        theirs[name] = mrr(fitted.score)
     return Usefulness(
         *(*size, ours.value),
         {name: other.value for name, other in theirs.items()},

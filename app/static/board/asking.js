@@ -25,7 +25,9 @@ export function startAsking(store) {
     const place = `${column}/${question}`;
     const body = bodyOf(state, question, state.models[column]);
     const text = JSON.stringify([body, state.epoch]);
-    if (under.get(place)?.text === text) return;
+    // A change of the model clears its answers.
+    const isAsked = Boolean(state.answers[column][question]?.status);
+    if (isAsked && under.get(place)?.text === text) return;
     under.get(place)?.controller.abort();
     const controller = new AbortController();
     under.set(place, { text, controller });

@@ -100,12 +100,14 @@ export function createGeneration(form, drawn, store, say) {
   });
   document.getElementById('discard').addEventListener('click', discard);
   document.getElementById('keep').addEventListener('click', () => {
-    const { things } = store.get().draft;
+    const { draft: { things, fresh }, relations } = store.get();
     if (things.length > MOST_OBJECTS) {
       store.set({ complaint: FULL });
       return;
     }
-    store.edit({ things, draft: null, tab: 'missing' });
+    // A relation that the user stated does not hold for a generated object with the same name.
+    const stated = relations.filter(({ subject, object }) => !fresh.has(subject) && !fresh.has(object));
+    store.edit({ things, relations: stated, draft: null, tab: 'missing', at: null });
     say(`The generated scene is on the board: ${things.length} objects.`);
   });
 

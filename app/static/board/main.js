@@ -144,7 +144,10 @@ store.subscribe((state, previous) => {
 
 combobox(get('search'), get('found'), () => store.get().words[store.get().models[0]]?.objects ?? [],
   (label) => actions.add(label));
-fileDialog(store, put, say);
+fileDialog(store, (scene) => {
+  put(scene);
+  if (!store.get().down) get('banner').hidden = true; // such as that of a broken link
+}, say);
 watchService(store, get('banner'), () => void reload());
 
 /** Lists the examples of the first model. */

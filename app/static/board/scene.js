@@ -81,7 +81,8 @@ export function fromScene(scene, sizes) {
   fail(!Array.isArray(scene.objects), 'A scene must have a list "objects".');
   fail(scene.objects.length > MOST_OBJECTS, `A scene can have at most ${MOST_OBJECTS} objects.`);
   const things = [];
-  scene.objects.forEach((entry, index) => things.push(readThing(entry, index, things, sizes)));
+  const ids = idsOf(scene.objects);
+  scene.objects.forEach((entry, index) => things.push(readThing(entry, ids[index], index, things, sizes)));
   const optical = /_optical(_frame)?$/.test(scene.frame_id ?? '');
   // In the optical frame of a camera, x and y have other directions than on the board.
   if (optical) for (const thing of things) thing.placed = false;
@@ -95,29 +96,48 @@ export function fromScene(scene, sizes) {
   return { things, viewer: { x, y, yaw }, room, relations: relations.map(readRelation(things)), optical };
 }
 
-/** Reads relations, whose ends are ids or labels. */
+/** Reads relations, as objects or arrays. Their ends are ids or unambiguous labels. */
 function readRelation(things) {
-  const names = new Map(things.map((thing) => [thing.label, thing.id]).reverse());
+  const names = new Map();
+  for (const { id, label } of things) names.set(label, names.has(label) ? null : id);
   for (const { id } of things) names.set(id, id);
   return (found, index) => {
     const where = `Relation ${index + 1}`;
     fail(!found || typeof found !== 'object', `${where} must have a subject, a relation and an object.`);
-    const { subject, relation, object } = found;
+    const [subject, relation, object] = Array.isArray(found) ? found : [found.subject, found.relation, found.object];
     fail(!Object.hasOwn(SPOKEN, relation), `${where} must be one of ${Object.keys(SPOKEN).join(', ')}.`);
-    for (const name of [subject, object]) fail(!names.has(name), `${where} names an object outside the scene: ${name}.`);
+    for (const name of [subject, object]) {
+      fail(!names.has(name), `${where} names an object outside the scene: ${name}.`);
+      fail(names.get(name) === null, `${where} needs an id, because several objects have the label ${name}.`);
+    }
     return { subject: names.get(subject), relation, object: names.get(object) };
   };
 }
 
-function readThing(entry, index, before, sizes) {
+/** The ids of objects as in the service: a repeated label without an id gets numbers from 1. */
+function idsOf(entries) {
+  const found = entries.map((entry) => (typeof entry === 'string' ? { label: entry } : entry ?? {}));
+  const bare = found.filter(({ id }) => id == null).map(({ label }) => label);
+  const taken = new Set(found.map(({ id }) => id).filter((id) => id != null));
+  return found.map(({ id, label }) => {
+    if (id != null) return id;
+    let own = label;
+    if (bare.indexOf(label) !== bare.lastIndexOf(label)) taken.add(label);
+    for (let number = 1; taken.has(own); number += 1) own = `${label}_${number}`;
+    taken.add(own);
+    return own;
+  });
+}
+
+function readThing(entry, id, index, before, sizes) {
   const found = typeof entry === 'string' ? { label: entry } : entry;
   const where = `Object ${index + 1}`;
   fail(!found || typeof found !== 'object', `${where} must be a label or a JSON object.`);
   fail(typeof found.label !== 'string' || !found.label.trim(), `${where} needs a label.`);
-  const id = found.id ?? freshId(before, found.label);
-  fail(typeof id !== 'string' || !id, `${where} has an id that is not a text.`);
+  fail(typeof id !== 'string' || !id.trim() || id.startsWith('\u0000'), `${where} has an id that is not a text.`);
   fail(before.some((thing) => thing.id === id), `${where} has the id of another object: ${id}.`);
-  const { position, size = null, orientation: q, confidence = 1 } = found;
+  const { position, size = null, orientation: q } = found;
+  const confidence = found.confidence ?? 1;
   fail(position && !AXES.every((axis) => isPlace(position[axis])), `${where} needs a position with numbers x, y, z within ±100 000 km.`);
   fail(size && !AXES.every((axis) => isExtent(size[axis])), `${where} needs a size with positive numbers x, y, z of at most 10 km.`);
   fail(!(isNumber(confidence) && confidence > 0 && confidence <= 1), `${where} has a confidence outside (0, 1].`);

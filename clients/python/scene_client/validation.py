@@ -132,7 +132,10 @@ def _worded(fault: ErrorDetails, form: type[Request]) -> tuple[str, list[str]]:
     if (wanted := _WRONG_TYPES.get(kind)) is not None:
         found = _KINDS.get(type(value)) or f"a {type(value).__name__}"
         if kind == "model_type":
-            return f"{wanted}{_members(fault['loc'], form)}, not {found}", []
+            members = _members(fault["loc"], form)
+            if isinstance(value, list) and members.endswith("values"):
+                found += f" of {len(value)}"
+            return f"{wanted}{members}, not {found}", []
         return f"{wanted}, not {found}", []
     if (template := _MESSAGES.get(kind)) is not None:
         context = fault.get("ctx", {})

@@ -143,9 +143,15 @@ def test_photographs_with_incomplete_lists_are_used_where_there_are_no_others() 
     assert found.scenes == len(flags)
 
 
-def test_too_few_test_scenes_decide_nothing_and_are_refused() -> None:
+@pytest.mark.parametrize("which", ["few scenes", "few scenes with two classes"])
+def test_too_few_test_scenes_decide_nothing_and_are_refused(which) -> None:
     data = rooms().training_data()
-    few = replace(data, test=subset(data.test, torch.arange(4)))
+    if which == "few scenes":
+        few = replace(data, test=subset(data.test, torch.arange(4)))
+    else:
+        v = torch.zeros_like(data.test.v)
+        v[:4] = data.test.v[:4]
+        few = replace(data, test=replace(data.test, v=v))
     artifact = draft_artifact(
         as_stored(Trainer(small(epochs=1), data).run().machine), rooms().vocabulary
     )

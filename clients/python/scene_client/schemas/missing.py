@@ -140,7 +140,8 @@ class MoreInstances(Reply):
     """A class that the request lists, and that probably has more instances in the scene.
 
     The statistics are those of training scenes. Listed objects count as present, whatever their
-    confidence.
+    confidence. In the shipped models, the number 12 stands for 12 or more, so a class with 12
+    listed objects has no entry.
     """
 
     label: str
