@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 from fastapi import FastAPI
@@ -63,7 +64,7 @@ def build(
     )
     app.add_middleware(Gateway, settings=settings, runtime=runtime, direct=direct)
     app.router.routes.extend(asked)
-    for router in (
+    routers = [
         stream.router,
         # `models.administration` stands before `models.router`, because both have the same paths.
         # The first route with a path sets the Allow header of a 405 response.
@@ -72,9 +73,11 @@ def build(
         models.router,
         health.router,
         health.protocol,
-    ):
+        *([monitoring.router] if settings.metrics else []),
+    ]
+    for router in routers:
         app.include_router(router)
-    if settings.metrics:
-        app.include_router(monitoring.router)
     pages.install(app, docs=settings.docs)
+    every = itertools.chain(app.routes, *(router.routes for router in routers))
+    app.state.paths = [route.path for route in every if hasattr(route, "path")]
     return app

@@ -219,8 +219,8 @@ async def answer(problem: ProblemError, scope: Scope, receive: Receive, send: Se
 async def _handle(request: Request, error: Exception) -> Response:
     problem = from_exception(error)
     if problem is not error and problem.kind is catalogue.NOT_FOUND:
-        paths = [route.path for route in request.app.routes if hasattr(route, "path")]
-        similar = get_close_matches(request.scope["path"][:64].lower(), paths)
+        path = request.scope["path"][:64].lower()
+        similar = get_close_matches(path, request.app.state.paths)
         if similar:
             problem.detail += f" Similar paths: {', '.join(similar)}."
     return respond(request, problem)

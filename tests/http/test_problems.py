@@ -390,6 +390,8 @@ async def test_a_misspelt_path_is_answered_with_similar_paths(client: httpx.Asyn
     for path in ("/mising", "/Missing", "/missing/", "/api/missing"):
         document = problem(await client.post(path, json={"objects": ["bed"]}), 404, "not-found")
         assert "/missing, /missing/batch" in document["detail"]
+    document = problem(await client.get("/health"), 404, "not-found")
+    assert "/health/ready" in document["detail"]
 
 
 @pytest.mark.parametrize(

@@ -310,7 +310,7 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         "averaging": 0.99 if n < 1500 else 0.998,
     }
     reasons = {
-        "machine.variant": "the scenes contain relations"
+        "machine.variant": "the scenes contain relations or positions"
         if related
         else "the scenes contain no relations or positions: the model learns objects only",
         "machine.H1": f"hidden units: many more would overfit the {n} training scenes",
