@@ -323,6 +323,8 @@ def _publish(
             progress=status.update,
         )
     _published(artifact)
+    if alias is not None:
+        console.print(f"{alias} moved without a comparison; `publish --promote` compares first")
 
 
 def _refit(reference: str, root: Path, store: Store, version: str, alias: str | None) -> None:
