@@ -50,10 +50,13 @@ def fit_counts(
 ) -> Counts | None:
     """Fit the statistics of counts. Return None if no class has enough data.
 
-    All data sources that count instances have the same total weight. A class gets statistics only
+    All data sources that count instances have the same total weight. Camera frames are left out,
+    because they show a part of a room. A class gets statistics only
     if the expected number is closer to the truth than the class mean on validation scenes.
     """
     counting = counted_classes(train, vocabulary)
+    views = {name for name, source in SOURCES.items() if source.of_one_view}
+    counting = {source: counted for source, counted in counting.items() if source not in views}
     known = [scene for scene in train if scene.source in counting]
     classes = _frequent(known, counting, vocabulary)
     if not len(classes):

@@ -115,6 +115,8 @@ class Source:
             unobserved.
         counts_movables: True if the source counts only movable objects. Other classes occur once
             in each scene that lists them.
+        of_one_view: True if a scene is one camera frame. A frame does not show how many objects are
+            in the room, so statistics of counts do not learn from it.
     """
 
     terms: str
@@ -124,12 +126,14 @@ class Source:
     left_out: tuple[str, ...] = ()
     open_vocabulary: bool = False
     counts_movables: bool = False
+    of_one_view: bool = False
 
 
 _BEDROOMS: Final = Source(
     "SUN RGB-D (Song, Lichtenberg, Xiao, CVPR 2015): 3D boxes of real bedrooms; research use",
     research_only=True,
     meaning=_CENTRES,
+    of_one_view=True,
 )
 
 SOURCES: Final[dict[str, Source]] = {
@@ -140,6 +144,7 @@ SOURCES: Final[dict[str, Source]] = {
         meaning=LISTS,  # its scenes list no relations
         left_out=("wall", "floor"),
         open_vocabulary=True,
+        of_one_view=True,
     ),
     "sunrgbd_bedrooms_3d": _BEDROOMS,
     "sunrgbd-bedroom-3d": _BEDROOMS,  # source name inside the file
