@@ -11,6 +11,7 @@ import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { fit, gridStep, onScreen } from './view.js';
 
+const MARK = 9; // radius of the mark of an outlier, in pixels
 const FONT = '500 13px system-ui, sans-serif';
 const SEEN = [
   'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'at', 'models', 'posed', 'refused',
@@ -127,6 +128,11 @@ export function createBoard(node, store, actions, takeGhost) {
     const half = ROBOT_SIDE / 2;
     const { x, y } = state.viewer;
     places.reserve({ left: view.across(y + half), right: view.across(y - half), top: view.down(x + half), bottom: view.down(x - half) });
+    const marks = boxes.filter((box) => !state.draft && wrong.get(box.id)?.is_outlier);
+    for (const box of marks) {
+      const { right: at, top } = onScreen(box, view);
+      places.reserve({ left: at - MARK, right: at + MARK, top: top - MARK, bottom: top + MARK });
+    }
     for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
       const words = (!state.draft && !left.has(box.label) && reading(state, state.shown, 'objects', box.label)) || box.id;
       const width = widthOf(words, FONT) + 6;
@@ -138,10 +144,9 @@ export function createBoard(node, store, actions, takeGhost) {
     labels.selectAll('text.name').data(texts, (text) => text.id).join('text')
       .attr('class', 'name').attr('x', (text) => text.x).attr('y', (text) => text.y)
       .classed('outlier', (text) => Boolean(text.wrong)).text((text) => text.words);
-    const marks = boxes.filter((box) => !state.draft && wrong.get(box.id)?.is_outlier);
     const each = labels.selectAll('g.mark').data(marks, (box) => box.id).join((enter) => {
       const g = enter.append('g').attr('class', 'mark');
-      g.append('circle').attr('r', 9);
+      g.append('circle').attr('r', MARK);
       g.append('text').attr('class', 'sign').text('!');
       return g;
     });
