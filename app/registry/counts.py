@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.registry.errors import ArtifactError
+from app.registry.fields import require_shapes
 
 Table = NDArray[np.float32]
 
@@ -58,15 +59,7 @@ class Counts:
         K = len(np.atleast_1d(tensors.get(f"{PREFIX}classes", ())))
         M = np.atleast_1d(tensors.get(f"{PREFIX}log_share", ())).shape[-1]
         shapes = {"classes": (K,), "log_share": (K, M), "weights": (K, ROOM + C + V)}
-        for name in sorted(tensors.keys() | {f"{PREFIX}{name}" for name in shapes}):
-            shape = shapes.get(name.removeprefix(PREFIX))
-            found = tensors[name].shape if name in tensors else None
-            if found != shape:
-                raise ArtifactError(
-                    "wrong_shape",
-                    f"tensor '{name}' has the shape {found}, but the shape must be {shape} (None "
-                    "means that the tensor does not exist)",
-                )
+        require_shapes(tensors, PREFIX, shapes)
         counts = cls(**{name: tensors[f"{PREFIX}{name}"] for name in shapes})
         if complaint := counts._complaint(V, C):
             raise ArtifactError("invalid_tensor", f"the count tensors are invalid: {complaint}")

@@ -285,8 +285,7 @@ class Description(Frozen):
     metrics: Many[Metric]
     terms: Text
     libraries: dict[str, str]
-    # Left out of a manifest without examples, so that earlier releases can read it.
-    examples: Annotated[Examples, Field(exclude_if=lambda examples: not examples)] = ()
+    examples: Examples = ()
 
     @field_validator("spec", "training", "libraries", "terms")
     @classmethod

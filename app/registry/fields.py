@@ -1,11 +1,13 @@
-"""Base class and field types of the files that the registry stores as JSON."""
+"""Base class and field types of stored JSON, and the check of stored tensors."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Annotated, Any, TypeVar
 
+from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     AwareDatetime,
@@ -15,6 +17,8 @@ from pydantic import (
     Field,
     StringConstraints,
 )
+
+from app.registry.errors import ArtifactError
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Text = Annotated[str, StringConstraints(min_length=1)]
@@ -45,3 +49,26 @@ class Frozen(BaseModel):
     """Base class of immutable pydantic models. They refuse unknown fields, NaN and infinity."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def require_shapes(
+    tensors: Mapping[str, NDArray[Any]], prefix: str, shapes: Mapping[str, tuple[int, ...]]
+) -> None:
+    """Check the names and shapes of a group of tensors.
+
+    Args:
+        tensors: all tensors whose names begin with the prefix.
+        shapes: maps each name without the prefix to the required shape.
+
+    Raises:
+        ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape.
+    """
+    for name in sorted(tensors.keys() | {f"{prefix}{name}" for name in shapes}):
+        shape = shapes.get(name.removeprefix(prefix))
+        found = tensors[name].shape if name in tensors else None
+        if found != shape:
+            raise ArtifactError(
+                "wrong_shape",
+                f"tensor '{name}' has the shape {found}, but the shape must be {shape} (None means "
+                "that the tensor does not exist)",
+            )

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.registry.errors import ArtifactError
+from app.registry.fields import require_shapes
 
 Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
@@ -79,15 +80,7 @@ class Offsets:
             "pair_offset": (P, 6),
             "pair_scenes": (P,),
         }
-        for name in sorted(tensors.keys() | {f"{PREFIX}{name}" for name in shapes}):
-            shape = shapes.get(name.removeprefix(PREFIX))
-            found = tensors[name].shape if name in tensors else None
-            if found != shape:
-                raise ArtifactError(
-                    "wrong_shape",
-                    f"tensor '{name}' has the shape {found}, but the shape must be {shape} (None "
-                    "means that the tensor does not exist)",
-                )
+        require_shapes(tensors, PREFIX, shapes)
         offsets = cls(**{name: tensors[f"{PREFIX}{name}"] for name in shapes})
         if complaint := offsets._complaint(A * V * V):
             raise ArtifactError("invalid_tensor", f"the offset tensors are invalid: {complaint}")
@@ -97,7 +90,7 @@ class Offsets:
         counted = (self.relation_scenes, self.pair, self.pair_scenes)
         if not all(np.issubdtype(array.dtype, np.integer) for array in counted):
             return "pair, pair_scenes and relation_scenes must be integers"
-        if (np.diff(self.pair) <= 0).any() or (self.pair[:1] < 0).any():
+        if (self.pair[1:] <= self.pair[:-1]).any() or (self.pair[:1] < 0).any():
             return "the keys in the tensor 'pair' must be non-negative and in ascending order"
         if (self.pair[-1:] >= most).any():
             return "a key in the tensor 'pair' has a relation or class that the model does not have"

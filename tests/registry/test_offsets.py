@@ -95,6 +95,7 @@ def test_an_artifact_without_them_loads_in_either_format(tmp_path: Path) -> None
         ({"pair": np.array([20, 3], np.int64)}, "invalid_tensor"),
         ({"pair": np.array([3, 3], np.int64)}, "invalid_tensor"),
         ({"pair": np.array([-1, 3], np.int64)}, "invalid_tensor"),
+        ({"pair": np.array([3, -(2**63)], np.int64)}, "invalid_tensor"),
         ({"pair": np.array([3, A * V * V], np.int64)}, "invalid_tensor"),
         ({"pair": np.array([3.0, 21.0], "f4")}, "invalid_tensor"),
         ({"pair_scenes": np.array([0, 12], np.int32)}, "invalid_tensor"),

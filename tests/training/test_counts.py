@@ -1,4 +1,4 @@
-"""Counts: what is learnt from scenes with known laws, and where nothing is learnt."""
+"""Statistics of counts on scenes with known laws, and classes without statistics."""
 
 from __future__ import annotations
 
