@@ -220,6 +220,15 @@ def launch(
     raise AssertionError(f"the service did not start:\n{log.read_text()}")
 
 
+def wait_until(condition: Callable[[], bool], log: Path | None = None) -> None:
+    """Wait until the condition holds. Fail with the log after 30 seconds."""
+    deadline = time.monotonic() + 30
+    while not condition():
+        if time.monotonic() > deadline:
+            pytest.fail("it takes too long" + (f":\n{log.read_text()}" if log else ""))
+        time.sleep(0.02)
+
+
 @pytest.fixture(scope="session")
 def live(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     """The service as a separate process, shared by all tests."""

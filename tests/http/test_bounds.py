@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from tests.http.test_problems import problem
-from tests.services import Replace, launch, serve
+from tests.services import Replace, launch, serve, wait_until
 
 SCENE = {"objects": ["bed", "chair", "lamp"]}
 
@@ -163,27 +163,53 @@ async def test_a_batch_stops_where_its_deadline_passes(
     assert statuses == [200] * answered + [504] * (20 - answered)
 
 
+HELD = """
+import sys, time
+from pathlib import Path
+from app import questions
+from app.__main__ import main
+
+generate, begun, release = questions.generate, Path({begun!r}), Path({release!r})
+
+def held(*args, **parameters):
+    if parameters["count"] == 3:
+        begun.touch()
+        while not release.exists():
+            time.sleep(0.01)
+    return generate(*args, **parameters)
+
+questions.generate = held
+sys.exit(main())
+"""
+"""A program for `launch`: drawing three scenes takes until the file `release` exists."""
+
+
 @pytest.mark.slow
 @pytest.mark.system
 def test_at_its_end_the_service_answers_everything_and_closes_connections(
     shared_store: Path, tmp_path: Path
 ) -> None:
-    with launch(shared_store, tmp_path / "log", SCENE_DRAIN_SECONDS="1.5") as service:
+    begun, release = tmp_path / "begun", tmp_path / "release"
+    program = HELD.format(begun=str(begun), release=str(release))
+    log = tmp_path / "log"
+    with launch(shared_store, log, program=("-c", program), SCENE_DRAIN_SECONDS="3") as service:
         answers: list[httpx.Response] = []
 
         def draw() -> None:
             with httpx.Client(base_url=service.client.base_url, timeout=60) as client:
-                # By tensors, which take longer than compiled chains.
-                body = {**SCENE, "model": "plain", "count": 64, "steps": 400}
                 headers = {"X-Request-Timeout-Ms": "60000"}
-                answers.append(client.post("/generate", json=body, headers=headers))
+                answers.append(
+                    client.post("/generate", json={**SCENE, "count": 3}, headers=headers)
+                )
+
+        def is_draining() -> bool:
+            return service.client.get("/health/ready").status_code == 503
 
         drawing = threading.Thread(target=draw)
         drawing.start()
-        time.sleep(0.2)
-        assert not answers
+        wait_until(begun.exists)
         service.process.send_signal(signal.SIGTERM)
-        time.sleep(0.2)
+        wait_until(is_draining)
         late = service.client.post("/relations", json=SCENE)
         assert late.status_code == 200
         assert late.headers["connection"] == "close"
@@ -191,6 +217,8 @@ def test_at_its_end_the_service_answers_everything_and_closes_connections(
         problem(refused, 503, "draining")
         assert "retry-after" in refused.headers
         assert service.client.get("/health/live").is_success
+        assert not answers
+        release.touch()
         drawing.join(timeout=60)
         assert answers[0].status_code == 200
         service.process.wait(timeout=30)

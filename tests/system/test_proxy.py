@@ -25,7 +25,7 @@ from scene_client import Client
 from tests.chaos.wire import BODY, Wire, exchange, wires
 from tests.http.stores import make_store
 from tests.http.streams import opened, talk
-from tests.services import ADMIN_KEY, LiveService, launch
+from tests.services import ADMIN_KEY, LiveService, launch, wait_until
 
 pytestmark = pytest.mark.system
 
@@ -102,14 +102,6 @@ def is_ready(proxy: Proxy) -> bool:
     with suppress(httpx.TransportError):
         return httpx.get(f"{proxy.address}/health/ready").status_code == 200
     return False
-
-
-def wait_until(condition: Callable[[], bool], log: Path | None = None) -> None:
-    for _ in range(300):
-        if condition():
-            return
-        time.sleep(0.1)
-    pytest.fail("it takes too long" + (f":\n{log.read_text()}" if log else ""))
 
 
 @pytest.fixture(scope="module")
