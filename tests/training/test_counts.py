@@ -11,6 +11,7 @@ import pytest
 from app.questions.counts import distribution
 from app.registry import Counts
 from app.scene import ObjectClass, Vocabulary
+from scripts.count_folds import cross_validate, folds
 from tests.training.evaluation.furnished_rooms import VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import scene
 from training.cases import MOST, scene_rng, some_instances
@@ -131,6 +132,20 @@ def test_generated_rooms_beat_the_class_mean():
     assert change.value == pytest.approx(error.value - mean.value)
     assert found["count in the interval"].value > 0.75
     assert found["proposals that are right"].value > 0.5
+
+
+def test_cross_validation_tests_each_room_once():
+    scenes = rooms(900, 0).scenes
+    tested = []
+    for fold in folds(scenes):
+        train, validation, test = ({scene.group for scene in part} for part in fold)
+        assert train.isdisjoint(validation | test)
+        assert validation.isdisjoint(test)
+        tested += [scene.scene_id for scene in fold.test]
+    assert sorted(tested) == sorted(scene.scene_id for scene in scenes)
+    change = cross_validate(room_model(), scenes)["rooms", "change of error, class mean"]
+    assert change.scenes == len({scene.group for scene in scenes})
+    assert change.figure().high < 0
 
 
 def test_the_task_needs_counts_and_a_source_that_counts():
