@@ -36,19 +36,17 @@ def fetch(
     """
     try:
         chosen = _sources(names or ())
+        if data is not None and not data.is_dir():
+            raise ConfigError(f"{data}: the folder does not exist")
     except ConfigError as error:
         fail(error)
+    command = " ".join(["python -m training fetch", *(names or ())])
     if data is None:
         for name in chosen:
             _describe(name)
-        _explain(chosen)
-        return
-    if not _check(chosen, data):
-        console.print(
-            f"`python -m training fetch{''.join(f' {name}' for name in names or ())}` says where "
-            "each file is to be had",
-            soft_wrap=True,
-        )
+        _explain(command)
+    elif not _check(chosen, data):
+        console.print(f"`{command}` says where each file is to be had", soft_wrap=True)
         raise typer.Exit(1)
 
 
@@ -91,41 +89,43 @@ def _describe(name: str) -> None:
     console.print(lines, highlight=False, markup=False)
 
 
-def _explain(chosen: Sequence[str]) -> None:
+def _explain(command: str) -> None:
     console.print(
-        "\nThis command downloads nothing: the terms of each data set are between you and its "
-        f"owner.\nFOLDER is the folder of --data; the default is {DATA}.\n"
-        "docs/training.md describes the format of the scenes (JSON lines). Python writes what a "
-        "reader reads:\n\n"
+        "\nThis command downloads nothing: the terms of each data set are between you and\n"
+        "its owner. FOLDER is your data folder. Without --data, training reads\n"
+        f"{DATA}.\n\n"
+        "docs/training.md describes the format of the scenes (JSON lines). Readers exist\n"
+        "for some official files. So Python converts 3DSSG:\n\n"
         "    from pathlib import Path\n"
         "    from training.datasets.jsonl import write_jsonl\n"
         "    from training.datasets.readers import READERS\n"
         '    scenes = READERS["3dssg"](Path("relationships.json"))\n'
         '    write_jsonl(scenes, Path("FOLDER/3dssg.jsonl.gz"))\n\n'
-        f"Check: python -m training fetch --data FOLDER  ({len(chosen)} sources)",
+        f"Check your files: {command} --data FOLDER",
         markup=False,
         highlight=False,
+        soft_wrap=True,
     )
 
 
 def _check(chosen: Sequence[str], root: Path) -> bool:
     """Print the state of each file. Return True if all files are found."""
-    table = Table("source", "file", "state", "scenes", box=box.SIMPLE_HEAD)
+    table = Table("source", "file", "state", "entries", box=box.SIMPLE_HEAD)
     table.columns[3].justify = "right"
-    table.columns[2].overflow = "fold"
-    complete = True
+    complete, problems = True, []
     for name in chosen:
-        path, count = file_of(name, root), ""
+        path, count, state = file_of(name, root), "", "missing"
         try:
             with console.status(f"reading {path.name}"):
-                state = "missing"
                 if path.is_file():
                     count, state = f"{count_entries(name, root):,}", "found"
         except DatasetError as error:
-            detail = ": ".join(filter(None, (error.where, error.problem)))
-            state = f"unreadable: {detail}"
+            state = "unreadable"
+            problems.append(str(error))
         complete &= state == "found"
         table.add_row(name, path.relative_to(root).as_posix(), state, count)
     console.print(f"folder: {root}", soft_wrap=True, highlight=False)
     console.print(table)
+    for problem in problems:
+        console.print(problem, soft_wrap=True, highlight=False, markup=False)
     return complete

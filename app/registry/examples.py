@@ -8,7 +8,8 @@ from typing import Annotated, Any, Final, Self
 from pydantic import AfterValidator, Field, StringConstraints, field_validator, model_validator
 
 from app.registry.fields import Frozen, Many, to_json
-from app.scene.relations import RELATIONS
+from app.scene.relations import RELATIONS, canonicalise
+from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 
 MAX_EXAMPLES: Final = 8
@@ -96,8 +97,9 @@ class ExampleScene(Frozen):
     """A scene with the fields and the meaning of a request to the service.
 
     Raises:
-        ValueError: two objects have the same name, or a relation names no object of the scene. The
-            name of an object is its id, or its label if it has no id.
+        ValueError: two objects have the same name, a relation names no object of the scene, or two
+            relations contradict each other. The name of an object is its id, or its label if it has
+            no id.
     """
 
     objects: Annotated[Many[ExampleObject], Field(min_length=1, max_length=MAX_OBJECTS)]
@@ -114,16 +116,19 @@ class ExampleScene(Frozen):
         return [{"label": value} if isinstance(value, str) else value for value in values]
 
     @model_validator(mode="after")
-    def _names_are_clear(self) -> Self:
+    def _makes_a_scene(self) -> Self:
         names = [thing.id or thing.label for thing in self.objects]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two objects are called {twice[0]!r}: give each an id of its own")
+        triples = []
         for relation in self.relations:
-            if relation.subject == relation.object:
-                raise ValueError(f"a relation has {relation.subject!r} at both ends")
             for name in (relation.subject, relation.object):
                 if name not in names:
                     raise ValueError(f"a relation names {name!r}, but the scene has no such object")
+            subject, other = names.index(relation.subject), names.index(relation.object)
+            triples.append(canonicalise(subject, relation.relation, other))
+        # A scene refuses contradictions, and a relation of an object to itself.
+        Scene(tuple(SceneObject(name, name, None) for name in names), tuple(triples))
         return self
 
 

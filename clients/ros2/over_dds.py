@@ -11,8 +11,11 @@ newest message is kept. Errors go to standard error. CYCLONEDDS_URI selects the 
 from __future__ import annotations
 
 import os
+import re
 import sys
+from argparse import ArgumentTypeError
 from collections.abc import Iterator
+from typing import Final
 
 import bridge
 from cyclonedds.core import (
@@ -29,6 +32,10 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from dds_messages import Detection3DArray, String, quality
+
+# The UDP ports of higher domains would exceed 65535.
+_MAX_DOMAIN: Final = 232
+_TOPIC: Final = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 def detections(participant: DomainParticipant, topic: str) -> Iterator[Detection3DArray]:
@@ -55,25 +62,51 @@ def detections(participant: DomainParticipant, topic: str) -> Iterator[Detection
 
 
 def ros_topic(name: str) -> str:
-    """Return the DDS name of a ROS topic."""
-    return f"rt/{name.lstrip('/')}"
+    """Return the DDS name of a ROS topic.
+
+    Raises:
+        ArgumentTypeError: the text is not the name of a topic.
+    """
+    if _TOPIC.fullmatch(name) is None:
+        raise ArgumentTypeError(
+            f"{name!r} is not the name of a topic, such as /camera/boxes: words of letters, digits "
+            "and _, separated by /, without a digit at the start"
+        )
+    return f"rt/{name.removeprefix('/')}"
+
+
+def domain(text: str) -> int:
+    """Return the number of a DDS domain.
+
+    Raises:
+        ArgumentTypeError: the text is not a number from 0 to 232.
+    """
+    if not text.isdecimal() or int(text) > _MAX_DOMAIN:
+        raise ArgumentTypeError(f"{text!r} is not a number from 0 to {_MAX_DOMAIN}")
+    return int(text)
 
 
 def main() -> None:
     arguments = bridge.options("Answer questions about detections over DDS.")
-    arguments.add_argument("detections", help="topic of a vision_msgs/Detection3DArray")
-    arguments.add_argument("--answers", default="/scene/answers", help="topic of the answers")
-    arguments.add_argument("--domain", type=int, default=os.environ.get("ROS_DOMAIN_ID") or 0)
+    arguments.add_argument(
+        "detections", type=ros_topic, help="topic of a vision_msgs/Detection3DArray"
+    )
+    arguments.add_argument(
+        "--answers", type=ros_topic, default="/scene/answers", help="topic of the answers"
+    )
+    arguments.add_argument(
+        "--domain", type=domain, default=os.environ.get("ROS_DOMAIN_ID") or "0", help="DDS domain"
+    )
     given = arguments.parse_args()
     try:
         participant = DomainParticipant(given.domain)
         writer = DataWriter(
             participant,
-            Topic(participant, ros_topic(given.answers), String),
+            Topic(participant, given.answers, String),
             quality(String, reliable=True),
         )
         with bridge.advisor(arguments, given) as advisor:
-            for message in detections(participant, ros_topic(given.detections)):
+            for message in detections(participant, given.detections):
                 if (answer := bridge.answer(advisor, message)) is not None:
                     writer.write(String(answer))
     except DDSException as error:

@@ -7,6 +7,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ pytest.importorskip("cyclonedds", reason="there is no wheel for this processor")
 
 from benchmarks.dds import Robot, bridge, measure, ros
 from scene_client import Client
+
+over_dds = import_module("over_dds")  # benchmarks.dds adds its folder to the path
 
 ARRAY = "vision_msgs/msg/Detection3DArray"
 
@@ -72,6 +75,38 @@ def test_every_field_has_the_bytes_of_ros(length: int) -> None:
 
 
 # ------------------------------------------------------------------------------------ the bridge
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (["/boxes", "--domain", "-1"], "--domain: '-1' is not a number from 0 to 232"),
+        (["/boxes", "--domain", "300"], "--domain: '300' is not a number from 0 to 232"),
+        ([""], "detections: '' is not the name of a topic"),
+        (["/a b"], "detections: '/a b' is not the name of a topic"),
+        (["/boxes", "--answers", "a//b"], "--answers: 'a//b' is not the name of a topic"),
+        (["/boxes", "--service", "robot:8000"], "the URL must start with http:// or https://"),
+    ],
+)
+def test_invalid_options_end_the_program_with_status_2(
+    options: list[str],
+    error: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("sys.argv", ["over_dds.py", *options])
+    with pytest.raises(SystemExit, match="2"):
+        over_dds.main()
+    assert error in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_service_that_does_not_answer_is_one_line_for_each_message(
+    recorded: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Client("http://127.0.0.1:9") as client:
+        assert over_dds.bridge.answer(over_dds.bridge.Advisor(client), recorded) is None
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("UnreachableError: http://127.0.0.1:9:")
 
 
 @pytest.fixture(scope="module")

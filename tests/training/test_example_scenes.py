@@ -22,6 +22,10 @@ from training.example_scenes import (
 
 SCENES = generate_rooms(60, 0, WORKPLACES)
 WORDS = source_vocabulary(SCENES, minimum=2)
+BOTH_LEFT = [
+    {"subject": "bed", "relation": "left", "object": "cup"},
+    {"subject": "bed", "relation": "right", "object": "cup"},
+]
 
 
 def test_chosen_scenes_are_requests_in_the_models_words_and_read_back(tmp_path) -> None:
@@ -60,6 +64,10 @@ def test_research_only_scenes_are_never_chosen() -> None:
         ("{", "Invalid JSON"),
         ([{"name": "a", "scene": {"objects": [{"id": "bed"}]}}], "label: Field required"),
         ([{"name": "a", "scene": {"objects": ["bed"]}}] * 9, "at most 8 items"),
+        (
+            [{"name": "a", "scene": {"objects": ["bed", "cup"], "relations": BOTH_LEFT}}],
+            "0.scene: .*'left' is stated from 'bed' to 'cup' and also from 'cup' to 'bed'",
+        ),
     ],
 )
 def test_an_unusable_file_is_named_with_the_reason(tmp_path, content, reason) -> None:

@@ -40,10 +40,12 @@ def test_files_are_found_missing_or_unreadable(tmp_path) -> None:
     file_of("nr3d", tmp_path).write_bytes(b"not gzip")
     text = fetch("3dssg", "nr3d", "vrd", "--data", tmp_path, code=1)
     assert "3dssg 3dssg.jsonl.gz found 2" in text
-    assert "nr3d extra/nr3d.jsonl.gz unreadable:" in text
+    assert "nr3d extra/nr3d.jsonl.gz unreadable" in text
+    assert f"{file_of('nr3d', tmp_path)}: cannot be read: Not a gzipped file" in text
     assert "vrd vrd.jsonl.gz missing" in text
     assert "`python -m training fetch 3dssg nr3d vrd` says" in text
     fetch("3dssg", "--data", tmp_path)
+    assert "the folder does not exist" in fetch("--data", tmp_path / "nowhere", code=1)
 
 
 @pytest.mark.parametrize("source", ["3dssg", "vrd", "nr3d"])
