@@ -57,7 +57,9 @@ from training.publish import publish_run, refit
 from training.runs import FinishedRun, RunError, load_run, save_run
 from training.trainer import Trainer
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
+app = typer.Typer(
+    rich_markup_mode="markdown", add_completion=False, no_args_is_help=True, help=__doc__
+)
 app.command()(example)
 app.command()(init)
 app.command()(fetch)
@@ -77,10 +79,8 @@ Data = Annotated[
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
 StorePath = Annotated[str, typer.Option("--store", help="the model store: a folder or a URL")]
-Alias = Annotated[
-    str | None, typer.Option("--alias", help="point this alias at the published version")
-]
 _RUNS, _STORE = Path("runs"), "model_store"
+_ALIAS = "`python -m app.registry alias` moves an alias without a comparison"
 
 
 @app.command()
@@ -102,7 +102,6 @@ def train(
         Path | None, typer.Option("--tensorboard", help="write TensorBoard logs to this folder")
     ] = None,
     publish: Annotated[str | None, typer.Option(help="publish the run as this version")] = None,
-    alias: Alias = None,
     store: StorePath = _STORE,
 ) -> None:
     """Train a configuration. With --publish, also calibrate, evaluate and publish the model."""
@@ -123,7 +122,7 @@ def train(
                 folder = folder.with_name(f"final-{folder.name}")
             _train(config, scenes, folder, root, fresh, tensorboard)
         if publish is not None and first:
-            _publish(load_run(folder), scenes, store, publish, alias, measured)
+            _publish(load_run(folder), scenes, store, publish, measured)
     except (
         *(ConfigError, DatasetError, RegistryError, RunError),
         FloatingPointError,
@@ -143,15 +142,17 @@ def publish(
     version: Annotated[str, typer.Argument(help="number of the new version, such as 1.0.0")],
     data: Data = None,
     store: StorePath = _STORE,
-    alias: Alias = None,
     promote: Annotated[
         bool,
         typer.Option(
             "--promote",
-            help="point the alias `default` (or --alias) at the new version, unless the new "
-            "version is useless or worse than the served version",
+            help="point an alias at the new version, unless the new version is useless or worse "
+            "than the served version",
         ),
     ] = False,
+    alias: Annotated[
+        str | None, typer.Option(help="with --promote: move this alias instead of `default`")
+    ] = None,
     margin: Annotated[
         float, typer.Option(min=0, help="with --promote: maximum accepted loss of a metric")
     ] = MARGIN,
@@ -175,10 +176,12 @@ def publish(
     version has results for relations. A refused version is not published, and the exit code is 3.
     """
     try:
+        if alias is not None and not promote:
+            raise ConfigError(f"--alias belongs to --promote; {_ALIAS}")
         if "@" in folder and not Path(folder).is_dir():
             if promote:
-                raise ConfigError("--promote compares training runs; use --alias with name@version")
-            _refit(folder, data or DATA, open_for_publisher(store), version, alias)
+                raise ConfigError(f"--promote compares training runs; {_ALIAS}")
+            _refit(folder, data or DATA, store, version)
             return
         run = load_run(Path(folder))
         root = data or (Path(run.data) if run.data else DATA)
@@ -187,7 +190,7 @@ def publish(
             gate = _Gate(alias or "default", margin, limit, even_if_worse)
             _promote(run, scenes, root, open_for_publisher(store), version, gate)
         else:
-            _publish(run, scenes, store, version, alias)
+            _publish(run, scenes, store, version)
     except RefusedError as error:
         console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
         console.print("nothing was published; --even-if-worse publishes and promotes it anyway")
@@ -312,31 +315,32 @@ def _publish(
     scenes: SplitScenes,
     store: str,
     version: str,
-    alias: str | None,
     measured: tuple[FinishedRun, SplitScenes] | None = None,
 ) -> None:
     with console.status("publishing") as status:
         artifact = publish_run(
             *(run, scenes, open_for_publisher(store), version),
-            alias=alias,
             measured=measured,
             progress=status.update,
         )
-    _published(artifact)
-    if alias is not None:
-        console.print(f"{alias} moved without a comparison; `publish --promote` compares first")
+    _published(artifact, store)
 
 
-def _refit(reference: str, root: Path, store: Store, version: str, alias: str | None) -> None:
-    artifact = store.load(*store.resolve(reference))
+def _refit(reference: str, root: Path, store: str, version: str) -> None:
+    models = open_for_publisher(store)
+    artifact = models.load(*models.resolve(reference))
     with console.status("publishing") as status:
-        artifact = refit(artifact, root, store, version, alias=alias, progress=status.update)
-    _published(artifact)
+        artifact = refit(artifact, root, models, version, progress=status.update)
+    _published(artifact, store)
 
 
-def _published(artifact: Artifact) -> None:
-    manifest = artifact.manifest
-    console.print(f"published {manifest.name}@{manifest.version}, digest {artifact.digest[:12]}")
+def _published(artifact: Artifact, unmoved: str | None = None) -> None:
+    """Print the new version. If no alias moved in the store `unmoved`, print the next step."""
+    reference = f"{artifact.manifest.name}@{artifact.manifest.version}"
+    console.print(f"published {reference}, digest {artifact.digest[:12]}")
+    if unmoved is not None:
+        command = f"python -m app.registry alias default {reference} --store {unmoved}"
+        console.print(f"no alias moved; to serve it as default: {command}", soft_wrap=True)
 
 
 @dataclass(frozen=True)

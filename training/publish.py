@@ -48,7 +48,6 @@ def publish_run(
     store: Store,
     version: str,
     *,
-    alias: str | None = None,
     measured: tuple[FinishedRun, SplitScenes] | None = None,
     judge: Callable[[Artifact], None] | None = None,
     progress: Callable[[str], None] = lambda _: None,
@@ -62,7 +61,6 @@ def publish_run(
         scenes: scenes of the run.
         store: store for the new version.
         version: number of the new version.
-        alias: alias that points at the new version afterwards. None changes no alias.
         measured: second run of the same configuration, and its scenes, for a `run` that was trained
             on test scenes. The second run did not use test scenes. Its test results and chosen
             calibration values are published.
@@ -107,7 +105,7 @@ def publish_run(
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
         examples=scenes.examples,
     )
-    return _stored(store, description, calibrated, alias)
+    return _stored(store, description, calibrated)
 
 
 def refit(
@@ -116,7 +114,6 @@ def refit(
     store: Store,
     version: str,
     *,
-    alias: str | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Artifact:
     """Publish a new version of a published model with refitted statistics, without training.
@@ -172,7 +169,7 @@ def refit(
     )
     changes = {"version": version, "created": _now(), "examples": examples}
     description = Description(**fields | changes)
-    return _stored(store, description, with_statistics(artifact, scenes), alias)
+    return _stored(store, description, with_statistics(artifact, scenes))
 
 
 def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
@@ -185,15 +182,13 @@ def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
     )
 
 
-def _stored(
-    store: Store, description: Description, artifact: Artifact, alias: str | None
-) -> Artifact:
+def _stored(store: Store, description: Description, artifact: Artifact) -> Artifact:
     """Publish weights and statistics in half precision."""
     state = dict(artifact.weights.arrays)
     for statistics in (artifact.offsets, artifact.counts):
         if statistics is not None:
             state |= statistics.tensors()
-    return store.publish(description, state, storage_dtype="float16", alias=alias)
+    return store.publish(description, state, storage_dtype="float16")
 
 
 def _now() -> datetime:

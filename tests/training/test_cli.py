@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from app.questions import generate, missing, outliers, relations
 from app.registry import Store
+from app.registry.references import AliasTarget
 from app.scene import Scene, SceneObject
 from training.cli import app
 from training.config import load_config
@@ -107,7 +108,9 @@ def test_from_rooms_to_answers(tmp_path):
     config = tmp_path / "config.toml"
     config.write_text(CONFIG)
     folders = ("--runs", str(tmp_path / "runs"), "--store", str(tmp_path / "store"))
-    run("train", str(config), *folders, "--publish", "1.0.0", "--alias", "default")
+    run("train", str(config), *folders, "--publish", "1.0.0")
+    first = AliasTarget(name="rooms-triway", version="1.0.0")
+    Store(tmp_path / "store").set_alias("default", first)
     run("publish", str(tmp_path / "runs/rooms-triway/seed-0"), "1.0.1", *folders[2:])
     assert "1.0.1" in run("list", *folders[2:])
     figures = tmp_path / "figures.json"
@@ -149,7 +152,8 @@ def test_from_rooms_to_answers(tmp_path):
         (("train", "everyday-gbm", "--data", "nowhere"), "`python -m training fetch` says where"),
         (("fetch", "nowhere"), "neither a source nor a shipped configuration"),
         (("publish", "nowhere", "1.0.0"), "no finished run"),
-        (("publish", "nowhere@1.0.0", "1.0.1", "--promote"), "use --alias with name@version"),
+        (("publish", "nowhere@1.0.0", "1.0.1", "--promote"), "app.registry alias` moves"),
+        (("publish", "nowhere", "1.0.0", "--alias", "lab"), "--alias belongs to --promote"),
         (("evaluate", "nowhere", "--store", "nowhere"), "error"),
         (("compare", "nowhere"), "names neither the folder of a finished run nor a model"),
         (("compare", "baselines"), "choose a first model that was trained"),
