@@ -56,7 +56,7 @@ def init(
 ) -> None:
     """Analyse your scenes, and propose a vocabulary and a training configuration.
 
-    The command writes <name>.toml, vocabulary.json and examples.json (scenes for the visual page)
+    The command writes NAME.toml, vocabulary.json and examples.json (scenes for the visual page)
     into the output folder. You can edit these files. The command overwrites existing files only
     with --force.
     """

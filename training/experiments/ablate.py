@@ -65,7 +65,7 @@ def ablate(
 ) -> None:
     """Train the full model and each of its ablations, and compare them on the same scenes.
 
-    The command writes results.json and results.md into <folder>/<configuration>. If the training of
+    The command writes results.json and results.md into FOLDER/CONFIGURATION. If the training of
     an ablation diverges, the results contain the error in place of its metrics. After Ctrl-C, run
     the same command again: it continues from the last finished epoch or task.
     """

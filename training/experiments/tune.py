@@ -111,7 +111,7 @@ def tune(
     """Search for better settings on validation scenes only.
 
     The first trial uses the unchanged configuration. Optuna chooses the settings of the other
-    trials. The command writes the best configuration to <folder>/<configuration>/best.toml. After
+    trials. The command writes the best configuration to FOLDER/CONFIGURATION/best.toml. After
     Ctrl-C, run the same command again: it keeps finished trials and resumes the interrupted trial.
     """
     with resumable(console):
