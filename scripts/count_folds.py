@@ -1,8 +1,7 @@
 """Cross-validate the statistics of counts of a model: is the expected count the better one?
 
-The groups of near-duplicate scenes are divided into five random folds. For each fold, the
-statistics are fitted to the other folds, of which each eighth group is for validation. Then the
-task of `training.evaluation.counts` measures the fold with four random parts of each scene. The
+The statistics are fitted to four of five folds of the scenes. Then the task of
+`training.evaluation.counts` measures the fifth fold, with four random parts of each scene. The
 statistics do not depend on the weights of the model, so its training scenes can be test scenes.
 
 Run as `python -m scripts.count_folds --model NAME --data FOLDER`. `python -m training fetch` says
@@ -13,10 +12,10 @@ from __future__ import annotations
 
 import argparse
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import torch
@@ -24,38 +23,14 @@ import torch
 from app.registry import Artifact, Store, load_model_set
 from training.batches import SceneTensors, scene_tensors
 from training.config import DATA, Config
-from training.counts import fit_counts
+from training.counts import fit_counts, folds
 from training.datasets import EncodedScene, annotated_classes
 from training.evaluation.counts import METRICS, counts_task
 from training.evaluation.metrics import Ratio
 from training.evaluation.setting import Contender, Setting
 from training.pipeline import read_sources, split_and_encode
 
-FOLDS: Final = 5
 PARTS: Final = 4
-_VALIDATION: Final = 8
-
-
-class Fold(NamedTuple):
-    """The scenes of a fold. A group is in one of the three lists."""
-
-    train: list[EncodedScene]
-    validation: list[EncodedScene]
-    test: list[EncodedScene]
-
-
-def folds(scenes: Sequence[EncodedScene], seed: int = 0) -> Iterator[Fold]:
-    """Yield the folds. Each group is in the test scenes of one fold."""
-    groups = sorted({scene.group for scene in scenes})
-    order = np.random.default_rng(seed).permutation(len(groups)).tolist()
-    place = dict(zip(groups, order, strict=True))
-    for number in range(FOLDS):
-        fold = Fold([], [], [])
-        for scene in scenes:
-            row, of = divmod(place[scene.group], FOLDS)
-            part = fold.train if row % _VALIDATION else fold.validation
-            (fold.test if of == number else part).append(scene)
-        yield fold
 
 
 def cross_validate(
@@ -70,12 +45,12 @@ def cross_validate(
     def tensors(some: Sequence[EncodedScene]) -> SceneTensors:
         return scene_tensors(some, annotated, len(vocabulary))
 
-    for fold in folds(scenes):
-        counts = fit_counts(fold.train, fold.validation, vocabulary)
-        contender, train = Contender(artifact=replace(artifact, counts=counts)), tensors(fold.train)
-        for source in sorted({scene.source for scene in fold.test}):
-            test = tensors([scene for scene in fold.test if scene.source == source])
-            settings = [Setting(test, structure, train, seed=seed) for seed in range(PARTS)]
+    for train, test in folds(scenes):
+        contender = Contender(artifact=replace(artifact, counts=fit_counts(train, vocabulary)))
+        known = tensors(train)
+        for source in sorted({scene.source for scene in test}):
+            asked = tensors([scene for scene in test if scene.source == source])
+            settings = [Setting(asked, structure, known, seed=seed) for seed in range(PARTS)]
             outcomes = [counts_task(contender, setting) for setting in settings]
             for name in METRICS:
                 parts = [outcome.metrics.get(name) for outcome in outcomes if outcome]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -40,40 +40,42 @@ _PRIOR: Final = 8.0
 # Penalties on the squares of the terms of a class and of the shared terms.
 _OWN, _SHARED = 0.3, 0.15
 _ITERATIONS: Final = 100
-# A class needs this many training scenes, groups in which it occurs several times, and validation
-# cases.
-_SCENES, _GROUPS, _CASES = 20, 10, 10
+# A class needs this many scenes, and groups in which it occurs several times.
+_SCENES, _GROUPS = 20, 10
+_FOLDS: Final = 5
 
 
-def fit_counts(
-    train: Sequence[EncodedScene], validation: Sequence[EncodedScene], vocabulary: Vocabulary
-) -> Counts | None:
+def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts | None:
     """Fit the statistics of counts. Return None if no class has enough data.
 
     All data sources that count instances have the same total weight. Camera frames are left out,
-    because they show a part of a room. A class gets statistics only
-    if the expected number is closer to the truth than the class mean on validation scenes.
+    because they show a part of a room. A class gets statistics only if, in a cross-validation, the
+    expected number is closer to the truth than the class mean.
     """
-    counting = counted_classes(train, vocabulary)
     views = {name for name, source in SOURCES.items() if source.of_one_view}
+    counting = counted_classes(scenes, vocabulary)
     counting = {source: counted for source, counted in counting.items() if source not in views}
-    known = [scene for scene in train if scene.source in counting]
+    known = [scene for scene in scenes if scene.source in counting]
     classes = _frequent(known, counting, vocabulary)
-    if not len(classes):
-        return None
-    cases = _Cases.of(_few_of_group(known), counting, vocabulary, _DRAWS)
-    share = _shares(cases, len(vocabulary))
-    weights = _weights(cases, share, len(vocabulary))
-    # The exponent -1 stands for the listed number, which is uniform from 1 to n.
-    weights[:, INTERCEPT] -= 1.0
-    itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))
-    weights[np.arange(len(vocabulary)), itself] = 0.0
-    counts = Counts(classes, _stored(share[classes]), _stored(weights[classes]))
-    some = [scene for scene in validation if scene.source in counting]
-    kept = _better(counts, _few_of_group(some), counting, vocabulary)
-    if not kept.any():
-        return None
-    return Counts(classes[kept], counts.log_share[kept], counts.weights[kept])
+    if len(classes):
+        known = _few_of_group(known)
+        classes = classes[_better(known, classes, counting, vocabulary)]
+    return _fit(known, classes, counting, vocabulary) if len(classes) else None
+
+
+def folds(
+    scenes: Sequence[EncodedScene], seed: int = 0
+) -> Iterator[tuple[list[EncodedScene], list[EncodedScene]]]:
+    """Yield the training and the test scenes of five folds. A group is in the test of one fold."""
+    groups = sorted({scene.group for scene in scenes})
+    order = np.random.default_rng(seed).permutation(len(groups)).tolist()
+    place = dict(zip(groups, order, strict=True))
+    for number in range(_FOLDS):
+        train: list[EncodedScene] = []
+        test: list[EncodedScene] = []
+        for scene in scenes:
+            (test if place[scene.group] % _FOLDS == number else train).append(scene)
+        yield train, test
 
 
 def counted_classes(
@@ -107,6 +109,22 @@ def listed_cases(
     """Return a listed part of a scene, and the places of its classes that the source counts."""
     part = some_instances(scene, structure, scene_rng(scene, seed))
     return part, np.flatnonzero(counted[part.classes])
+
+
+def _fit(
+    scenes: Sequence[EncodedScene],
+    classes: Ints,
+    counting: dict[str, NDArray[np.bool_]],
+    vocabulary: Vocabulary,
+) -> Counts:
+    cases = _Cases.of(scenes, counting, vocabulary, _DRAWS)
+    share = _shares(cases, len(vocabulary))
+    weights = _weights(cases, share, len(vocabulary))
+    # The exponent -1 stands for the listed number, which is uniform from 1 to n.
+    weights[:, INTERCEPT] -= 1.0
+    itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))
+    weights[np.arange(len(vocabulary)), itself] = 0.0
+    return Counts(classes, _stored(share[classes]), _stored(weights[classes]))
 
 
 def _few_of_group(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
@@ -242,27 +260,34 @@ def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
 
 
 def _better(
-    counts: Counts,
     scenes: Sequence[EncodedScene],
+    classes: Ints,
     counting: dict[str, NDArray[np.bool_]],
     vocabulary: Vocabulary,
 ) -> NDArray[np.bool_]:
     """Return the classes (K,) whose expected number is closer than the class mean."""
-    V, K = len(vocabulary), len(counts.classes)
-    gain, cases = np.zeros(K), np.zeros(K, dtype=np.int64)
-    for scene in scenes:
-        for seed in range(_DRAWS):
-            part, asked = listed_cases(scene, counting[scene.source], vocabulary.structure, seed)
-            room = part.room if part.room >= 0 else None
-            which, p = distribution(counts, V, part.classes, part.listed, room)
-            usable = np.isin(which, asked)
-            which, expected = which[usable], p[usable] @ np.arange(1, MOST + 1)
-            row = np.searchsorted(counts.classes, part.classes[which])
-            mean = class_mean(counts, row, part.listed[which])
-            number = part.number[which]
-            gain[row] += np.abs(mean - number) - np.abs(expected - number)
-            cases[row] += 1
-    return (cases >= _CASES) & (gain > 0)
+    gain = np.zeros(len(classes))
+    for train, test in folds(scenes):
+        counts = _fit(train, classes, counting, vocabulary)
+        for scene in test:
+            for seed in range(_DRAWS):
+                counted = counting[scene.source]
+                part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
+                row, change = _changes(counts, part, asked, len(vocabulary))
+                gain[row] -= change
+    return gain > 0
+
+
+def _changes(counts: Counts, part: Part, asked: NDArray[np.intp], V: int) -> tuple[Ints, Floats]:
+    """Return rows of classes (k,), and error of the expected number minus error of the mean."""
+    room = part.room if part.room >= 0 else None
+    which, p = distribution(counts, V, part.classes, part.listed, room)
+    usable = np.isin(which, asked)
+    which, expected = which[usable], p[usable] @ np.arange(1, MOST + 1)
+    row = np.searchsorted(counts.classes, part.classes[which])
+    mean, number = class_mean(counts, row, part.listed[which]), part.number[which]
+    change: Floats = np.abs(expected - number) - np.abs(mean - number)
+    return row, change
 
 
 def class_mean(counts: Counts, row: Ints, listed: Ints) -> Floats:

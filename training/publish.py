@@ -178,7 +178,7 @@ def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
     return replace(
         artifact,
         offsets=fit_offsets(train, len(vocabulary)),
-        counts=fit_counts(train, scenes.parts["validation"], vocabulary),
+        counts=fit_counts([*train, *scenes.parts["validation"]], vocabulary),
     )
 
 
