@@ -57,6 +57,21 @@ export function createActions(store, say, menu) {
     say(`${id} removed.`);
   }
 
+  /** Gives an object another label, and the id of this label if its id was its label. */
+  function rename(id, label) {
+    const { things, relations, at } = store.get();
+    const own = id === find(id).label ? freshId(things, label) : id;
+    const end = (name) => (name === id ? own : name);
+    refocus(things.findIndex((thing) => thing.id === id));
+    store.edit({
+      things: things.map((thing) => (thing.id === id ? { ...thing, id: own, label } : thing)),
+      relations: relations.map((one) => ({ ...one, subject: end(one.subject), object: end(one.object) })),
+      selected: own,
+      at: at && { ...at, object: end(at.object) },
+    });
+    say(`${id} renamed to ${own}.`);
+  }
+
   /** Moves the focus to the next object after a removal, so that keyboard users keep their place. */
   function refocus(index) {
     const all = document.activeElement?.closest('#board') ? '#board .object' : '#list .name';
@@ -138,5 +153,5 @@ export function createActions(store, say, menu) {
     ], `Actions for ${id}`);
   }
 
-  return { select, add, remove, place, change, keys, open, find, sized };
+  return { select, add, remove, rename, place, change, keys, open, find, sized };
 }

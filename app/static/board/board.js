@@ -6,7 +6,7 @@ import { edgesOf } from './edges.js';
 import { drawGhosts } from './ghost_drawing.js';
 import { ghostsOf, ROBOT_SIDE } from './ghosts.js';
 import { labelPlaces, LINE, Places, widthOf } from './labels.js';
-import { reading, refusedBy, sizesOf } from './questions.js';
+import { inWords, reading, refusedBy, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { fit, gridStep, onScreen } from './view.js';
@@ -134,7 +134,7 @@ export function createBoard(node, store, actions, takeGhost) {
       places.reserve({ left: at - MARK, right: at + MARK, top: top - MARK, bottom: top + MARK });
     }
     for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
-      const words = (!state.draft && !left.has(box.label) && reading(state, state.shown, 'objects', box.label)) || box.id;
+      const words = (!state.draft && !left.has(box.label) && inWords(reading(state, state.shown, 'objects', box.label))) || box.id;
       const width = widthOf(words, FONT) + 6;
       const rect = onScreen(box, view);
       const at = places.take(width, LINE, labelPlaces(rect, width));

@@ -4,7 +4,7 @@ import { outliersOf } from './board.js';
 import { el } from './dom.js';
 import { edgesOf, wrongIn } from './edges.js';
 import { ghostsOf } from './ghosts.js';
-import { knownTo, readings } from './questions.js';
+import { inWords, knownTo, readings } from './questions.js';
 import { changed } from './store.js';
 import { SPOKEN } from './words.js';
 
@@ -62,7 +62,7 @@ export function settings(store) {
     get('posed').checked = state.posed;
     get('evidence').textContent = evidence(state);
     get('search-error').textContent = state.complaint;
-    get('room-error').textContent = readings(state, 'rooms', state.room);
+    get('room-error').textContent = readings(state, 'rooms', state.room).map(inWords).join('. ');
     get('undo').disabled = !state.canUndo;
     document.body.classList.toggle('two', Boolean(state.models[1]));
     get('at').hidden = !state.at;
