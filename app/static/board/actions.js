@@ -1,6 +1,6 @@
 /** Actions on objects, by mouse, touch or keyboard. */
 
-import { floorUnder, moved, round } from './geometry.js';
+import { floorUnder, moved, overlap, round } from './geometry.js';
 import { openMenu } from './menu.js';
 import { sizesOf } from './questions.js';
 import { FULL, freePlace, MOST_OBJECTS, freshId, sizer } from './scene.js';
@@ -59,12 +59,18 @@ export function createActions(store, say, menu) {
 
   /** Gives an object another label, and the id of this label if its id was its label. */
   function rename(id, label) {
-    const { things, relations, at } = store.get();
+    const { things, relations, at, viewer } = store.get();
     const own = id === find(id).label ? freshId(things, label) : id;
     const end = (name) => (name === id ? own : name);
+    const renamed = { ...find(id), id: own, label };
+    const box = sized()(renamed);
+    const others = things.filter((thing) => thing.id !== id).map(sized());
+    // The typical size of the new label may need another place.
+    const meets = !box.placed && !box.z && others.some((other) => overlap(other, box));
+    const place = meets ? freePlace(others, box.size, viewer) : {};
     refocus(things.findIndex((thing) => thing.id === id));
     store.edit({
-      things: things.map((thing) => (thing.id === id ? { ...thing, id: own, label } : thing)),
+      things: things.map((thing) => (thing.id === id ? { ...renamed, ...place } : thing)),
       relations: relations.map((one) => ({ ...one, subject: end(one.subject), object: end(one.object) })),
       selected: own,
       at: at && { ...at, object: end(at.object) },

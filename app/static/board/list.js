@@ -33,7 +33,7 @@ export function createList(list, empty, count, actions) {
   /** What the list says about an object besides its name. */
   function about(thing, state, out) {
     const where = !state.posed ? null
-      : thing.placed ? whereabouts(thing.x, thing.y, state.viewer) : 'position not given: move it to give one';
+      : thing.placed ? whereabouts(thing.x, thing.y, state.viewer) : 'position not given';
     return [thing.id === thing.label ? null : thing.label, where, out ? 'does not belong here' : null]
       .filter(Boolean).join(' · ');
   }
