@@ -142,10 +142,10 @@ def test_an_object_of_unknown_size_is_round(open_board: OpenBoard, api: httpx.Cl
     words = api.get("/models/default/vocabulary").json()["objects"]
     (tv,) = [entry for entry in words if entry["label"] == "tv"]
     place = {"x": 2, "y": 0, "z": 0.5}
-    objects = [{"label": name, "position": place} for name in (tv["aliases"][0], "table")]
-    board = open_board({"objects": objects})
+    names = (str(tv["aliases"][0]), "table")
+    board = open_board({"objects": [{"label": name, "position": place} for name in names]})
     assert board.scene["objects"][0]["size"] == tv["size"]
-    boxes = [board.thing(one["label"]).locator("rect") for one in objects]
+    boxes = [board.thing(name).locator("rect") for name in names]
     round_corners = [float(box.get_attribute("rx") or 0) > 100 for box in boxes]
     assert round_corners == [False, True]
     expect(board.page.locator("#legend .guess")).to_have_text("size not known")

@@ -3,8 +3,7 @@
 import { call } from './api.js';
 import { el } from './dom.js';
 import { changed } from './store.js';
-
-const plain = (text) => text.toLowerCase().replace(/[\s_-]+/g, ' ').trim();
+import { plain } from './words.js';
 
 /** The selectable models: aliases first, then all usable versions. */
 function choices({ models, aliases }) {
