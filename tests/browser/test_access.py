@@ -68,6 +68,18 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     assert {state: found[state] for state in found if found[state]} == {}
 
 
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
+def test_the_api_page_has_enough_contrast(
+    open_board: OpenBoard, api: httpx.Client, scheme: str
+) -> None:
+    board = open_board(color_scheme=scheme)
+    board.page.goto(f"{api.base_url}/docs")
+    board.page.get_by_role("button", name="POST /missing What").click()
+    board.page.get_by_role("tab", name="Schema").first.click()
+    expect(board.page.get_by_role("button", name="Execute")).to_be_visible()
+    assert [one for one in complaints(board) if one.startswith("color-contrast")] == []
+
+
 @pytest.mark.slow
 def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
     board = open_board()

@@ -138,6 +138,19 @@ def test_sizes_that_nobody_gave_are_the_models(open_board: OpenBoard, api: httpx
     assert float(shown) == pytest.approx(typical["x"], abs=1e-3)
 
 
+def test_an_object_of_unknown_size_is_round(open_board: OpenBoard, api: httpx.Client) -> None:
+    words = api.get("/models/default/vocabulary").json()["objects"]
+    (tv,) = [entry for entry in words if entry["label"] == "tv"]
+    place = {"x": 2, "y": 0, "z": 0.5}
+    names = (str(tv["aliases"][0]), "table")
+    board = open_board({"objects": [{"label": name, "position": place} for name in names]})
+    assert board.scene["objects"][0]["size"] == tv["size"]
+    boxes = [board.thing(name).locator("rect") for name in names]
+    round_corners = [float(box.get_attribute("rx") or 0) > 100 for box in boxes]
+    assert round_corners == [False, True]
+    expect(board.page.locator("#legend .guess")).to_have_text("size not known")
+
+
 def test_the_robot_can_stand_elsewhere(open_board: OpenBoard) -> None:
     board = open_board()
     board.page.get_by_role("button", name="Robot at x 0").focus()

@@ -79,10 +79,28 @@ def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> 
     expect(board.column("missing")).to_contain_text("fridgee → fridge? flux capacitor not known")
     board.page.locator("#room").select_option("bedroom")
     board.page.get_by_role("button", name="Remove flux capacitor").click()
-    board.page.get_by_role("button", name="Remove fridgee").click()
+    board.page.get_by_role("button", name="Rename fridgee to fridge").press("Enter")
     board.settle()
-    expect(board.page.locator("#room-error")).to_be_empty()
+    assert board.things == ["bed", "fridge"]
+    assert [thing["label"] for thing in board.scene["objects"]] == ["bed", "fridge"]
+    expect(board.page.locator("#list .name").nth(1)).to_be_focused()
+    expect(board.page.locator("#list .error:visible, #room-error:visible")).to_have_count(0)
     expect(board.column("missing").locator("header + .problem + p")).to_be_empty()
+
+
+def test_a_renamed_object_keeps_its_id_and_relations(open_board: OpenBoard) -> None:
+    scene = {
+        "objects": ["fridgee", {"id": "7", "label": "tabel"}, "fridge"],
+        "relations": [["fridgee", "left", "7"]],
+    }
+    board = open_board(scene, allow=("422",))
+    board.page.get_by_role("button", name="Rename fridgee to fridge").click()
+    board.page.get_by_role("button", name="Rename tabel to table").click()
+    board.settle()
+    found = [(one["id"], one["label"]) for one in board.scene["objects"]]
+    assert found == [("fridge_2", "fridge"), ("7", "table"), ("fridge", "fridge")]
+    stated = {"subject": "fridge_2", "relation": "left", "object": "7"}
+    assert board.scene["relations"] == [stated]
 
 
 def test_an_unknown_room_is_left_out_visibly(open_board: OpenBoard) -> None:

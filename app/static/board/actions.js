@@ -1,6 +1,6 @@
 /** Actions on objects, by mouse, touch or keyboard. */
 
-import { floorUnder, moved, round } from './geometry.js';
+import { floorUnder, moved, overlap, round } from './geometry.js';
 import { openMenu } from './menu.js';
 import { sizesOf } from './questions.js';
 import { FULL, freePlace, MOST_OBJECTS, freshId, sizer } from './scene.js';
@@ -55,6 +55,27 @@ export function createActions(store, say, menu) {
       at: at?.object === id ? null : at,
     });
     say(`${id} removed.`);
+  }
+
+  /** Gives an object another label, and the id of this label if its id was its label. */
+  function rename(id, label) {
+    const { things, relations, at, viewer } = store.get();
+    const own = id === find(id).label ? freshId(things, label) : id;
+    const end = (name) => (name === id ? own : name);
+    const renamed = { ...find(id), id: own, label };
+    const box = sized()(renamed);
+    const others = things.filter((thing) => thing.id !== id).map(sized());
+    // The typical size of the new label may need another place.
+    const meets = !box.placed && !box.z && others.some((other) => overlap(other, box));
+    const place = meets ? freePlace(others, box.size, viewer) : {};
+    refocus(things.findIndex((thing) => thing.id === id));
+    store.edit({
+      things: things.map((thing) => (thing.id === id ? { ...renamed, ...place } : thing)),
+      relations: relations.map((one) => ({ ...one, subject: end(one.subject), object: end(one.object) })),
+      selected: own,
+      at: at && { ...at, object: end(at.object) },
+    });
+    say(`${id} renamed to ${own}.`);
   }
 
   /** Moves the focus to the next object after a removal, so that keyboard users keep their place. */
@@ -138,5 +159,5 @@ export function createActions(store, say, menu) {
     ], `Actions for ${id}`);
   }
 
-  return { select, add, remove, place, change, keys, open, find, sized };
+  return { select, add, remove, rename, place, change, keys, open, find, sized };
 }

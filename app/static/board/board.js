@@ -4,12 +4,13 @@ import { ROBOT, whereabouts } from './actions.js';
 import { drawEdges } from './edge_drawing.js';
 import { edgesOf } from './edges.js';
 import { drawGhosts } from './ghost_drawing.js';
+import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf, ROBOT_SIDE } from './ghosts.js';
 import { labelPlaces, LINE, Places, widthOf } from './labels.js';
-import { reading, refusedBy, sizesOf } from './questions.js';
+import { inWords, reading, refusedBy, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
-import { fit, gridStep, onScreen } from './view.js';
+import { fit, gridStep, onScreen, ROUND } from './view.js';
 
 const MARK = 9; // radius of the mark of an outlier, in pixels
 const FONT = '500 13px system-ui, sans-serif';
@@ -55,7 +56,7 @@ export function createBoard(node, store, actions, takeGhost) {
 
   function drawGrid() {
     const lines = [];
-    const step = gridStep(Math.max(view.width, view.height) / view.scale);
+    const step = gridStep(view.scale);
     const from = view.metres(0, view.height);
     const to = view.metres(view.width, 0);
     for (let x = Math.ceil(from.x / step) * step; x <= to.x; x += step) lines.push({ key: `x${x}`, x1: 0, x2: view.width, y1: view.down(x), y2: view.down(x), words: view.down(x) > 16 ? `${x} m` : '', tx: 4, ty: view.down(x) - 3 });
@@ -110,7 +111,7 @@ export function createBoard(node, store, actions, takeGhost) {
     each.select('rect.box')
       .attr('width', (box) => box.size.y * view.scale).attr('height', (box) => box.size.x * view.scale)
       .attr('x', (box) => (-box.size.y / 2) * view.scale).attr('y', (box) => (-box.size.x / 2) * view.scale)
-      .attr('rx', (box) => Math.min(5, (Math.min(box.size.x, box.size.y) * view.scale) / 4));
+      .attr('rx', (box) => (box.size === UNKNOWN_SIZE ? ROUND : Math.min(5, (Math.min(box.size.x, box.size.y) * view.scale) / 4)));
     each.select('title').text((box) => described(box, state, boxes, wrong));
     if (focused && focused !== document.activeElement && focused.isConnected) focused.focus();
   }
@@ -134,7 +135,7 @@ export function createBoard(node, store, actions, takeGhost) {
       places.reserve({ left: at - MARK, right: at + MARK, top: top - MARK, bottom: top + MARK });
     }
     for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
-      const words = (!state.draft && !left.has(box.label) && reading(state, state.shown, 'objects', box.label)) || box.id;
+      const words = (!state.draft && !left.has(box.label) && inWords(reading(state, state.shown, 'objects', box.label))) || box.id;
       const width = widthOf(words, FONT) + 6;
       const rect = onScreen(box, view);
       const at = places.take(width, LINE, labelPlaces(rect, width));
@@ -157,7 +158,7 @@ export function createBoard(node, store, actions, takeGhost) {
   }
 
   function draw(state) {
-    if (!size.width) return;
+    if (!size.width || !size.height) return;
     const boxes = (state.draft?.things ?? state.things).map(sizer(sizesOf(state, state.models[0])));
     const shown = ghostsOf(state);
     const wrong = outliersOf(state);

@@ -4,7 +4,7 @@ import { curl, python } from './calls.js';
 import { bar, copy, el, redraw } from './dom.js';
 import { wrongIn } from './edges.js';
 import { accept, ghostsOf } from './ghosts.js';
-import { common, QUESTIONS, reading, whyNot } from './questions.js';
+import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
 import { percent, SPOKEN } from './words.js';
 
@@ -30,7 +30,7 @@ function reasons(because, company = []) {
 function notes({ warnings = [] }, state, column) {
   const names = [...new Set(state.things.map(({ label }) => label))].map((label) => reading(state, column, 'objects', label));
   return [
-    ...[...names, reading(state, column, 'rooms', state.room)].filter(Boolean).map((words) => (words.endsWith('?') ? words : `${words}.`)),
+    ...[...names, reading(state, column, 'rooms', state.room)].map(inWords).filter(Boolean).map((words) => (words.endsWith('?') ? words : `${words}.`)),
     ...warnings.map((one) => `Check ${one.objects.join(', ')}: ${one.message}.`),
   ].join(' ');
 }

@@ -1,8 +1,8 @@
 /** Suggestions as dashed boxes ("ghosts") with their probability. */
 
-import { overlap } from './geometry.js';
+import { overlap, UNKNOWN_SIZE } from './geometry.js';
 import { labelPlaces, widthOf } from './labels.js';
-import { onScreen } from './view.js';
+import { onScreen, ROUND } from './view.js';
 import { percent, SPOKEN } from './words.js';
 
 const FONT = '500 12px system-ui, sans-serif';
@@ -20,7 +20,7 @@ export function drawGhosts(layer, ghosts, boxes, view, places, take) {
   }
   const each = layer.selectAll('g.ghost').data(ghosts, (ghost) => ghost.id).join((enter) => {
     const g = enter.append('g').attr('class', 'ghost').attr('tabindex', 0).attr('role', 'button');
-    g.append('rect').attr('rx', 4);
+    g.append('rect');
     g.append('text');
     g.append('title');
     return g.on('click', (_, ghost) => take(ghost)).on('keydown', (event, ghost) => {
@@ -32,6 +32,7 @@ export function drawGhosts(layer, ghosts, boxes, view, places, take) {
   each.attr('aria-label', (ghost) => `Suggested: ${spokenGhost(ghost)}. Put it there`);
   each.select('title').text((ghost) => `${spokenGhost(ghost)}: click to put it there`);
   each.select('rect')
+    .attr('rx', (ghost) => (ghost.size === UNKNOWN_SIZE ? ROUND : 4))
     .attr('width', (ghost) => ghost.size.y * view.scale).attr('height', (ghost) => ghost.size.x * view.scale)
     .attr('x', (ghost) => view.across(ghost.y) - (ghost.size.y / 2) * view.scale)
     .attr('y', (ghost) => view.down(ghost.x) - (ghost.size.x / 2) * view.scale);

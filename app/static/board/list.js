@@ -2,7 +2,7 @@
 
 import { whereabouts } from './actions.js';
 import { outliersOf } from './board.js';
-import { el } from './dom.js';
+import { el, redraw } from './dom.js';
 import { readings } from './questions.js';
 import { changed } from './store.js';
 
@@ -27,16 +27,22 @@ export function createList(list, empty, count, actions) {
     const remove = el('button', {
       type: 'button', class: 'icon', 'aria-label': `Remove ${id}`, onclick: () => actions.remove(id),
     }, '✕');
-    return el('li', {}, name, more, remove, el('p', { class: 'error' }));
+    return el('li', {}, name, more, remove, el('div', { class: 'error' }));
   }
 
   /** What the list says about an object besides its name. */
   function about(thing, state, out) {
     const where = !state.posed ? null
-      : thing.placed ? whereabouts(thing.x, thing.y, state.viewer) : 'position not given: move it to give one';
+      : thing.placed ? whereabouts(thing.x, thing.y, state.viewer) : 'position not given';
     return [thing.id === thing.label ? null : thing.label, where, out ? 'does not belong here' : null]
       .filter(Boolean).join(' · ');
   }
+
+  /** How a model reads an unknown label. Each similar label is a button that renames the object. */
+  const suggested = ({ id, label }, [words, ...names]) => el('p', {}, words, ...names.flatMap((name) => [' ', el('button', {
+    type: 'button', class: 'link', 'data-key': name, 'aria-label': `Rename ${label} to ${name}`,
+    onclick: () => actions.rename(id, name),
+  }, `${name}?`)]));
 
   function draw(state) {
     const wrong = outliersOf(state);
@@ -49,7 +55,7 @@ export function createList(list, empty, count, actions) {
       this.classList.toggle('outlier', out);
       this.querySelector('.name').setAttribute('aria-current', String(chosen));
       this.querySelector('.name span').textContent = about(thing, state, out);
-      this.querySelector('.error').textContent = readings(state, 'objects', thing.label);
+      redraw(this.querySelector('.error'), readings(state, 'objects', thing.label).map((one) => suggested(thing, one)));
     });
     empty.hidden = state.things.length > 0;
     count.textContent = state.things.length ? `(${state.things.length})` : '';

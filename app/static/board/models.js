@@ -3,8 +3,7 @@
 import { call } from './api.js';
 import { el } from './dom.js';
 import { changed } from './store.js';
-
-const plain = (text) => text.toLowerCase().replace(/[\s_-]+/g, ' ').trim();
+import { plain } from './words.js';
 
 /** The selectable models: aliases first, then all usable versions. */
 function choices({ models, aliases }) {
@@ -27,7 +26,8 @@ function words({ objects, room_types: rooms, examples = [] }) {
     objects, rooms, examples,
     proposed: objects.filter(({ structure }) => !structure).map(({ label }) => label),
     // A Map, because a label such as “constructor” would clash with a property of plain objects.
-    sizes: new Map(objects.filter(({ size }) => size).map(({ label, size }) => [label, size])),
+    sizes: new Map(objects.filter(({ size }) => size).flatMap(
+      ({ label, aliases, size }) => [label, ...aliases].map((name) => [name, size]))),
     canonical: (label) => names.get(plain(label)) ?? label,
   };
 }

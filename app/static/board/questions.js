@@ -65,20 +65,24 @@ export function whyNot(state, question, model) {
 }
 
 /**
- * How a model reads an unknown name: "fridgee → fridge?", "flux not known, left out", or ''.
+ * How a model reads an unknown name: ["fridgee →", "fridge"], ["flux not known, left out"], or [].
  * @param {'objects' | 'rooms'} kind
+ * @returns {string[]} words, then similar names
  */
 export function reading(state, column, kind, name) {
   const similar = refusedBy(state, state.models[column])[kind].get(name);
-  if (similar) return `${name} not known, left out${similar.length ? ` (${similar.join(', ')}?)` : ''}`;
+  if (similar) return [`${name} not known, left out${similar.length ? ':' : ''}`, ...similar];
   const mapped = QUESTIONS.flatMap((question) => state.answers[column][question]?.answer?.mapped ?? []);
   const found = mapped.find(({ label }) => label === name);
-  return found ? `${name} → ${found.class}?` : '';
+  return found ? [`${name} →`, found.class] : [];
 }
+
+/** A reading as text: "fridgee → fridge?". */
+export const inWords = ([words, ...names]) => [words, ...names.map((name) => `${name}?`)].join(' ');
 
 /** The readings of all models; with two models, each begins with the name of its model. */
 export const readings = (state, kind, name) =>
   state.models.flatMap((model, column) => {
-    const words = model && reading(state, column, kind, name);
-    return words ? [state.models[1] ? `${model}: ${words}` : words] : [];
-  }).join('. ');
+    const [words, ...names] = model ? reading(state, column, kind, name) : [];
+    return words ? [[state.models[1] ? `${model}: ${words}` : words, ...names]] : [];
+  });

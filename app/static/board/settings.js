@@ -3,8 +3,10 @@
 import { outliersOf } from './board.js';
 import { el } from './dom.js';
 import { edgesOf, wrongIn } from './edges.js';
+import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf } from './ghosts.js';
-import { knownTo, readings } from './questions.js';
+import { inWords, knownTo, readings, sizesOf } from './questions.js';
+import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { SPOKEN } from './words.js';
 
@@ -13,7 +15,7 @@ const get = (id) => document.getElementById(id);
 /** The symbols of the board in words; the legend lists those that are visible. */
 const SYMBOLS = {
   robot: 'robot and the direction it looks in', selected: 'selected', outlier: 'does not belong',
-  unknown: 'not known to the model, left out', loose: 'position not given', anchor: 'place of the question', ghost: 'suggestion: click to add it',
+  unknown: 'not known to the model, left out', guess: 'size not known', loose: 'position not given', anchor: 'place of the question', ghost: 'suggestion: click to add it',
   misplaced: 'probably in the wrong place', holds: 'expected and observed', expected: 'expected',
   disagrees: 'expected instead of what is observed', fresh: 'generated', drawn: 'relation',
 };
@@ -24,6 +26,7 @@ function visible(state) {
   const seen = {
     robot: true, selected, outlier: [...outliersOf(state).values()].some((one) => one.is_outlier),
     unknown: knownTo(state, state.models[state.shown]).length < things.length,
+    guess: [...things.map(sizer(sizesOf(state, state.models[0]))), ...ghostsOf(state)].some(({ size }) => size === UNKNOWN_SIZE),
     loose: posed && things.some(({ placed }) => !placed), anchor: at, ghost: ghostsOf(state).length,
   };
   return Object.keys(SYMBOLS).filter((kind) => edges.has(kind) || (draft ? ['robot', 'fresh'].includes(kind) : seen[kind]));
@@ -62,7 +65,7 @@ export function settings(store) {
     get('posed').checked = state.posed;
     get('evidence').textContent = evidence(state);
     get('search-error').textContent = state.complaint;
-    get('room-error').textContent = readings(state, 'rooms', state.room);
+    get('room-error').textContent = readings(state, 'rooms', state.room).map(inWords).join('. ');
     get('undo').disabled = !state.canUndo;
     document.body.classList.toggle('two', Boolean(state.models[1]));
     get('at').hidden = !state.at;

@@ -28,12 +28,15 @@ export function fit(boxes, viewer, width, height) {
   };
 }
 
-const MOST_LINES = 40;
+/** Radius of corners that makes a circle of any square. */
+export const ROUND = 999;
 
-/** Metres between grid lines: the smallest of 1, 2, 5, 10, 20 … with at most `MOST_LINES` lines. */
-export function gridStep(metres) {
+const LEAST_STEP = 40; // pixels, so that the texts of grid lines do not overlap
+
+/** Metres between grid lines: the smallest of 1, 2, 5, 10, 20 … with at least `LEAST_STEP`. */
+export function gridStep(scale) {
   for (let ten = 1; ; ten *= 10) {
-    const step = [1, 2, 5].find((digit) => metres <= MOST_LINES * digit * ten);
+    const step = [1, 2, 5].find((digit) => digit * ten * scale >= LEAST_STEP);
     if (step) return step * ten;
   }
 }

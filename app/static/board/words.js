@@ -2,7 +2,8 @@
 
 /** @typedef {{label: string, aliases: string[], structure: boolean}} Entry */
 
-const plain = (text) => text.toLowerCase().replace(/[\s_-]+/g, ' ').trim();
+/** A label for comparisons: in lower case, with single spaces. */
+export const plain = (text) => text.toLowerCase().replace(/[\s_-]+/g, ' ').trim();
 
 function rank(name, wanted) {
   if (name === wanted) return 0;
