@@ -99,24 +99,27 @@ clean:  ## remove the environment and all caches
 
 $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing the service's packages into $(VENV) ..."
-	@$(PIP) install -r requirements.lock
+	@$(PIP) install -qq -r requirements.lock
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
-	@echo "Compiling kernels for this machine ..."
+	@echo "Installed. Compiling kernels for this machine ..."
 	@$(BIN)/python -m app.compile
+	@echo "Compiled."
 	@touch $@
 
 $(EVERYTHING): requirements-dev.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing every package into $(VENV) ..."
 	@$(PIP) install -qq $(INDEX) -r requirements-dev.lock
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
+	@echo "Installed."
 	@touch $(SERVICE) $@
 
 $(RAY): requirements-ray.lock pyproject.toml clients/python/pyproject.toml | $(RAY_VENV)/bin/python
 	@echo "Installing the service and Ray into $(RAY_VENV) ..."
 	@$(RAY_VENV)/bin/python -m pip --disable-pip-version-check install -qq -r requirements-ray.lock
 	@$(RAY_VENV)/bin/python -m pip --disable-pip-version-check install -qq --no-deps --editable clients/python --editable .
-	@echo "Compiling kernels for this machine ..."
+	@echo "Installed. Compiling kernels for this machine ..."
 	@$(RAY_VENV)/bin/python -m app.compile
+	@echo "Compiled."
 	@touch $@
 
 # This target is an order-only prerequisite above, so an existing environment is never created again.

@@ -77,6 +77,14 @@ Data = Annotated[
         f"{DATA} for a shipped configuration (`fetch` says what belongs there)",
     ),
 ]
+StoredData = Annotated[
+    Path | None,
+    typer.Option(
+        "--data",
+        help="folder with the scene files. For a stored model of your own scenes, pass the folder "
+        f"of its configuration file; default: {DATA}, or for a run, the folder of its training",
+    ),
+]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
 StorePath = Annotated[str, typer.Option("--store", help="the model store: a folder or a URL")]
 _RUNS, _STORE = Path("runs"), "model_store"
@@ -110,16 +118,18 @@ def train(
             first = is_first()
             console.quiet = not first
             config = load_config(configuration, seed=seed)
+            if publish is not None and first:
+                open_for_publisher(store).require_new(config.name, publish)
             root = data_folder(configuration, config, data)
-            scenes = _prepare(config, root)
             folder = runs / config.name / f"seed-{config.training.seed}"
             measured = None
             if final:
                 if publish is not None:
-                    measured = load_run(folder), scenes
+                    with console.status("reading and encoding scenes"):
+                        measured = load_run(folder), prepare(config, root)
                 config = with_settings(config, {"data.split": "final"})
-                scenes = _prepare(config, root)
                 folder = folder.with_name(f"final-{folder.name}")
+            scenes = _prepare(config, root)
             _train(config, scenes, folder, root, fresh, tensorboard)
         if publish is not None and first:
             _publish(load_run(folder), scenes, store, publish, measured)
@@ -140,7 +150,7 @@ def publish(
         ),
     ],
     version: Annotated[str, typer.Argument(help="number of the new version, such as 1.0.0")],
-    data: Data = None,
+    data: StoredData = None,
     store: StorePath = _STORE,
     promote: Annotated[
         bool,
@@ -184,11 +194,13 @@ def publish(
             _refit(folder, data or DATA, store, version)
             return
         run = load_run(Path(folder))
+        models = open_for_publisher(store)
+        models.require_new(run.config.name, version)
         root = data or (Path(run.data) if run.data else DATA)
         scenes = _prepare(run.config, root)
         if promote:
             gate = _Gate(alias or "default", margin, limit, even_if_worse)
-            _promote(run, scenes, root, open_for_publisher(store), version, gate)
+            _promote(run, scenes, root, models, version, gate)
         else:
             _publish(run, scenes, store, version)
     except RefusedError as error:
@@ -202,7 +214,7 @@ def publish(
 @app.command(name="evaluate")
 def evaluate_command(
     models: Annotated[list[str], typer.Argument(help="model: an alias, name or name@version")],
-    data: Data = None,
+    data: StoredData = None,
     store: StorePath = _STORE,
     source: Annotated[list[str] | None, typer.Option(help="use only these data sources")] = None,
     part: Annotated[str, typer.Option(help="scenes: train, validation or test")] = "test",
@@ -328,7 +340,9 @@ def _publish(
 
 def _refit(reference: str, root: Path, store: str, version: str) -> None:
     models = open_for_publisher(store)
-    artifact = models.load(*models.resolve(reference))
+    name, old = models.resolve(reference)
+    models.require_new(name, version)
+    artifact = models.load(name, old)
     with console.status("publishing") as status:
         artifact = refit(artifact, root, models, version, progress=status.update)
     _published(artifact, store)

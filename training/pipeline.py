@@ -175,12 +175,17 @@ def _require_files(data: DataConfig, root: Path) -> None:
         return
     names = ", ".join(path.relative_to(root).as_posix() for path in missing.values())
     text = f"{len(missing)} of {len(paths)} files of scenes are missing in {root}: {names}. "
-    if not all(map(is_file, missing)):
-        text += (
-            "The repository does not contain the public data sets. `python -m training fetch` says "
-            "where each of them is to be had. "
+    if all(map(is_file, missing)):
+        advice = (
+            "The paths start at the folder of your configuration file. Pass this folder with "
+            "--data, such as --data my-lab"
         )
-    raise ConfigError(f"{text}Pass the folder of the files with --data")
+    else:
+        advice = (
+            "The repository does not contain the public data sets. `python -m training fetch` says "
+            "where each of them is to be had. Pass the folder of the files with --data"
+        )
+    raise ConfigError(text + advice)
 
 
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:

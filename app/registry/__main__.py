@@ -1,7 +1,8 @@
 """``python -m app.registry``: move aliases of a store, publish to a remote store, revoke versions.
 
-SCENE_STORE replaces --store. SCENE_SIGNING_KEY is the PEM file of the signing key, and
-SCENE_TRUSTED_KEYS lists public keys. A publisher trusts its own key.
+Without --store, the store is SCENE_STORE, or else the folder model_store, as for the service.
+SCENE_SIGNING_KEY is the PEM file of the signing key, and SCENE_TRUSTED_KEYS lists public keys. A
+publisher trusts its own key.
 """
 
 from __future__ import annotations
@@ -11,11 +12,14 @@ import logging
 import os
 import sys
 from pathlib import Path
+from typing import Final
 
 from app.registry import AliasTarget, RegistryError, Store, StoreError, load_model_set
 from app.registry.index import Signer
 from app.registry.location import open_for_publisher
 from app.registry.remote import RemoteStore
+
+_STORE: Final = "model_store"  # as `Settings.store`
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -23,15 +27,28 @@ def main(arguments: list[str] | None = None) -> int:
     asked = _parser().parse_args(arguments)
     # The messages of this command contain the errors.
     logging.getLogger("app.registry").addHandler(logging.NullHandler())
+    place = ""
     try:
         if asked.command == "key":
             _say(f"public key for SCENE_TRUSTED_KEYS: {Signer.create(Path(asked.file)).public}")
             return 0
-        _run(asked, open_for_publisher(asked.store or os.environ.get("SCENE_STORE", "")))
+        location = asked.store or os.environ.get("SCENE_STORE") or _STORE
+        place = f"store {location}: "
+        if asked.command == "upload":
+            place = f"upload from {asked.source} to {location}: "
+            _require_folder(asked.source)
+        _require_folder(location)
+        _run(asked, open_for_publisher(location))
     except RegistryError as error:
-        sys.stderr.write(f"{error.reason}\n")
+        sys.stderr.write(f"{place}{error.reason}\n")
         return 1
     return 0
+
+
+def _require_folder(location: str) -> None:
+    """Refuse a folder that does not exist, because `Store` would create it."""
+    if "://" not in location and not Path(location).is_dir():
+        raise StoreError("unreadable", f"there is no folder {location}")
 
 
 def _run(asked: argparse.Namespace, store: Store) -> None:
@@ -87,14 +104,18 @@ def _parser() -> argparse.ArgumentParser:
     key = commands.add_parser("key", help="create a signing key and print its public key")
     key.add_argument("file", help="new PEM file")
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--store", help="folder or URL of the store")
+    common.add_argument(
+        "--store", help=f"folder or URL of the store; default: SCENE_STORE, or else {_STORE}"
+    )
 
     def add(name: str, text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, parents=[common])
 
     upload = add("upload", "copy versions from a folder store to the remote store")
     upload.add_argument("references", nargs="+", help="alias, name or name@version")
-    upload.add_argument("--from", dest="source", default="model_store", help="the folder store")
+    upload.add_argument(
+        "--from", dest="source", default=_STORE, help=f"the folder store; default: {_STORE}"
+    )
     upload.add_argument("--alias", help="afterwards, point this alias at the version")
     alias = add("alias", "point an alias at a version, for example to roll back")
     alias.add_argument("alias")

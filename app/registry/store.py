@@ -181,6 +181,30 @@ class Store:
 
     # -- writing --------------------------------------------------------------------------------
 
+    def require_new(self, name: str, version: str, alias: str | None = None) -> None:
+        """Check that a version can be published: its number is valid and new.
+
+        Args:
+            name, version: name and number of the new version.
+            alias: alias that will point at the version, or None.
+
+        Raises:
+            StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
+                or `unreadable`.
+        """
+        check_version(version)
+        if name == alias or name in self.aliases():
+            raise StoreError(
+                "name_conflict",
+                f"'{name}' is the name of an alias, so it cannot be the name of a model",
+            )
+        if version in (known := self.versions(name)):
+            raise StoreError(
+                "version_exists",
+                f"{name}@{version} is already published, and a version never changes. Choose a "
+                f"new number; the newest version is {known[-1]}",
+            )
+
     def publish(
         self,
         description: Description,
@@ -212,11 +236,7 @@ class Store:
         if alias is not None:
             check_name(alias, "alias")
         with self._writing():
-            if name == alias or name in self.aliases():
-                raise StoreError(
-                    "name_conflict",
-                    f"'{name}' is the name of an alias, so it cannot be the name of a model",
-                )
+            self.require_new(name, version, alias)
             if alias is not None:
                 self._require_no_model(alias)
             folder = self._prepare_folder(name)
@@ -224,7 +244,8 @@ class Store:
             if os.path.lexists(place):
                 raise StoreError(
                     "version_exists",
-                    f"{name}@{version} is already published; publish under another version",
+                    f"{name}/{version} is a folder without a manifest. Choose a new number, or "
+                    "remove the folder",
                 )
             temporary = folder / f"{TEMPORARY}{version}-{token_hex(8)}"
             try:

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from app.registry import AliasTarget, ArtifactError, RegistryError, Store, StoreError
+from app.registry.__main__ import main
 from app.registry.locking import exclusive
+from app.settings import Settings
 from tests.registry.small_artifacts import description, state
 
 
@@ -358,3 +360,26 @@ def test_errors_have_a_code_a_reason_and_one_base() -> None:
     assert (error.code, error.reason, str(error)) == ("locked", "by another", "locked: by another")
     assert issubclass(StoreError, RegistryError)
     assert issubclass(ArtifactError, RegistryError)
+
+
+# -- the command --------------------------------------------------------------------------------
+
+
+def test_the_command_changes_the_store_of_the_service_and_creates_none(
+    store: Store,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    publish(store)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SCENE_STORE", raising=False)
+    alias = ["alias", "default", "tiny@1.0.0"]
+    assert main([*alias, "--store", "stor"]) == 1
+    assert "there is no folder stor" in capsys.readouterr().err
+    assert main(alias) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+    store.root.rename(Settings.model_fields["store"].default)
+    assert main(["alias", "default", "tiny@2.0.0"]) == 1
+    assert "store model_store: model 'tiny' does not have" in capsys.readouterr().err
+    assert main(alias) == 0

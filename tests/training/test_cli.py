@@ -18,6 +18,7 @@ from app.questions import generate, missing, outliers, relations
 from app.registry import Store
 from app.registry.references import AliasTarget
 from app.scene import Scene, SceneObject
+from tests.registry.small_artifacts import description, state
 from training.cli import app
 from training.config import load_config
 from training.offsets import fit_offsets
@@ -163,6 +164,34 @@ def test_errors_are_one_clear_line(arguments, message):
     result = CliRunner().invoke(app, list(arguments))
     assert result.exit_code == 1
     assert message in " ".join(result.output.split())
+
+
+def test_a_version_is_checked_before_the_work(tmp_path):
+    store, config = tmp_path / "store", tmp_path / "config.toml"
+    Store(store).publish(description("tiny", "1.2.0"), state())
+    config.write_text(CONFIG.replace("rooms-triway", "tiny"))
+    for version, message in (
+        ("1.2.0", "tiny@1.2.0 is already published"),
+        ("abc", "error: a version must be MAJOR.MINOR.PATCH"),
+    ):
+        for command in (
+            ("train", str(config), "--runs", str(tmp_path / "runs"), "--publish", version),
+            ("publish", "tiny@1.2.0", version),
+        ):
+            result = CliRunner().invoke(app, [*command, "--store", str(store)])
+            assert result.exit_code == 1, result.output
+            output = " ".join(result.output.split())
+            assert message in output
+            assert ("the newest version is 1.2.0" in output) == (version == "1.2.0")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_missing_scenes_of_ones_own_are_looked_for_beside_the_configuration(tmp_path):
+    config = tmp_path / "config.toml"
+    config.write_text(CONFIG.replace('"rooms"]', '"../lost.jsonl"]'))
+    result = CliRunner().invoke(app, ["train", str(config)])
+    assert result.exit_code == 1
+    assert "Pass this folder with --data" in " ".join(result.output.split())
 
 
 def test_a_bad_configuration_names_its_entry(tmp_path):

@@ -11,6 +11,7 @@ from typing import Annotated, Literal, NoReturn
 import typer
 from rich.console import Console
 
+from app.registry import RegistryError
 from training.config import ConfigError, is_file, shipped_configs, source_name
 from training.datasets import (
     READERS,
@@ -36,12 +37,19 @@ class BadLinesError(ValueError):
     """Some lines of a file are not valid scenes. `errors` contains the error of each line."""
 
     def __init__(self, errors: list[DatasetError]) -> None:
-        super().__init__(f"{len(errors)} lines are not scenes")
+        n = len(errors)
+        super().__init__("1 line is not a scene" if n == 1 else f"{n} lines are not scenes")
         self.errors = errors
 
 
 def init(
-    name: Annotated[str, typer.Argument(help="name of the model: lower case, digits and hyphens")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="name of the model, such as my-lab: words of a-z and 0-9, joined by hyphens; "
+            "capitals, underscores, dots and spaces are refused"
+        ),
+    ],
     files: Annotated[list[Path], typer.Argument(help="files with the scenes of one domain")],
     output: Annotated[
         Path | None, typer.Option(help="output folder; default: a folder named like the model")
@@ -99,7 +107,8 @@ def init(
 def _check_name(name: str) -> None:
     if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
         raise ConfigError(
-            f"the model name is {name!r}; use lower-case words and digits, joined by hyphens"
+            f"the model name is {name!r}; use lower-case words and digits, joined by hyphens, "
+            "such as my-lab"
         )
     if name in shipped_configs():
         raise ConfigError(f"{name} is the name of a shipped configuration; choose another name")
@@ -181,8 +190,9 @@ def _fail_lines(error: BadLinesError) -> NoReturn:
 
 
 def fail(error: Exception) -> NoReturn:
-    """Print the error and exit with code 1."""
-    console.print(f"[red]error:[/red] {error}", soft_wrap=True)
+    """Print the error, without the code of a registry error, and exit with code 1."""
+    reason = error.reason if isinstance(error, RegistryError) else error
+    console.print(f"[red]error:[/red] {reason}", soft_wrap=True)
     raise typer.Exit(1) from None
 
 

@@ -213,12 +213,17 @@ def _duplicates(scenes: Sequence[AnnotatedScene]) -> Finding:
     )
     first: dict[object, AnnotatedScene] = {}
     for scene in scenes:
+        labels = {thing.id: label_key(thing.label) for thing in scene.objects}
         things = [
-            (label_key(thing.label), _rounded(thing.position), thing.box2d)
+            (
+                labels[thing.id],
+                _rounded(thing.position),
+                thing.box2d,
+                None if thing.supported_by is None else labels[thing.supported_by],
+            )
             for thing in scene.objects
         ]
-        telling = scene.relations or any(place or box for _, place, box in things)
-        if not telling:
+        if not scene.relations and not any(any(placed) for _, *placed in things):
             continue  # two small scenes often have the same objects by chance
         content = (tuple(sorted(things, key=repr)), tuple(sorted(scene.relations or ())))
         other = first.setdefault(content, scene)

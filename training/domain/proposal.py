@@ -280,7 +280,8 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
     # About eight updates an epoch or more: validation after each epoch takes longer than an update.
     batch = max(4, min(32, n // 8)) if n < 1500 else 64
     updates = _between(n, (200, 600), (2500, 1800))
-    epochs = max(15, math.ceil(updates / math.ceil(n / batch)))
+    per_epoch = math.ceil(n / batch)
+    epochs = max(15, math.ceil(updates / per_epoch))
     patience = max(10, epochs // 4)
     machine: dict[str, Any] = {"variant": "triway" if related else "rbm", "form": "local"}
     machine |= {"H1": H1, "H2": 0, "initial_c1": -1.0, "N": 128 if n < 1500 else 512}
@@ -314,12 +315,14 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         if related
         else "the scenes contain no relations or positions: the model learns objects only",
         "machine.H1": f"hidden units: many more would overfit the {n} training scenes",
-        "training.epochs": f"at most {updates} updates, {math.ceil(n / batch)} updates an epoch",
+        "training.epochs": f"at most {epochs} epochs of {per_epoch} updates",
         "training.patience": f"training stops after {patience} epochs without a better score on "
         "validation scenes, and keeps the best epoch",
         "training.weight_decay": "few scenes need a larger decay",
         "objective.unlisted": "an unlisted relation counts as false: /relations then predicts the "
-        "relations that an annotator would list",
+        "relations that an annotator would list"
+        if facts.shares["relations"]
+        else "a relation counts as false unless positions, boxes or supports show it",
     }
     values = {
         "machine": machine,

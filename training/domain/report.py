@@ -83,7 +83,7 @@ def _labels(proposal: Proposal, console: Console) -> None:
             console.print(f"  {label.spellings[0]} → {label.name}", markup=False)
     varied = [label for label in labels if len(label.spellings) > 1]
     if varied:
-        console.print(f"{len(varied)} labels have several spellings; each counts as one label:")
+        console.print(f"labels with several spellings, each counted as one label: {len(varied)}")
         for label in varied[:ROWS]:
             console.print(f"  {' = '.join(label.spellings[:6])}", markup=False)
 

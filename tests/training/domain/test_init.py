@@ -65,6 +65,15 @@ def test_an_edited_vocabulary_is_used(file, tmp_path) -> None:
     path.write_text(json.dumps(values))
     config = load_config(str(folder))
     assert prepare(config, folder).vocabulary.index(gone) is None
+    # A built-in synonym becomes a class, and another class becomes an alias.
+    table = next(entry for entry in values["objects"] if "lab bench" in entry["aliases"])
+    table["aliases"].remove("lab bench")
+    merged = values["objects"].pop(values["objects"][0] is table)["label"]
+    table["aliases"].append(merged)
+    path.write_text(json.dumps(values | {"objects": [*values["objects"], {"label": "lab bench"}]}))
+    vocabulary = prepare(config, folder).vocabulary
+    assert vocabulary.index(merged) == vocabulary.index("table")
+    assert vocabulary.labels[vocabulary.index("lab bench")] == "lab bench"
     path.write_text("{}")
     with pytest.raises(ConfigError, match=r"vocabulary\.json cannot be used"):
         prepare(config, folder)
@@ -104,6 +113,8 @@ def test_every_bad_line_is_named_up_to_a_bound(tmp_path) -> None:
     assert "line 24" not in output
     assert "and 14 more" in output
     assert not (tmp_path / "lab").exists()
+    path.write_text("[]")
+    assert "1 line is not a scene;" in invoke("init", "lab", path, code=1)
 
 
 @pytest.mark.parametrize(

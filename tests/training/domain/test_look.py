@@ -78,6 +78,10 @@ def test_copies_in_other_groups_are_found() -> None:
     assert finding("different groups", first, second) == (1, ["a and b"])
     framed = scene("c", "cup", "table", group="a", **related)
     assert finding("different groups", first, framed) == (0, [])
+    stacked = {"supported_by": ["1", None]}
+    assert finding(
+        "different groups", scene("a", "cup", "bed", **stacked), scene("b", "cup", "bed", **stacked)
+    ) == (1, ["a and b"])
     # Two small rooms may hold the same things.
     assert finding("different groups", scene("a", "cup", "bed"), scene("b", "cup", "bed"))[0] == 0
 
