@@ -7,6 +7,7 @@ command then continues the run.
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -51,7 +52,7 @@ from training.experiments.gate import (
 )
 from training.experiments.tune import tune
 from training.fetch import fetch
-from training.live import Display, summarise
+from training.live import Display, next_steps, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import publish_run, refit
 from training.runs import FinishedRun, RunError, load_run, save_run
@@ -131,6 +132,8 @@ def train(
                 folder = folder.with_name(f"final-{folder.name}")
             scenes = _prepare(config, root)
             _train(config, scenes, folder, root, fresh, tensorboard)
+            if publish is None and not final:
+                next_steps(folder, console)
         if publish is not None and first:
             _publish(load_run(folder), scenes, store, publish, measured)
     except (
@@ -196,11 +199,17 @@ def publish(
         run = load_run(Path(folder))
         models = open_for_publisher(store)
         models.require_new(run.config.name, version)
+        if promote and run.config.data.split == "final":
+            raise ConfigError(
+                f"{folder} is a final run without test scenes, so it cannot be compared; {_ALIAS}"
+            )
         root = data or (Path(run.data) if run.data else DATA)
         scenes = _prepare(run.config, root)
         if promote:
             gate = _Gate(alias or "default", margin, limit, even_if_worse)
             _promote(run, scenes, root, models, version, gate)
+            command = f"SCENE_STORE={shlex.quote(store)} python -m app"
+            console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)
         else:
             _publish(run, scenes, store, version)
     except RefusedError as error:

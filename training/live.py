@@ -143,7 +143,7 @@ def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
 
 
 def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: Console) -> None:
-    """Print the validation curve, best epoch and duration of a run, and commands for next steps."""
+    """Print the validation curve, best epoch and duration of a run."""
     best = result.epochs[result.best_epoch]
     table = Table("curve", "", "first", "best epoch", "last", title_justify="left")
     table.title = f"{trainer.config.name}, seed {trainer.config.training.seed}"
@@ -166,6 +166,10 @@ def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: C
         console.print(f"stopped early: {idle} epochs without a better score on validation scenes")
     elif advice := _advice(result):
         console.print(advice, soft_wrap=True)
+
+
+def next_steps(folder: Path, console: Console) -> None:
+    """Print the commands that compare a run and publish it."""
     console.print(
         f"next: python -m training compare {folder} --store my-store\n"
         f"      python -m training publish {folder} 1.0.0 --store my-store --promote",

@@ -200,3 +200,20 @@ def test_a_bad_configuration_names_its_entry(tmp_path):
     result = CliRunner().invoke(app, ["train", str(config)])
     assert result.exit_code == 1
     assert "training.epochs" in result.output
+
+
+def test_a_final_run_is_not_promoted_by_comparison(tmp_path):
+    config = tmp_path / "config.toml"
+    config.write_text(CONFIG)
+    output = run("train", str(config), "--final", "--runs", str(tmp_path / "runs"))
+    assert "best epoch" in output
+    assert "next:" not in output
+    folder = tmp_path / "runs/rooms-triway/final-seed-0"
+    result = CliRunner().invoke(
+        app, ["publish", str(folder), "1.0.0", "--promote", "--store", str(tmp_path / "store")]
+    )
+    assert result.exit_code == 1
+    text = " ".join(result.output.split())
+    assert "is a final run without test scenes" in text
+    assert "`python -m app.registry alias` moves an alias without a comparison" in text
+    assert "object classes" not in text  # refused before the scenes are read

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from training.cli import app
 from training.config import Config
-from training.live import Display, sparkline, summarise
+from training.live import Display, next_steps, sparkline, summarise
 from training.pipeline import prepare
 from training.runs import save_checkpoint
 from training.trainer import Trainer
@@ -64,6 +64,7 @@ def test_a_run_shows_its_scores_and_what_to_do_next(tmp_path) -> None:
     with Display(trainer, console, tmp_path / "logs") as display:
         result = trainer.run(display.progress, display.ended)
     summarise(result, trainer, tmp_path, console)
+    next_steps(tmp_path, console)
     shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", console.file.getvalue())
     assert "epoch 4/4" in shown
     assert f"MRR {result.epochs[result.best_epoch].mrr_validation:.3f}" in shown

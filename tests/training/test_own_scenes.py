@@ -116,6 +116,7 @@ def test_the_same_again_is_not_worse_and_may_take_its_place(workplace) -> None:
     assert "Questions with the most different answers" not in output
     output = workplace.publish(workplace.run, "1.0.1", "--promote")
     assert "promoted: default → my-lab@1.0.1, before my-lab@1.0.0" in output
+    assert output.endswith(f"next: SCENE_STORE={workplace.store} python -m app")
 
 
 def test_a_worse_version_is_refused_unless_somebody_insists(workplace) -> None:
@@ -134,7 +135,7 @@ def test_a_worse_version_is_refused_unless_somebody_insists(workplace) -> None:
 
     for alias in ("default", "new-alias"):
         output = workplace.publish(run, "2.0.0", "--promote", "--alias", alias, code=3)
-        assert "refused: the new version is not better than popularity" in output
+        assert "refused: the new version is not clearly better than popularity" in output
         assert "the new version is worse than EASE" in output
         assert "nothing was published" in output
         assert (workplace.served, workplace.versions) == (before, versions)

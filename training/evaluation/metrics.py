@@ -20,6 +20,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm, t
 
 from training.evaluation.item_statistics import STATISTICS
 
@@ -123,10 +124,10 @@ def paired_difference(
     Args:
         groups: group of each scene. With groups, a resample draws groups instead of scenes, because
             scenes of one group are near-duplicates (Field and Welsh, "Bootstrapping clustered
-            data", 2007).
+            data", 2007). The draws are widened by `_widening`.
 
     Raises:
-        ValueError: the numbers of scenes differ.
+        ValueError: the numbers of scenes differ, or all scenes belong to one group.
     """
     if a.scenes != b.scenes or (groups is not None and len(groups) != a.scenes):
         of = "" if groups is None else f" and {len(groups)} group labels"
@@ -137,9 +138,27 @@ def paired_difference(
         draws = x[:both] - y[:both]
     else:
         names, place = np.unique(np.array(groups), return_inverse=True)
+        if len(names) < 2:
+            raise ValueError("an interval needs scenes of at least two groups")
         weights = scene_weights(len(names), resamples, seed)
         draws = np.array([a.at(weight[place]) - b.at(weight[place]) for weight in weights])
+        value = a.value - b.value
+        draws = value + _widening(len(names)) * (draws - value)
     return Figure.of(a.value - b.value, draws, min(a.n, b.n))
+
+
+def _widening(groups: int) -> float:
+    """Return the factor that widens bootstrap intervals over G groups.
+
+    The bootstrap variance of a mean is too small by (G - 1)/G. Its percentiles are those of a
+    normal distribution; with an estimated variance, those of Student's t with G - 1 degrees of
+    freedom apply.
+
+    Source: Cameron, Gelbach and Miller, "Bootstrap-based improvements for inference with clustered
+    errors" (2008), on the problem of few clusters.
+    """
+    quantiles = t.ppf(0.975, groups - 1) / norm.ppf(0.975)
+    return float(quantiles * np.sqrt(groups / (groups - 1)))
 
 
 @lru_cache(maxsize=4)

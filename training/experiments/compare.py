@@ -57,8 +57,6 @@ RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3
 
 # Tasks that leave out scenes without relations.
 _RELATED = ("T2-at missing at a place", "T3b placement")
-# With fewer groups of near-duplicate scenes, the bootstrap intervals are inaccurate.
-_ENOUGH_GROUPS = 15
 # Number of answers per model in an example.
 _FIRST = 3
 _COLOURS = {"better": "green", "worse": "red"}
@@ -199,18 +197,19 @@ def show(comparison: Comparison, console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    table = Table("task, metric", "A", "B", "A - B, 95 % interval", "A is", box=box.SIMPLE_HEAD)
-    for column in table.columns[1:]:
-        column.no_wrap = True
+    heads = "task, metric", "A", "B", "A - B, 95 % interval", "A is"
+    # Without edges and padding, the table fits into 80 columns.
+    table = Table(*heads, box=box.SIMPLE_HEAD, show_edge=False, padding=0)
     cells = comparison.results.cells
     values = {(cell.row, cell.task, cell.metric): cell.figure.value for cell in cells}
+    task = ""
     for row in comparison.results.differences:
+        if row.task != task:
+            task = row.task
+            table.add_row(f"[bold]{in_words(task)}[/bold]")
         colour, figure = _COLOURS.get(row.verdict, "dim"), row.figure
-        name = f"  {row.metric}"
-        if is_primary(row):
-            name = f"{in_words(row.task)},\n{name}"
         table.add_row(
-            name,
+            f"  {row.metric}",
             *(f"{values[x, row.task, row.metric]:.3f}" for x in (comparison.a, comparison.b)),
             f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]",
             f"[{colour}]{row.verdict}[/{colour}]",
@@ -285,7 +284,7 @@ def compare(
         scenes=len(scenes),
         groups=groups,
         certain=held.certain,
-        notes=tuple(_notes(a, b, held, limit, groups)),
+        notes=tuple(_notes(a, b, held, limit)),
         examples=tuple(found),
         unmeasured=unmeasured(results.differences, b),
     )
@@ -309,7 +308,8 @@ def side_by_side(
         structure: (classes,) bool, True for structure classes such as walls.
 
     Raises:
-        ValueError: the scenes belong to fewer than two groups, so intervals are undefined.
+        ValueError: for every task, the scenes belong to fewer than two groups, so intervals are
+            undefined.
     """
     setting = Setting(scenes, structure, limit=None)
 
@@ -317,12 +317,13 @@ def side_by_side(
         asked = setting.complete if TASKS[task].of_objects else setting
         return [scene.group for scene in asked.some(task in _RELATED).scenes]
 
-    if len({scene.group for scene in scenes.scenes}) < 2:
+    tasks = [task for task in COMPARED if len(set(groups(task))) > 1]
+    if not tasks:
         raise ValueError("the scenes belong to one group, but intervals need at least two groups")
     reports = {}
     for title, rival in zip(titles, rivals, strict=True):
         report = SourceReport("held out", digest(setting))
-        for task in COMPARED:
+        for task in tasks:
             for _ in run(rival(task), setting, report, tasks=[task], progress=progress):
                 pass
         reports[title, 0] = {"held out": only(report, COMPARED)}
@@ -346,27 +347,29 @@ def _tensors(scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary) -> SceneT
     return scene_tensors(encoded, annotated_classes(encoded, vocabulary), len(vocabulary))
 
 
-def _notes(a: Side, b: Side, held: HeldOut, limit: int | None, groups: int) -> Iterator[str]:
+def _notes(a: Side, b: Side, held: HeldOut, limit: int | None) -> Iterator[str]:
     """Generate remarks on the results, for the user."""
     yield from held.notes
     asked, other = a.vocabulary, b.vocabulary
     if asked is not None and other is not None and not same_classes(asked, other):
-        yield _classes_note(a, b, asked, other, held)
+        yield from _classes_note(a, b, asked, other, held)
     if limit is not None and len(held.scenes) > limit:
         yield f"only {limit} of {len(held.scenes)} held-out scenes are compared, because of --limit"
-    if groups < _ENOUGH_GROUPS:
-        yield f"the scenes belong to only {groups} groups: the intervals are inaccurate and narrow"
 
 
-def _classes_note(a: Side, b: Side, asked: Vocabulary, other: Vocabulary, held: HeldOut) -> str:
-    """Return a note on the classes of the first model that the second model lacks."""
+def _classes_note(
+    a: Side, b: Side, asked: Vocabulary, other: Vocabulary, held: HeldOut
+) -> Iterator[str]:
+    """Generate a note on the classes of the first model that the second model lacks, if any."""
     own = Translation.between(asked, other).own
+    if not (missing := int((own < 0).sum())):
+        return
     labels = [thing.label for scene in held.scenes for thing in scene.objects]
     mentions = [index for label in labels if (index := asked.index(label)) is not None]
     lost = sum(int(own[index]) < 0 for index in mentions)
-    return (
+    yield (
         f"the questions use the {len(asked)} classes of {a.title}. {b.title} lacks "
-        f"{int((own < 0).sum())} of these classes ({lost / max(len(mentions), 1):.0%} of the "
+        f"{missing} of these classes ({lost / max(len(mentions), 1):.0%} of the "
         "objects in the scenes). Objects of these classes are not part of its input, and it ranks "
         "these classes last"
     )

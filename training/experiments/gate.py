@@ -1,7 +1,8 @@
 """Decide whether an alias may point at a new version.
 
 First, the new version must be useful. On the test scenes of its run, it must rank missing objects
-better than popularity (the class frequencies), and not worse than EASE (class co-occurrence).
+better than popularity (the class frequencies) by at least `GAIN`, and not worse than EASE (class
+co-occurrence).
 
 Then the new version is compared with the version that the alias serves, on common held-out scenes
 (see compare.py). It is refused if a primary metric is lower by more than the margin, over the whole
@@ -33,8 +34,13 @@ from training.trainer import TrainingData
 # Accepted loss of a primary metric when a new version replaces the served version.
 MARGIN = 0.02
 
+GAIN = 0.02
+"""Minimum lead of a new version over popularity, in MRR. A smaller lead is of no use, even if it is
+certain: a model that is trained on shuffled labels can lead by 0.006."""
+
 NEW = "the new version"
 POPULARITY, CO_OCCURRENCE = "popularity", "EASE"
+_REQUIRED = f"at least {GAIN:+.3f}, whole interval above zero"
 
 
 class RefusedError(RuntimeError):
@@ -69,6 +75,7 @@ class Usefulness:
         yield f"  {NEW:16} {self.ours:.3f}"
         for name, value in self.theirs.items():
             yield f"  {name:16} {value:.3f}  difference {_signed(self.differences[name])}"
+        yield f"  required over {POPULARITY}: {_REQUIRED}"
 
     def objections(self) -> list[str]:
         """Return the reasons against the new version; an empty list if it is useful."""
@@ -80,11 +87,11 @@ class Usefulness:
             ]
         reasons = []
         gain, loss = self.differences[POPULARITY], self.differences[CO_OCCURRENCE]
-        if not gain.low > 0:
+        if not (gain.value >= GAIN and gain.low > 0):
             reasons.append(
-                f"{NEW} is not better than popularity, which only knows how frequent each class "
-                f"is: difference {_signed(gain)}, {self._place()}. Check the labels, train longer "
-                "or provide more scenes"
+                f"{NEW} is not clearly better than {POPULARITY}, which only knows how frequent "
+                f"each class is: difference {_signed(gain)} (required: {_REQUIRED}), "
+                f"{self._place()}. Check the labels, train longer or provide more scenes"
             )
         if loss.high < 0:
             reasons.append(

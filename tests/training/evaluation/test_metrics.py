@@ -211,7 +211,11 @@ def test_copies_of_a_scene_in_a_group_narrow_no_interval():
     places = np.array([f"{k:02}" for k in range(20)])
     one = paired_difference(mean_of(x), mean_of(y), groups=places.tolist())
     single = paired_difference(mean_of(x), mean_of(y))
-    assert (one.value, one.low, one.high) == pytest.approx((single.value, single.low, single.high))
+    # Student's t with 19 degrees of freedom instead of a normal distribution; n - 1 instead of n.
+    wider = 2.0930 / 1.9600 * np.sqrt(20 / 19)
+    assert one.value == single.value
+    assert one.low - one.value == pytest.approx(wider * (single.low - single.value), rel=1e-4)
+    assert one.high - one.value == pytest.approx(wider * (single.high - single.value), rel=1e-4)
     a, b = mean_of(np.repeat(x, 10)), mean_of(np.repeat(y, 10))
     ten = paired_difference(a, b, groups=np.repeat(places, 10).tolist())
     assert (ten.low, ten.high) == pytest.approx((one.low, one.high))
@@ -231,6 +235,27 @@ def test_intervals_over_groups_hold_the_truth_about_as_often_as_they_say():
         found = paired_difference(a, none, groups=groups, resamples=200)
         held += found.low <= 0 <= found.high
     assert 0.87 * trials <= held <= 0.99 * trials
+
+
+@pytest.mark.parametrize("groups", [6, 9, 20])
+def test_intervals_over_few_groups_hold_the_truth_in_95_percent(groups):
+    """1000 samples of N(0, 1) x groups: 0 is within the interval 919 to 976 times.
+
+    A binomial of 1000 and .943, the lowest coverage that 4000 samples show, leaves that range with
+    probability below 2e-3. The percentiles without widening hold 0 in 86 %, 89 % and 92 %.
+    """
+    rng, none = np.random.default_rng(groups), mean_of(np.zeros(groups))
+    names = [str(k) for k in range(groups)]
+    figures = [
+        paired_difference(mean_of(rng.normal(size=groups)), none, groups=names, resamples=400)
+        for _ in range(1000)
+    ]
+    assert 919 <= sum(figure.low <= 0 <= figure.high for figure in figures) <= 976
+
+
+def test_one_group_has_no_interval():
+    with pytest.raises(ValueError, match="at least two groups"):
+        paired_difference(mean_of([1, 2]), mean_of([0, 0]), groups=["a", "a"])
 
 
 @pytest.mark.parametrize(("scenes", "groups"), [(3, None), (3, ["a", "b"]), (2, ["a", "b", "c"])])

@@ -1,11 +1,33 @@
 from __future__ import annotations
 
+import io
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
+import torch
+from rich.console import Console
+
+from app.scene import Vocabulary
 from tests.training.baselines.furnished import STRUCTURE, furnished, tensors
 from training.baselines import BASELINES
+from training.config import Config
 from training.evaluation.setting import Contender
-from training.experiments.compare import side_by_side
+from training.evaluation.tasks import in_words
+from training.experiments.compare import COMPARED, compare, show, side_by_side
+from training.experiments.sides import Side
+from training.pipeline import prepare
+from training.publish import as_stored, draft_artifact
+from training.trainer import new_machine
+
+CONFIG = Config.model_validate(
+    {
+        "name": "small",
+        "data": {"sources": ["rooms"], "rooms": 120, "vocabulary": "rooms", "split": "stable"},
+        "machine": {"variant": "rbm", "form": "local", "H1": 4, "H2": 0, "K": 0},
+        "objective": {"name": "composite"},
+    }
+)
 
 
 def test_scenes_with_incomplete_lists_are_compared_on_relations_alone() -> None:
@@ -26,3 +48,31 @@ def test_scenes_with_incomplete_lists_are_compared_on_relations_alone() -> None:
     assert scenes_of["T1a relations"] == 60
     assert scenes_of["T2 missing"] == 30
     assert {row.task for row in results.differences} >= {"T1a relations", "T2 missing"}
+
+
+@pytest.mark.parametrize("lacking", [0, 1])
+def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacking) -> None:
+    """The second model has the classes in another order, all of them or all but one."""
+    scenes = prepare(CONFIG, Path())
+    classes = list(reversed(scenes.vocabulary.objects))
+    if lacking:
+        classes[0] = replace(classes[0], label="unheard of", aliases=())
+    machine = new_machine(CONFIG, scenes.training_data(), torch.Generator().manual_seed(0))
+    other = Vocabulary(classes, scenes.vocabulary.room_types)
+    a, b = (
+        Side(title, CONFIG, scenes.digests, draft_artifact(as_stored(machine), vocabulary))
+        for title, vocabulary in (("new", scenes.vocabulary), ("old", other))
+    )
+    found = compare(a, b, Path(), limit=None, examples=0, say=lambda _: None)
+    assert ["old lacks 1 of these classes" in note for note in found.notes] == [True] * lacking
+    assert {row.task for row in found.results.differences} == set(COMPARED)
+    console = Console(file=io.StringIO(), width=80)
+    show(found, console)
+    lines = [line.strip() for line in console.file.getvalue().splitlines()]
+    for row in found.results.differences:
+        assert in_words(row.task) in lines
+        # The name of a metric, its values and the verdict are on one line.
+        assert any(
+            line.startswith(f"{row.metric} ") and line.endswith(f"] {row.verdict}")
+            for line in lines
+        )

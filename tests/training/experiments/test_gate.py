@@ -126,10 +126,26 @@ def test_a_useless_model_is_refused_with_its_figures(how: str) -> None:
     else:
         found = usefulness(rooms().shuffled(0), small())
     popularity, ease = found.objections()
-    assert "not better than popularity" in popularity
+    assert "not clearly better than popularity" in popularity
     assert "worse than EASE" in ease
     assert f"{found.differences['popularity'].value:+.3f}" in popularity
     assert f"{found.scenes} test scenes" in popularity
+
+
+@pytest.mark.parametrize(
+    ("popularity", "reasons"),
+    [
+        (Figure(0.006, 0.001, 0.011, 90), 1),  # a model of shuffled labels, from few groups
+        (Figure(0.030, -0.001, 0.061, 90), 1),  # may be chance
+        (Figure(0.020, 0.001, 0.039, 90), 0),
+    ],
+)
+def test_a_useful_model_leads_popularity_for_sure_and_by_enough(popularity, reasons) -> None:
+    differences = {"popularity": popularity, "EASE": Figure(0.0, -0.1, 0.1, 90)}
+    found = Usefulness(30, 9, 0.417, {"popularity": 0.4, "EASE": 0.417}, differences)
+    required = "at least +0.020, whole interval above zero"
+    assert [required in text for text in found.objections()] == [True] * reasons
+    assert any(required in line for line in found.lines())
 
 
 def test_photographs_with_incomplete_lists_are_used_where_there_are_no_others() -> None:
