@@ -362,7 +362,7 @@ def _published(artifact: Artifact, unmoved: str | None = None) -> None:
     reference = f"{artifact.manifest.name}@{artifact.manifest.version}"
     console.print(f"published {reference}, digest {artifact.digest[:12]}")
     if unmoved is not None:
-        command = f"python -m app.registry alias default {reference} --store {unmoved}"
+        command = f"python -m app.registry alias default {reference} --store {shlex.quote(unmoved)}"
         console.print(f"no alias moved; to serve it as default: {command}", soft_wrap=True)
 
 

@@ -52,7 +52,7 @@ def publish_run(
     judge: Callable[[Artifact], None] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Artifact:
-    """Calibrate on validation scenes, fit statistics to training scenes, evaluate, and publish.
+    """Calibrate on validation scenes, fit statistics, evaluate on test scenes, and publish.
 
     The store keeps weights in half precision. Calibration and evaluation use the same precision.
 
