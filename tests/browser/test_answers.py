@@ -57,8 +57,8 @@ def bedroom(open_board: OpenBoard) -> Board:
 def test_missing_objects_are_listed_with_their_places(bedroom: Board, api: httpx.Client) -> None:
     answer = ask(api, "missing", bedroom.scene, top_k=5)
     rows = bedroom.rows("missing")
-    assert len(rows) == 5
-    for row, missing in zip(rows, answer["missing"], strict=True):
+    assert len(rows) == 5 + len(answer["more"])
+    for row, missing in zip(rows[:5], answer["missing"], strict=True):
         assert row.startswith(f"{missing['label']} {percent(missing['probability'])}")
         placed = missing["label"] in bedroom.ghosts
         assert placed != ("no free place on the board" in row)
@@ -261,8 +261,8 @@ def test_disagreements_are_drawn_where_an_answer_has_them(bedroom: Board) -> Non
 
 
 def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> None:
-    listed = api.get("/models").json()["models"]
-    references = [f"{one['name']}@{v['version']}" for one in listed for v in one["versions"]]
+    models = api.get("/models").json()["models"]
+    references = [f"{one['name']}@{v['version']}" for one in models for v in one["versions"]]
     shown = bedroom.page.locator("#second option")
     assert set(references) <= {option.get_attribute("value") for option in shown.all()}
     (second,) = [name for name in references if name.startswith("indoor-rbm@")]
@@ -271,9 +271,10 @@ def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> No
     for number, model in enumerate(("default", second)):
         answer = ask(api, "missing", bedroom.scene, top_k=5, model=model)
         rows = bedroom.rows("missing", number)
+        listed = [(one["label"], one) for one in answer["missing"]]
+        listed += [(f"another {one['label']}", one) for one in answer["more"]]
         assert [row.split(" %")[0] for row in rows] == [
-            f"{one['label']} {percent(one['probability'])}".removesuffix(" %")
-            for one in answer["missing"]
+            f"{name} {percent(one['probability'])}".removesuffix(" %") for name, one in listed
         ]
         title = f"{answer['model']['name']} {answer['model']['version']}"
         expect(bedroom.column("missing", number).locator("h3")).to_have_text(title)
