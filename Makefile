@@ -99,7 +99,7 @@ clean:  ## remove the environment and all caches
 
 $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing the service's packages into $(VENV) ..."
-	@$(PIP) install -qq -r requirements.lock
+	@$(PIP) install -r requirements.lock
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@echo "Installed. Compiling kernels for this machine ..."
 	@$(BIN)/python -m app.compile
