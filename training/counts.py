@@ -117,6 +117,7 @@ def _fit(
     counting: dict[str, NDArray[np.bool_]],
     vocabulary: Vocabulary,
 ) -> Counts:
+    """Fit the statistics to all cases of the scenes. Return those of the given classes (K,)."""
     cases = _Cases.of(scenes, counting, vocabulary, _DRAWS)
     share = _shares(cases, len(vocabulary))
     weights = _weights(cases, share, len(vocabulary))
