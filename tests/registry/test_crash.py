@@ -23,7 +23,7 @@ from tests.registry.small_artifacts import description, state
 pytestmark = pytest.mark.system
 
 KILLS = 10
-PUBLICATIONS = 4  # the kills are spread over the time that so many take
+PUBLICATIONS = 3  # a kill waits for 0 to 3 of them, and for a part of one more
 
 
 class Publishers:
@@ -102,16 +102,24 @@ def seconds_per_publication(root: Path) -> float:
     return (time.monotonic() - start) / 5
 
 
+def wait_for(root: Path, publications: int) -> None:
+    """Wait until the store has so many more versions than its first one."""
+    deadline = time.monotonic() + 60
+    while sum(1 for _ in root.glob("tiny/*.0.0")) <= publications:
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
 def test_kill_at_random_moments(publishers: Publishers, published: Path, tmp_path: Path) -> None:
     generator = random.Random(0)
-    span = PUBLICATIONS * seconds_per_publication(tmp_path / "timed")
-    delays = [span * (n + generator.random()) / KILLS for n in range(KILLS)]
+    span = seconds_per_publication(tmp_path / "timed")
     interrupted = completed = 0
-    for number, delay in enumerate(delays):
+    for number in range(KILLS):
         root = tmp_path / str(number)
         shutil.copytree(published, root)
         child = publishers.start("publish_for_ever", root=str(root))
-        time.sleep(delay)
+        wait_for(root, number % (PUBLICATIONS + 1))
+        time.sleep(span * generator.random())
         os.kill(child, signal.SIGKILL)
         assert publishers.wait(child) == {"code": None, "signal": signal.SIGKILL}
         interrupted += bool(leftovers(root))
