@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import minimize
 
-from app.questions.counts import distribution
-from app.registry.counts import INTERCEPT, LISTED, ROOM, SEVERAL, Counts
+from app.questions.counts import distribution, functions
+from app.registry.counts import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
 from app.scene import Vocabulary
 from training.cases import MOST, Part, scene_rng, some_instances
 from training.datasets import EncodedScene
@@ -39,8 +39,9 @@ _DRAWS: Final = 2  # listings of each training and validation scene
 _PRIOR: Final = 8.0
 # Penalties on the squares of the terms of a class and of the shared terms.
 _OWN, _SHARED = 0.3, 0.15
-_ITERATIONS: Final = 100
-# A class needs this many scenes, and groups in which it occurs several times.
+# A smaller relative change of the loss ends the fit.
+_PRECISION: Final = 1e-6
+# A class needs this many scenes, and this many groups that have several instances.
 _SCENES, _GROUPS = 20, 10
 _FOLDS: Final = 5
 
@@ -56,11 +57,11 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     counting = counted_classes(scenes, vocabulary)
     counting = {source: counted for source, counted in counting.items() if source not in views}
     known = [scene for scene in scenes if scene.source in counting]
-    classes = _frequent(known, counting, vocabulary)
-    if len(classes):
+    most = _most(known, counting, vocabulary)
+    if (most > 1).any():
         known = _few_of_group(known)
-        classes = classes[_better(known, classes, counting, vocabulary)]
-    return _fit(known, classes, counting, vocabulary) if len(classes) else None
+        most *= _better(known, most, counting, vocabulary)
+    return _fit(known, most, counting, vocabulary) if (most > 1).any() else None
 
 
 def folds(
@@ -113,19 +114,20 @@ def listed_cases(
 
 def _fit(
     scenes: Sequence[EncodedScene],
-    classes: Ints,
+    most: Ints,
     counting: dict[str, NDArray[np.bool_]],
     vocabulary: Vocabulary,
 ) -> Counts:
-    """Fit the statistics to all cases of the scenes. Return those of the given classes (K,)."""
+    """Fit the statistics to all cases of the scenes. Return those of the classes with a `most`."""
     cases = _Cases.of(scenes, counting, vocabulary, _DRAWS)
     share = _shares(cases, len(vocabulary))
     weights = _weights(cases, share, len(vocabulary))
     # The exponent -1 stands for the listed number, which is uniform from 1 to n.
-    weights[:, INTERCEPT] -= 1.0
+    weights[:, 0, INTERCEPT] -= 1.0
     itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))
-    weights[np.arange(len(vocabulary)), itself] = 0.0
-    return Counts(classes, _stored(share[classes]), _stored(weights[classes]))
+    weights[np.arange(len(vocabulary)), :, itself] = 0.0
+    classes = np.flatnonzero(most)
+    return Counts(classes, most[classes], _stored(share[classes]), _stored(weights[classes]))
 
 
 def _few_of_group(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
@@ -138,20 +140,30 @@ def _few_of_group(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
     return found
 
 
-def _frequent(
+def _most(
     scenes: Sequence[EncodedScene], counting: dict[str, NDArray[np.bool_]], vocabulary: Vocabulary
 ) -> Ints:
-    """Return the classes with enough scenes, and enough groups with several instances."""
+    """Return the maximum listed number of each class that the data can tell about, (V,).
+
+    Enough groups of scenes have at least this number of instances. It is 0 for a class with too few
+    scenes, or with too few groups that have several instances.
+    """
     times = np.zeros(len(vocabulary), dtype=np.int64)
-    groups: set[tuple[int, str, str]] = set()
+    of_group: dict[tuple[int, str, str], int] = {}
     for scene in scenes:
-        classes, counts = scene.evidence.classes, scene.evidence.counts
-        usable = counting[scene.source][classes]
-        times[classes[usable]] += 1
-        several = classes[usable & (counts > 1)].tolist()
-        groups |= {(index, scene.source, scene.group) for index in several}
-    of = np.bincount([index for index, _, _ in groups], minlength=len(vocabulary))
-    return np.flatnonzero((times >= _SCENES) & (of >= _GROUPS))
+        usable = counting[scene.source][scene.evidence.classes]
+        classes, counts = scene.evidence.classes[usable], scene.evidence.counts[usable]
+        times[classes] += 1
+        for index, count in zip(classes.tolist(), counts.tolist(), strict=True):
+            key = index, scene.source, scene.group
+            of_group[key] = max(count, of_group.get(key, 0))
+    numbers = np.array([(index, count) for (index, _, _), count in of_group.items()]).reshape(-1, 2)
+    most = np.zeros_like(times)
+    for index in np.flatnonzero(times >= _SCENES).tolist():
+        largest = np.sort(numbers[numbers[:, 0] == index, 1])[::-1]
+        if len(largest) >= _GROUPS and largest[_GROUPS - 1] > 1:
+            most[index] = min(largest[_GROUPS - 1], MOST - 1)
+    return most
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +174,7 @@ class _Cases:
         index: (N,) the class.
         listed: (N,) number of listed instances, from 1 to `number`.
         number: (N,) number of instances in the scene.
-        features: (N, 3 + C + V) features of the rest of the scene, in the columns of
-            `Counts.weights`.
+        features: (N, 3 + C + V) features of the listed part, in the columns of `Counts.weights`.
         weight: (N,) weight that balances the data sources.
     """
 
@@ -207,8 +218,8 @@ def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
         start: first column of the other classes.
     """
     others, listed = np.delete(part.classes, k), np.delete(part.listed, k)
-    columns = [INTERCEPT, LISTED, SEVERAL, *(start + others).tolist()]
-    values = [1.0, math.log(part.listed[k]), float((listed > 1).any())]
+    columns = [INTERCEPT, SINGLE, SEVERAL, *(start + others).tolist()]
+    values = [1.0, float(part.listed[k] == 1), float((listed > 1).any())]
     values += [1 / math.sqrt(max(len(others), 1))] * len(others)
     if part.room >= 0:
         columns.append(ROOM + part.room)
@@ -228,7 +239,7 @@ def _shares(cases: _Cases, V: int) -> Floats:
 
 
 def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
-    """Return the weights of each class, (V, 3 + C + V), by maximum penalised likelihood."""
+    """Return the weights of each class, (V, 2, 3 + C + V), by maximum penalised likelihood."""
     features, (N, width) = cases.features, cases.features.shape
     # The terms of a class act only on cases of this class.
     entries = features.tocoo()
@@ -238,57 +249,62 @@ def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
     )
     used = np.unique(own.indices)
     both = sparse.hstack([own[:, used], features]).tocsr()
-    penalty = np.repeat([_OWN, _SHARED], [len(used), width])
-    numbers = np.arange(1, MOST + 1)
-    logs, rows, place = np.log(numbers), np.arange(N), cases.number - 1
-    base = share[cases.index] - logs
-    base[numbers < cases.listed[:, None]] = -np.inf
+    penalty = np.repeat([_OWN, _SHARED], [len(used), width])[:, None]
+    numbers, of_number = np.arange(1, MOST + 1), functions(MOST)
+    place, case = cases.number - 1, np.arange(N)
+    base = share.T[:, cases.index] - np.log(numbers)[:, None]
+    base[numbers[:, None] < cases.listed] = -np.inf
 
-    def loss(terms: Floats) -> tuple[float, Floats]:
-        logits = base + (both @ terms)[:, None] * logs
-        logits -= logits.max(axis=1, keepdims=True)
+    def loss(flat: Floats) -> tuple[float, Floats]:
+        terms = flat.reshape(-1, EXPONENTS)
+        logits = of_number.T @ (both @ terms).T
+        logits += base
+        logits -= logits.max(axis=0)
         p = np.exp(logits)
-        total = p.sum(axis=1)
-        fit = cases.weight @ (logits[rows, place] - np.log(total))
-        error = cases.weight * (p @ logs / total - logs[place])
-        return 0.5 * penalty @ terms**2 - fit, both.T @ error + penalty * terms
+        total = p.sum(axis=0)
+        fit = cases.weight @ (logits[place, case] - np.log(total))
+        error = cases.weight * (of_number @ p / total - of_number[:, place])
+        slope = both.T @ error.T + penalty * terms
+        return 0.5 * (penalty * terms**2).sum() - fit, slope.ravel()
 
-    options = {"maxiter": _ITERATIONS}
-    terms = minimize(loss, np.zeros(both.shape[1]), jac=True, method="L-BFGS-B", options=options).x
-    weights = np.zeros(V * width)
+    start, options = np.zeros(both.shape[1] * EXPONENTS), {"ftol": _PRECISION}
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", options=options)
+    terms = found.x.reshape(-1, EXPONENTS)
+    weights = np.zeros((V * width, EXPONENTS))
     weights[used] = terms[: len(used)]
-    return weights.reshape(V, width) + terms[len(used) :]
+    of_class: Floats = weights.reshape(V, width, EXPONENTS) + terms[len(used) :]
+    return of_class.swapaxes(1, 2)
 
 
 def _better(
     scenes: Sequence[EncodedScene],
-    classes: Ints,
+    most: Ints,
     counting: dict[str, NDArray[np.bool_]],
     vocabulary: Vocabulary,
 ) -> NDArray[np.bool_]:
-    """Return the classes (K,) whose expected number is closer than the class mean."""
-    gain = np.zeros(len(classes))
+    """Return the classes, (V,), whose expected number is closer than the class mean."""
+    gain = np.zeros(len(vocabulary))
     for train, test in folds(scenes):
-        counts = _fit(train, classes, counting, vocabulary)
+        counts = _fit(train, most, counting, vocabulary)
         for scene in test:
             for seed in range(_DRAWS):
                 counted = counting[scene.source]
                 part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
-                row, change = _changes(counts, part, asked, len(vocabulary))
-                gain[row] -= change
+                classes, change = _changes(counts, part, asked, len(vocabulary))
+                gain[classes] -= change
     return gain > 0
 
 
 def _changes(counts: Counts, part: Part, asked: NDArray[np.intp], V: int) -> tuple[Ints, Floats]:
-    """Return rows of classes (k,), and error of the expected number minus error of the mean."""
+    """Return classes (k,), and error of the expected number minus error of the mean."""
     room = part.room if part.room >= 0 else None
     which, p = distribution(counts, V, part.classes, part.listed, room)
     usable = np.isin(which, asked)
     which, expected = which[usable], p[usable] @ np.arange(1, MOST + 1)
-    row = np.searchsorted(counts.classes, part.classes[which])
-    mean, number = class_mean(counts, row, part.listed[which]), part.number[which]
+    classes, number = part.classes[which], part.number[which]
+    mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[which])
     change: Floats = np.abs(expected - number) - np.abs(mean - number)
-    return row, change
+    return classes, change
 
 
 def class_mean(counts: Counts, row: Ints, listed: Ints) -> Floats:

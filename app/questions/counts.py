@@ -3,13 +3,15 @@
 The models score classes. This module adds statistics of counts. Let n be the number of instances of
 a class in the scene, of which the request lists k. Then, for n from k to M,
 
-    p(n) ∝ s(n) n^η ρ^(n - k)
-    η = a + b log k + c u + d_t + (1/√m) Σ_j e_j
+    p(n) ∝ s(n) exp(η log n + ζ log n log(M/n)) ρ^(n - k)
+    η = a + b [k = 1] + c u + d_t + (1/√m) Σ_j e_j
 
-s(n) is the share of training scenes with n instances. u is 1 if the request lists another class
-several times, and 0 otherwise. The sum goes over the m other listed classes j, without structure.
-a, b, c, d (for the room type t) and e are weights of the class. A request that states a coverage
-above the model's coverage lowers ρ from 1 to (1 - coverage) / (1 - model's coverage).
+s(n) is the share of training scenes with n instances. A large η makes large numbers probable, and a
+large ζ makes numbers between 1 and M probable. ζ has the form of η, with weights of its own. u is 1
+if the request lists another class several times, and 0 otherwise. The sum goes over the m other
+listed classes j, without structure. a, b, c, d (for the room type t) and e are weights of the
+class. A request that states a coverage above the model's coverage lowers ρ from 1 to
+(1 - coverage) / (1 - model's coverage).
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from numpy.typing import NDArray
 
 from app.questions.posterior import present
 from app.registry.artifact import Artifact
-from app.registry.counts import INTERCEPT, LISTED, ROOM, SEVERAL, Counts
+from app.registry.counts import INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
 from app.scene.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -67,7 +69,7 @@ def more(
     """Return the listed classes with probably more instances than listed, likeliest first.
 
     Listed objects count as present, whatever their confidence. The answer never contains structural
-    classes, or classes without statistics.
+    classes, classes without statistics, or classes with more listed objects than these cover.
 
     Args:
         artifact: the model.
@@ -133,26 +135,31 @@ def distribution(
         unlisted: ρ of the formula.
 
     Returns:
-        Indices into `classes` of the k classes with statistics and with fewer than M listed
-        objects, (k,). Then the probability of 1, 2, ... M instances, (k, M).
+        Indices into `classes` of the k classes with statistics that cover the listed number, (k,).
+        Then the probability of 1, 2, ... M instances, (k, M).
     """
     M = counts.log_share.shape[1]
     row = np.searchsorted(counts.classes, classes)
     row[row == len(counts.classes)] = 0
-    which = np.flatnonzero((counts.classes[row] == classes) & (listed < M))
+    which = np.flatnonzero((counts.classes[row] == classes) & (listed <= counts.most[row]))
     row, number, k = row[which], np.arange(1, M + 1), listed[which, None]
-    exponent = counts.weights[row, INTERCEPT].astype(np.float64)
-    exponent += counts.weights[row, LISTED] * np.log(listed[which])
-    several = listed > 1
-    exponent += counts.weights[row, SEVERAL] * (several.sum() > several[which])
+    own, several = counts.weights[row, :, :ROOM].astype(np.float64), listed > 1
+    exponents = own[..., INTERCEPT] + own[..., SINGLE] * (k == 1)
+    exponents += own[..., SEVERAL] * (several.sum() > several[which, None])
     if room is not None:
-        exponent += counts.weights[row, ROOM + room]
+        exponents += counts.weights[row, :, ROOM + room]
     if (others := len(classes) - 1) > 0:
         # The effect of a class on itself is 0, so the sum over all listed classes is correct.
-        effects = counts.weights[row[:, None], counts.weights.shape[1] - V + classes]
-        exponent += effects.sum(axis=1, dtype=np.float64) / math.sqrt(others)
-    logits = counts.log_share[row] + exponent[:, None] * np.log(number)
+        effects = counts.weights[row[:, None], :, counts.weights.shape[-1] - V + classes]
+        exponents += effects.sum(axis=1, dtype=np.float64) / math.sqrt(others)
+    logits = counts.log_share[row] + exponents @ functions(M)
     logits += (number - k) * math.log(max(unlisted, sys.float_info.min))
     logits[number < k] = -np.inf
     p = np.exp(logits - logits.max(axis=1, keepdims=True, initial=-np.inf))
     return which, p / p.sum(axis=1, keepdims=True)
+
+
+def functions(M: int) -> Floats:
+    """Return log n and log n log(M/n) for n = 1, 2, ... M, (2, M). The exponents multiply them."""
+    log = np.log(np.arange(1, M + 1))
+    return np.stack([log, log * (math.log(M) - log)])

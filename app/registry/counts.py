@@ -17,9 +17,13 @@ Table = NDArray[np.float32]
 PREFIX: Final = "counts."
 """Prefix of the names of count tensors. They are in the same file as the machine's tensors."""
 
-INTERCEPT, LISTED, SEVERAL, ROOM = 0, 1, 2, 3
-"""Columns of `Counts.weights`: intercept, log of the listed number, 1 if another class is listed
+INTERCEPT, SINGLE, SEVERAL, ROOM = 0, 1, 2, 3
+"""Columns of `Counts.weights`: intercept, 1 if one object is listed, 1 if another class is listed
 several times, and the first of C room types. The last V columns are those of the other classes."""
+
+EXPONENTS: Final = 2
+"""Exponents of the formula: the first raises large numbers, and the second numbers between 1 and M.
+"""
 
 _LARGEST: Final = 64.0
 _MOST: Final = 256
@@ -31,13 +35,16 @@ class Counts:
 
     Attributes:
         classes: (K,) indices of the classes with statistics, in ascending order.
+        most: (K,) maximum listed number, from 1 to M - 1. Too few training scenes have more
+            instances.
         log_share: (K, M) log of the share of scenes with 1, 2, ... instances, of the scenes with
             the class. The last column stands for M or more instances.
-        weights: (K, 3 + C + V) effects of the scene on the exponent of the number of instances. A
-            class has no effect on itself.
+        weights: (K, 2, 3 + C + V) effects of the scene on the two exponents. A class has no effect
+            on itself.
     """
 
     classes: NDArray[np.integer[Any]]
+    most: NDArray[np.integer[Any]]
     log_share: Table
     weights: Table
 
@@ -58,7 +65,12 @@ class Counts:
         """
         K = len(np.atleast_1d(tensors.get(f"{PREFIX}classes", ())))
         M = np.atleast_1d(tensors.get(f"{PREFIX}log_share", ())).shape[-1]
-        shapes = {"classes": (K,), "log_share": (K, M), "weights": (K, ROOM + C + V)}
+        shapes = {
+            "classes": (K,),
+            "most": (K,),
+            "log_share": (K, M),
+            "weights": (K, EXPONENTS, ROOM + C + V),
+        }
         require_shapes(tensors, PREFIX, shapes)
         counts = cls(**{name: tensors[f"{PREFIX}{name}"] for name in shapes})
         if complaint := counts._complaint(V, C):
@@ -66,8 +78,9 @@ class Counts:
         return counts
 
     def _complaint(self, V: int, C: int) -> str | None:
-        if not np.issubdtype(self.classes.dtype, np.integer):
-            return "classes must be integers"
+        for name in ("classes", "most"):
+            if not np.issubdtype(getattr(self, name).dtype, np.integer):
+                return f"{name} must be integers"
         for name in ("log_share", "weights"):
             if not np.issubdtype(getattr(self, name).dtype, np.floating):
                 return f"{name} must be floating-point numbers"
@@ -78,10 +91,12 @@ class Counts:
             return "the tensor 'classes' has a class that the model does not have"
         if not 2 <= self.log_share.shape[1] <= _MOST:
             return f"log_share must have 2 to {_MOST} columns"
+        if (self.most < 1).any() or (self.most >= self.log_share.shape[1]).any():
+            return "most must be from 1 to the number of columns of log_share minus 1"
         if (self.log_share > 0).any() or (self.log_share < -_LARGEST).any():
             return f"log_share must be between -{_LARGEST:g} and 0"
         if (np.abs(self.weights) > _LARGEST).any():
             return f"weights must be between -{_LARGEST:g} and {_LARGEST:g}"
-        if self.weights[np.arange(len(self.classes)), ROOM + C + self.classes].any():
+        if self.weights[np.arange(len(self.classes)), :, ROOM + C + self.classes].any():
             return "the weight of a class on itself must be 0"
         return None

@@ -15,24 +15,25 @@ from app.questions import more
 from app.questions.counts import LIKELY, distribution
 from app.registry import Counts
 from app.scene import Scene
-from tests.questions.artifacts import LARGER, calibration, larger_artifact, scene_of
+from tests.questions.artifacts import LABELS, LARGER, calibration, larger_artifact, scene_of
 
 SPEC = LARGER["triway-local"]
 V, C, M = SPEC.V, SPEC.C, 5
 LAMP, DESK, CHAIR, SHELF, WALL = 1, 2, 3, 6, 8
+MOST = np.array([M - 1, M - 1, 2, M - 1])
 
 
 def counts(scale: float = 0.6, seed: int = 0) -> Counts:
     """Random statistics of four classes. Wall is structure."""
     rng = np.random.default_rng(seed)
     classes = np.array([LAMP, CHAIR, SHELF, WALL])
-    weights = rng.normal(0, scale, (4, 3 + C + V))
-    weights[np.arange(4), 3 + C + classes] = 0
+    weights = rng.normal(0, scale, (4, 2, 3 + C + V))
+    weights[np.arange(4), :, 3 + C + classes] = 0
     share = rng.dirichlet(np.ones(M), 4)
-    return Counts(classes, np.log(share).astype("f4"), weights.astype("f4"))
+    return Counts(classes, MOST, np.log(share).astype("f4"), weights.astype("f4"))
 
 
-COUNTS = counts(seed=4)
+COUNTS = counts(seed=7)
 ARTIFACT = replace(larger_artifact("triway-local"), counts=COUNTS)
 SCENE = scene_of([DESK, CHAIR, LAMP, CHAIR, WALL, WALL], room=1)
 EVERY = list(range(V))
@@ -43,16 +44,21 @@ def by_hand(
 ) -> list[float]:
     """The formula of `app.questions.counts`, term by term."""
     own = int(found.classes[row])
-    a, b, c, *rest = found.weights[row].tolist()
-    d, e = rest[:C], rest[C:]
     k, others = listed[own], [j for j in listed if j != own]
-    m = len(others)
-    eta = a + b * math.log(k) + (0.0 if room is None else d[room])
-    if m:
-        eta += c * any(listed[j] > 1 for j in others)
-        eta += sum(e[j] for j in others) / math.sqrt(m)
+    exponents = []
+    for a, b, c, *rest in found.weights[row].tolist():
+        d, e = rest[:C], rest[C:]
+        exponent = a + b * (k == 1) + (0.0 if room is None else d[room])
+        if others:
+            exponent += c * any(listed[j] > 1 for j in others)
+            exponent += sum(e[j] for j in others) / math.sqrt(len(others))
+        exponents.append(exponent)
+    eta, zeta = exponents
     s = [math.exp(x) for x in found.log_share[row].tolist()]
-    weight = [s[n - 1] * n**eta * rho ** (n - k) if n >= k else 0.0 for n in range(1, M + 1)]
+    weight = [0.0] * M
+    for n in range(k, M + 1):
+        middle = math.log(n) * math.log(M / n)
+        weight[n - 1] = s[n - 1] * n**eta * math.exp(zeta * middle) * rho ** (n - k)
     return [w / sum(weight) for w in weight]
 
 
@@ -67,7 +73,9 @@ def test_the_distribution_is_the_formula(listed, room, unlisted, seed):
     classes = np.array(sorted(listed))
     numbers = np.array([listed[index] for index in classes.tolist()])
     which, p = distribution(known, V, classes, numbers, room, unlisted)
-    expected = [k for k, index in enumerate(classes.tolist()) if index in known.classes]
+    largest = dict(zip(known.classes.tolist(), MOST.tolist(), strict=True))
+    covered = [listed[index] <= largest.get(index, 0) for index in sorted(listed)]
+    expected = np.flatnonzero(covered).tolist()
     assert which.tolist() == expected
     for k, found in zip(which.tolist(), p, strict=True):
         row = known.classes.tolist().index(classes[k])
@@ -110,9 +118,11 @@ def test_at_full_coverage_nothing_more_is_there():
         assert entry.probability == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_class_with_as_many_objects_as_are_told_apart_is_left_out():
-    scene = scene_of([CHAIR] * M + [LAMP])
-    assert [entry.label for entry in more(ARTIFACT, scene, candidates=EVERY)] == ["lamp"]
+@pytest.mark.parametrize(("label", "most"), [(CHAIR, M - 1), (SHELF, 2)])
+def test_a_number_that_the_statistics_do_not_cover_is_left_out(label, most):
+    for number, expected in ((most, {LAMP, label}), (most + 1, {LAMP})):
+        found = more(ARTIFACT, scene_of([label] * number + [LAMP]), candidates=EVERY)
+        assert {entry.label for entry in found} == {LABELS[index] for index in expected}
 
 
 def test_structure_and_models_without_counts_propose_nothing():
@@ -129,7 +139,7 @@ def test_the_largest_weights_that_a_store_may_hold_give_numbers(sign):
     shares[:, 0] = 0
     artifact = replace(
         larger_artifact("triway-local", coverage=1.0),
-        counts=Counts(huge.classes, shares, weights),
+        counts=Counts(huge.classes, MOST, shares, weights),
     )
     objects = [index for index in range(WALL) for _ in range(M - 1)]
     assert Counter(objects)[CHAIR] == M - 1

@@ -15,10 +15,11 @@ V, C, M = 3, 2, 4  # V and C as in `small_artifacts`
 
 def counts(**changes: np.ndarray) -> Counts:
     """Of the classes bed and lamp."""
-    weights = np.full((2, 3 + C + V), 0.25, np.float32)
-    weights[0, 3 + C] = weights[1, 4 + C] = 0
+    weights = np.full((2, 2, 3 + C + V), 0.25, np.float32)
+    weights[0, :, 3 + C] = weights[1, :, 4 + C] = 0
     values = {
         "classes": np.array([0, 1]),
+        "most": np.array([1, M - 1]),
         "log_share": np.full((2, M), -1.5, np.float32),
         "weights": weights,
     }
@@ -43,8 +44,10 @@ def test_they_come_back_with_the_artifact(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "code"),
     [
-        ({"weights": np.zeros((2, 2 + C + V), "f4")}, "wrong_shape"),
-        ({"weights": np.zeros((3, 3 + C + V), "f4")}, "wrong_shape"),
+        ({"weights": np.zeros((2, 2, 2 + C + V), "f4")}, "wrong_shape"),
+        ({"weights": np.zeros((3, 2, 3 + C + V), "f4")}, "wrong_shape"),
+        ({"weights": np.zeros((2, 3 + C + V), "f4")}, "wrong_shape"),
+        ({"most": np.array([1])}, "wrong_shape"),
         ({"log_share": np.float32(-1)}, "wrong_shape"),
         ({"log_share": np.full((1, M), -1, "f4")}, "wrong_shape"),
         ({"classes": np.int64(0)}, "wrong_shape"),
@@ -53,8 +56,9 @@ def test_they_come_back_with_the_artifact(tmp_path: Path) -> None:
         (
             {
                 "classes": np.zeros(0, np.int64),
+                "most": np.zeros(0, np.int64),
                 "log_share": np.zeros((0, M), "f4"),
-                "weights": np.zeros((0, 3 + C + V), "f4"),
+                "weights": np.zeros((0, 2, 3 + C + V), "f4"),
             },
             "invalid_tensor",
         ),
@@ -62,15 +66,18 @@ def test_they_come_back_with_the_artifact(tmp_path: Path) -> None:
         ({"classes": np.array([-1, 1])}, "invalid_tensor"),
         ({"classes": np.array([0, V])}, "invalid_tensor"),
         ({"classes": np.array([0, -(2**63)])}, "invalid_tensor"),
+        ({"most": np.array([1.0, 2.0], "f4")}, "invalid_tensor"),
+        ({"most": np.array([0, 1])}, "invalid_tensor"),
+        ({"most": np.array([1, M])}, "invalid_tensor"),
         ({"log_share": np.full((2, M), -1, "i4")}, "invalid_tensor"),
-        ({"weights": np.zeros((2, 3 + C + V), "i4")}, "invalid_tensor"),
+        ({"weights": np.zeros((2, 2, 3 + C + V), "i4")}, "invalid_tensor"),
         ({"log_share": np.full((2, 1), -1, "f4")}, "invalid_tensor"),
         ({"log_share": np.full((2, 300), -1, "f4")}, "invalid_tensor"),
         ({"log_share": np.full((2, M), 0.5, "f4")}, "invalid_tensor"),
         ({"log_share": np.full((2, M), -1e4, "f4")}, "invalid_tensor"),
-        ({"weights": np.full((2, 3 + C + V), 6e4, "f4")}, "invalid_tensor"),
-        ({"weights": np.full((2, 3 + C + V), 0.5, "f4")}, "invalid_tensor"),
-        ({"weights": np.full((2, 3 + C + V), np.nan, "f4")}, "not_finite"),
+        ({"weights": np.full((2, 2, 3 + C + V), 6e4, "f4")}, "invalid_tensor"),
+        ({"weights": np.full((2, 2, 3 + C + V), 0.5, "f4")}, "invalid_tensor"),
+        ({"weights": np.full((2, 2, 3 + C + V), np.nan, "f4")}, "not_finite"),
     ],
 )
 def test_invalid_counts_are_refused(tmp_path: Path, change: dict, code: str) -> None:

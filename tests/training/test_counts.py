@@ -60,19 +60,31 @@ def exact(law: tuple[float, ...], listed: int) -> float:
 
 
 def test_the_scene_moves_the_expected_number():
-    """2,000 scenes. The tolerance is for the formula, which has one exponent for each scene."""
+    """2,000 scenes. With four other seeds, the largest error is 0.08."""
     counts = fit_counts(furnished(2000, 0), WORDS)
     assert counts.classes.tolist() == [CHAIR]
     for anchor, law in ((DESK, FEW), (TABLE, MANY)):
         for listed in (1, 2):
             assert expected(counts, anchor, listed) == pytest.approx(
-                exact(law, listed), abs=0.25
+                exact(law, listed), abs=0.15
             ), (anchor, listed)
     again = Counts.from_tensors(counts.tensors(), len(WORDS), 2)
     for name, tensor in counts.tensors().items():
         assert np.array_equal(again.tensors()[name], tensor)
         if tensor.ndim > 1:
             assert np.array_equal(tensor.astype(np.float16), tensor), "half precision changes it"
+
+
+@pytest.mark.parametrize(("groups", "most"), [(9, 4), (10, 7)])
+def test_a_listed_number_needs_ten_groups_that_have_it(groups, most):
+    # A group has two scenes, one of them with fewer chairs.
+    many = [
+        scene([CHAIR] * chairs + [TABLE], group=f"many {k}", name=f"many {k} {chairs}")
+        for k in range(groups)
+        for chairs in (2, 7 + k)
+    ]
+    counts = fit_counts([*furnished(400, 0), *many], WORDS)
+    assert counts.most.tolist() == [most]
 
 
 def test_a_part_lists_what_its_docstring_says():
