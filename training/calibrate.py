@@ -36,6 +36,7 @@ from app.scene import CANONICAL
 from training.batches import SceneTensors, subset
 from training.calibrate_objects import ALARMS, calibrate_objects, recalibrated
 from training.cases import (
+    RIDGE,
     Triple,
     altered_case,
     known_relations,
@@ -431,7 +432,7 @@ def fit_misplaced(
     examples = np.array(rows)
     if len(examples) < 20 or len(np.unique(examples[:, 1])) < 2 or not untouched:
         return Slope(), Thresholds()
-    slope, intercept = logistic(examples[:, :1], examples[:, 1] > 0)
+    slope, intercept = logistic(examples[:, :1], examples[:, 1] > 0, C=RIDGE)
     group = np.array([encoded.group for encoded, _ in untouched])
     _, source = np.unique([encoded.source for encoded, _ in untouched], return_inverse=True)
     worst = np.array([max(intercept + slope * z for z in logits) for _, logits in untouched])

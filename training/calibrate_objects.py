@@ -32,7 +32,7 @@ from app.questions.posterior import posterior
 from app.registry import Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
 from app.scene import Scene, SceneObject
 from training.batches import SceneTensors, subset
-from training.cases import logistic
+from training.cases import RIDGE, logistic
 from training.evaluation.evidence import removals
 from training.evaluation.intruders import (
     IntruderScores,
@@ -369,7 +369,7 @@ def fit_outliers(
         features = np.stack([found.log_odds, np.log(found.size)], 1)[used]
         parts.append(np.column_stack([features, found.intruder[used]]))
     examples = np.concatenate(parts)
-    slope, size, intercept = logistic(examples[:, :2], examples[:, 2] > 0)
+    slope, size, intercept = logistic(examples[:, :2], examples[:, 2] > 0, C=RIDGE)
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
     untouched = next(iter(judged.values()))
     limits = _limits(untouched, scenes, entry, rng)

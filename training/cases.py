@@ -25,6 +25,9 @@ Triple: TypeAlias = tuple[int, int, int]
 MOST: Final = 12
 """Largest number of instances that is told apart. It stands for larger numbers too."""
 
+RIDGE: Final = 1.0
+"""`C` of `logistic` for a few unweighted examples, such as those of 20 validation scenes."""
+
 _LISTED: Final = (0.25, 0.5, 0.75, 1.0)
 _VERTICAL = [CANONICAL.index("on-top"), CANONICAL.index("above")]
 
@@ -211,13 +214,16 @@ def logistic(
     features: NDArray[np.float64],
     truth: NDArray[np.bool_],
     weight: NDArray[np.float64] | None = None,
+    C: float = 1e6,
 ) -> list[float]:
-    """Return the coefficients and then the intercept of a nearly unpenalised logistic regression.
+    """Return the coefficients and then the intercept of a logistic regression.
 
     Args:
         features: features of each example, (examples, features).
         truth: truth value of each example, (examples,).
         weight: weight of each example, (examples,). None means equal weights.
+        C: inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
+            unweighted examples are separable.
     """
-    fit = LogisticRegression(C=1e6, max_iter=1000).fit(features, truth, weight)
+    fit = LogisticRegression(C=C, max_iter=1000).fit(features, truth, weight)
     return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]

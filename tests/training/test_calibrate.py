@@ -30,7 +30,7 @@ from training.calibrate_objects import (
     popularity,
     smallest_scenes,
 )
-from training.cases import altered_case
+from training.cases import RIDGE, altered_case, logistic
 from training.config import ObjectsConfig
 from training.evaluation.answers import QUESTIONS, collect
 from training.evaluation.asking import of_classes
@@ -322,6 +322,16 @@ def test_a_rising_curve_follows_a_bend_and_never_falls():
         assert (np.diff(found) > 0).all()
         if law(1.0) > law(0.0):
             assert found == pytest.approx(law(places), abs=0.3)
+
+
+def test_a_ridge_bounds_the_slope_of_few_examples_and_leaves_many_alone():
+    rng = np.random.default_rng(0)
+    few = np.array([-6.0, -5.0, -4.0, 1.0, 2.0, 3.0])[:, None]
+    assert logistic(few, few[:, 0] > 0)[0] > 3
+    assert logistic(few, few[:, 0] > 0, C=RIDGE)[0] < 1.5
+    many = rng.normal(0, 2, (5000, 1))
+    truth = rng.random(5000) < 1 / (1 + np.exp(1 - many[:, 0]))
+    assert logistic(many, truth, C=RIDGE) == pytest.approx(logistic(many, truth), rel=0.01)
 
 
 def test_misplaced_alarms_are_kept_in_untouched_scenes():
