@@ -164,8 +164,8 @@ INVALID_REQUEST: Final = ProblemType(
 UNKNOWN_LABELS: Final = ProblemType(
     "unknown-labels",
     422,
-    "The model does not know some of the labels",
-    "`errors` points at each unknown label and suggests the nearest known labels. With "
+    "The model does not know some labels or room types",
+    "`errors` points at each unknown name and suggests the nearest known ones. With "
     "`unknown_labels` set to `ignore`, the service ignores unknown labels and lists them in "
     "`ignored`. With `nearest`, it maps each unknown label to the most similar class and lists it "
     "in `mapped`. It refuses a label without a similar class. GET /models/{name}/vocabulary lists "

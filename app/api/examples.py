@@ -23,10 +23,10 @@ _ENVELOPE: Final = {"model": _MODEL, "request_id": _ID, "ignored": [], "mapped":
 
 _UNKNOWN: Final = {
     "type": "/problems/unknown-labels",
-    "title": "The model does not know some of the labels",
+    "title": "The model does not know some labels or room types",
     "status": 422,
     "detail": "The request has 1 error, listed in `errors`. GET /models/{name}/vocabulary lists "
-    "the known labels. With `unknown_labels` set to `ignore`, the service leaves unknown labels "
+    "the known names. With `unknown_labels` set to `ignore`, the service leaves unknown names "
     "out.",
     "instance": f"/problems/unknown-labels#{_ID}",
     "request_id": _ID,

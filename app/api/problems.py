@@ -161,8 +161,8 @@ def _faulty(kind: ProblemType, errors: list[FieldError], count: int) -> ProblemE
     detail = f"The request has {count} error{'' if count == 1 else 's'}, listed in `errors`."
     if kind is catalogue.UNKNOWN_LABELS:
         detail += (
-            " GET /models/{name}/vocabulary lists the known labels. With `unknown_labels` set to "
-            "`ignore`, the service leaves unknown labels out."
+            " GET /models/{name}/vocabulary lists the known names. With `unknown_labels` set to "
+            "`ignore`, the service leaves unknown names out."
         )
     return ProblemError(kind, detail, errors=errors)
 

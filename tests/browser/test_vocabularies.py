@@ -139,7 +139,7 @@ def test_two_models_answer_about_their_common_classes(
     said = f"Both models answer about their {len(shared)} common classes."
     expect(board.column("missing")).to_contain_text(said)
     for number in (0, 1):
-        rows = board.rows("missing", number)
+        rows = [row for row in board.rows("missing", number) if not row.startswith("another ")]
         assert len(rows) == 5
         answer = api.post("/missing", json=board.body("missing", number)).json()
         found = [one["label"] for one in answer["missing"]]

@@ -568,8 +568,10 @@ def placements() -> None:
 
 
 @formula(
-    r"p(n) \propto s(n) \, n^{\eta} \, \rho^{n - k}, \quad \eta = a + b \log k"
-    r" + c u + d_t + \frac{1}{\sqrt{m}} \sum_j e_j"
+    r"p(n) \propto s(n) \, \exp\Bigl(\eta \log n + \zeta \log n \log \frac{M}{n}\Bigr) \,"
+    r" \rho^{n - k}, \quad"
+    "\n"
+    r"\eta = a + b \, [k = 1] + c u + d_t + \frac{1}{\sqrt{m}} \sum_j e_j"
 )
 def numbers_of_instances() -> None:
     listed = {DESK: 2, CHAIR: 1, LAMP: 1}

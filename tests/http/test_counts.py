@@ -29,8 +29,9 @@ CHAIR, NIGHTSTAND = VOCABULARY.index("chair"), VOCABULARY.index("nightstand")
 def counts() -> Counts:
     """Usually one nightstand, and four chairs."""
     share = np.array([[0.8, 0.1, 0.05, 0.05], [0.1, 0.1, 0.1, 0.7]])
-    weights = np.zeros((2, 3 + C + V), np.float32)
-    return Counts(np.array([NIGHTSTAND, CHAIR]), np.log(share).astype("f4"), weights)
+    weights = np.zeros((2, 2, 3 + C + V), np.float32)
+    most = np.array([3, 3])
+    return Counts(np.array([NIGHTSTAND, CHAIR]), most, np.log(share).astype("f4"), weights)
 
 
 @pytest.fixture(scope="module")
