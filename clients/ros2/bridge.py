@@ -23,7 +23,8 @@ from scene_reasoning.advisor import QUESTIONS, Advisor
 def options(description: str) -> argparse.ArgumentParser:
     """Return a parser with the options of every bridge."""
     arguments = argparse.ArgumentParser(description=description)
-    arguments.add_argument("--service", default="http://127.0.0.1:8000", help="URL of the service")
+    address = os.environ.get("SCENE_URL") or "http://127.0.0.1:8000"
+    arguments.add_argument("--service", default=address, help="URL of the service (SCENE_URL)")
     arguments.add_argument("--timeout", type=float, default=1.0, help="seconds for one question")
     arguments.add_argument(
         "--questions", nargs="+", choices=QUESTIONS, default=["missing", "outliers"]

@@ -98,6 +98,8 @@ def main() -> None:
         "--domain", type=domain, default=os.environ.get("ROS_DOMAIN_ID") or "0", help="DDS domain"
     )
     given = arguments.parse_args()
+    if given.answers == given.detections:
+        arguments.error("--answers: the answers need another topic than the detections")
     try:
         participant = DomainParticipant(given.domain)
         writer = DataWriter(

@@ -156,7 +156,7 @@ def test_from_rooms_to_answers(tmp_path):
         (("publish", "nowhere@1.0.0", "1.0.1", "--promote"), "app.registry alias` moves"),
         (("publish", "nowhere", "1.0.0", "--alias", "lab"), "--alias belongs to --promote"),
         (("evaluate", "nowhere", "--store", "nowhere"), "error"),
-        (("compare", "nowhere"), "names neither the folder of a finished run nor a model"),
+        (("compare", "nowhere"), "nor a model in model_store: no model or alias has the name"),
         (("compare", "baselines"), "choose a first model that was trained"),
     ],
 )

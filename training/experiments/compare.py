@@ -23,6 +23,7 @@ from training.batches import SceneTensors, scene_tensors
 from training.cases import some_scenes
 from training.config import DATA, ConfigError
 from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
+from training.domain.command import fail
 from training.evaluation.missing import ObjectScore, leave_one_out
 from training.evaluation.report import Progress, SourceReport, digest, run, silent
 from training.evaluation.setting import Setting
@@ -170,8 +171,7 @@ def compare_command(
             b = find(old or _served(models), models, data, say)
             comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
-        console.print(f"[red]error:[/red] {error}", soft_wrap=True)
-        raise typer.Exit(1) from None
+        fail(error)
     if output is not None:
         text = json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False)
         output.write_text(text + "\n", encoding="utf-8")

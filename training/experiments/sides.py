@@ -144,7 +144,7 @@ def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
             raise RunError(f"the folder {reference} contains no finished run") from error
         raise ConfigError(
             f"{reference!r} names neither the folder of a finished run nor a model in "
-            f"{store.root}: {error}"
+            f"{store.root}: {error.reason}"
         ) from error
 
 
@@ -205,6 +205,11 @@ def held_out(
     data = a.config.data
     candidates = split(everything, seed=data.split_seed, protocol=data.split)["test"]
     if not candidates:
+        if data.split == "final":
+            raise ConfigError(
+                f"{a.title} learnt from all of its scenes, because it was trained with --final; "
+                "compare the run without --final"
+            )
         raise ConfigError("the test part contains no scenes: provide more scenes or more groups")
     notes: list[str] = []
     certain = True

@@ -11,12 +11,12 @@ from rich.console import Console
 from app.scene import Vocabulary
 from tests.training.baselines.furnished import STRUCTURE, furnished, tensors
 from training.baselines import BASELINES
-from training.config import Config
+from training.config import Config, ConfigError, with_settings
 from training.evaluation.setting import Contender
 from training.evaluation.tasks import in_words
 from training.experiments.compare import COMPARED, compare, show, side_by_side
-from training.experiments.sides import Side
-from training.pipeline import prepare
+from training.experiments.sides import Side, held_out
+from training.pipeline import prepare, read_sources
 from training.publish import as_stored, draft_artifact
 from training.trainer import new_machine
 
@@ -76,3 +76,9 @@ def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacki
             line.startswith(f"{row.metric} ") and line.endswith(f"] {row.verdict}")
             for line in lines
         )
+
+
+def test_a_model_of_all_scenes_has_no_test_scenes() -> None:
+    side = Side("new", with_settings(CONFIG, {"data.split": "final"}), {}, None)
+    with pytest.raises(ConfigError, match="trained with --final"):
+        held_out(side, side, read_sources(side.config.data, Path()), Path())
