@@ -43,6 +43,8 @@ _OWN, _SHARED = 0.3, 0.15
 _PRECISION: Final = 1e-6
 # A class needs this many scenes, and this many groups that have several instances.
 _SCENES, _GROUPS = 20, 10
+# Three or more listed instances are covered if this many groups have as many.
+_GROUPS_OF_MANY: Final = 20
 _FOLDS: Final = 5
 
 
@@ -145,8 +147,8 @@ def _most(
 ) -> Ints:
     """Return the maximum listed number of each class that the data can tell about, (V,).
 
-    Enough groups of scenes have at least this number of instances. It is 0 for a class with too few
-    scenes, or with too few groups that have several instances.
+    It is at least 2 for a class with enough scenes and enough groups with several instances, and 0
+    for the other classes.
     """
     times = np.zeros(len(vocabulary), dtype=np.int64)
     of_group: dict[tuple[int, str, str], int] = {}
@@ -160,9 +162,10 @@ def _most(
     numbers = np.array([(index, count) for (index, _, _), count in of_group.items()]).reshape(-1, 2)
     most = np.zeros_like(times)
     for index in np.flatnonzero(times >= _SCENES).tolist():
-        largest = np.sort(numbers[numbers[:, 0] == index, 1])[::-1]
-        if len(largest) >= _GROUPS and largest[_GROUPS - 1] > 1:
-            most[index] = min(largest[_GROUPS - 1], MOST - 1)
+        of_class = numbers[numbers[:, 0] == index, 1]
+        groups = np.array([(of_class >= number).sum() for number in range(2, MOST)])
+        if groups[0] >= _GROUPS:
+            most[index] = max(2, 1 + (groups >= _GROUPS_OF_MANY).sum())
     return most
 
 

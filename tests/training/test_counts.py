@@ -75,8 +75,8 @@ def test_the_scene_moves_the_expected_number():
             assert np.array_equal(tensor.astype(np.float16), tensor), "half precision changes it"
 
 
-@pytest.mark.parametrize(("groups", "most"), [(9, 4), (10, 7)])
-def test_a_listed_number_needs_ten_groups_that_have_it(groups, most):
+@pytest.mark.parametrize(("groups", "most"), [(19, 4), (20, 7)])
+def test_a_listed_number_needs_twenty_groups_that_have_it(groups, most):
     # A group has two scenes, one of them with fewer chairs.
     many = [
         scene([CHAIR] * chairs + [TABLE], group=f"many {k}", name=f"many {k} {chairs}")
