@@ -140,8 +140,8 @@ class MoreInstances(Reply):
     """A class that the request lists, and that probably has more instances in the scene.
 
     The statistics are those of training scenes. Listed objects count as present, whatever their
-    confidence. In the shipped models, the number 12 stands for 12 or more, so a class with 12
-    listed objects has no entry.
+    confidence. In the shipped models, the number 12 stands for 12 or more. A class has no entry if
+    too few training scenes contain as many objects as the request lists.
     """
 
     label: str
@@ -171,7 +171,8 @@ class MissingAnswer(Answer):
         Field(
             description="listed classes with probably more instances than listed, most probable "
             "first. Without `candidates`, their probability is at least 0.5. The list is empty "
-            "with `at`, and for models without statistics of counts"
+            "with `at`, and for models without statistics of counts. Classes and numbers of "
+            "objects with too little data are left out"
         ),
     ] = []
 
