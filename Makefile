@@ -1,6 +1,6 @@
 # Every target needs Python ≥ 3.11 and make. The packages of the lock files are installed into .venv.
 
-PORT ?= 8000
+PORT ?= $(or $(SCENE_PORT),8000)
 PYTHON ?= python3
 # Package index with CPU builds of torch. On Linux the default index has CUDA builds. See README.md.
 TORCH_INDEX_URL ?=
@@ -108,7 +108,7 @@ $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(B
 
 $(EVERYTHING): requirements-dev.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing every package into $(VENV) ..."
-	@$(PIP) install -qq $(INDEX) -r requirements-dev.lock
+	@$(PIP) install $(INDEX) -r requirements-dev.lock
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@echo "Installed."
 	@touch $(SERVICE) $@
