@@ -102,8 +102,9 @@ def choose_examples(
 ) -> tuple[Example, ...]:
     """Return up to three typical scenes, if possible of different room types.
 
-    A typical scene contains many frequent classes. Scenes with positions take precedence. Scenes of
-    research-only data sets are left out.
+    A typical scene contains frequent classes, and as many classes as the median scene of its room
+    type: in a complete scene, nothing would be missing. Scenes with positions take precedence.
+    Scenes of research-only data sets are left out.
     """
     known = {
         scene: _known(scene, vocabulary)
@@ -112,10 +113,16 @@ def choose_examples(
     }
     classes = {scene: {index for index, _ in found} for scene, found in known.items()}
     frequency = Counter(index for found in classes.values() for index in found)
+    usable = [scene for scene in known if len(classes[scene]) >= _FEWEST_CLASSES]
+    sizes: dict[str | None, list[int]] = {}
+    for scene in usable:
+        sizes.setdefault(scene.room_type, []).append(len(classes[scene]))
+    usual = {room: np.median(found) for room, found in sizes.items()}
     ranked = sorted(
-        (scene for scene in known if len(classes[scene]) >= _FEWEST_CLASSES),
+        usable,
         key=lambda scene: (
             not any(thing.position for _, thing in known[scene]),
+            abs(len(classes[scene]) - usual[scene.room_type]),
             -sum(frequency[index] for index in classes[scene]),
         ),
     )

@@ -240,3 +240,23 @@ def test_a_suggestion_without_a_place_says_so(open_board: OpenBoard) -> None:
     expect_no_button = board.column("missing").get_by_role("button", name="Put ")
     assert expect_no_button.count() == 0
     assert json.dumps(board.body("missing")["objects"])
+
+
+def test_objects_and_places_below_one_percent_are_left_out(open_board: OpenBoard) -> None:
+    def improbable(route: Any) -> None:
+        response = route.fetch()
+        answer = response.json()
+        first, second, *_ = answer["missing"]
+        for place in first["placements"]:
+            place["probability"] = 0.009
+        second["probability"] = 0.009
+        answer |= {"missing": [first, second], "more": []}
+        route.fulfill(response=response, json=answer)
+
+    board = open_board()
+    board.page.route("**/missing", improbable)
+    board.add("laptop")
+    assert board.ghosts == []
+    (row,) = board.rows("missing")
+    assert row.count("%") == 1, "the probability of the object, and no place"
+    assert "no free place" not in row

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from app.registry import Example
@@ -38,6 +39,19 @@ def test_chosen_scenes_are_requests_in_the_models_words_and_read_back(tmp_path) 
         assert all(thing.label in WORDS.labels and thing.position for thing in request.objects)
     (tmp_path / "examples.json").write_text(examples_json(chosen))
     assert read_examples("examples.json", tmp_path) == chosen
+
+
+def test_a_chosen_scene_has_as_many_classes_as_the_median_of_its_room_type() -> None:
+    sizes: dict[str | None, list[int]] = {}
+    of_scene = {}
+    for scene in SCENES:
+        classes = {WORDS.index(thing.label) for thing in scene.objects} - {None}
+        of_scene[scene.scene_id] = sum(not WORDS.structure[index] for index in classes)
+        sizes.setdefault(scene.room_type, []).append(of_scene[scene.scene_id])
+    rooms = {scene.scene_id: scene.room_type for scene in SCENES}
+    for example in choose_examples(SCENES, WORDS):
+        own = example.name.split(", ")[1]
+        assert abs(of_scene[own] - np.median(sizes[rooms[own]])) <= 1
 
 
 def test_supports_become_relations_where_there_are_no_positions() -> None:

@@ -3,7 +3,7 @@
 import { curl, python } from './calls.js';
 import { bar, copy, el, redraw } from './dom.js';
 import { wrongIn } from './edges.js';
-import { accept, ghostsOf } from './ghosts.js';
+import { accept, ghostsOf, likely } from './ghosts.js';
 import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
 import { percent, SPOKEN } from './words.js';
@@ -44,11 +44,11 @@ const row = (kind, words, probability, flag, ...more) =>
 const ROWS = {
   missing(answer, state, store, column) {
     const ghosts = new Map(column === state.shown ? ghostsOf(state).map((ghost) => [ghost.label, ghost]) : []);
-    const rows = answer.missing.map(({ label, probability, placements, because = [] }) => {
+    const rows = likely(answer, state.at).map(({ label, probability, placements, because = [] }) => {
       const ghost = ghosts.get(label);
       const places = placements.slice().sort((a, b) => (b === ghost?.placement) - (a === ghost?.placement)).slice(0, PLACES)
         .map((one) => `${SPOKEN[one.relation]} ${one.object} ${percent(one.probability)}`);
-      if (!ghost && column === state.shown) places.push('no free place on the board');
+      if (places.length && !ghost && column === state.shown) places.push('no free place on the board');
       const button = ghost && el('button', {
         type: 'button', class: 'icon', 'data-key': `add-${label}`,
         'aria-label': `Put ${label} ${SPOKEN[ghost.placement.relation]} ${ghost.placement.object}`,

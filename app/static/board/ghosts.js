@@ -43,8 +43,17 @@ export function ghostsOf(state) {
   if (last.keys.every((key, index) => key === keys[index]) && last.keys.length) return last.ghosts;
   const sizes = sizesOf(state, state.models[0]);
   const shown = answer && state.tab === 'missing' && !state.draft;
-  last = { keys, ghosts: shown ? standing(answer.missing, state.things.map(sizer(sizes)), state.viewer, sizes, state.at) : [] };
+  last = { keys, ghosts: shown ? standing(likely(answer, state.at), state.things.map(sizer(sizes)), state.viewer, sizes, state.at) : [] };
   return last.ghosts;
+}
+
+const LEAST = 0.01;
+
+/** The missing objects and their places with a probability of at least 1 %; all of them in an answer about a place. */
+export function likely({ missing }, at) {
+  if (at) return missing;
+  const shown = ({ probability }) => probability >= LEAST;
+  return missing.filter(shown).map((one) => ({ ...one, placements: one.placements.filter(shown) }));
 }
 
 /**

@@ -30,6 +30,9 @@ MOST_MISPLACED: Final = 10
 A scene of twelve objects with positions can have a hundred relations.
 """
 
+LEAST_PLACE: Final = 0.01
+"""Minimum probability of a place in a table of missing objects."""
+
 
 def relations(answer: RelationsAnswer) -> RenderableType:
     """Return a table of relations, most probable first, and a table of disagreements."""
@@ -67,7 +70,9 @@ def missing(answer: MissingAnswer) -> RenderableType:
             entry.label,
             _share(entry.probability),
             f"{entry.log_odds:+.2f}",
-            "\n".join(map(_placement, entry.placements)),
+            "\n".join(
+                _placement(one) for one in entry.placements if one.probability >= LEAST_PLACE
+            ),
             _reasons(entry.because),
         )
         for entry in answer.missing
