@@ -162,9 +162,7 @@ def test_promotions_under_load_lose_and_mix_nothing(fleet: Fleet, load: Constant
     assert load.tally.faults == []
     assert load.tally.statuses[200] == load.tally.sent
     # Two polls, which may come 10 % late, and half a second for the two loads beside the requests.
-    # A poll that fails because the machine is busy doubles the time to the next one.
-    assert sorted(seconds)[int(0.9 * PROMOTIONS)] < 2 * 1.1 * POLL + 0.5, sorted(seconds)[-9:]
-    assert max(seconds) < 4 * 1.1 * POLL + 0.5, sorted(seconds)[-9:]
+    assert max(seconds) < 2 * 1.1 * POLL + 0.5, sorted(seconds)[-5:]
 
 
 def test_a_killed_replica_costs_at_most_its_requests(fleet: Fleet, load: ConstantLoad) -> None:
