@@ -35,8 +35,8 @@ class Counts:
 
     Attributes:
         classes: (K,) indices of the classes with statistics, in ascending order.
-        most: (K,) maximum listed number, from 1 to M - 1. Too few training scenes have more
-            instances.
+        most: (K,) maximum listed number, from 1 to M - 1. Too few groups of training scenes have
+            more instances.
         log_share: (K, M) log of the share of scenes with 1, 2, ... instances, of the scenes with
             the class. The last column stands for M or more instances.
         weights: (K, 2, 3 + C + V) effects of the scene on the two exponents. A class has no effect
