@@ -167,6 +167,7 @@ def test_promotions_under_load_lose_and_mix_nothing(fleet: Fleet, load: Constant
 
 def test_a_killed_replica_costs_at_most_its_requests(fleet: Fleet, load: ConstantLoad) -> None:
     killed = fleet.replicas[0]
+    killed.client.close()
     with load:
         time.sleep(1)
         killed.process.kill()
@@ -175,10 +176,11 @@ def test_a_killed_replica_costs_at_most_its_requests(fleet: Fleet, load: Constan
         fleet.replicas[0] = fleet.start(0, killed.port)
         wait_until_ready(killed.port)
         time.sleep(3)
-    assert set(load.tally.statuses) <= {200, 502}
-    assert load.tally.statuses[502] <= 4  # one for each connection
+    # The replica writes the head of an answer before the body. If it dies in between, the proxy
+    # has already sent the head, and it can only close the connection: status 0.
+    assert load.tally.statuses.keys() <= {200, 502, 0}
+    assert load.tally.statuses[502] + load.tally.statuses[0] <= 4  # one for each connection
     assert load.tally.statuses[200] > 100
-    killed.client.close()
 
 
 def test_a_rolling_update_of_the_settings_loses_and_mixes_nothing(
