@@ -60,11 +60,12 @@ def test_missing_objects_are_listed_with_their_places(bedroom: Board, api: httpx
     assert len(rows) == 5 + len(answer["more"])
     for row, missing in zip(rows[:5], answer["missing"], strict=True):
         assert row.startswith(f"{missing['label']} {percent(missing['probability'])}")
-        placed = missing["label"] in bedroom.ghosts
-        assert placed != ("no free place on the board" in row)
         best = missing["placements"][0]
-        where = f"{SPOKEN[best['relation']]} {best['object']}"
-        assert f"{where} {percent(best['probability'])}" in row
+        where = f"{SPOKEN[best['relation']]} {best['object']} {percent(best['probability'])}"
+        likely = best["probability"] >= 0.25
+        assert (where in row, "no likely place" in row) == (likely, not likely)
+        placed = missing["label"] in bedroom.ghosts
+        assert (likely and not placed) == ("no free place on the board" in row)
         assert reasons(missing["because"]) in row
     assert set(bedroom.ghosts) <= {one["label"] for one in answer["missing"]}
 

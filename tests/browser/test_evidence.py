@@ -42,17 +42,17 @@ def test_positions_count_only_when_switched_on(open_board: OpenBoard, api: httpx
 def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> None:
     board = open_board()
     assert board.page.get_by_label(SWITCH).is_checked()
-    board.add("lamp")
+    board.add("monitor")
     board.page.locator("#board .ghost").first.press("Enter")
     board.settle()
     expect(board.page.locator("#board .object.loose")).to_have_count(2)
     assert placed(board) == ["desk", "chair"]
     expect(board.page.locator("#evidence")).to_contain_text("positions of 2 of 4 objects")
     expect(board.page.locator("#list li").nth(2)).to_contain_text("position not given")
-    board.thing("lamp").focus()
+    board.thing("monitor").focus()
     board.page.keyboard.press("ArrowUp")
     board.settle()
-    assert placed(board) == ["desk", "chair", "lamp"]
+    assert placed(board) == ["desk", "chair", "monitor"]
 
 
 def test_stated_relations_are_evidence_in_place_of_positions(open_board: OpenBoard) -> None:

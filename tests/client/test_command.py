@@ -274,6 +274,10 @@ def test_offsets_reasons_and_disagreements_are_shown_where_an_answer_has_them() 
     }
     text = shown(tables.missing(MissingAnswer(**ANSWERED, missing=[lamp])))
     assert "on-top desk 0.500 (x +0.10±0.01, y -0.20±0.02, z +0.30±0.03 m)" in text
+    lamp["placements"] = [{**placement, "probability": 0.24}]
+    unlikely = MissingAnswer(**ANSWERED, missing=[lamp])
+    assert "on-top desk" not in shown(tables.missing(unlikely))
+    assert "on-top desk 0.240" in shown(tables.missing(unlikely, asked_place=True))
     assert "bed +1.50" in text
     doubt = Disagreement("lamp", "desk", ["left", "above"], "on-top", 0.9, 0.05)
     answer = RelationsAnswer(**ANSWERED, relations=[], disagreements=[doubt])

@@ -55,7 +55,7 @@ const ROWS = {
         onclick: () => accept(store, ghost),
       }, '+');
       return row('missing', el('b', {}, label), probability, { button },
-        places.length ? el('p', { class: 'quiet' }, places.join(' · ')) : null, reasons(because));
+        el('p', { class: 'quiet' }, places.join(' · ') || 'no likely place'), reasons(because));
     });
     // An answer about chosen classes also has improbable instances.
     const further = answer.more.filter((one) => one.probability >= 0.5).map((one) =>

@@ -1,7 +1,7 @@
 /** Places on the board for missing objects ("ghosts"). */
 
 import { gap, halves, inside, overlap, round, UNKNOWN_SIZE } from './geometry.js';
-import { sizesOf } from './questions.js';
+import { LIKELY, sizesOf } from './questions.js';
 import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
 
 /** Direction from the anchor to the subject of a relation, in the robot's axes: [ahead, left]. */
@@ -49,11 +49,11 @@ export function ghostsOf(state) {
 
 const LEAST = 0.01;
 
-/** The missing objects and their places with a probability of at least 1 %; all of them in an answer about a place. */
+/** The missing objects of at least 1 %, and their likely places; all of them in an answer about a place. */
 export function likely({ missing }, at) {
   if (at) return missing;
-  const shown = ({ probability }) => probability >= LEAST;
-  return missing.filter(shown).map((one) => ({ ...one, placements: one.placements.filter(shown) }));
+  return missing.filter(({ probability }) => probability >= LEAST)
+    .map((one) => ({ ...one, placements: one.placements.filter(({ probability }) => probability >= LIKELY) }));
 }
 
 /**

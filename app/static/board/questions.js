@@ -11,7 +11,8 @@ export const DEPENDS = [
 
 const SUGGESTIONS = 5;
 const MOST_RELATIONS = 12;
-const LEAST_PROBABILITY = 0.25;
+/** Minimum probability of a relation or place that the page shows. */
+export const LIKELY = 0.25;
 
 /** Typical sizes of a model's classes, by label. */
 export const sizesOf = (state, model) => state.words[model]?.sizes ?? new Map();
@@ -38,7 +39,7 @@ const OWN = {
     return { top_k: SUGGESTIONS, ...(state.at && { at: state.at }), ...(candidates && { candidates }) };
   },
   outliers: ({ sensitivity }) => (sensitivity === 'medium' ? {} : { sensitivity }),
-  relations: () => ({ top_k: MOST_RELATIONS, min_probability: LEAST_PROBABILITY }),
+  relations: () => ({ top_k: MOST_RELATIONS, min_probability: LIKELY }),
 };
 
 /** The scene as a model gets it, without the labels and the room type that it refused. */

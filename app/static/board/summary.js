@@ -1,6 +1,7 @@
 /** A summary of the answers for the live region, which screen readers read aloud. */
 
 import { wrongIn } from './edges.js';
+import { likely } from './ghosts.js';
 import { QUESTIONS } from './questions.js';
 import { percent, SPOKEN } from './words.js';
 
@@ -11,7 +12,7 @@ export function summary(state) {
   const own = state.answers[state.shown];
   if (!QUESTIONS.every((question) => own[question]?.status === 'answered')) return null;
   const parts = [];
-  const [first] = own.missing.answer.missing;
+  const [first] = likely(own.missing.answer, state.at);
   if (first) {
     const [place] = first.placements;
     const where = place ? ` ${SPOKEN[place.relation]} ${place.object}` : '';

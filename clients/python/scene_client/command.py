@@ -19,6 +19,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -246,7 +247,8 @@ def missing(
         detail=detail,
     )
     asked: Asked = context.obj
-    asked.show(lambda client: client.missing(request), tables.missing)
+    shown = partial(tables.missing, asked_place=at is not None)
+    asked.show(lambda client: client.missing(request), shown)
 
 
 @app.command()

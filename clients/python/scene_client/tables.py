@@ -30,8 +30,11 @@ MOST_MISPLACED: Final = 10
 A scene of twelve objects with positions can have a hundred relations.
 """
 
-LEAST_PLACE: Final = 0.01
-"""Minimum probability of a place in a table of missing objects."""
+LIKELY_PLACE: Final = 0.25
+"""Minimum probability of a place in a table of missing objects.
+
+A table of answers about one place contains all places.
+"""
 
 
 def relations(answer: RelationsAnswer) -> RenderableType:
@@ -63,16 +66,19 @@ def relations(answer: RelationsAnswer) -> RenderableType:
     return Group(stated, _table(*columns, rows=doubted, title="disagreements"))
 
 
-def missing(answer: MissingAnswer) -> RenderableType:
-    """Return a table of missing objects with places and reasons, and a table of counts."""
+def missing(answer: MissingAnswer, *, asked_place: bool = False) -> RenderableType:
+    """Return a table of missing objects with places and reasons, and a table of counts.
+
+    Args:
+        asked_place: True if the request names a place.
+    """
+    least = 0.0 if asked_place else LIKELY_PLACE
     rows = [
         (
             entry.label,
             _share(entry.probability),
             f"{entry.log_odds:+.2f}",
-            "\n".join(
-                _placement(one) for one in entry.placements if one.probability >= LEAST_PLACE
-            ),
+            "\n".join(_placement(one) for one in entry.placements if one.probability >= least),
             _reasons(entry.because),
         )
         for entry in answer.missing
