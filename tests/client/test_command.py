@@ -45,6 +45,14 @@ def scene(url: str, monkeypatch: pytest.MonkeyPatch) -> Any:
     return run
 
 
+def test_a_place_in_a_file_is_a_place(scene: Any, tmp_path: Path) -> None:
+    body = {"objects": ["bed"], "at": ["on-top", "bed"], "candidates": ["lamp"]}
+    (tmp_path / "scene.json").write_text(json.dumps(body))
+    by_option = scene("missing", "bed", "--at", "on-top bed", "--candidates", "lamp")
+    assert "on-top bed" in by_option.stdout
+    assert scene("missing", str(tmp_path / "scene.json")).stdout == by_option.stdout
+
+
 def test_what_is_missing_is_a_table(scene: Any, url: str) -> None:
     done = scene("missing", "bed", "nightstand", "--at", "on-top nightstand", "--top-k", "2")
     assert done.exit_code == 0

@@ -247,7 +247,7 @@ def missing(
         detail=detail,
     )
     asked: Asked = context.obj
-    shown = partial(tables.missing, asked_place=at is not None)
+    shown = partial(tables.missing, asked_place=request.get("at") is not None)
     asked.show(lambda client: client.missing(request), shown)
 
 
