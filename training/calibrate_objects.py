@@ -56,10 +56,10 @@ PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
 ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Shares of unaltered scenes with an alarm, on the large data source with the most alarms."""
 
-# Scenes with up to `_SHORT_LISTS` listed classes have separate thresholds if there are enough
-# scenes.
-_SHORT_LISTS = 4
-_SHORT_LIST_SCENES = 30
+# Scenes with up to `_SHORT_LISTS` listed classes have separate thresholds. Each threshold is fitted
+# to at least `_SHORTENED` shortened lists; few scenes are shortened several times.
+_SHORT_LISTS = 8
+_SHORTENED = 200
 _NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 # Number of scenes used from each source.
 _PARTIAL_SCENES = 120
@@ -380,8 +380,8 @@ def fit_outliers(
     }
     short: list[Thresholds] = []
     for listed in range(1, _SHORT_LISTS + 1):
-        some, parts_of = listing(scenes, structure, listed, rng)
-        if len(some) < _SHORT_LIST_SCENES:
+        some, parts_of = listing(scenes, structure, listed, rng, _SHORTENED)
+        if not len(some):
             break
         found = clean_scores(parts_of, structure, score).with_prior(alpha * prior)
         own = _between(limits, _limits(found, some, entry, rng), short[-1] if short else _NEVER)
@@ -392,15 +392,21 @@ def fit_outliers(
 
 
 def listing(
-    scenes: SceneTensors, structure: Tensor, listed: int, rng: np.random.Generator
+    scenes: SceneTensors,
+    structure: Tensor,
+    listed: int,
+    rng: np.random.Generator,
+    least: int = 0,
 ) -> tuple[SceneTensors, Tensor]:
     """Return the scenes with more than `listed` classes, and shortened object lists.
 
     A shortened list contains `listed` random classes and all structure classes of the scene. The
-    lists have the shape (scenes, classes).
+    lists have the shape (scenes, classes). All scenes are repeated until there are `least` lists.
     """
     plain = (scenes.v > 0) & ~structure
     large = (plain.sum(1) > listed).nonzero().squeeze(1)
+    if len(large):
+        large = large.repeat(max(1, -(-least // len(large))))
     order = torch.from_numpy(rng.random(plain[large].shape)).masked_fill(~plain[large], 2.0)
     kept = order.argsort(1)[:, :listed]
     shown = scenes.v[large] * structure

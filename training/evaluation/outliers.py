@@ -190,7 +190,7 @@ def _bound(worst: Floats, group: NDArray[np.str_], rng: np.random.Generator, sha
 # ------------------------------------------------------------------------------------------ tasks
 
 # Lengths of short lists, as at the start of an exploration by a robot.
-_SHORT_LISTS = (1, 2, 4)
+_SHORT_LISTS = (1, 2, 4, 6)
 
 
 def outliers_task(contender: Contender, setting: Setting, law: Law | None = None) -> Outcome | None:
