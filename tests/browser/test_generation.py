@@ -46,7 +46,7 @@ def test_a_drawn_scene_is_the_service_s_and_the_next_one_is_another(
         assert chips(board) == scene["objects"]
         shown = board.page.locator("#board .object").all()
         names = {str(one.get_attribute("aria-label")).split(",")[0] for one in shown}
-        assert names == set(scene["objects"])
+        assert names == set(scene["objects"]) == set(board.things)
         seen.append(chips(board))
     assert seen[0] != seen[1]
 

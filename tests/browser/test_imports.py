@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -47,8 +48,29 @@ def test_detections_are_read_as_the_client_reads_them(
     assert page.get_by_label("Positions count as evidence").is_checked()
 
 
+def test_supports_are_read_as_relations(open_board: OpenBoard) -> None:
+    board = open_board()
+    objects = [{"id": 0, "label": "table"}, {"id": 1, "label": "mug", "supported_by": 0}]
+    stated = {"subject": "mug", "relation": "on-top", "object": "table"}
+    for relations in ([], [[1, "on-top", 0]]):
+        board.put(json.dumps({"scene_id": "one", "objects": objects, "relations": relations}))
+        assert board.scene["relations"] == [stated]
+
+
+def test_objects_with_foreign_ids_are_named_by_their_class(open_board: OpenBoard) -> None:
+    board = open_board()
+    things = {"track_3": "desk", "track_4": "bathtub", "desk_2": "desk"}
+    board.put(json.dumps({"objects": [{"id": id, "label": label} for id, label in things.items()]}))
+    assert board.things == ["desk (track_3)", "bathtub (track_4)", "desk_2"]
+    board.tab("Wrong")
+    assert any(row.startswith("bathtub (track_4) ") for row in board.rows("outliers"))
+
+
 def test_labels_and_flat_detections_are_read(open_board: OpenBoard) -> None:
     board = open_board()
+    for text in ("bed, lamp, mug", "bed\nlamp\nmug\n"):
+        board.put(text)
+        assert board.things == ["bed", "lamp", "mug"]
     board.put('["bed", "lamp", "lamp"]')
     assert board.things == ["bed", "lamp_1", "lamp_2"]
     board.put('{"objects": ["desk", "lamp"], "relations": [["lamp", "on-top", "desk"]]}')
@@ -80,6 +102,8 @@ def test_one_of_several_scenes_is_chosen(open_board: OpenBoard) -> None:
     board.page.locator("#which").fill("2")
     board.page.get_by_role("button", name="Put on the board").click()
     board.settle()
-    (table, mug) = board.scene["objects"]
-    assert table["position"] == {"x": 2, "y": 0.5, "z": 0.4}
-    assert mug == {"id": "mug", "label": "mug"}
+    # The mug has no position, so the relations count and the positions only place the table.
+    assert board.scene["objects"] == [{"id": label, "label": label} for label in ("table", "mug")]
+    assert board.scene["relations"] == [{"subject": "mug", "relation": "on-top", "object": "table"}]
+    expect(board.thing("table")).to_have_accessible_name(re.compile("2.0 m ahead, 0.5 m left"))
+    expect(board.thing("mug")).to_have_accessible_name(re.compile("on table"))

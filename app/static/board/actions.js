@@ -121,7 +121,7 @@ export function createActions(store, say, menu) {
   /** Handles a key on an object of the board or the list. */
   function keys(event, id) {
     const thing = id === ROBOT ? store.get().viewer : find(id);
-    if (!thing || event.ctrlKey || event.metaKey) return;
+    if (!thing || store.get().draft || event.ctrlKey || event.metaKey) return;
     if (STEPS[event.key]) {
       const length = event.shiftKey ? 0.5 : event.altKey ? 0.01 : 0.1;
       const [x, y] = STEPS[event.key];
@@ -147,6 +147,7 @@ export function createActions(store, say, menu) {
 
   /** Opens the menu of an object at the pointer, or beside the element that opens it. */
   function open(id, opener, pointer) {
+    if (store.get().draft) return;
     const box = opener.getBoundingClientRect();
     const at = pointer ?? { left: box.left + Math.min(box.width, 40), top: box.bottom };
     const asks = ['on-top', 'under', 'left', 'right', 'front', 'behind'];

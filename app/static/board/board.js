@@ -11,6 +11,7 @@ import { inWords, reading, refusedBy, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
 import { fit, gridStep, onScreen, ROUND } from './view.js';
+import { nameOf } from './words.js';
 
 const MARK = 9; // radius of the mark of an outlier, in pixels
 const FONT = '500 13px system-ui, sans-serif';
@@ -119,7 +120,7 @@ export function createBoard(node, store, actions, takeGhost) {
   function openAt(event, box) {
     event.preventDefault();
     const pointer = event.type === 'keydown' ? undefined : { left: event.clientX, top: event.clientY };
-    if (!store.get().draft) actions.open(box.id, event.currentTarget, pointer);
+    actions.open(box.id, event.currentTarget, pointer);
   }
 
   /** Draws labels inside their boxes if they fit, else beside them. Upper objects take precedence. */
@@ -135,12 +136,11 @@ export function createBoard(node, store, actions, takeGhost) {
       places.reserve({ left: at - MARK, right: at + MARK, top: top - MARK, bottom: top + MARK });
     }
     for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
-      const words = (!state.draft && !left.has(box.label) && inWords(reading(state, state.shown, 'objects', box.label))) || box.id;
+      const words = (!state.draft && !left.has(box.label) && inWords(reading(state, state.shown, 'objects', box.label))) || nameOf(box);
       const width = widthOf(words, FONT) + 6;
       const rect = onScreen(box, view);
-      const at = places.take(width, LINE, labelPlaces(rect, width));
+      const at = places.take(width, LINE, labelPlaces(rect, width), rect);
       if (at) texts.push({ id: box.id, words, ...at, wrong: !state.draft && wrong.get(box.id)?.is_outlier });
-      if (box.z > 0.05) places.reserve(rect);
     }
     labels.selectAll('text.name').data(texts, (text) => text.id).join('text')
       .attr('class', 'name').attr('x', (text) => text.x).attr('y', (text) => text.y)
@@ -167,7 +167,7 @@ export function createBoard(node, store, actions, takeGhost) {
     drawGrid();
     drawRobot(state);
     drawObjects(state, boxes, wrong);
-    for (const ghost of shown) places.reserve(onScreen(ghost, view));
+    for (const box of [...boxes, ...shown]) places.reserve(onScreen(box, view));
     drawLabels(state, boxes, places, wrong);
     drawGhosts(ghosts, shown, boxes, view, places, takeGhost);
     drawEdges(edges, edgesOf(state), boxes, view, places);
@@ -193,12 +193,12 @@ export function createBoard(node, store, actions, takeGhost) {
 }
 
 function described(box, state, boxes, wrong) {
-  const parts = [box.id === box.label ? box.id : `${box.id}, ${box.label}`, whereabouts(box.x, box.y, state.viewer)];
+  const parts = [nameOf(box), whereabouts(box.x, box.y, state.viewer)];
   const below = boxes.find(
     (other) => other.id !== box.id && box.z > 0.05 && Math.abs(other.z + other.size.z - box.z) < 0.03 &&
       Math.hypot(other.x - box.x, other.y - box.y) < Math.hypot(other.size.x, other.size.y) / 2,
   );
-  if (below) parts.push(`on ${below.id}`);
+  if (below) parts.push(`on ${nameOf(below)}`);
   if (wrong.get(box.id)?.is_outlier) parts.push('does not belong here');
   return parts.join(', ');
 }

@@ -6,19 +6,19 @@ import { wrongIn } from './edges.js';
 import { accept, ghostsOf, likely } from './ghosts.js';
 import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
-import { percent, SPOKEN } from './words.js';
+import { namesOf, percent, SPOKEN } from './words.js';
 
 const SEEN = ['answers', 'shown', 'models', 'things', 'tab', 'draft', 'words', 'at', 'refused', 'posed', 'relations', 'room'];
 
-const PLACES = 2; // listed places of a missing object: first the one on the board, then the likeliest
+const PLACES = 2; // listed places of a missing object, likeliest first
 
-const spoken = ({ subject, relation, object }) => `${subject} ${SPOKEN[relation]} ${object}`;
+const spoken = ({ subject, relation, object }, name) => `${name(subject)} ${SPOKEN[relation]} ${name(object)}`;
 
 /** Reasons in words: "bed, lamp speak for it; oven speaks against it". */
-function reasons(because, company = []) {
+function reasons(because, name, company = []) {
   const speak = (side, objects) =>
     objects.length ? `${objects.join(', ')} ${objects.length > 1 ? 'speak' : 'speaks'} ${side} it` : '';
-  const named = (sign) => because.filter((one) => sign * one.log_odds_change > 0).map(({ object }) => object);
+  const named = (sign) => because.filter((one) => sign * one.log_odds_change > 0).map(({ object }) => name(object));
   const words = [
     company.length ? `usually seen with ${company.join(', ')}` : '',
     speak('for', named(1)), speak('against', named(-1)),
@@ -27,11 +27,11 @@ function reasons(because, company = []) {
 }
 
 /** What a model did with unknown names, and the warnings of its answer. */
-function notes({ warnings = [] }, state, column) {
+function notes({ warnings = [] }, state, column, name) {
   const names = [...new Set(state.things.map(({ label }) => label))].map((label) => reading(state, column, 'objects', label));
   return [
     ...[...names, reading(state, column, 'rooms', state.room)].map(inWords).filter(Boolean).map((words) => (words.endsWith('?') ? words : `${words}.`)),
-    ...warnings.map((one) => `Check ${one.objects.join(', ')}: ${one.message}.`),
+    ...warnings.map((one) => `Check ${one.objects.map(name).join(', ')}: ${one.message}.`),
   ].join(' ');
 }
 
@@ -42,37 +42,40 @@ const row = (kind, words, probability, flag, ...more) =>
     bar(probability, kind), ...more);
 
 const ROWS = {
-  missing(answer, state, store, column) {
+  missing(answer, name, state, store, column) {
     const ghosts = new Map(column === state.shown ? ghostsOf(state).map((ghost) => [ghost.label, ghost]) : []);
     const rows = likely(answer, state.at).map(({ label, probability, placements, because = [] }) => {
       const ghost = ghosts.get(label);
-      const places = placements.slice().sort((a, b) => (b === ghost?.placement) - (a === ghost?.placement)).slice(0, PLACES)
-        .map((one) => `${SPOKEN[one.relation]} ${one.object} ${percent(one.probability)}`);
+      const first = placements.slice(0, PLACES);
+      // The place on the board is always listed.
+      if (ghost && placements.indexOf(ghost.placement) >= PLACES) first.splice(-1, 1, ghost.placement);
+      const places = first.map((one) => `${SPOKEN[one.relation]} ${name(one.object)} ${percent(one.probability)}`);
       if (places.length && !ghost && column === state.shown) places.push('no free place on the board');
       const button = ghost && el('button', {
         type: 'button', class: 'icon', 'data-key': `add-${label}`,
-        'aria-label': `Put ${label} ${SPOKEN[ghost.placement.relation]} ${ghost.placement.object}`,
-        onclick: () => accept(store, ghost),
+        'aria-label': `Put ${label} ${SPOKEN[ghost.placement.relation]} ${name(ghost.placement.object)}`,
+        // The second click of a double click would take the next suggestion.
+        onclick: ({ detail }) => detail < 2 && accept(store, ghost),
       }, '+');
-      return row('missing', el('b', {}, label), probability, { button },
-        el('p', { class: 'quiet' }, places.join(' · ') || 'no likely place'), reasons(because));
+      return [probability, row('missing', el('b', {}, label), probability, { button },
+        el('p', { class: 'quiet' }, places.join(' · ') || 'no likely place'), reasons(because, name))];
     });
     // An answer about chosen classes also has improbable instances.
     const further = answer.more.filter((one) => one.probability >= 0.5).map((one) =>
-      row('missing', el('b', {}, `another ${one.label}`), one.probability, {},
-        el('p', { class: 'quiet' }, `${one.listed_count} listed, about ${Math.round(one.expected_count)} expected`)));
-    return [...rows, ...further];
+      [one.probability, row('missing', el('b', {}, `another ${one.label}`), one.probability, {},
+        el('p', { class: 'quiet' }, `${one.listed_count} listed, about ${Math.round(one.expected_count)} expected`))]);
+    return [...rows, ...further].sort(([a], [b]) => b - a).map(([, node]) => node);
   },
 
-  outliers(answer, state, store) {
+  outliers(answer, name, state, store) {
     const objects = answer.outliers.map((one) =>
       row('outliers', el('button', {
         type: 'button', class: 'link', 'data-key': `of-${one.object}`,
         onclick: () => store.set({ selected: one.object }),
-      }, one.object), one.probability, one.is_outlier ? { kind: 'alarm', words: 'does not belong' } : {},
-      reasons(one.because, one.usually_with)));
+      }, name(one.object)), one.probability, one.is_outlier ? { kind: 'alarm', words: 'does not belong' } : {},
+      reasons(one.because, name, one.usually_with)));
     const misplaced = wrongIn(answer).misplaced.map((one) =>
-      row('outliers', el('b', {}, spoken(one)), one.probability, { kind: 'alarm', words: 'in the wrong place' }));
+      row('outliers', el('b', {}, spoken(one, name)), one.probability, { kind: 'alarm', words: 'in the wrong place' }));
     const stated = state.posed || state.relations.length;
     const alarms = wrongIn(answer).outliers.length; // the first ones, because the least fitting objects come first
     return [
@@ -81,15 +84,15 @@ const ROWS = {
     ].filter(Boolean);
   },
 
-  relations: ({ disagreements, relations }) => [
+  relations: ({ disagreements, relations }, name) => [
     ...disagreements.map((one) =>
       el('li', { class: 'disagrees' },
         el('div', { class: 'headline' },
-          el('b', {}, `${one.subject} ${one.observed.map((name) => SPOKEN[name]).join(', ')} ${one.object}`),
+          el('b', {}, `${name(one.subject)} ${one.observed.map((relation) => SPOKEN[relation]).join(', ')} ${name(one.object)}`),
           el('span', {}, percent(one.observed_probability))),
         el('p', {}, `expected: ${SPOKEN[one.expected]}, ${percent(one.probability)}`))),
     ...relations.map((one) =>
-      row('relations', el('b', {}, spoken(one)), one.probability,
+      row('relations', el('b', {}, spoken(one, name)), one.probability,
         one.observed ? { kind: 'holds', words: 'observed' } : { kind: 'expected' })),
   ],
 };
@@ -171,13 +174,14 @@ export function createColumns(store, parents, askKey) {
       own.problem.replaceChildren(...problemWords(problem, entry.body), ...(problem.status === 401 ? [askKey()] : []));
     }
     own.told = problem;
-    const rows = answer ? ROWS[question](answer, state, store, column) : [];
+    const name = namesOf(state.things);
+    const rows = answer ? ROWS[question](answer, name, state, store, column) : [];
     redraw(own.rows, rows);
     const waiting = status === 'down' ? 'Waiting for the service.' : whyNot(state, question, model);
     const shared = question === 'missing' && column === 0 && common(state);
     own.note.textContent = [
       shared ? `Both models answer about their ${shared.length} common classes.` : '',
-      notes(answer ?? {}, state, column), rows.length ? '' : answer ? NOTHING[question] : waiting,
+      notes(answer ?? {}, state, column, name), rows.length ? '' : answer ? NOTHING[question] : waiting,
     ].filter(Boolean).join(' ');
     own.calls.show(question, entry.body);
   }

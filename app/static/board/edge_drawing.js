@@ -1,9 +1,10 @@
 /** Relations as arrows from subject to object, with texts that do not overlap. */
 
-import { widthOf } from './labels.js';
+import { labelPlaces, widthOf } from './labels.js';
 import { onScreen } from './view.js';
 
 const FONT = '11px system-ui, sans-serif';
+const PADDING = 6; // pixels
 
 /** The point where the line from a box's centre to another point leaves the box. */
 function border(box, towards) {
@@ -20,19 +21,20 @@ function line(edge, rects) {
   if (!a || !b) return null;
   const [from, to] = [border(a, b), border(b, a)];
   // If one box lies on the other, only the text is drawn.
-  if (!from || !to) return { ...edge, from: null, spots: [{ x: a.x, y: a.top - 9 }, { x: a.x, y: a.bottom + 9 }] };
+  const width = widthOf(edge.words, FONT) + PADDING;
+  if (!from || !to) return { ...edge, width, from: null, spots: [a, b].flatMap((rect) => labelPlaces(rect, width)) };
   const at = (part) => ({ x: from.x + (to.x - from.x) * part, y: from.y + (to.y - from.y) * part });
   const length = Math.hypot(to.x - from.x, to.y - from.y) || 1;
   const [nx, ny] = [(from.y - to.y) / length, (to.x - from.x) / length];
   const aside = (by) => ({ x: at(0.5).x + nx * by, y: at(0.5).y + ny * by });
   const spots = [...[0.5, 0.38, 0.62, 0.25, 0.75].map(at), ...[12, -12, 24, -24, 38, -38].map(aside)];
-  return { ...edge, from, to, spots };
+  return { ...edge, width, from, to, spots };
 }
 
 export function drawEdges(layer, edges, boxes, view, places) {
   const rects = new Map(boxes.map((box) => [box.id, onScreen(box, view)]));
   const lines = edges.map((edge) => line(edge, rects)).filter(Boolean);
-  for (const one of lines) one.text = places.take(widthOf(one.words, FONT) + 6, 15, one.spots);
+  for (const one of lines) one.text = places.take(one.width, 15, one.spots);
   const each = layer.selectAll('g').data(lines, (one) => one.key).join((enter) => {
     const g = enter.append('g');
     g.append('path').attr('class', 'line');

@@ -1,6 +1,7 @@
 /**
- * Reads the texts that the command `scene` and the training read: a request, a list of objects, a ROS
- * message with detections as JSON (with or without the envelope of rosbridge), or JSON lines of scenes.
+ * Reads the texts that the command `scene` and the training read: a request, a list of objects or of
+ * labels, a ROS message with detections as JSON (with or without the envelope of rosbridge), or JSON
+ * lines of scenes.
  */
 
 import { SceneError } from './scene.js';
@@ -10,6 +11,7 @@ import { SceneError } from './scene.js';
  * @throws {SceneError | SyntaxError}
  */
 export function scenesIn(text) {
+  if (LABELS.test(text)) return [{ objects: text.split(/[,\n]/).map((label) => label.trim()).filter(Boolean) }];
   try {
     return [sceneOf(JSON.parse(text))];
   } catch (error) {
@@ -18,6 +20,9 @@ export function scenesIn(text) {
     return lines.map((line) => sceneOf(JSON.parse(line)));
   }
 }
+
+/** Labels with commas or line ends between them: a text without the brackets and quotes of JSON. */
+const LABELS = /^[^{}[\]":]*\p{L}[^{}[\]":]*$/u;
 
 function sceneOf(found) {
   try {
@@ -41,14 +46,16 @@ function annotated({ objects, relations, room_type: room }) {
   const name = ({ id, label }) =>
     objects.filter((other) => other.label === label).length > 1 ? `${label}_${id}` : label;
   const names = new Map(objects.map((thing) => [thing.id, name(thing)]));
-  const positions = objects.some(({ position }) => position);
+  const positions = objects.every(({ position }) => position);
+  const supports = objects.filter((thing) => thing.supported_by != null).map((thing) => [thing.id, 'on-top', thing.supported_by]);
+  const stated = new Map([...(relations ?? []), ...supports].map((one) => [String(one), one]));
   return {
     objects: objects.map(({ label, position, size, yaw = 0, ...thing }) => ({
       id: names.get(thing.id), label,
       ...(position && { position: metres(position), ...(size && { size: metres(size) }), orientation: turned(yaw) }),
     })),
-    ...(relations?.length && !positions && {
-      relations: relations.map(([subject, relation, object]) => ({ subject: names.get(subject), relation, object: names.get(object) })),
+    ...(stated.size && !positions && {
+      relations: [...stated.values()].map(([subject, relation, object]) => ({ subject: names.get(subject), relation, object: names.get(object) })),
     }),
     ...(room && { room_type: room }),
   };

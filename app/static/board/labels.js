@@ -1,4 +1,4 @@
-/** Texts that do not overlap: each takes its first free place. */
+/** Texts that do not overlap: each takes the place that covers the fewest boxes. */
 
 /** Height of a label in pixels. */
 export const LINE = 17;
@@ -31,17 +31,19 @@ export class Places {
   }
 
   /**
-   * Takes the first centre where a text of this size meets neither a text nor a reserved rectangle,
-   * else the first where it meets no text, else null.
-   * @param {{x: number, y: number}[]} centres
+   * Takes a centre where a text of this size meets no other text and the fewest reserved rectangles; null if there is none.
+   * @param {{x: number, y: number}[]} centres best first
+   * @param {object} [own] the box of the text. A text may cover the rectangles around its box, such as the support.
    */
-  take(width, height, centres) {
+  take(width, height, centres, own) {
     const around = ({ x, y }) => ({
       left: x - width / 2, right: x + width / 2, top: y - height / 2, bottom: y + height / 2,
     });
     const clear = (centre) => this.#inside(around(centre)) && !this.#texts.some((other) => meet(around(centre), other));
     const free = centres.filter(clear);
-    const centre = free.find((one) => !this.#boxes.some((other) => meet(around(one), other))) ?? free[0] ?? null;
+    const others = this.#boxes.filter((box) => !own || !holds(box, own));
+    const covered = (one) => others.filter((other) => meet(around(one), other)).length;
+    const [[, centre] = [0, null]] = free.map((one) => [covered(one), one]).sort(([a], [b]) => a - b);
     if (centre) this.#texts.push(around(centre));
     return centre;
   }
@@ -51,6 +53,7 @@ export class Places {
   }
 }
 
+const holds = (a, b) => a.left <= b.left && b.right <= a.right && a.top <= b.top && b.bottom <= a.bottom;
 const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
 
 /** Possible places for the text of a box, best first. */

@@ -5,12 +5,12 @@ import { outliersOf } from './board.js';
 import { el, redraw } from './dom.js';
 import { readings } from './questions.js';
 import { changed } from './store.js';
+import { nameOf } from './words.js';
 
 const SEEN = ['things', 'selected', 'answers', 'shown', 'viewer', 'draft', 'refused', 'models', 'posed'];
 
 export function createList(list, empty, count, actions) {
-  function row(thing) {
-    const { id } = thing;
+  function row({ id }) {
     const name = el('button', {
       type: 'button', class: 'name', 'aria-describedby': 'board-help',
       onclick: () => actions.select(id),
@@ -19,7 +19,7 @@ export function createList(list, empty, count, actions) {
         event.preventDefault();
         actions.open(id, event.currentTarget, { left: event.clientX, top: event.clientY });
       },
-    }, el('b', {}, id), el('span', { class: 'quiet' }));
+    }, el('b'), el('span', { class: 'quiet' }));
     const more = el('button', {
       type: 'button', class: 'icon', 'aria-haspopup': 'menu', 'aria-label': `Actions for ${id}`,
       onclick: (event) => actions.open(id, event.currentTarget),
@@ -32,10 +32,9 @@ export function createList(list, empty, count, actions) {
 
   /** What the list says about an object besides its name. */
   function about(thing, state, out) {
-    const where = !state.posed ? null
+    const where = !state.posed || state.draft ? null
       : thing.placed ? whereabouts(thing.x, thing.y, state.viewer) : 'position not given';
-    return [thing.id === thing.label ? null : thing.label, where, out ? 'does not belong here' : null]
-      .filter(Boolean).join(' · ');
+    return [where, out ? 'does not belong here' : null].filter(Boolean).join(' · ');
   }
 
   /** How a model reads an unknown label. Each similar label is a button that renames the object. */
@@ -46,19 +45,22 @@ export function createList(list, empty, count, actions) {
 
   function draw(state) {
     const wrong = outliersOf(state);
-    const rows = d3.select(list).selectAll('li').data(state.things, (thing) => thing.id)
+    const things = state.draft?.things ?? state.things;
+    list.classList.toggle('draft', Boolean(state.draft));
+    const rows = d3.select(list).selectAll('li').data(things, (thing) => thing.id)
       .join((enter) => enter.append(row));
     rows.each(function update(thing) {
-      const out = Boolean(wrong.get(thing.id)?.is_outlier);
+      const out = !state.draft && Boolean(wrong.get(thing.id)?.is_outlier);
       const chosen = thing.id === state.selected;
       this.classList.toggle('selected', chosen);
       this.classList.toggle('outlier', out);
       this.querySelector('.name').setAttribute('aria-current', String(chosen));
+      this.querySelector('.name b').textContent = nameOf(thing);
       this.querySelector('.name span').textContent = about(thing, state, out);
       redraw(this.querySelector('.error'), readings(state, 'objects', thing.label).map((one) => suggested(thing, one)));
     });
-    empty.hidden = state.things.length > 0;
-    count.textContent = state.things.length ? `(${state.things.length})` : '';
+    empty.hidden = things.length > 0;
+    count.textContent = things.length ? `(${things.length}${state.draft ? ', generated' : ''})` : '';
   }
 
   return (state, previous) => changed(state, previous, ...SEEN) && draw(state);

@@ -5,12 +5,12 @@ import { el } from './dom.js';
 import { changed } from './store.js';
 import { plain } from './words.js';
 
-/** The selectable models: aliases first, then all usable versions. */
+/** The selectable models: aliases first, then the usable versions without an alias. */
 function choices({ models, aliases }) {
+  const targets = Object.values(aliases);
   const versions = models.flatMap(({ name, versions: own }) =>
-    own.filter(({ status }) => status === 'ready').map(({ version, variant }) => ({
-      value: `${name}@${version}`, words: `${name} ${version} (${variant})`,
-    })),
+    own.filter(({ version, status }) => status === 'ready' && !targets.includes(`${name}@${version}`))
+      .map(({ version }) => ({ value: `${name}@${version}`, words: `${name} ${version}` })),
   );
   const named = Object.entries(aliases).map(([alias, target]) => ({ value: alias, words: `${alias}: ${target.replace('@', ' ')}` }));
   return [...named, ...versions];

@@ -3,6 +3,7 @@
 import { round } from './geometry.js';
 import { sizesOf } from './questions.js';
 import { changed } from './store.js';
+import { nameOf } from './words.js';
 
 export function createProperties(form, store, actions) {
   const field = (name) => form.elements.namedItem(name);
@@ -46,14 +47,16 @@ export function createProperties(form, store, actions) {
     form.hidden = !thing || Boolean(state.draft);
     if (form.hidden) return;
     const { size } = actions.sized()(thing);
-    form.querySelector('h3').textContent = thing.id === thing.label ? thing.id : `${thing.id} (${thing.label})`;
+    form.querySelector('h3').textContent = nameOf(thing);
     for (const set of form.querySelectorAll('fieldset')) set.hidden = !state.posed;
     const known = sizesOf(state, state.models[0]).has(thing.label);
     document.getElementById('size-source').textContent = thing.size ? '' : known ? '(typical)' : '(a guess)';
-    const values = { ...thing, sx: size.x, sy: size.y, sz: size.z };
+    const unplaced = thing.placed ? {} : { x: '', y: '', z: '' };
+    const values = { ...thing, ...unplaced, sx: size.x, sy: size.y, sz: size.z };
     for (const input of form.querySelectorAll('input')) {
       if (typing.has(input) || (input === document.activeElement && input.getAttribute('aria-invalid'))) continue;
-      const text = String(round(values[input.name]));
+      const value = values[input.name];
+      const text = value === '' ? '' : String(round(value));
       if (field(input.name).value !== text) input.value = text;
       input.removeAttribute('aria-invalid');
     }

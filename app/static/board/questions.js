@@ -1,6 +1,7 @@
 /** The bodies of the three questions that the page asks about every scene. */
 
 import { toScene } from './scene.js';
+import { namesOf } from './words.js';
 
 export const QUESTIONS = ['missing', 'outliers', 'relations'];
 
@@ -61,7 +62,7 @@ export function whyNot(state, question, model) {
   const known = knownTo(state, model);
   if (!known.length) return 'The model knows none of the objects.';
   if (question !== 'missing') return '';
-  if (state.at && !known.some(({ id }) => id === state.at.object)) return `The model does not know ${state.at.object}.`;
+  if (state.at && !known.some(({ id }) => id === state.at.object)) return `The model does not know ${namesOf(state.things)(state.at.object)}.`;
   return common(state)?.length === 0 ? 'The two models have no class in common.' : '';
 }
 
@@ -81,9 +82,11 @@ export function reading(state, column, kind, name) {
 /** A reading as text: "fridgee → fridge?". */
 export const inWords = ([words, ...names]) => [words, ...names.map((name) => `${name}?`)].join(' ');
 
-/** The readings of all models; with two models, each begins with the name of its model. */
-export const readings = (state, kind, name) =>
-  state.models.flatMap((model, column) => {
-    const [words, ...names] = model ? reading(state, column, kind, name) : [];
-    return words ? [[state.models[1] ? `${model}: ${words}` : words, ...names]] : [];
-  });
+/** The readings of all models. Different readings of two models begin with the name of the model. */
+export function readings(state, kind, name) {
+  const found = state.models.flatMap((model, column) => (model ? [[model, ...reading(state, column, kind, name)]] : []));
+  const different = new Set(found.map(([, ...words]) => String(words))).size > 1;
+  const told = found.filter(([, words]) => words);
+  if (!different) return told.slice(0, 1).map(([, ...words]) => words);
+  return told.map(([model, words, ...names]) => [`${model}: ${words}`, ...names]);
+}

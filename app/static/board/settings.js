@@ -8,7 +8,7 @@ import { ghostsOf } from './ghosts.js';
 import { inWords, knownTo, readings, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
-import { SPOKEN } from './words.js';
+import { namesOf, SPOKEN } from './words.js';
 
 const get = (id) => document.getElementById(id);
 
@@ -69,13 +69,13 @@ export function settings(store) {
     get('undo').disabled = !state.canUndo;
     document.body.classList.toggle('two', Boolean(state.models[1]));
     get('at').hidden = !state.at;
-    if (state.at) get('at-words').textContent = `Missing ${SPOKEN[state.at.relation]} ${state.at.object}`;
+    if (state.at) get('at-words').textContent = `Missing ${SPOKEN[state.at.relation]} ${namesOf(state.things)(state.at.object)}`;
     if (changed(state, previous, 'words', 'models', 'room')) rooms(state);
-    if (changed(state, previous, 'answers', 'shown')) {
+    if (changed(state, previous, 'answers', 'shown', 'draft')) {
       const answer = state.answers[state.shown].outliers?.answer;
       const { outliers, misplaced } = answer ? wrongIn(answer) : { outliers: [], misplaced: [] };
       get('alarms').textContent = outliers.length + misplaced.length;
-      get('alarms').hidden = get('alarms').textContent === '0';
+      get('alarms').hidden = Boolean(state.draft) || get('alarms').textContent === '0';
     }
     get('legend').replaceChildren(...visible(state).map((kind) => el('span', { class: kind }, SYMBOLS[kind])));
   }

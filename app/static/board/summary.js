@@ -3,7 +3,7 @@
 import { wrongIn } from './edges.js';
 import { likely } from './ghosts.js';
 import { QUESTIONS } from './questions.js';
-import { percent, SPOKEN } from './words.js';
+import { namesOf, percent, SPOKEN } from './words.js';
 
 const MOST_SAID = 3; // maximum number of listed relations
 
@@ -11,17 +11,18 @@ const MOST_SAID = 3; // maximum number of listed relations
 export function summary(state) {
   const own = state.answers[state.shown];
   if (!QUESTIONS.every((question) => own[question]?.status === 'answered')) return null;
+  const name = namesOf(state.things);
   const parts = [];
   const [first] = likely(own.missing.answer, state.at);
   if (first) {
     const [place] = first.placements;
-    const where = place ? ` ${SPOKEN[place.relation]} ${place.object}` : '';
+    const where = place ? ` ${SPOKEN[place.relation]} ${name(place.object)}` : '';
     parts.push(`Most likely missing: ${first.label}${where}, ${percent(first.probability)}.`);
   }
   const { outliers, misplaced } = wrongIn(own.outliers.answer);
-  if (outliers.length) parts.push(`Does not belong here: ${outliers.map((one) => one.object).join(', ')}.`);
+  if (outliers.length) parts.push(`Does not belong here: ${outliers.map((one) => name(one.object)).join(', ')}.`);
   if (misplaced.length) {
-    const places = misplaced.map((one) => `${one.subject} ${SPOKEN[one.relation]} ${one.object}`);
+    const places = misplaced.map((one) => `${name(one.subject)} ${SPOKEN[one.relation]} ${name(one.object)}`);
     const rest = places.length > MOST_SAID ? ` and ${places.length - MOST_SAID} more` : '';
     parts.push(`In the wrong place: ${places.slice(0, MOST_SAID).join(', ')}${rest}.`);
   }

@@ -34,6 +34,15 @@ export function search(entries, text, limit = 12) {
   return found.sort((a, b) => a.best - b.best).slice(0, limit);
 }
 
+/** The name of an object: its id, with its label if the id does not begin with it, as in "desk (track_3)". */
+export const nameOf = ({ id, label }) => (plain(id).startsWith(plain(label)) ? id : `${label} (${id})`);
+
+/** A function from the id of an object to its name. */
+export function namesOf(things) {
+  const names = new Map(things.map((thing) => [thing.id, nameOf(thing)]));
+  return (id) => names.get(id) ?? id;
+}
+
 /** Relations in words, for example "on top of". */
 export const SPOKEN = {
   left: 'left of',
