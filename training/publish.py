@@ -27,6 +27,7 @@ from training.calibrate import calibrate
 from training.config import Config, DataConfig, load_config, shipped_configs
 from training.counts import fit_counts
 from training.datasets.sources import SOURCES
+from training.datasets.vocabulary import with_room_aliases
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.evaluation.tasks import STATISTICS
@@ -96,7 +97,7 @@ def publish_run(
         version=version,
         created=_now(),
         spec=machine.spec.to_dict(),
-        vocabulary=VocabularyEntry.of(scenes.vocabulary, machine.spec.A),
+        vocabulary=VocabularyEntry.of(with_room_aliases(scenes.vocabulary), machine.spec.A),
         calibration=calibrated.calibration,
         training=_training(run, measured),
         data=data_sources(scenes),

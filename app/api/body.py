@@ -229,6 +229,9 @@ class JSONRoute(APIRoute):
             return
         http = Request(scope, receive)
         self.check(http)
+        if scope["query_string"]:
+            detail = "This route has no query parameters. Send all fields in the JSON body."
+            raise ProblemError(catalogue.BAD_REQUEST, detail)
         kind = next((value for name, value in scope["headers"] if name == b"content-type"), b"")
         if not _is_json(kind):
             detail = "The header Content-Type must be application/json."

@@ -191,6 +191,7 @@ class VocabularyEntry(Frozen):
     objects: Many[ClassEntry]
     relations: Many[str] = CANONICAL
     room_types: Many[Text] = ()
+    room_aliases: dict[Text, Many[Text]] = Field(default_factory=dict)
     _words: Vocabulary = PrivateAttr()
 
     @model_validator(mode="after")

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -55,20 +56,32 @@ class Vocabulary:
     Args:
         objects: object classes. Their order defines the class indices.
         room_types: canonical names of the room types. Their order defines the room indices.
+        room_aliases: maps room types to their synonyms.
 
     Raises:
-        ValueError: the list of classes is empty, a room type has an empty name, or a name is
-            ambiguous. A name is ambiguous if two classes, or two room types, have names with the
+        ValueError: the list of classes is empty, a room type has an empty name, a key of
+            `room_aliases` is no room type, or a name is ambiguous. A name is ambiguous if two classes, or two room types, have names with the
             same `label_key`.
     """
 
-    __slots__ = ("__dict__", "_by_key", "_by_spelling", "_objects", "_room_by_key", "_room_types")
+    __slots__ = (
+        *("__dict__", "_by_key", "_by_spelling", "_objects"),
+        *("_room_aliases", "_room_by_key", "_room_types"),
+    )
 
-    def __init__(self, objects: Sequence[ObjectClass], room_types: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        objects: Sequence[ObjectClass],
+        room_types: Sequence[str] = (),
+        room_aliases: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    ) -> None:
         if not objects:
             raise ValueError("a vocabulary needs at least one object class")
         self._objects = tuple(objects)
         self._room_types = tuple(room_types)
+        self._room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
+        if others := self._room_aliases.keys() - set(self._room_types):
+            raise ValueError(f"room_aliases has keys that are no room types: {sorted(others)}")
         self._by_key: dict[str, int] = {}
         self._by_spelling: dict[str, int] = {}
         for index, entry in enumerate(self._objects):
@@ -82,13 +95,14 @@ class Vocabulary:
                 self._by_spelling[name] = index
         self._room_by_key: dict[str, int] = {}
         for index, room in enumerate(self._room_types):
-            if not label_key(room):
-                raise ValueError(f"a room type has an empty name: {room!r}")
-            claimed = self._room_by_key.setdefault(label_key(room), index)
-            if claimed != index:
-                raise ValueError(
-                    f"room types {self._room_types[claimed]!r} and {room!r} have the same name"
-                )
+            for name in (room, *self._room_aliases.get(room, ())):
+                if not label_key(name):
+                    raise ValueError(f"a room type has an empty name: {name!r}")
+                claimed = self._room_by_key.setdefault(label_key(name), index)
+                if claimed != index:
+                    raise ValueError(
+                        f"room types {self._room_types[claimed]!r} and {room!r} have the same name"
+                    )
 
     def __len__(self) -> int:
         return len(self._objects)
@@ -96,7 +110,11 @@ class Vocabulary:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Vocabulary):
             return NotImplemented
-        return self._objects == other._objects and self._room_types == other._room_types
+        return (
+            self._objects == other._objects
+            and self._room_types == other._room_types
+            and self._room_aliases == other._room_aliases
+        )
 
     def __hash__(self) -> int:
         return hash((self._objects, self._room_types))
@@ -165,7 +183,13 @@ class Vocabulary:
 
     @cached_property
     def _room_names(self) -> NameIndex:
-        return NameIndex([(room, index) for index, room in enumerate(self._room_types)])
+        return NameIndex(
+            [
+                (name, index)
+                for index, room in enumerate(self._room_types)
+                for name in (room, *self._room_aliases.get(room, ()))
+            ]
+        )
 
     def nearest(self, label: str, limit: int = 3) -> tuple[Match, ...]:
         """Return plausible classes with names similar to ``label``, most similar first.
@@ -184,6 +208,7 @@ class Vocabulary:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-compatible values that `from_dict` accepts."""
+        aliases = {room: list(names) for room, names in self._room_aliases.items()}
         return {
             "objects": [
                 {
@@ -195,13 +220,13 @@ class Vocabulary:
                 for entry in self._objects
             ],
             "room_types": list(self._room_types),
-        }
+        } | ({"room_aliases": aliases} if aliases else {})
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Build a vocabulary from the result of `to_dict`.
 
-        ``aliases``, ``structure`` and ``size`` are optional.
+        ``aliases``, ``structure``, ``size`` and ``room_aliases`` are optional.
 
         Raises:
             ValueError: a field is missing, unknown or of the wrong type. `Vocabulary` lists more
@@ -214,7 +239,13 @@ class Vocabulary:
             raise ValueError(f"'room_types' must be a list, not {rooms!r}")
         if not all(isinstance(room, str) for room in rooms):
             raise ValueError("'room_types' must be a list of strings")
-        return cls([_object_class(entry) for entry in values["objects"]], rooms)
+        aliases = values.get("room_aliases", {})
+        if not isinstance(aliases, Mapping) or not all(
+            isinstance(names, list) and all(isinstance(name, str) for name in names)
+            for names in aliases.values()
+        ):
+            raise ValueError("'room_aliases' must map room types to lists of strings")
+        return cls([_object_class(entry) for entry in values["objects"]], rooms, aliases)
 
 
 def _are_extents(size: Sequence[float]) -> bool:

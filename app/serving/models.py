@@ -12,6 +12,7 @@ import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import cached_property
 from types import MappingProxyType
 
@@ -131,9 +132,11 @@ class ServedModels:
             return UnknownModelError(
                 f"This model has no such version. Its versions: {some_of(versions)}."
             )
+        similar = get_close_matches(name[:64], {*self.store.aliases, *self.store.versions})
+        hint = f" Similar names: {', '.join(similar)}." if similar else ""
         aliases, models = some_of(self.store.aliases), some_of(self.store.versions)
         return UnknownModelError(
-            f"No model or alias has this name. Aliases: {aliases}. Models: {models}."
+            f"No model or alias has this name.{hint} Aliases: {aliases}. Models: {models}."
         )
 
     def with_alias(self, alias: str, target: AliasTarget) -> ServedModels:

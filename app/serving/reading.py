@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import cached_property
 from typing import Final
 
@@ -99,7 +100,8 @@ class LookUps:
     10,000 unknown labels.
 
     Attributes:
-        suggestions: number of errors of the request that already have suggestions.
+        suggestions: number of errors of the request that already have suggestions, or for which the
+            service has looked for similar ids.
     """
 
     suggestions: int = 0
@@ -166,6 +168,9 @@ class Unknown:
             )
             return found
         message = "the model does not know this label"
+        if not is_room and self.vocabulary.room_index(label) is not None:
+            message = "this is a room type, not an object; send it as `room_type`"
+            matches = ()
         if is_room:
             message = "this model does not have room types"
             if known:
@@ -225,7 +230,7 @@ class Reading:
     @cached_property
     def names(self) -> Names:
         """Look-up of objects by id or label. The first access builds the look-up tables."""
-        return Names(self.scene.objects, self.left_out, self.unknown.vocabulary)
+        return Names(self.scene.objects, self.left_out, self.unknown)
 
     def longest_name(self) -> int:
         """Return the maximum size in bytes of an id or label in the JSON text of the answer."""
@@ -248,16 +253,17 @@ class Names:
     Args:
         objects: objects of the scene.
         ignored: pairs (id, label) of the ignored objects.
-        vocabulary: classes of the model.
+        unknown: classes of the model, and the number of suggestions so far.
     """
 
     def __init__(
         self,
         objects: Sequence[SceneObject],
         ignored: Sequence[tuple[str, str]],
-        vocabulary: Vocabulary,
+        unknown: Unknown,
     ) -> None:
-        self._vocabulary = vocabulary
+        self._vocabulary = unknown.vocabulary
+        self._look_ups = unknown.look_ups
         self._objects = objects
         self._ignored_ids = {name for name, _ in ignored}
         self._ignored_labels = {label_key(label) for _, label in ignored}
@@ -305,8 +311,16 @@ class Names:
             )
             faults.add(Reason.INVALID, location, message)
         else:
-            faults.add(Reason.INVALID, location, "no entry of `objects` has this id or label")
+            message = "no entry of `objects` has this id or label"
+            faults.add(Reason.INVALID, location, message, self._similar(name))
         return None
+
+    def _similar(self, name: str) -> list[str]:
+        """Return similar ids for the first `MAX_SUGGESTED` unknown names of a request."""
+        if self._look_ups.suggestions >= MAX_SUGGESTED:
+            return []
+        self._look_ups.suggestions += 1
+        return get_close_matches(name[:64], [thing.id[:64] for thing in self._objects])
 
     def is_ignored(self, name: str) -> bool:
         """Return whether an ignored object has this id or label."""

@@ -60,7 +60,9 @@ def test_supports_are_read_as_relations(open_board: OpenBoard) -> None:
 def test_objects_with_foreign_ids_are_named_by_their_class(open_board: OpenBoard) -> None:
     board = open_board()
     things = {"track_3": "desk", "track_4": "bathtub", "desk_2": "desk"}
-    board.put(json.dumps({"objects": [{"id": id, "label": label} for id, label in things.items()]}))
+    board.put(
+        json.dumps({"objects": [{"id": name, "label": label} for name, label in things.items()]})
+    )
     assert board.things == ["desk (track_3)", "bathtub (track_4)", "desk_2"]
     board.tab("Wrong")
     assert any(row.startswith("bathtub (track_4) ") for row in board.rows("outliers"))

@@ -60,6 +60,18 @@ def test_rooms_have_one_spelling() -> None:
     assert VOCABULARY.room_index("garage") is None
 
 
+def test_rooms_have_synonyms() -> None:
+    aliases = {"storage room": ["pantry", "storeroom"]}
+    words = Vocabulary([ObjectClass("box")], ["bedroom", "storage room"], aliases)
+    assert [words.room_index(name) for name in ("Store Room", "pantry", "storage_room")] == [1] * 3
+    assert words.nearest_room("storerom")[0].entry == 1
+    assert Vocabulary.from_dict(words.to_dict()) == words
+    with pytest.raises(ValueError, match="no room types"):
+        Vocabulary([ObjectClass("box")], ["bedroom"], aliases)
+    with pytest.raises(ValueError, match="same name"):
+        Vocabulary([ObjectClass("box")], ["pantry", "storage room"], aliases)
+
+
 def test_masks_and_sizes() -> None:
     assert VOCABULARY.structure.tolist() == [False] * 5 + [True]
     assert VOCABULARY.sizes[4].tolist() == [0.3, 0.3, 2.0]
@@ -102,6 +114,10 @@ def test_two_classes_cannot_share_a_name() -> None:
         ({"objects": [{"label": "bed", "colour": "red"}]}, "unknown fields.*colour"),
         ({"objects": [{"label": "bed"}], "room_types": "attic"}, "room_types"),
         ({"objects": [{"label": "bed"}], "room_types": [1]}, "room_types"),
+        (
+            {"objects": [{"label": "bed"}], "room_types": ["a"], "room_aliases": {"a": "b"}},
+            "lists of strings",
+        ),
         ({"objects": [{"label": "bed"}], "room_types": [""]}, "room type has an empty name"),
     ],
 )

@@ -245,6 +245,20 @@ def test_lists_of_few_classes_keep_the_share_too(model, fitted):
         assert limit >= fitted.outlier_thresholds.medium
 
 
+def test_few_scenes_suffice_for_lists_of_few_classes(model):
+    """Fitted on 24 rooms, as for a user with 300 scenes; measured on 300 other rooms."""
+    few = calibrate_objects(model, rooms(24, 1), rooms(ROOM_COUNT, 2), STRUCTURE)
+    scenes, rng = complete_scenes(rooms(300, 3)), np.random.default_rng(7)
+    score = MachineScore(machine_of(model.weights))
+    for listed in (1, 2, 3, 4):
+        _, parts = listing(scenes, STRUCTURE, listed, rng)
+        found = clean_scores(parts, STRUCTURE, score)
+        alarms = found.false_alarms(calibrated_alarm(few).raised(found)).value
+        whole = replace(calibrated_alarm(few), short=())
+        # The share of .1 is estimated from 24 rooms. It lies above .3 with probability 2e-3.
+        assert alarms <= 0.3 < found.false_alarms(whole.raised(found)).value
+
+
 def test_hidden_classes_are_as_likely_as_said(model, fitted):
     """On 200 other rooms."""
     artifact = replace(model, calibration=fitted)

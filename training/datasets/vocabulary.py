@@ -116,6 +116,23 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
     return f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n'
 
 
+def with_room_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
+    """Return the vocabulary with the curated synonyms of its room types.
+
+    Args:
+        vocabulary: the vocabulary of a training run.
+        names: the curated names. None means those of `vocabularies/names.toml`.
+    """
+    names = names or curated_names()
+    own = {label_key(room) for room in vocabulary.room_types}
+    aliases = {
+        room: [name for name in names.rooms.get(room, ()) if label_key(name) not in own]
+        for room in vocabulary.room_types
+    }
+    found = {room: others for room, others in aliases.items() if others}
+    return Vocabulary(vocabulary.objects, vocabulary.room_types, found)
+
+
 def read_vocabulary(path: Path) -> Vocabulary:
     """Read a vocabulary from a JSON file. `vocabulary_json` returns the format.
 

@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import partial
 from importlib.util import find_spec
 from itertools import islice
@@ -31,16 +33,18 @@ from rich.console import Console, RenderableType
 from typer.core import TyperGroup
 
 from scene_client import __version__, tables
+from scene_client.annotated import from_annotated, is_annotated
 from scene_client.errors import (
     ClientError,
     DeadlineError,
     InvalidRequestError,
     ProblemError,
     UnreachableError,
+    problem_text,
 )
 from scene_client.offline import OfflineClient
 from scene_client.ros_fields import MessageError
-from scene_client.schemas import Detail, RelationName, Sensitivity, UnknownLabels
+from scene_client.schemas import Detail, FieldError, RelationName, Sensitivity, UnknownLabels
 from scene_client.sync import Client
 from scene_client.vision_msgs import from_message, is_message
 
@@ -52,6 +56,8 @@ MAX_FILE: Final = 64 * 2**20
 _FLAGS: Final = ("--json",)
 _VALUED: Final = ("--url", "--model", "--offline", "--timeout")
 _RELATIONS: Final = get_args(RelationName)
+# A file with one scene per line, and the number of a line.
+_LINES: Final = re.compile(r"(?P<file>.+\.jsonl)(:(?P<line>[0-9]{1,9}))?$")
 
 
 class _Group(TyperGroup):
@@ -97,9 +103,14 @@ class Asked:
     timeout: float
     as_json: bool
 
-    def ask(self, question: Callable[[Client], T]) -> T:
-        """Return the answer to a question. An error ends the program."""
-        with _failing(), self._client() as client:
+    def ask(self, question: Callable[[Client], T], request: Any = None) -> T:
+        """Return the answer to a question. An error ends the program.
+
+        Args:
+            question: function that sends the question.
+            request: body of the request, for the messages of errors.
+        """
+        with _failing(request), self._client() as client:
             return question(client)
 
     def _client(self) -> Client:
@@ -111,10 +122,13 @@ class Asked:
         return Client(self.url, timeout=self.timeout, model=self.model, api_key=key)
 
     def show(
-        self, question: Callable[[Client], AnswerT], table: Callable[[AnswerT], RenderableType]
+        self,
+        question: Callable[[Client], AnswerT],
+        table: Callable[[AnswerT], RenderableType],
+        request: Any = None,
     ) -> AnswerT:
         """Ask a question, and print the answer as JSON or as a table."""
-        answer = self.ask(question)
+        answer = self.ask(question, request)
         if self.as_json:
             print(answer.model_dump_json(exclude_unset=True))
             return answer
@@ -168,9 +182,10 @@ def main(
 Things = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="LABEL... | SCENE.json | -",
+        metavar="LABEL... | SCENE.json | SCENES.jsonl:LINE | -",
         help="Labels of the objects, or a JSON file, or - for standard input. The JSON is a "
-        "request of the HTTP contract, or detections in the format of rosbridge.",
+        "request of the HTTP contract, a scene of the training format, or detections in the "
+        "format of rosbridge.",
         show_default=False,
     ),
 ]
@@ -214,7 +229,7 @@ def relations(
         include_opposites=include_opposites or None,
     )
     asked: Asked = context.obj
-    asked.show(lambda client: client.relations(request), tables.relations)
+    asked.show(lambda client: client.relations(request), tables.relations, request)
 
 
 @app.command()
@@ -248,7 +263,7 @@ def missing(
     )
     asked: Asked = context.obj
     shown = partial(tables.missing, asked_place=request.get("at") is not None)
-    asked.show(lambda client: client.missing(request), shown)
+    asked.show(lambda client: client.missing(request), shown, request)
 
 
 @app.command()
@@ -274,7 +289,7 @@ def outliers(
         detail=detail,
     )
     asked: Asked = context.obj
-    asked.show(lambda client: client.outliers(request), tables.outliers)
+    asked.show(lambda client: client.outliers(request), tables.outliers, request)
 
 
 @app.command()
@@ -306,7 +321,7 @@ def generate(
         _fail("the option --plot needs matplotlib: run pip install matplotlib", MEANINGLESS)
     scene = _scene(things or [], relations, room_type, unknown_labels)
     request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
-    answer = asked.show(lambda client: client.generate(request), tables.generate)
+    answer = asked.show(lambda client: client.generate(request), tables.generate, request)
     if plot is not None:
         from scene_client.plot import draw
 
@@ -380,10 +395,12 @@ def _named(**options: Any) -> dict[str, Any]:
 
 def _is_file(thing: str) -> bool:
     """Return whether an argument is a file. Labels do not end in .json or contain a slash."""
-    return thing == "-" or thing.endswith(".json") or os.sep in thing
+    return thing == "-" or thing.endswith(".json") or bool(_LINES.match(thing)) or os.sep in thing
 
 
-def _read(name: str) -> dict[str, Any]:
+def _read(argument: str) -> dict[str, Any]:
+    lines = _LINES.match(argument)
+    name = lines["file"] if lines else argument
     try:
         if name == "-":
             text = sys.stdin.buffer.read(MAX_FILE + 1)
@@ -394,17 +411,37 @@ def _read(name: str) -> dict[str, Any]:
         _fail(f"cannot read {name}: {error.strerror}", MEANINGLESS)
     if len(text) > MAX_FILE:
         _fail(f"{name} is too large: it has more than {MAX_FILE} bytes", MEANINGLESS)
+    if lines:
+        text = _line(name, text, lines["line"])
     try:
         scene = json.loads(text)
     except (ValueError, RecursionError) as error:
-        _fail(f"{name} is not JSON: {error}", MEANINGLESS)
+        _fail(f"{argument} is not JSON: {error}", MEANINGLESS)
     if is_message(scene):
         return _detected(name, scene)
+    if is_annotated(scene):
+        try:
+            return from_annotated(scene)
+        except (KeyError, TypeError, ValueError):
+            _fail(
+                f"{argument} is neither a request nor a scene of the training format", MEANINGLESS
+            )
     if isinstance(scene, list):
         return {"objects": scene}
     if not isinstance(scene, dict):
         _fail(f"{name} must contain a request or a list of objects", MEANINGLESS)
     return scene
+
+
+def _line(name: str, text: bytes, line: str | None) -> bytes:
+    """Return one line of a file with one scene per line."""
+    scenes = [one for one in text.splitlines() if one.strip()]
+    if line is None and len(scenes) != 1:
+        _fail(f"{name} has {len(scenes)} scenes: choose one, such as {name}:1", MEANINGLESS)
+    number = int(line or 1)
+    if not 1 <= number <= len(scenes):
+        _fail(f"{name} has the scenes 1 to {len(scenes)}, not {number}", MEANINGLESS)
+    return scenes[number - 1]
 
 
 def _detected(name: str, message: Any) -> dict[str, Any]:
@@ -422,11 +459,8 @@ def _detected(name: str, message: Any) -> dict[str, Any]:
 def _anchor(text: str) -> dict[str, str]:
     relation, _, object = text.strip().partition(" ")
     if relation not in _RELATIONS or not object:
-        names = ", ".join(_RELATIONS)
-        _fail(
-            f'--at must be a relation and an object, such as "on-top desk"; relations: {names}',
-            MEANINGLESS,
-        )
+        wanted = '--at must be a relation and an object, such as "on-top desk"'
+        _fail(f"{wanted}; {_relations_for([relation])}", MEANINGLESS)
     return {"relation": relation, "object": object.strip()}
 
 
@@ -435,27 +469,32 @@ def _relation(text: str) -> dict[str, str]:
     words = text.split()
     place = next((n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS), None)
     if place is None:
-        names = ", ".join(_RELATIONS)
-        _fail(
-            f'--relations must be a subject, a relation and an object, as in "lamp on-top desk"; '
-            f"relations: {names}",
-            MEANINGLESS,
-        )
+        wanted = '--relations must be a subject, a relation and an object, as in "lamp on-top desk"'
+        _fail(f"{wanted}; {_relations_for(words[1:-1])}", MEANINGLESS)
     subject, object = " ".join(words[:place]), " ".join(words[place + 1 :])
     return {"subject": subject, "relation": words[place], "object": object}
+
+
+def _relations_for(words: Iterable[str]) -> str:
+    """Return the names of the relations, and names that are similar to one of the words."""
+    similar = [name for word in words for name in get_close_matches(word, _RELATIONS, 1)]
+    hint = f" (did you mean {similar[0]}?)" if similar else ""
+    return f"relations: {', '.join(_RELATIONS)}{hint}"
 
 
 # ------------------------------------------------------------------------------------- errors
 
 
 @contextmanager
-def _failing() -> Iterator[None]:
+def _failing(request: Any) -> Iterator[None]:
     try:
         yield
     except InvalidRequestError as error:
         _fail(str(error), MEANINGLESS)
     except ProblemError as problem:
-        _fail(str(problem), _status(problem))
+        errors = [_quoted(error, request) for error in problem.errors]
+        known = (problem.type, problem.status, problem.title, problem.detail)
+        _fail(problem_text(*known, errors), _status(problem))
     except UnreachableError as error:
         _fail(f"the service cannot be reached: {error}", UNREACHABLE)
     except DeadlineError as error:
@@ -464,6 +503,19 @@ def _failing() -> Iterator[None]:
         _fail(str(error), FAILED)
     except ImportError as error:
         _fail(str(error), MEANINGLESS)
+
+
+def _quoted(error: FieldError, request: Any) -> FieldError:
+    """Return the error with the text of the request that it is about, if its value is a text."""
+    value = request
+    for step in error.pointer.split("/")[1:]:
+        if isinstance(value, list) and step.isdigit():
+            value = value[int(step)] if int(step) < len(value) else None
+        else:
+            value = value.get(step) if isinstance(value, dict) else None
+    if not isinstance(value, str):
+        return error
+    return error.model_copy(update={"message": f'"{value}": {error.message}'})
 
 
 def _status(problem: ProblemError) -> int:

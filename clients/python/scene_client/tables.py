@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Final
+from typing import Final, Literal
 
 from pydantic import BaseModel
 from rich import box
@@ -85,7 +85,7 @@ def missing(answer: MissingAnswer, *, asked_place: bool = False) -> RenderableTy
     ]
     found = _table("missing", "probability", "log-odds", "where", "because", rows=rows)
     if not answer.more:
-        return found
+        return found if rows else "No object is missing."
     further = [
         (
             entry.label,
@@ -96,7 +96,8 @@ def missing(answer: MissingAnswer, *, asked_place: bool = False) -> RenderableTy
         for entry in answer.more
     ]
     columns = ("more of", "listed", "expected", "probability")
-    return Group(found, _table(*columns, rows=further))
+    counts = _table(*columns, rows=further)
+    return Group(found, counts) if rows else counts
 
 
 def outliers(answer: OutliersAnswer) -> RenderableType:
@@ -211,7 +212,9 @@ def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = Non
         numbers = column.startswith("probability") or column in {"log-odds", "log score"}
         # Only cells with the objects of a scene can be long. Other cells have short lines.
         width = 60 if column == "objects" else None
-        table.add_column(column, justify="right" if numbers else "left", max_width=width)
+        side: Literal["left", "right"] = "right" if numbers else "left"
+        # A narrow terminal wraps an id, because two shortened ids may look the same.
+        table.add_column(column, justify=side, max_width=width, overflow="fold")
     for row in rows:
         table.add_row(*[row[n] for n in shown])
     return table

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.scene import ObjectClass, Vocabulary
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
@@ -20,7 +21,11 @@ from training.datasets import (
     with_typical_sizes,
     write_indoor_vocabulary,
 )
-from training.datasets.vocabulary import INDOOR_MINIMUM_MENTIONS, MINIMUM_MENTIONS
+from training.datasets.vocabulary import (
+    INDOOR_MINIMUM_MENTIONS,
+    MINIMUM_MENTIONS,
+    with_room_aliases,
+)
 
 NAMES = Names(
     base=("chair", "throne"),
@@ -243,3 +248,11 @@ def test_real_scenes_encode(real: dict[str, list[AnnotatedScene]]) -> None:
         assert wall not in scene.evidence.classes
         assert floor not in scene.evidence.classes
         assert not scene.evidence.observed.any()
+
+
+def test_the_curated_synonyms_of_rooms_are_added() -> None:
+    """A synonym that the vocabulary uses as a room type of its own stays a room type."""
+    words = Vocabulary([ObjectClass("chair")], ["bathroom", "attic"])
+    assert with_room_aliases(words, NAMES).room_index("toilet") == 0
+    both = Vocabulary([ObjectClass("chair")], ["bathroom", "Toilet"])
+    assert with_room_aliases(both, NAMES) == both
