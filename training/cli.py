@@ -208,7 +208,7 @@ def publish(
         if promote:
             gate = _Gate(alias or "default", margin, limit, even_if_worse)
             _promote(run, scenes, root, models, version, gate)
-            command = f"SCENE_STORE={shlex.quote(store)} python -m app"
+            command = f"SCENE_STORE={shlex.quote(store)} SCENE_PORT=8055 python -m app"
             console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)
         else:
             _publish(run, scenes, store, version)

@@ -60,8 +60,8 @@ class Vocabulary:
 
     Raises:
         ValueError: the list of classes is empty, a room type has an empty name, a key of
-            `room_aliases` is no room type, or a name is ambiguous. A name is ambiguous if two classes, or two room types, have names with the
-            same `label_key`.
+            `room_aliases` is no room type, or a name is ambiguous. A name is ambiguous if two
+            classes, or two room types, have names with the same `label_key`.
     """
 
     __slots__ = (

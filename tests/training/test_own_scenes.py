@@ -133,7 +133,7 @@ def test_the_same_again_is_not_worse_and_may_take_its_place(workplace) -> None:
     assert "Questions with the most different answers" not in output
     output = workplace.publish(workplace.run, "1.0.1", "--promote")
     assert "promoted: default → my-lab@1.0.1, before my-lab@1.0.0" in output
-    assert output.endswith(f"next: SCENE_STORE={workplace.store} python -m app")
+    assert output.endswith(f"next: SCENE_STORE={workplace.store} SCENE_PORT=8055 python -m app")
 
 
 def test_a_worse_version_is_refused_unless_somebody_insists(workplace) -> None:
