@@ -56,9 +56,12 @@ PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
 ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Shares of unaltered scenes with an alarm, on the large data source with the most alarms."""
 
-# Scenes with up to `_SHORT_LISTS` listed classes have separate thresholds. Each threshold is fitted
-# to at least `_SHORTENED` shortened lists; few scenes are shortened several times.
+# Lists of up to `_SHORT_LISTS` classes have separate thresholds, until the threshold of whole
+# scenes raises alarms in at most `_ENOUGH` times the target share of the shortened lists. Each
+# threshold is fitted to at least `_SHORTENED` shortened lists; few scenes are shortened several
+# times.
 _SHORT_LISTS = 8
+_ENOUGH = 1.5
 _SHORTENED = 200
 _NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 # Number of scenes used from each source.
@@ -384,10 +387,11 @@ def fit_outliers(
         if not len(some):
             break
         found = clean_scores(parts_of, structure, score).with_prior(alpha * prior)
-        own = _between(limits, _limits(found, some, entry, rng), short[-1] if short else _NEVER)
-        if own == limits:
+        share = _ENOUGH * ALARMS["medium"]
+        if _limit(found, some, entry, np.random.default_rng(seed), share) <= limits.medium:
             break
-        short.append(own)
+        own = _limits(found, some, entry, rng)
+        short.append(_between(limits, own, short[-1] if short else _NEVER))
     return fitted | {"short_list_thresholds": tuple(short)}
 
 
@@ -416,12 +420,21 @@ def listing(
 def _limits(
     untouched: IntruderScores, scenes: SceneTensors, entry: CountSlope, rng: np.random.Generator
 ) -> Thresholds:
+    return Thresholds(
+        **{name: _limit(untouched, scenes, entry, rng, share) for name, share in ALARMS.items()}
+    )
+
+
+def _limit(
+    untouched: IntruderScores,
+    scenes: SceneTensors,
+    entry: CountSlope,
+    rng: np.random.Generator,
+    share: float,
+) -> float:
+    """Return the probability that raises alarms in a share of the untouched scenes."""
     logits = entry.log_odds(untouched.log_odds, untouched.size).astype(np.float64)
-    limits = {
-        name: float(1 / (1 + np.exp(-alarm_threshold(logits, untouched, scenes, rng, share))))
-        for name, share in ALARMS.items()
-    }
-    return Thresholds(**limits)
+    return float(1 / (1 + np.exp(-alarm_threshold(logits, untouched, scenes, rng, share))))
 
 
 def _between(low: Thresholds, found: Thresholds, high: Thresholds) -> Thresholds:
