@@ -146,7 +146,7 @@ def _worded(fault: ErrorDetails, form: type[Request]) -> tuple[str, list[str]]:
 def _unknown_field(location: Sequence[str | int], form: type[Request]) -> tuple[str, list[str]]:
     part, _ = _part(location[:-1], form)
     names = list(part.model_fields) if part is not None else []
-    similar = get_close_matches(str(location[-1])[:64], names)
+    similar = _like(location[-1], names)
     if similar or not names:
         return "unknown field", similar
     return f"unknown field; this object has the fields {listed(names)}", []
@@ -158,7 +158,7 @@ def _like(value: Any, choices: Sequence[str]) -> list[str]:
         return []
     text = value[:64].lower()
     words = set(re.findall("[a-z]+", text))
-    shared = [choice for choice in choices if words & set(choice.split("-"))]
+    shared = [choice for choice in choices if words & set(re.findall("[a-z]+", choice))]
     return shared[:3] or get_close_matches(text, choices, cutoff=0.7)
 
 
