@@ -374,8 +374,7 @@ def fit_outliers(
     examples = np.concatenate(parts)
     slope, size, intercept = logistic(examples[:, :2], examples[:, 2] > 0, C=RIDGE)
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
-    untouched = next(iter(judged.values()))
-    limits = _limits(untouched, scenes, entry, rng)
+    limits = _limits([(next(iter(judged.values())), scenes)], entry, rng)
     fitted: dict[str, Any] = {
         "popularity_weight": alpha,
         "outlier": entry,
@@ -383,58 +382,63 @@ def fit_outliers(
     }
     short: list[Thresholds] = []
     for listed in range(1, _SHORT_LISTS + 1):
-        some, parts_of = listing(scenes, structure, listed, rng, _SHORTENED)
-        if not len(some):
+        lists = [listing(scenes, structure, listed, rng)]
+        if not len(lists[0][0]):
             break
-        found = clean_scores(parts_of, structure, score).with_prior(alpha * prior)
+        while len(lists) * len(lists[0][0]) < _SHORTENED:
+            lists.append(listing(scenes, structure, listed, rng))
+        parts_scored = [
+            (clean_scores(parts_of, structure, score).with_prior(alpha * prior), some)
+            for some, parts_of in lists
+        ]
         share = _ENOUGH * ALARMS["medium"]
-        if _limit(found, some, entry, np.random.default_rng(seed), share) <= limits.medium:
+        if _limit(parts_scored, entry, np.random.default_rng(seed), share) <= limits.medium:
             break
-        own = _limits(found, some, entry, rng)
+        own = _limits(parts_scored, entry, rng)
         short.append(_between(limits, own, short[-1] if short else _NEVER))
     return fitted | {"short_list_thresholds": tuple(short)}
 
 
 def listing(
-    scenes: SceneTensors,
-    structure: Tensor,
-    listed: int,
-    rng: np.random.Generator,
-    least: int = 0,
+    scenes: SceneTensors, structure: Tensor, listed: int, rng: np.random.Generator
 ) -> tuple[SceneTensors, Tensor]:
     """Return the scenes with more than `listed` classes, and shortened object lists.
 
     A shortened list contains `listed` random classes and all structure classes of the scene. The
-    lists have the shape (scenes, classes). All scenes are repeated until there are `least` lists.
+    lists have the shape (scenes, classes).
     """
     plain = (scenes.v > 0) & ~structure
     large = (plain.sum(1) > listed).nonzero().squeeze(1)
-    if len(large):
-        large = large.repeat(max(1, -(-least // len(large))))
     order = torch.from_numpy(rng.random(plain[large].shape)).masked_fill(~plain[large], 2.0)
     kept = order.argsort(1)[:, :listed]
     shown = scenes.v[large] * structure
     return subset(scenes, large), shown.scatter(1, kept, 1.0)
 
 
-def _limits(
-    untouched: IntruderScores, scenes: SceneTensors, entry: CountSlope, rng: np.random.Generator
-) -> Thresholds:
+Scored = Sequence[tuple[IntruderScores, SceneTensors]]
+"""Scores of untouched scenes, and these scenes: one entry for each shortening of the scenes."""
+
+
+def _limits(untouched: Scored, entry: CountSlope, rng: np.random.Generator) -> Thresholds:
     return Thresholds(
-        **{name: _limit(untouched, scenes, entry, rng, share) for name, share in ALARMS.items()}
+        **{name: _limit(untouched, entry, rng, share) for name, share in ALARMS.items()}
     )
 
 
-def _limit(
-    untouched: IntruderScores,
-    scenes: SceneTensors,
-    entry: CountSlope,
-    rng: np.random.Generator,
-    share: float,
-) -> float:
-    """Return the probability that raises alarms in a share of the untouched scenes."""
-    logits = entry.log_odds(untouched.log_odds, untouched.size).astype(np.float64)
-    return float(1 / (1 + np.exp(-alarm_threshold(logits, untouched, scenes, rng, share))))
+def _limit(untouched: Scored, entry: CountSlope, rng: np.random.Generator, share: float) -> float:
+    """Return the probability that raises alarms in a share of the untouched scenes.
+
+    The function averages over the shortenings, because several shortenings of a scene are not
+    several scenes for `alarm_threshold`.
+    """
+    logits = [
+        alarm_threshold(
+            entry.log_odds(scores.log_odds, scores.size).astype(np.float64),
+            *(scores, scenes, rng, share),
+        )
+        for scores, scenes in untouched
+    ]
+    return float(1 / (1 + np.exp(-np.mean(logits))))
 
 
 def _between(low: Thresholds, found: Thresholds, high: Thresholds) -> Thresholds:

@@ -115,6 +115,18 @@ class NameIndex:
         return best
 
 
+def spelt_alike(name: str, known: Sequence[str], limit: int = 3) -> list[str]:
+    """Return known names with a similar spelling, most similar first, without reading words."""
+    found = process.extract(
+        name[:LONGEST],
+        [other[:LONGEST] for other in known],
+        scorer=OSA.normalized_similarity,
+        limit=limit,
+        score_cutoff=_LEAST,
+    )
+    return [known[place] for _, _, place in found]
+
+
 def _keep(best: dict[int, float], index: int, similarity: float) -> None:
     best[index] = max(similarity, best.get(index, 0.0))
 

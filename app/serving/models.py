@@ -12,12 +12,12 @@ import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from functools import cached_property
 from types import MappingProxyType
 
 from app import questions
 from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
+from app.scene.nearest import spelt_alike
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import WorkQueue
 from app.serving.errors import (
@@ -132,7 +132,7 @@ class ServedModels:
             return UnknownModelError(
                 f"This model has no such version. Its versions: {some_of(versions)}."
             )
-        similar = get_close_matches(name[:64], {*self.store.aliases, *self.store.versions})
+        similar = spelt_alike(name, sorted({*self.store.aliases, *self.store.versions}))
         hint = f" Similar names: {', '.join(similar)}." if similar else ""
         aliases, models = some_of(self.store.aliases), some_of(self.store.versions)
         return UnknownModelError(

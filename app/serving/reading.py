@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from functools import cached_property
 from typing import Final
 
@@ -18,7 +17,7 @@ from pydantic_core import to_json
 from app.scene.frames import body_pose, is_optical
 from app.scene.geometry import Viewpoint
 from app.scene.labels import label_key
-from app.scene.nearest import ACCEPTED, Match
+from app.scene.nearest import ACCEPTED, Match, spelt_alike
 from app.scene.observe import observe
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene, SceneObject
@@ -34,6 +33,7 @@ from scene_client.schemas import (
     SceneWarning,
     UnknownLabels,
 )
+from scene_client.validation import PLAIN
 
 MAX_SUGGESTED: Final = 32
 """Maximum number of searches for classes similar to an unknown label, per scene.
@@ -169,8 +169,7 @@ class Unknown:
             return found
         message = "the model does not know this label"
         if not is_room and self.vocabulary.room_index(label) is not None:
-            message = "this is a room type, not an object; send it as `room_type`"
-            matches = ()
+            message += "; it is a room type: send it as `room_type`"
         if is_room:
             message = "this model does not have room types"
             if known:
@@ -316,11 +315,15 @@ class Names:
         return None
 
     def _similar(self, name: str) -> list[str]:
-        """Return similar ids for the first `MAX_SUGGESTED` unknown names of a request."""
+        """Return similar ids for the first `MAX_SUGGESTED` unknown names of a request.
+
+        Only plain ids are returned, so that a request cannot put arbitrary text into an error.
+        """
         if self._look_ups.suggestions >= MAX_SUGGESTED:
             return []
         self._look_ups.suggestions += 1
-        return get_close_matches(name[:64], [thing.id[:64] for thing in self._objects])
+        plain = [thing.id for thing in self._objects if PLAIN.fullmatch(thing.id.replace(" ", "_"))]
+        return spelt_alike(name, plain)
 
     def is_ignored(self, name: str) -> bool:
         """Return whether an ignored object has this id or label."""

@@ -181,8 +181,8 @@ def test_labels_and_relations_alone_are_laid_out(open_board: OpenBoard) -> None:
 
 
 NO_SCENES = [
-    ("{", "not JSON"),
-    ('{"objects": ["bed"]}\n{"objects": ', "not JSON"),
+    ("{", "neither JSON nor a list"),
+    ('{"objects": ["bed"]}\n{"objects": ', "neither JSON nor a list"),
     ('{"detections": [null]}', "neither a scene nor a message"),
     ('{"detections": []}', "no detection with a class"),
     ("3", "A scene must be a JSON object"),

@@ -155,6 +155,69 @@ def test_without_matplotlib_nothing_is_asked_and_the_way_out_is_said(
     assert done.stdout == ""
 
 
+SCENES = [
+    {
+        "scene_id": "one", "room_type": "bedroom",
+        "objects": [{"id": 0, "label": "bed"}, {"id": 1, "label": "lamp", "supported_by": 0}],
+        "relations": [],
+    },
+    {
+        "scene_id": "two", "viewer_frame": True,
+        "objects": [
+            {"id": 0, "label": "bed", "position": [2, 0, 0.2], "size": [2, 1, 0.4], "yaw": 1.57},
+            {"id": 1, "label": "lamp", "position": [2, 0, 0.5], "size": [0.2, 0.2, 0.2]},
+            {"id": 2, "label": "lamp", "position": [1, 1, 0.1], "size": [0.2, 0.2, 0.2]},
+        ],
+    },
+]  # fmt: skip
+
+
+def test_scenes_of_the_training_are_read(scene: Any, tmp_path: Path) -> None:
+    path = tmp_path / "scenes.jsonl"
+    path.write_text("\n".join(map(json.dumps, SCENES)))
+    (tmp_path / "scene.json").write_text(json.dumps(SCENES[0]))
+    first = scene("missing", f"{path}:1")
+    assert (first.exit_code, first.stderr) == (0, "")
+    words = ("missing", "bed", "lamp", "--relations", "lamp on-top bed", "--room-type", "bedroom")
+    assert first.stdout == scene(*words).stdout
+    assert first.stdout == scene("missing", str(tmp_path / "scene.json")).stdout
+    second = json.loads(scene("relations", f"{path}:2", "--json").stdout)
+    stated = [tuple(one.values()) for one in second["observed_relations"]]
+    assert ("lamp_1", "on-top", "bed") in stated
+    assert not any(one[:2] == ("lamp_2", "on-top") for one in stated)
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "word"),
+    [
+        ("", "{}\n{}", "has 2 lines: choose one, such as"),
+        (":3", "{}\n{}", "has no line 3"),
+        ("", "", "has 0 lines"),
+        (":1", '{"scene_id": "a"}', "not a scene of the training format"),
+        (":1", '{"scene_id": "a", "objects": ["bed"]}', "not a scene of the training format"),
+        (
+            ":1",
+            json.dumps({"scene_id": "a", "objects": [{"id": 0, "label": "bed"}] * 2}),
+            "not a scene of the training format",
+        ),
+        (":2", '{"scene_id": "a"}\n{', "scenes.jsonl:2 is not JSON"),
+    ],
+)
+def test_other_lines_are_2(scene: Any, tmp_path: Path, line: str, text: str, word: str) -> None:
+    (tmp_path / "scenes.jsonl").write_text(text)
+    done = scene("missing", f"{tmp_path / 'scenes.jsonl'}{line}")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert word in done.stderr
+
+
+def test_errors_quote_the_text_that_they_are_about(scene: Any) -> None:
+    assert '"nightstnad": the model does not know' in scene("missing", "bed", "nightstnad").stderr
+    assert '"bedd": no entry of' in scene("missing", "bed", "--at", "on-top bedd").stderr
+    wrong = scene("missing", "bed", "lamp", "--relations", "lamp ontop bed")
+    assert "(did you mean on-top?)" in wrong.stderr
+    assert "it is a room type: send it as" in scene("generate", "bedroom").stderr
+
+
 def test_a_refusal_is_1_and_says_what_was_meant(scene: Any) -> None:
     done = scene("missing", "bed", "nightstnad")
     assert (done.exit_code, done.stdout) == (1, "")

@@ -386,6 +386,37 @@ async def test_unknown_routes_are_not_found(client: httpx.AsyncClient, path: str
     problem(await client.get(path), 404, "not-found")
 
 
+async def test_a_misspelt_model_is_answered_with_similar_names(client: httpx.AsyncClient) -> None:
+    response = await client.post("/missing", json={"objects": ["bed"], "model": "hoome"})
+    assert "Similar names: home." in problem(response, 404, "model-not-found")["detail"]
+
+
+async def test_misspelt_ids_are_answered_with_similar_ids(client: httpx.AsyncClient) -> None:
+    things = [{"id": "bed_7", "label": "bed"}, {"id": f"<{MARKER}>", "label": "lamp"}]
+    body = {"objects": things, "at": {"relation": "on-top", "object": "bed7"}}
+    (fault,) = problem(await client.post("/missing", json=body), 422, "invalid-request")["errors"]
+    assert (fault["pointer"], fault["suggestions"]) == ("#/at/object", ["bed_7"])
+    # Only plain ids are repeated.
+    body["at"]["object"] = f"{MARKER}>"
+    (fault,) = problem(await client.post("/missing", json=body), 422, "invalid-request")["errors"]
+    assert "suggestions" not in fault or not fault["suggestions"]
+
+
+async def test_similar_ids_are_looked_up_for_the_first_faults_only(
+    client: httpx.AsyncClient,
+) -> None:
+    things = [{"id": f"{n}_{'ab' * 30}", "label": "bed"} for n in range(256)]
+    ends = [f"{n}-{'ba' * 30}" for n in range(60)]
+    body = {"objects": things, "pairs": [[end, "bed"] for end in ends]}
+    errors = problem(await client.post("/relations", json=body), 422, "invalid-request")["errors"]
+    assert sum(bool(fault.get("suggestions")) for fault in errors) <= 32
+
+
+async def test_query_parameters_are_refused(client: httpx.AsyncClient) -> None:
+    response = await client.post("/missing?model=home", json={"objects": ["bed"]})
+    assert "JSON body" in problem(response, 400, "bad-request")["detail"]
+
+
 async def test_a_misspelt_path_is_answered_with_similar_paths(client: httpx.AsyncClient) -> None:
     for path in ("/mising", "/Missing", "/missing/", "/api/missing"):
         document = problem(await client.post(path, json={"objects": ["bed"]}), 404, "not-found")

@@ -4,7 +4,7 @@ import { floorUnder, moved, overlap, round } from './geometry.js';
 import { openMenu } from './menu.js';
 import { sizesOf } from './questions.js';
 import { FULL, freePlace, MOST_OBJECTS, freshId, sizer } from './scene.js';
-import { SPOKEN } from './words.js';
+import { nameOf, SPOKEN } from './words.js';
 
 /** Id of the robot, which moves like an object. Ids of objects are printable, so they differ from it. */
 export const ROBOT = '\u0000robot';
@@ -22,6 +22,7 @@ export function whereabouts(x, y, viewer = { x: 0, y: 0, yaw: 0 }) {
 export function createActions(store, say, menu) {
   const sized = () => sizer(sizesOf(store.get(), store.get().models[0]));
   const find = (id) => store.get().things.find((thing) => thing.id === id);
+  const named = (id) => nameOf(find(id) ?? { id, label: id });
   const snapped = (value) => round(Math.round(value / GRID) * GRID);
 
   function select(id) {
@@ -47,6 +48,7 @@ export function createActions(store, say, menu) {
 
   function remove(id) {
     const { things, relations, at, selected } = store.get();
+    const name = named(id);
     refocus(things.findIndex((thing) => thing.id === id));
     store.edit({
       things: things.filter((thing) => thing.id !== id),
@@ -54,12 +56,13 @@ export function createActions(store, say, menu) {
       selected: selected === id ? null : selected,
       at: at?.object === id ? null : at,
     });
-    say(`${id} removed.`);
+    say(`${name} removed.`);
   }
 
   /** Gives an object another label, and the id of this label if its id was its label. */
   function rename(id, label) {
     const { things, relations, at, viewer } = store.get();
+    const name = named(id);
     const own = id === find(id).label ? freshId(things, label) : id;
     const end = (name) => (name === id ? own : name);
     const renamed = { ...find(id), id: own, label };
@@ -75,7 +78,7 @@ export function createActions(store, say, menu) {
       selected: own,
       at: at && { ...at, object: end(at.object) },
     });
-    say(`${id} renamed to ${own}.`);
+    say(`${name} renamed to ${nameOf(renamed)}.`);
   }
 
   /** Moves the focus to the next object after a removal, so that keyboard users keep their place. */
@@ -113,7 +116,7 @@ export function createActions(store, say, menu) {
     }
     const yaw = round((((find(id).yaw + degrees) % 360) + 360) % 360, 2);
     change(id, { yaw });
-    say(`${id} rotated to ${yaw} degrees.`);
+    say(`${named(id)} rotated to ${yaw} degrees.`);
   }
 
   const STEPS = { ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowLeft: [0, 1], ArrowRight: [0, -1] };
@@ -127,7 +130,7 @@ export function createActions(store, say, menu) {
       const [x, y] = STEPS[event.key];
       place(id, thing.x + x * length, thing.y + y * length, false, true);
       const now = id === ROBOT ? store.get().viewer : find(id);
-      say(`${id === ROBOT ? 'Robot' : id}: x ${now.x.toFixed(2)}, y ${now.y.toFixed(2)}.`);
+      say(`${id === ROBOT ? 'Robot' : named(id)}: x ${now.x.toFixed(2)}, y ${now.y.toFixed(2)}.`);
     } else if (event.key === 'r' || event.key === 'R') {
       turn(id, event.shiftKey ? -15 : 15);
     } else if (id !== ROBOT && (event.key === 'Delete' || event.key === 'Backspace')) {
@@ -142,7 +145,7 @@ export function createActions(store, say, menu) {
 
   function ask(relation, id) {
     store.set({ at: { relation, object: id }, tab: 'missing' });
-    say(`Asking what is missing ${SPOKEN[relation]} ${id}.`);
+    say(`Asking what is missing ${SPOKEN[relation]} ${named(id)}.`);
   }
 
   /** Opens the menu of an object at the pointer, or beside the element that opens it. */
@@ -157,7 +160,7 @@ export function createActions(store, say, menu) {
       ['Rotate by 90°', () => turn(id, 90)],
       ['Add another object of this class', () => add(find(id).label)],
       ['Remove', () => remove(id)],
-    ], `Actions for ${id}`);
+    ], `Actions for ${named(id)}`);
   }
 
   return { select, add, remove, rename, place, change, keys, open, find, sized };

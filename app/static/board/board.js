@@ -199,6 +199,6 @@ function described(box, state, boxes, wrong) {
       Math.hypot(other.x - box.x, other.y - box.y) < Math.hypot(other.size.x, other.size.y) / 2,
   );
   if (below) parts.push(`on ${nameOf(below)}`);
-  if (wrong.get(box.id)?.is_outlier) parts.push('does not belong here');
+  if (!state.draft && wrong.get(box.id)?.is_outlier) parts.push('does not belong here');
   return parts.join(', ');
 }

@@ -44,7 +44,7 @@ export function fileDialog(store, put, say) {
       say('The scene is on the board.');
     } catch (problem) {
       if (!(problem instanceof SceneError || problem instanceof SyntaxError)) throw problem;
-      error.textContent = problem instanceof SyntaxError ? `This is not JSON: ${problem.message}.` : problem.message;
+      error.textContent = problem instanceof SyntaxError ? `This is neither JSON nor a list of labels: ${problem.message}.` : problem.message;
     }
   });
   get('download').addEventListener('click', () => {

@@ -11,7 +11,7 @@ import { SceneError } from './scene.js';
  * @throws {SceneError | SyntaxError}
  */
 export function scenesIn(text) {
-  if (LABELS.test(text)) return [{ objects: text.split(/[,\n]/).map((label) => label.trim()).filter(Boolean) }];
+  if (isLabels(text)) return [{ objects: text.split(/[,\n]/).map((label) => label.trim()).filter(Boolean) }];
   try {
     return [sceneOf(JSON.parse(text))];
   } catch (error) {
@@ -21,8 +21,8 @@ export function scenesIn(text) {
   }
 }
 
-/** Labels with commas or line ends between them: a text without the brackets and quotes of JSON. */
-const LABELS = /^[^{}[\]":]*\p{L}[^{}[\]":]*$/u;
+/** Whether a text consists of labels, with commas or line ends between them, instead of JSON. */
+const isLabels = (text) => !/[{}[\]":]/.test(text) && /\p{L}/u.test(text);
 
 function sceneOf(found) {
   try {
@@ -39,7 +39,7 @@ function converted(found) {
   return found?.objects?.some?.(({ id, position }) => typeof id === 'number' || Array.isArray(position)) ? annotated(found) : found;
 }
 
-const metres = (list) => list && { x: list[0], y: list[1], z: list[2] };
+const metres = (vector) => (Array.isArray(vector) ? { x: vector[0], y: vector[1], z: vector[2] } : vector);
 
 /** A scene in the format of the training: numbers as ids, lists as vectors, relations as triples. */
 function annotated({ objects, relations, room_type: room }) {

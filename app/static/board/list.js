@@ -21,11 +21,11 @@ export function createList(list, empty, count, actions) {
       },
     }, el('b'), el('span', { class: 'quiet' }));
     const more = el('button', {
-      type: 'button', class: 'icon', 'aria-haspopup': 'menu', 'aria-label': `Actions for ${id}`,
+      type: 'button', class: 'icon', 'aria-haspopup': 'menu',
       onclick: (event) => actions.open(id, event.currentTarget),
     }, '⋯');
     const remove = el('button', {
-      type: 'button', class: 'icon', 'aria-label': `Remove ${id}`, onclick: () => actions.remove(id),
+      type: 'button', class: 'icon', onclick: () => actions.remove(id),
     }, '✕');
     return el('li', {}, name, more, remove, el('div', { class: 'error' }));
   }
@@ -55,9 +55,12 @@ export function createList(list, empty, count, actions) {
       this.classList.toggle('selected', chosen);
       this.classList.toggle('outlier', out);
       this.querySelector('.name').setAttribute('aria-current', String(chosen));
+      const [, more, remove] = this.querySelectorAll('button');
+      more.setAttribute('aria-label', `Actions for ${nameOf(thing)}`);
+      remove.setAttribute('aria-label', `Remove ${nameOf(thing)}`);
       this.querySelector('.name b').textContent = nameOf(thing);
       this.querySelector('.name span').textContent = about(thing, state, out);
-      redraw(this.querySelector('.error'), readings(state, 'objects', thing.label).map((one) => suggested(thing, one)));
+      redraw(this.querySelector('.error'), (state.draft ? [] : readings(state, 'objects', thing.label)).map((one) => suggested(thing, one)));
     });
     empty.hidden = things.length > 0;
     count.textContent = things.length ? `(${things.length}${state.draft ? ', generated' : ''})` : '';

@@ -5,9 +5,9 @@ import { el } from './dom.js';
 import { changed } from './store.js';
 import { plain } from './words.js';
 
-/** The selectable models: aliases first, then the usable versions without an alias. */
-function choices({ models, aliases }) {
-  const targets = Object.values(aliases);
+/** The selectable models: aliases first, then the usable versions without an alias, and the chosen versions. */
+function choices({ models, aliases }, chosen) {
+  const targets = Object.values(aliases).filter((target) => !chosen.includes(target));
   const versions = models.flatMap(({ name, versions: own }) =>
     own.filter(({ version, status }) => status === 'ready' && !targets.includes(`${name}@${version}`))
       .map(({ version }) => ({ value: `${name}@${version}`, words: `${name} ${version}` })),
@@ -54,7 +54,7 @@ export function createModels(store, first, second, tell) {
 
   async function load() {
     try {
-      const found = choices(await call('models'));
+      const found = choices(await call('models'), store.get().models);
       const [model, other] = store.get().models;
       asked.clear();
       // A store without the alias "default" opens with its first model.

@@ -51,12 +51,11 @@ export function createProperties(form, store, actions) {
     for (const set of form.querySelectorAll('fieldset')) set.hidden = !state.posed;
     const known = sizesOf(state, state.models[0]).has(thing.label);
     document.getElementById('size-source').textContent = thing.size ? '' : known ? '(typical)' : '(a guess)';
-    const unplaced = thing.placed ? {} : { x: '', y: '', z: '' };
-    const values = { ...thing, ...unplaced, sx: size.x, sy: size.y, sz: size.z };
+    document.getElementById('place-source').textContent = thing.placed ? '' : '(not given)';
+    const values = { ...thing, sx: size.x, sy: size.y, sz: size.z };
     for (const input of form.querySelectorAll('input')) {
       if (typing.has(input) || (input === document.activeElement && input.getAttribute('aria-invalid'))) continue;
-      const value = values[input.name];
-      const text = value === '' ? '' : String(round(value));
+      const text = String(round(values[input.name]));
       if (field(input.name).value !== text) input.value = text;
       input.removeAttribute('aria-invalid');
     }

@@ -35,7 +35,7 @@ export function search(entries, text, limit = 12) {
 }
 
 /** The name of an object: its id, with its label if the id does not begin with it, as in "desk (track_3)". */
-export const nameOf = ({ id, label }) => (plain(id).startsWith(plain(label)) ? id : `${label} (${id})`);
+export const nameOf = ({ id, label }) => (`${plain(id)} `.startsWith(`${plain(label)} `) ? id : `${label} (${id})`);
 
 /** A function from the id of an object to its name. */
 export function namesOf(things) {

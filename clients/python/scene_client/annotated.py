@@ -9,24 +9,18 @@ from typing import Any
 
 
 def is_annotated(scene: Any) -> bool:
-    """Return whether a scene has the ids or the positions of the training format."""
-    objects = scene.get("objects") if isinstance(scene, dict) else None
-    return isinstance(objects, list) and any(
-        isinstance(thing, dict)
-        and (isinstance(thing.get("id"), int) or isinstance(thing.get("position"), list))
-        for thing in objects
-    )
+    """Return whether a value is a scene of the training format. Requests have no `scene_id`."""
+    return isinstance(scene, dict) and "scene_id" in scene
 
 
 def from_annotated(scene: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a request for a scene of the training format.
 
-    An object gets its label as id, followed by its number if several objects have the label. If all
-    objects have positions, the request contains the positions, and otherwise the relations and
-    supports of the scene.
+    An object gets its label as id, followed by its own id if several objects have the label. If an
+    object has no position, the request also contains the relations and supports of the scene.
 
     Raises:
-        KeyError, TypeError, ValueError: the scene does not have the training format.
+        ArithmeticError, KeyError, TypeError, ValueError: the scene does not have this format.
     """
     objects = scene["objects"]
     counts = Counter(thing["label"] for thing in objects)
@@ -36,38 +30,36 @@ def from_annotated(scene: Mapping[str, Any]) -> dict[str, Any]:
         else thing["label"]
         for thing in objects
     }
-    found: dict[str, Any] = {}
-    if all(thing.get("position") is not None for thing in objects):
-        found["objects"] = [_with_pose(ids[thing["id"]], thing) for thing in objects]
-        if not scene.get("viewer_frame"):
-            found["frame_id"] = "map"
-    else:
-        found["objects"] = [{"id": ids[thing["id"]], "label": thing["label"]} for thing in objects]
+    if len(set(ids.values())) < len(objects):
+        raise ValueError("two objects have the same id")
+    found: dict[str, Any] = {"objects": [_detection(ids[thing["id"]], thing) for thing in objects]}
+    if not all("position" in thing for thing in found["objects"]):
         supports = [
             [thing["id"], "on-top", thing["supported_by"]]
             for thing in objects
             if thing.get("supported_by") is not None
         ]
-        stated = {tuple(one): None for one in [*(scene.get("relations") or ()), *supports]}
+        stated = dict.fromkeys(map(tuple, [*(scene.get("relations") or ()), *supports]))
         relations = [
             {"subject": ids[subject], "relation": relation, "object": ids[other]}
             for subject, relation, other in stated
         ]
         found |= {"relations": relations} if relations else {}
+    if not scene.get("viewer_frame"):
+        found["frame_id"] = "map"
     if scene.get("room_type") is not None:
         found["room_type"] = scene["room_type"]
     return found
 
 
-def _with_pose(name: str, thing: Mapping[str, Any]) -> dict[str, Any]:
-    half = thing.get("yaw", 0.0) / 2
-    pose = {
-        "id": name,
-        "label": thing["label"],
-        "position": _metres(thing["position"]),
-        "orientation": {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)},
-    }
-    return pose | ({"size": _metres(thing["size"])} if thing.get("size") is not None else {})
+def _detection(name: str, thing: Mapping[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {"id": name, "label": thing["label"]}
+    if thing.get("position") is not None:
+        half = thing.get("yaw", 0.0) / 2
+        found["position"] = _metres(thing["position"])
+        found["orientation"] = {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)}
+        found |= {"size": _metres(thing["size"])} if thing.get("size") is not None else {}
+    return found
 
 
 def _metres(vector: list[float]) -> dict[str, float]:

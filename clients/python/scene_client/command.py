@@ -422,10 +422,8 @@ def _read(argument: str) -> dict[str, Any]:
     if is_annotated(scene):
         try:
             return from_annotated(scene)
-        except (KeyError, TypeError, ValueError):
-            _fail(
-                f"{argument} is neither a request nor a scene of the training format", MEANINGLESS
-            )
+        except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError):
+            _fail(f"{argument} is not a scene of the training format", MEANINGLESS)
     if isinstance(scene, list):
         return {"objects": scene}
     if not isinstance(scene, dict):
@@ -435,13 +433,13 @@ def _read(argument: str) -> dict[str, Any]:
 
 def _line(name: str, text: bytes, line: str | None) -> bytes:
     """Return one line of a file with one scene per line."""
-    scenes = [one for one in text.splitlines() if one.strip()]
-    if line is None and len(scenes) != 1:
-        _fail(f"{name} has {len(scenes)} scenes: choose one, such as {name}:1", MEANINGLESS)
+    lines = text.splitlines()
+    if line is None and len(lines) != 1:
+        _fail(f"{name} has {len(lines)} lines: choose one, such as {name}:1", MEANINGLESS)
     number = int(line or 1)
-    if not 1 <= number <= len(scenes):
-        _fail(f"{name} has the scenes 1 to {len(scenes)}, not {number}", MEANINGLESS)
-    return scenes[number - 1]
+    if not 1 <= number <= len(lines):
+        _fail(f"{name} has {len(lines)} lines; it has no line {number}", MEANINGLESS)
+    return lines[number - 1]
 
 
 def _detected(name: str, message: Any) -> dict[str, Any]:
