@@ -125,7 +125,7 @@ def test_two_models_answer_about_their_common_classes(
     scene = {"objects": ["bed", "lamp", "wardrobe"], "room_type": "bedroom"}
     board = open_board(scene, allow=("422",))
     models = [one["name"] for one in api.get("/models").json()["models"]]
-    (second,) = [f"{name}@1.5.0" for name in models if name == "everyday-triway"]
+    (second,) = [f"{name}@1.6.0" for name in models if name == "everyday-triway"]
     board.page.get_by_label("compare with").select_option(second)
     board.settle()
     assert notes(board, 2) == f"{second}: wardrobe not known, left out"
