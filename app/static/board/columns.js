@@ -180,6 +180,7 @@ export function createColumns(store, parents, askKey) {
     const waiting = status === 'down' ? 'Waiting for the service.' : whyNot(state, question, model);
     const shared = question === 'missing' && column === 0 && common(state);
     own.note.textContent = [
+      question === 'outliers' && answer ? `An object raises an alarm from ${percent(answer.threshold)}.` : '',
       shared ? `Both models answer about their ${shared.length} common classes.` : '',
       notes(answer ?? {}, state, column, name), rows.length ? '' : answer ? NOTHING[question] : waiting,
     ].filter(Boolean).join(' ');
