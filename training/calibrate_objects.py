@@ -56,6 +56,9 @@ PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
 ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Shares of unaltered scenes with an alarm, on the large data source with the most alarms."""
 
+# Minimum thresholds. If the scores of intruders and other objects do not overlap, as in scenes that
+# hardly vary, the target shares would need alarms for objects that probably belong to the scene.
+_LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
 # Lists of up to `_SHORT_LISTS` classes have separate thresholds, until the threshold of whole
 # scenes raises alarms in at most `_ENOUGH` times the target share of the shortened lists. Each
 # threshold is fitted to at least `_SHORTENED` shortened lists; few scenes are shortened several
@@ -374,7 +377,7 @@ def fit_outliers(
     examples = np.concatenate(parts)
     slope, size, intercept = logistic(examples[:, :2], examples[:, 2] > 0, C=RIDGE)
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
-    limits = _limits([(next(iter(judged.values())), scenes)], entry, rng)
+    limits = thresholds([(next(iter(judged.values())), scenes)], entry, rng)
     fitted: dict[str, Any] = {
         "popularity_weight": alpha,
         "outlier": entry,
@@ -394,7 +397,7 @@ def fit_outliers(
         share = _ENOUGH * ALARMS["medium"]
         if _limit(parts_scored, entry, np.random.default_rng(seed), share) <= limits.medium:
             break
-        own = _limits(parts_scored, entry, rng)
+        own = thresholds(parts_scored, entry, rng)
         short.append(_between(limits, own, short[-1] if short else _NEVER))
     return fitted | {"short_list_thresholds": tuple(short)}
 
@@ -419,9 +422,13 @@ Scored = Sequence[tuple[IntruderScores, SceneTensors]]
 """Scores of untouched scenes, and these scenes: one entry for each shortening of the scenes."""
 
 
-def _limits(untouched: Scored, entry: CountSlope, rng: np.random.Generator) -> Thresholds:
+def thresholds(untouched: Scored, entry: CountSlope, rng: np.random.Generator) -> Thresholds:
+    """Return the thresholds with the target shares of alarms, and at least the minimum."""
     return Thresholds(
-        **{name: _limit(untouched, entry, rng, share) for name, share in ALARMS.items()}
+        **{
+            name: max(_LEAST[name], _limit(untouched, entry, rng, share))
+            for name, share in ALARMS.items()
+        }
     )
 
 

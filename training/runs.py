@@ -124,9 +124,10 @@ def load_run(folder: Path) -> FinishedRun:
     """
     for name in ("config.json", "model.safetensors", "result.json"):
         if not (folder / name).is_file():
+            runs = ", ".join(str(path.parent) for path in sorted(folder.glob("*/result.json")))
+            advice = f"name a folder of a run: {runs}" if runs else "finish the training first"
             raise RunError(
-                f"{folder} contains no finished run: the file {name} is missing; finish the "
-                "training first"
+                f"{folder} contains no finished run: the file {name} is missing; {advice}"
             )
     try:
         config = Config.model_validate_json((folder / "config.json").read_text(encoding="utf-8"))

@@ -210,6 +210,10 @@ def test_other_lines_are_2(scene: Any, tmp_path: Path, line: str, text: str, wor
     assert word in done.stderr
 
 
+def test_commas_separate_labels(scene: Any) -> None:
+    assert scene("missing", "bed, lamp,").stdout == scene("missing", "bed", "lamp").stdout
+
+
 def test_errors_quote_the_text_that_they_are_about(scene: Any) -> None:
     assert '"nightstnad": the model does not know' in scene("missing", "bed", "nightstnad").stderr
     assert '"bedd": no entry of' in scene("missing", "bed", "--at", "on-top bedd").stderr

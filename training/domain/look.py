@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from app.scene import CANONICAL, canonicalise, label_key
+from app.serving.warnings import LARGEST, MOST_DISTANT
 from training.datasets import AnnotatedScene, Names
 
 _ON_TOP, _ABOVE = CANONICAL.index("on-top"), CANONICAL.index("above")
@@ -164,6 +166,17 @@ def _findings(
         if placed and scene.relations is None and not scene.viewer_frame:
             axes.add(scene.scene_id)
     yield axes
+    units = Finding(
+        f"Positions are beyond {MOST_DISTANT:g} m, or sides of objects beyond {LARGEST:g} m.",
+        "Positions and sizes must be in metres.",
+    )
+    for scene in scenes:
+        distances = [math.hypot(*(thing.position or ())) for thing in scene.objects]
+        sides = [side for thing in scene.objects for side in thing.size or ()]
+        far = scene.viewer_frame and max(distances, default=0) > MOST_DISTANT
+        if far or max(sides, default=0) > LARGEST:
+            units.add(scene.scene_id)
+    yield units
 
 
 def _unaskable(scenes: Sequence[AnnotatedScene], names: Names) -> Finding:

@@ -129,7 +129,7 @@ def propose(
     labels = count_labels(scenes, names)
     pairs = lookalikes(labels, scenes, names)
     minimum, covered = _minimum(scenes, pairs)
-    vocabulary = _vocabulary(scenes, pairs, minimum)
+    vocabulary = _in_own_words(_vocabulary(scenes, pairs, minimum), labels)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
@@ -216,6 +216,26 @@ def _vocabulary(
         else entry
         for entry in vocabulary.objects
     ]
+    return Vocabulary(objects, vocabulary.room_types)
+
+
+def _in_own_words(vocabulary: Vocabulary, labels: Sequence[Label]) -> Vocabulary:
+    """Return the vocabulary with the most frequent spelling of the scenes as label of each class.
+
+    Only a synonym becomes a label: a class of "milk bottle" and "water bottle" stays "bottle".
+    """
+    objects = list(vocabulary.objects)
+    for label in reversed(labels):  # the most frequent label of a class comes last and wins
+        index = vocabulary.index(label.name)
+        if index is None:
+            continue
+        entry, own = vocabulary.objects[index], label_key(label.spellings[0])
+        if own in map(label_key, entry.aliases):
+            word = " ".join(label.spellings[0].casefold().replace("_", " ").split())
+            others = [name for name in entry.aliases if label_key(name) != own]
+            objects[index] = replace(entry, label=word, aliases=(entry.label, *others))
+        else:
+            objects[index] = entry
     return Vocabulary(objects, vocabulary.room_types)
 
 

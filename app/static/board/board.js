@@ -128,6 +128,7 @@ export function createBoard(node, store, actions, takeGhost) {
     const texts = [];
     const left = refusedBy(state, state.models[state.shown]).objects;
     const half = ROBOT_SIDE / 2;
+    const named = (box) => (boxes.some(({ id, label }) => label === box.label && id !== box.id) ? nameOf(box) : box.label);
     const { x, y } = state.viewer;
     places.reserve({ left: view.across(y + half), right: view.across(y - half), top: view.down(x + half), bottom: view.down(x - half) });
     const marks = boxes.filter((box) => !state.draft && wrong.get(box.id)?.is_outlier);
@@ -136,10 +137,10 @@ export function createBoard(node, store, actions, takeGhost) {
       places.reserve({ left: at - MARK, right: at + MARK, top: top - MARK, bottom: top + MARK });
     }
     for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
-      const words = (!state.draft && !left.has(box.label) && inWords(reading(state, state.shown, 'objects', box.label))) || nameOf(box);
+      const words = (!state.draft && !left.has(box.label) && inWords(reading(state, state.shown, 'objects', box.label))) || named(box);
       const width = widthOf(words, FONT) + 6;
       const rect = onScreen(box, view);
-      const at = places.take(width, LINE, labelPlaces(rect, width), rect);
+      const at = places.take(width, LINE, labelPlaces(rect, width), [rect]);
       if (at) texts.push({ id: box.id, words, ...at, wrong: !state.draft && wrong.get(box.id)?.is_outlier });
     }
     labels.selectAll('text.name').data(texts, (text) => text.id).join('text')

@@ -22,19 +22,19 @@ function line(edge, rects) {
   const [from, to] = [border(a, b), border(b, a)];
   // If one box lies on the other, only the text is drawn.
   const width = widthOf(edge.words, FONT) + PADDING;
-  if (!from || !to) return { ...edge, width, from: null, spots: [a, b].flatMap((rect) => labelPlaces(rect, width)) };
+  if (!from || !to) return { ...edge, width, ends: [a, b], from: null, spots: labelPlaces(a, width) };
   const at = (part) => ({ x: from.x + (to.x - from.x) * part, y: from.y + (to.y - from.y) * part });
   const length = Math.hypot(to.x - from.x, to.y - from.y) || 1;
   const [nx, ny] = [(from.y - to.y) / length, (to.x - from.x) / length];
   const aside = (by) => ({ x: at(0.5).x + nx * by, y: at(0.5).y + ny * by });
   const spots = [...[0.5, 0.38, 0.62, 0.25, 0.75].map(at), ...[12, -12, 24, -24, 38, -38].map(aside)];
-  return { ...edge, width, from, to, spots };
+  return { ...edge, width, ends: [a, b], from, to, spots };
 }
 
 export function drawEdges(layer, edges, boxes, view, places) {
   const rects = new Map(boxes.map((box) => [box.id, onScreen(box, view)]));
   const lines = edges.map((edge) => line(edge, rects)).filter(Boolean);
-  for (const one of lines) one.text = places.take(one.width, 15, one.spots);
+  for (const one of lines) one.text = places.take(one.width, 15, one.spots, one.ends);
   const each = layer.selectAll('g').data(lines, (one) => one.key).join((enter) => {
     const g = enter.append('g');
     g.append('path').attr('class', 'line');

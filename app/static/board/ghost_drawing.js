@@ -16,7 +16,7 @@ export function drawGhosts(layer, ghosts, boxes, view, places, take) {
   for (const ghost of ghosts) {
     const width = widthOf(ghost.label, FONT) + 8;
     const rect = onScreen(ghost, view);
-    texts.set(ghost.id, places.take(width, 16, labelPlaces(rect, width), rect));
+    texts.set(ghost.id, places.take(width, 16, labelPlaces(rect, width), [rect]));
   }
   const each = layer.selectAll('g.ghost').data(ghosts, (ghost) => ghost.id).join((enter) => {
     const g = enter.append('g').attr('class', 'ghost').attr('tabindex', 0).attr('role', 'button');

@@ -1,4 +1,4 @@
-/** Texts that do not overlap: each takes the place that covers the fewest boxes. */
+/** Texts that overlap neither each other nor foreign boxes: each takes its first free place. */
 
 /** Height of a label in pixels. */
 export const LINE = 17;
@@ -31,19 +31,18 @@ export class Places {
   }
 
   /**
-   * Takes a centre where a text of this size meets no other text and the fewest reserved rectangles; null if there is none.
+   * Takes the first centre where a text of this size meets neither a text nor a reserved rectangle; null if there is none.
+   * A text on a foreign box would name the wrong object.
    * @param {{x: number, y: number}[]} centres best first
-   * @param {object} [own] the box of the text. A text may cover the rectangles around its box, such as the support.
+   * @param {object[]} own the boxes of the text. A text may cover the rectangles around its boxes, such as a support.
    */
   take(width, height, centres, own) {
     const around = ({ x, y }) => ({
       left: x - width / 2, right: x + width / 2, top: y - height / 2, bottom: y + height / 2,
     });
     const clear = (centre) => this.#inside(around(centre)) && !this.#texts.some((other) => meet(around(centre), other));
-    const free = centres.filter(clear);
-    const others = this.#boxes.filter((box) => !own || !holds(box, own));
-    const covered = (one) => others.filter((other) => meet(around(one), other)).length;
-    const [[, centre] = [0, null]] = free.map((one) => [covered(one), one]).sort(([a], [b]) => a - b);
+    const others = this.#boxes.filter((box) => !own.some((one) => holds(box, one)));
+    const centre = centres.find((one) => clear(one) && !others.some((other) => meet(around(one), other))) ?? null;
     if (centre) this.#texts.push(around(centre));
     return centre;
   }

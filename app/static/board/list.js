@@ -63,7 +63,7 @@ export function createList(list, empty, count, actions) {
       redraw(this.querySelector('.error'), (state.draft ? [] : readings(state, 'objects', thing.label)).map((one) => suggested(thing, one)));
     });
     empty.hidden = things.length > 0;
-    count.textContent = things.length ? `(${things.length}${state.draft ? ', generated' : ''})` : '';
+    count.textContent = things.length ? `(${things.length}${state.draft ? `, ${state.draft.fresh.size} new` : ''})` : '';
   }
 
   return (state, previous) => changed(state, previous, ...SEEN) && draw(state);

@@ -33,10 +33,12 @@ function visible(state) {
 }
 
 /** What counts as evidence, in words. */
-function evidence({ posed, things, relations }) {
-  const given = things.filter(({ placed }) => placed).length;
+function evidence(state) {
+  const { posed, things, relations } = state;
+  const known = knownTo(state, state.models[state.shown]);
+  const given = known.filter(({ placed }) => placed).length;
   if (posed) {
-    const rest = given < things.length ? ` Move an object to give its position.` : '';
+    const rest = given < known.length ? ' Move an object to give its position.' : '';
     return `The answers use the positions of ${given} of ${things.length} objects.${rest}`;
   }
   const stated = relations.length ? ` and ${relations.length} stated ${relations.length === 1 ? 'relation' : 'relations'}` : '';

@@ -377,6 +377,7 @@ def _scene(
             "the objects are missing: give labels, a file that ends in .json, or - for stdin",
             MEANINGLESS,
         )
+    things = [part for thing in things for part in _labels(thing)]
     files = [thing for thing in things if _is_file(thing)]
     if files and things != files[:1]:
         _fail(f"{files[0]} is a whole scene: remove the labels and other files", MEANINGLESS)
@@ -391,6 +392,13 @@ def _scene(
 def _named(**options: Any) -> dict[str, Any]:
     """Return the options that the user has set."""
     return {name: value for name, value in options.items() if value is not None}
+
+
+def _labels(thing: str) -> list[str]:
+    """Return the labels of an argument, which commas may separate; a file stays one argument."""
+    if _is_file(thing):
+        return [thing]
+    return [label.strip() for label in thing.split(",") if label.strip()]
 
 
 def _is_file(thing: str) -> bool:
