@@ -60,7 +60,7 @@ class Vocabulary:
 
     Raises:
         ValueError: the list of classes is empty, a room type has an empty name, a key of
-            `room_aliases` is no room type, or a name is ambiguous. A name is ambiguous if two
+            `room_aliases` is not a room type, or a name is ambiguous. A name is ambiguous if two
             classes, or two room types, have names with the same `label_key`.
     """
 
@@ -81,7 +81,7 @@ class Vocabulary:
         self._room_types = tuple(room_types)
         self._room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
         if others := self._room_aliases.keys() - set(self._room_types):
-            raise ValueError(f"room_aliases has keys that are no room types: {sorted(others)}")
+            raise ValueError(f"room_aliases names unknown room types: {sorted(others)}")
         self._by_key: dict[str, int] = {}
         self._by_spelling: dict[str, int] = {}
         for index, entry in enumerate(self._objects):

@@ -66,7 +66,7 @@ def test_rooms_have_synonyms() -> None:
     assert [words.room_index(name) for name in ("Store Room", "pantry", "storage_room")] == [1] * 3
     assert words.nearest_room("storerom")[0].entry == 1
     assert Vocabulary.from_dict(words.to_dict()) == words
-    with pytest.raises(ValueError, match="no room types"):
+    with pytest.raises(ValueError, match="unknown room types"):
         Vocabulary([ObjectClass("box")], ["bedroom"], aliases)
     with pytest.raises(ValueError, match="same name"):
         Vocabulary([ObjectClass("box")], ["pantry", "storage room"], aliases)
