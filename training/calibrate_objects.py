@@ -54,7 +54,7 @@ WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
 ALPHAS = (0.0, 0.125, 0.25, 0.375)
 PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
 ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
-"""Shares of unaltered scenes with an alarm, on the large data source with the most alarms."""
+"""Maximum shares of unaltered scenes with an alarm, on the large source with the most alarms."""
 
 # Minimum thresholds. If the scores of intruders and other objects do not overlap, as in scenes that
 # hardly vary, the target shares would need alarms for objects that probably belong to the scene.

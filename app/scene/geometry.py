@@ -42,6 +42,9 @@ CONTACT: Final = 0.05  # maximum distance in metres between bottom and top for *
 NEIGHBOUR_GAP: Final = 1.0  # maximum distance in metres between the footprints of neighbours
 NEIGHBOUR_DISTANCE: Final = 1.5  # maximum distance in metres between centres if a size is unknown
 MIN_OFFSET: Final = 0.10  # minimum |dx| or |dy| in metres for *front* or *left*
+MOST_DISTANT: Final = 100.0  # longest plausible distance from the viewer in metres; detects mm
+SMALLEST: Final = 1e-3  # shortest plausible side of a box in metres
+LARGEST: Final = 20.0  # longest plausible side of a box in metres
 
 _NONE: Final = -1  # index for "no relation"
 

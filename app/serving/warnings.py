@@ -8,12 +8,11 @@ from statistics import median
 from typing import Final, Literal
 
 from app.scene.frames import is_optical, is_world_fixed
+from app.scene.geometry import LARGEST, MOST_DISTANT, SMALLEST
 from app.scene.scene import Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import SceneRequest, SceneWarning
 
-MOST_DISTANT: Final = 100.0  # maximum distance from the viewer in m; detects positions in mm
-SMALLEST, LARGEST = 1e-3, 20.0  # shortest and longest plausible side of a box, in m
 _SAME_DEPTH: Final = 1e-3  # maximum difference in m of depths that count as equal
 _LEAST_FLAT: Final = 3  # minimum number of objects for the warning flat-scene
 

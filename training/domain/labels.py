@@ -26,7 +26,7 @@ class Label:
     """One name of objects, with all its spellings.
 
     Attributes:
-        name: spelling in the vocabulary.
+        name: curated name, or the most frequent spelling.
         mentions: number of objects with this name.
         scenes: number of scenes with this name.
         spellings: spellings in the scenes, most frequent first.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from app.scene import CANONICAL, canonicalise, label_key
-from app.serving.warnings import LARGEST, MOST_DISTANT
+from app.scene.geometry import LARGEST, MOST_DISTANT
 from training.datasets import AnnotatedScene, Names
 
 _ON_TOP, _ABOVE = CANONICAL.index("on-top"), CANONICAL.index("above")
@@ -171,10 +172,10 @@ def _findings(
         "Positions and sizes must be in metres.",
     )
     for scene in scenes:
-        distances = [math.hypot(*(thing.position or ())) for thing in scene.objects]
-        sides = [side for thing in scene.objects for side in thing.size or ()]
-        far = scene.viewer_frame and max(distances, default=0) > MOST_DISTANT
-        if far or max(sides, default=0) > LARGEST:
+        points = [thing.position for thing in scene.objects if thing.position] or [(0.0, 0.0, 0.0)]
+        middle = np.zeros(3) if scene.viewer_frame else np.median(points, 0)
+        far = bool((np.linalg.norm(points - middle, axis=1) > MOST_DISTANT).any())
+        if far or max((max(thing.size or (0,)) for thing in scene.objects), default=0) > LARGEST:
             units.add(scene.scene_id)
     yield units
 

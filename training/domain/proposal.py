@@ -8,6 +8,7 @@ for a better configuration.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -129,7 +130,7 @@ def propose(
     labels = count_labels(scenes, names)
     pairs = lookalikes(labels, scenes, names)
     minimum, covered = _minimum(scenes, pairs)
-    vocabulary = _in_own_words(_vocabulary(scenes, pairs, minimum), labels)
+    vocabulary = _in_own_words(_vocabulary(scenes, pairs, minimum), scenes)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
@@ -209,33 +210,36 @@ def _vocabulary(
 ) -> Vocabulary:
     merged = {label_key(pair.name): pair.like for pair in pairs if pair.merged}
     vocabulary = source_vocabulary([_renamed(scene, merged) for scene in scenes], minimum=minimum)
-    also = {label_key(pair.like): pair.name for pair in pairs if pair.merged}
+    also: dict[str, list[str]] = {}
+    for pair in pairs:
+        if pair.merged and vocabulary.index(pair.name) is None:
+            also.setdefault(label_key(pair.like), []).append(pair.name)
     objects = [
-        replace(entry, aliases=(*entry.aliases, also[key]))
-        if (key := label_key(entry.label)) in also and vocabulary.index(also[key]) is None
-        else entry
+        replace(entry, aliases=(*entry.aliases, *also.get(label_key(entry.label), ())))
         for entry in vocabulary.objects
     ]
     return Vocabulary(objects, vocabulary.room_types)
 
 
-def _in_own_words(vocabulary: Vocabulary, labels: Sequence[Label]) -> Vocabulary:
-    """Return the vocabulary with the most frequent spelling of the scenes as label of each class.
+def _in_own_words(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]) -> Vocabulary:
+    """Return the vocabulary with the synonyms that most objects of a class have as its label.
 
-    Only a synonym becomes a label: a class of "milk bottle" and "water bottle" stays "bottle".
+    A class of "plastic bottle", "glass bottle" and "bottle" stays "bottle", unless one of these
+    names has more than half of the objects.
     """
+    spelt: dict[int, Counter[str]] = {}
+    for thing in (thing for scene in scenes for thing in scene.objects):
+        index = vocabulary.index(thing.label)
+        if index is not None:
+            spelt.setdefault(index, Counter())[label_key(thing.label)] += 1
     objects = list(vocabulary.objects)
-    for label in reversed(labels):  # the most frequent label of a class comes last and wins
-        index = vocabulary.index(label.name)
-        if index is None:
-            continue
-        entry, own = vocabulary.objects[index], label_key(label.spellings[0])
-        if own in map(label_key, entry.aliases):
-            word = " ".join(label.spellings[0].casefold().replace("_", " ").split())
-            others = [name for name in entry.aliases if label_key(name) != own]
-            objects[index] = replace(entry, label=word, aliases=(entry.label, *others))
-        else:
-            objects[index] = entry
+    for index, counts in spelt.items():
+        entry = objects[index]
+        ((most, count),) = counts.most_common(1)
+        own = next((name for name in entry.aliases if label_key(name) == most), None)
+        if own is not None and 2 * count > counts.total():
+            others = [name for name in entry.aliases if name != own]
+            objects[index] = replace(entry, label=own, aliases=(entry.label, *others))
     return Vocabulary(objects, vocabulary.room_types)
 
 

@@ -78,7 +78,7 @@ def _labels(proposal: Proposal, console: Console) -> None:
     console.print(table)
     renamed = [label for label in labels if label_key(label.name) != label_key(label.spellings[0])]
     if renamed:
-        console.print("joined by built-in synonyms; a class has your most frequent name:")
+        console.print("joined by built-in synonyms; vocabulary.json has the classes:")
         for label in renamed[:ROWS]:
             console.print(f"  {label.spellings[0]} = {label.name}", markup=False)
     varied = [label for label in labels if len(label.spellings) > 1]

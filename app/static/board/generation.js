@@ -116,6 +116,6 @@ export function createGeneration(form, drawn, store, say) {
     if (!changed(state, previous, 'draft')) return;
     document.getElementById('draft').hidden = !state.draft;
     document.getElementById('draft-words').textContent = state.draft
-      ? `${state.draft.fresh.size} new objects` : '';
+      ? `${state.draft.fresh.size} new ${state.draft.fresh.size === 1 ? 'object' : 'objects'}` : '';
   };
 }

@@ -25,13 +25,14 @@ export class Places {
     this.height = height;
   }
 
-  /** Keeps a rectangle free of texts, if they have another place. */
+  /** Keeps a rectangle free of texts, except of texts inside their own box. */
   reserve(box) {
     this.#boxes.push(box);
   }
 
   /**
-   * Takes the first centre where a text of this size meets neither a text nor a reserved rectangle; null if there is none.
+   * Takes the first centre where a text of this size meets neither a text nor a reserved rectangle, else the first inside
+   * its own box without a text, else null.
    * A text on a foreign box would name the wrong object.
    * @param {{x: number, y: number}[]} centres best first
    * @param {object[]} own the boxes of the text. A text may cover the rectangles around its boxes, such as a support.
@@ -42,7 +43,9 @@ export class Places {
     });
     const clear = (centre) => this.#inside(around(centre)) && !this.#texts.some((other) => meet(around(centre), other));
     const others = this.#boxes.filter((box) => !own.some((one) => holds(box, one)));
-    const centre = centres.find((one) => clear(one) && !others.some((other) => meet(around(one), other))) ?? null;
+    const free = centres.filter(clear);
+    const centre = free.find((one) => !others.some((other) => meet(around(one), other)))
+      ?? free.find((one) => own.some((box) => holds(box, around(one)))) ?? null;
     if (centre) this.#texts.push(around(centre));
     return centre;
   }

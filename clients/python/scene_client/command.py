@@ -183,9 +183,9 @@ Things = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="LABEL... | SCENE.json | SCENES.jsonl:LINE | -",
-        help="Labels of the objects, or a JSON file, or - for standard input. The JSON is a "
-        "request of the HTTP contract, a scene of the training format, or detections in the "
-        "format of rosbridge.",
+        help="Labels of the objects (spaces or commas between them), or a JSON file, or - for "
+        "standard input. The JSON is a request of the HTTP contract, a scene of the training "
+        "format, or detections in the format of rosbridge.",
         show_default=False,
     ),
 ]

@@ -3,8 +3,10 @@ from __future__ import annotations
 from tests.training.domain.scenes import scene
 from training.datasets.names import Names
 from training.domain.labels import count_labels, lookalikes
+from training.domain.proposal import propose
 
 NAMES = Names(base=("cup", "table"), aliases={"sofa": ("couch",)})
+REST = ("cup", "spoon", "plate")
 
 
 def test_spellings_and_aliases_count_as_one_label() -> None:
@@ -57,3 +59,24 @@ def test_a_slip_is_merged_into_one_label_alone() -> None:
     merged = [pair for pair in found.values() if pair.merged]
     assert len(merged) == 1
     assert merged[0].name == "soldering irok"
+
+
+def test_a_class_has_the_name_of_most_of_its_objects() -> None:
+    """A synonym with more than half of the objects, in the spelling of the curated names."""
+
+    def name(**counts: int) -> str:
+        labels = [label.replace("_", " ") for label, n in counts.items() for _ in range(n)]
+        scenes = [scene(str(k), label, *REST) for k, label in enumerate([*labels, *["fork"] * 40])]
+        vocabulary = propose("lab", scenes, ["scenes.jsonl"], terms="").vocabulary
+        return vocabulary.labels[vocabulary.index(labels[0])]
+
+    assert name(waste_bins=12, garbage_bin=9) == "waste bin"
+    assert name(Garbage_bin=12, waste_bin=9) == "garbage bin"
+    assert name(plastic_bottle=9, glass_bottle=8, bottle=7) == "bottle"
+
+
+def test_every_merged_misspelling_is_an_alias() -> None:
+    labels = ["oscilloscope"] * 60 + ["oscilloscop", "osciloscope"]
+    scenes = [scene(str(k), label, *REST) for k, label in enumerate(labels)]
+    vocabulary = propose("lab", scenes, ["scenes.jsonl"], terms="").vocabulary
+    assert len({vocabulary.index(label) for label in labels}) == 1

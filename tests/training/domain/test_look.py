@@ -111,8 +111,9 @@ def test_millimetres_are_found() -> None:
     far = scene("far", "cup", "table", position=[(2100.0, 0.0, 400.0), (1.0, 0.0, 0.4)])
     big = scene("big", "cup", "table", size=[(80.0, 80.0, 100.0), None])
     near = scene("near", "cup", "table", position=[(2.1, 0.0, 0.4)] * 2, size=[(1.0, 1.0, 1.0)] * 2)
-    viewed = [replace(one, viewer_frame=True) for one in (far, big, near)]
-    assert finding("Positions are beyond", *viewed) == (2, ["far", "big"])
+    for axes in (True, False):
+        every = [replace(one, viewer_frame=axes) for one in (far, big, near)]
+        assert finding("Positions are beyond", *every) == (2, ["far", "big"])
 
 
 def test_generated_scenes_contradict_nothing() -> None:

@@ -26,9 +26,9 @@ class OutliersOptions(Request):
     sensitivity: Annotated[
         Sensitivity,
         Field(
-            description="rate of alarms in unchanged scenes: about 2, 10 and 20 % of the scenes "
-            "with low, medium and high. The rates apply to the large data source with the most "
-            "alarms, and also to short lists of objects"
+            description="rate of alarms in unchanged scenes: at most about 2, 10 and 20 % of the "
+            "scenes with low, medium and high. The rates apply to the large data source with the "
+            "most alarms, and also to short lists of objects"
         ),
     ] = "medium"
     threshold: Annotated[
