@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from random import Random
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 
@@ -260,3 +262,16 @@ def test_improbable_objects_and_places_are_left_out(open_board: OpenBoard) -> No
     (row,) = board.rows("missing")
     assert row.count("%") == 1, "the probability of the object, and no place"
     assert "no likely place" in row
+
+
+def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board(scene=None)
+    (oven,) = [
+        one["object"]
+        for one in api.post("/outliers", json=board.scene).json()["outliers"]
+        if one["is_outlier"]
+    ]
+    missing = api.post("/missing", json=board.scene | {"top_k": 5}).json()["missing"]
+    places = [place for one in missing for place in one["placements"]]
+    assert any(place["object"] == oven and place["probability"] >= 0.25 for place in places)
+    assert not any(re.search(rf"{oven} \d+ %", row) for row in board.rows("missing"))

@@ -44,7 +44,7 @@ const row = (kind, words, probability, flag, ...more) =>
 const ROWS = {
   missing(answer, name, state, store, column) {
     const ghosts = new Map(column === state.shown ? ghostsOf(state).map((ghost) => [ghost.label, ghost]) : []);
-    const rows = likely(answer, state.at).map(({ label, probability, placements, because = [] }) => {
+    const rows = likely(state.answers[column], state.at).map(({ label, probability, placements, because = [] }) => {
       const ghost = ghosts.get(label);
       const first = placements.slice(0, PLACES);
       // The place on the board is always listed.

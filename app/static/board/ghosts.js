@@ -37,23 +37,29 @@ let last = { keys: [], ghosts: [] };
 
 /** The shown suggestions. @returns {Ghost[]} */
 export function ghostsOf(state) {
-  const answer = state.answers[state.shown].missing?.answer;
+  const own = state.answers[state.shown];
   const model = state.models[state.shown];
-  const keys = [answer, state.things, state.viewer, state.tab, state.words, state.draft, model, state.at];
+  const keys = [own, state.things, state.viewer, state.tab, state.words, state.draft, model, state.at];
   if (last.keys.every((key, index) => key === keys[index]) && last.keys.length) return last.ghosts;
   const sizes = sizesOf(state, state.models[0]);
-  const shown = answer && state.tab === 'missing' && !state.draft;
-  last = { keys, ghosts: shown ? standing(likely(answer, state.at), state.things.map(sizer(sizes)), state.viewer, sizes, state.at) : [] };
+  const shown = own.missing?.answer && state.tab === 'missing' && !state.draft;
+  last = { keys, ghosts: shown ? standing(likely(own, state.at), state.things.map(sizer(sizes)), state.viewer, sizes, state.at) : [] };
   return last.ghosts;
 }
 
 const LEAST = 0.01;
 
-/** The missing objects of at least 1 %, and their likely places; all of them in an answer about a place. */
-export function likely({ missing }, at) {
+/**
+ * The missing objects of at least 1 %, and their likely places beside objects that belong to the scene; all objects and
+ * places in an answer about a place.
+ * @param {object} own the answers of one model
+ */
+export function likely({ missing: { answer: { missing } }, outliers }, at) {
   if (at) return missing;
+  const wrong = new Set((outliers?.answer?.outliers ?? []).filter((one) => one.is_outlier).map(({ object }) => object));
+  const isLikely = ({ probability, object }) => probability >= LIKELY && !wrong.has(object);
   return missing.filter(({ probability }) => probability >= LEAST)
-    .map((one) => ({ ...one, placements: one.placements.filter(({ probability }) => probability >= LIKELY) }));
+    .map((one) => ({ ...one, placements: one.placements.filter(isLikely) }));
 }
 
 /**

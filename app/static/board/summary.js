@@ -13,7 +13,7 @@ export function summary(state) {
   if (!QUESTIONS.every((question) => own[question]?.status === 'answered')) return null;
   const name = namesOf(state.things);
   const parts = [];
-  const [first] = likely(own.missing.answer, state.at);
+  const [first] = likely(own, state.at);
   if (first) {
     const [place] = first.placements;
     const where = place ? ` ${SPOKEN[place.relation]} ${name(place.object)}` : '';
