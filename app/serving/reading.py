@@ -289,6 +289,11 @@ class Names:
                 places.setdefault(thing.class_index, []).append(place)
         return places
 
+    @cached_property
+    def _plain_ids(self) -> list[str]:
+        # A request cannot put arbitrary text into an error through its ids.
+        return [thing.id for thing in self._objects if PLAIN.fullmatch(thing.id.replace(" ", "_"))]
+
     def find(self, name: str, location: Location, faults: Faults) -> int | None:
         """Return the index of the object with a name. On failure, add an error and return None.
 
@@ -315,15 +320,11 @@ class Names:
         return None
 
     def _similar(self, name: str) -> list[str]:
-        """Return similar ids for the first `MAX_SUGGESTED` unknown names of a request.
-
-        Only plain ids are returned, so that a request cannot put arbitrary text into an error.
-        """
+        """Return similar ids for the first `MAX_SUGGESTED` unknown names of a request."""
         if self._look_ups.suggestions >= MAX_SUGGESTED:
             return []
         self._look_ups.suggestions += 1
-        plain = [thing.id for thing in self._objects if PLAIN.fullmatch(thing.id.replace(" ", "_"))]
-        return spelt_alike(name, plain)
+        return spelt_alike(name, self._plain_ids)
 
     def is_ignored(self, name: str) -> bool:
         """Return whether an ignored object has this id or label."""
