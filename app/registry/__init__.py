@@ -3,6 +3,7 @@
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.counts import Counts
 from app.registry.description import (
+    NEVER,
     Calibration,
     CountSlope,
     DataSource,
@@ -24,6 +25,7 @@ from app.registry.references import AliasTarget
 from app.registry.store import Store, StoreState
 
 __all__ = [
+    "NEVER",
     "AliasTarget",
     "Artifact",
     "ArtifactError",

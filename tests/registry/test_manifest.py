@@ -19,6 +19,7 @@ from app.registry import (
     EvidenceWeights,
     Manifest,
     PairSlope,
+    Slope,
     Thresholds,
 )
 from app.registry.description import VocabularyEntry
@@ -78,6 +79,7 @@ changes = st.fixed_dictionaries(
             popularity_weight=share,
             outlier=count_slopes,
             outlier_thresholds=thresholds,
+            misplaced=st.builds(Slope, intercept=number, slope=number),
             misplaced_thresholds=thresholds,
             relation=st.tuples(*[pair_slopes] * 4),
             placement=st.just(()) | st.tuples(*[pair_slopes] * 4),
@@ -196,6 +198,7 @@ def change_nested(members: dict[str, Any], path: str, value: object) -> None:
         ("calibration.misplaced_thresholds.high", -0.5),
         ("calibration.outlier.slope", math.nan),
         ("calibration.outlier.slope", math.inf),
+        ("calibration.outlier", None),  # without a fit, there are no thresholds
         ("training.rate", math.nan),
         ("data.0.digest", "xyz"),
         ("data.0.scenes", -1),
@@ -267,8 +270,7 @@ def test_neutral_calibration_changes_nothing() -> None:
     assert neutral.missing == CountSlope(intercept=0, slope=1, log_count=0)
     assert set(neutral.evidence.model_dump().values()) == {1.0}
     assert (neutral.popularity, neutral.popularity_weight) == ((), 0)
-    assert neutral.misplaced.slope == 1
-    assert neutral.outlier == CountSlope(intercept=0, slope=1, log_count=0)
+    assert neutral.misplaced is neutral.outlier is None
 
 
 def test_what_earlier_releases_calibrated_is_passed_over() -> None:

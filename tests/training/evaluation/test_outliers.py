@@ -19,6 +19,7 @@ from tests.training.evaluation.scenes import (
 )
 from training.datasets import shuffle_objects
 from training.evaluation import outliers
+from training.evaluation.alarms import ALARMS
 from training.evaluation.asking import (
     SENSITIVITIES,
     LeakError,
@@ -39,7 +40,6 @@ from training.evaluation.intruders import (
     signatures,
 )
 from training.evaluation.outliers import (
-    MEDIUM,
     Alarm,
     alarm_threshold,
     calibrated_alarm,
@@ -337,7 +337,7 @@ def shares(score, alarm, scenes):
 def test_the_promise_is_kept_in_every_large_source(score):
     scenes = varied([400, 400])
     found = shares(score, fitted_alarm(score, scenes, WIDE_STRUCTURE), scenes)
-    assert max(found.values()) <= MEDIUM + 0.02
+    assert max(found.values()) <= ALARMS["medium"] + 0.02
 
 
 def test_the_source_that_alarms_most_sets_the_threshold():
@@ -357,7 +357,7 @@ def test_a_smaller_share_of_alarms_has_a_higher_threshold():
     scenes = varied([400])
     scores = intruder_scores(scenes, WIDE_STRUCTURE, smooth)
     limits = []
-    for share in (0.02, MEDIUM, 0.2):
+    for share in (0.02, ALARMS["medium"], 0.2):
         alarms = []
         for suspicion in (-scores.log_odds, 1 - 2 * scores.log_odds):
             rng = np.random.default_rng(0)

@@ -87,7 +87,9 @@ class OutliersAnswer(Answer):
     """Results for all objects and for all observed relations.
 
     `outliers` starts with the most probable outlier. `misplaced` starts with the relation that is
-    most probably false. There, `probability` is the probability that the relation is false.
+    most probably false. There, `probability` is the probability that the relation is false. A
+    model that was calibrated with too few scenes gives no judgement: the list is empty, and a
+    warning says so.
     """
 
     threshold: Annotated[
