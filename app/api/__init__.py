@@ -75,5 +75,5 @@ def build(
         app.include_router(router)
     pages.install(app, docs=settings.docs)
     every = itertools.chain(app.routes, *(router.routes for router in routers))
-    app.state.paths = [route.path for route in every if hasattr(route, "path")]
+    app.state.paths = {route.path for route in every if hasattr(route, "path")}
     return app
