@@ -239,18 +239,6 @@ class Settings(BaseSettings):
             description="maximum time limit in milliseconds that a client may choose",
         ),
     ] = 60_000
-    max_streams: Annotated[
-        int, Field(ge=0, le=4096, description="maximum number of open streams of a process")
-    ] = 64
-    stream_idle: Annotated[
-        float,
-        Field(
-            ge=1,
-            le=86_400,
-            allow_inf_nan=False,
-            description="seconds without a message after which the service closes a stream",
-        ),
-    ] = 300
     drain_seconds: Annotated[
         float,
         Field(
@@ -274,8 +262,8 @@ class Settings(BaseSettings):
             ge=0.1,
             le=3600,
             allow_inf_nan=False,
-            description="seconds that a client may take to send a request body, to acknowledge an "
-            "answer, and to answer the ping of a stream",
+            description="seconds that a client may take to send a request body, and to acknowledge "
+            "an answer",
         ),
     ] = 20
     retry_after: Annotated[

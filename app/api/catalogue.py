@@ -206,8 +206,8 @@ DRAINING: Final = ProblemType(
     "draining",
     503,
     "The service is shutting down",
-    "The service soon closes its socket. It opens no more streams. Use another instance, or send "
-    "the request again after the time in Retry-After.",
+    "The service soon closes its socket. Use another instance, or send the request again after the "
+    "time in Retry-After.",
 )
 NOT_READY: Final = ProblemType(
     "not-ready",
@@ -229,22 +229,6 @@ INTERNAL_ERROR: Final = ProblemType(
     "The service failed",
     "This is a defect of the service. Search the log of the service for the request id to find the "
     "details.",
-)
-
-UPGRADE_REQUIRED: Final = ProblemType(
-    "upgrade-required",
-    426,
-    "This route is for WebSockets",
-    "GET /stream opens a WebSocket of version 13. Send its handshake as the first request of a "
-    "connection, or after the answers to all earlier requests. docs/stream.md describes the "
-    "protocol.",
-)
-TOO_MANY_STREAMS: Final = ProblemType(
-    "too-many-streams",
-    503,
-    "Too many streams are open",
-    "The process already has SCENE_MAX_STREAMS open streams. Try again after the time in "
-    "Retry-After. Until then, send the questions as POST requests.",
 )
 
 PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
@@ -277,7 +261,5 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         DRAINING,
         QUEUE_FULL,
         DEADLINE_PASSED,
-        UPGRADE_REQUIRED,
-        TOO_MANY_STREAMS,
     )
 }

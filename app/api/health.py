@@ -28,6 +28,8 @@ _NOT_READY = problems(catalogue.NOT_READY, catalogue.DRAINING)
 _NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
 
 
+# Load balancers may check health with HEAD. OpenAPI describes only GET.
+@router.head("/health/live", include_in_schema=False, response_model_exclude_none=True)
 @router.get(
     "/health/live",
     summary="Is the process alive?",
@@ -39,6 +41,7 @@ async def health_live() -> Health:
     return Health(status="live")
 
 
+@router.head("/health/ready", include_in_schema=False, response_model_exclude_none=True)
 @router.get(
     "/health/ready",
     summary="Is the default model usable?",
@@ -60,12 +63,14 @@ async def server_metadata() -> ServerMetadata:
     return ServerMetadata(name="scene-boltzmann", version=__version__, extensions=[])
 
 
+@protocol.head("/health/live", include_in_schema=False)
 @protocol.get("/health/live", summary="Is the process alive?", responses=problems())
 async def server_live() -> ServerLive:
     """Run the same check as `GET /health/live`."""
     return ServerLive(live=True)
 
 
+@protocol.head("/health/ready", include_in_schema=False)
 @protocol.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
 async def server_ready(runtime: RuntimeDep) -> ServerReady:
     """Run the same check as `GET /health/ready`."""
@@ -85,6 +90,7 @@ async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
     )
 
 
+@protocol.head("/models/{name}/ready", include_in_schema=False)
 @protocol.get("/models/{name}/ready", summary="Is this model usable?", responses=_NO_MODEL)
 async def model_ready(name: Reference, runtime: RuntimeDep) -> ModelReady:
     """Return status 200 if the model is usable, 404 if it does not exist, or else 503."""

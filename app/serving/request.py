@@ -40,8 +40,6 @@ class Record:
             used no model.
         answered_at: time of the last answer of a model, as a value of `time.perf_counter`.
         serialise_seconds: time in seconds from the last answer of a model to the response.
-        stream: dictionary with the numbers of messages, answers and superseded updates of a stream,
-            and its close code. It is None for other requests.
     """
 
     outcome: str = SUCCESS
@@ -51,7 +49,6 @@ class Record:
     compute_seconds: float | None = None
     answered_at: float | None = None
     serialise_seconds: float | None = None
-    stream: dict[str, int] | None = None
 
     def begin(self, status: int) -> None:
         """Record that the response starts."""
@@ -64,7 +61,7 @@ class Record:
 
         The dictionary contains the model only if the request used exactly one model.
         """
-        entry: dict[str, str | float] = {"outcome": self.outcome, **(self.stream or {})}
+        entry: dict[str, str | float] = {"outcome": self.outcome}
         if len(self.models) == 1:
             ((entry["model"], entry["version"]),) = self.models
         if self.queue_seconds is not None:
@@ -85,8 +82,6 @@ class Request(Ticket):
         metrics: metrics of the service.
         record: values for the log and the metrics.
         holding: whether the request has already reserved rows (scenes) in the queues of the models.
-        known: stored result of `read`, if several questions concern the same scene.
-        low_priority: whether other requests take precedence, because this one belongs to a stream.
         look_ups: searches for classes similar to unknown labels, shared by all scenes of the
             request.
     """
@@ -97,8 +92,6 @@ class Request(Ticket):
     metrics: Metrics = field(kw_only=True)
     record: Record = field(default_factory=Record)
     holding: bool = False
-    known: tuple[ServedModel, Reading] | None = None
-    low_priority: bool = False
     look_ups: LookUps = field(default_factory=LookUps)
 
     def read(
@@ -111,8 +104,6 @@ class Request(Ticket):
             ModelUnavailableError: the service refused to load the model.
             RequestError: the scene is invalid; see `read_scene`.
         """
-        if self.known is not None:
-            return self.known
         model = self.models.resolve(scene.model)
         self.record.models.add(model.key)
         return model, read_scene(
@@ -149,7 +140,6 @@ class Request(Ticket):
                 kind=_kind_of_cost(name, scene, kwargs),
                 # The time for relations grows with the number of pairs of objects.
                 size=(1 + len(scene.objects)) ** 2,
-                low_priority=self.low_priority,
             )
         finally:
             model.queue.give_back(rows)

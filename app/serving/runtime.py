@@ -160,7 +160,7 @@ class Runtime:
 
     @property
     def draining(self) -> bool:
-        """Whether the service refuses new requests."""
+        """Whether the service is shutting down."""
         return self.backlog.draining
 
     def check_ready(self) -> None:
@@ -187,7 +187,7 @@ class Runtime:
         return StoreHealth(age_s=round(age, 1), reason=None if error is None else error.code)
 
     def drain(self) -> None:
-        """Answer readiness checks with 503, refuse streams, and close connections after answers."""
+        """Answer readiness checks with 503, and close connections after answers."""
         self.backlog.draining = True
 
     async def start(self) -> None:

@@ -12,7 +12,7 @@ from app.main import create_app
 from app.settings import Settings
 from tests.http.stores import corrupt
 from tests.http.test_problems import problem
-from tests.services import NAMED, serve
+from tests.services import NAMED, LiveService, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -30,6 +30,17 @@ async def test_a_ready_service_says_so(client: httpx.AsyncClient) -> None:
     for path, expected in answers.items():
         response = await client.get(path)
         assert (response.status_code, response.json()) == (200, expected)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    "path", ["/health/live", "/v2/health/live", *READY, "/v2/models/none/ready"]
+)
+def test_head_answers_like_get_without_a_body(live: LiveService, path: str) -> None:
+    get, head = live.client.get(path), live.client.head(path)
+    assert head.status_code == get.status_code == (404 if "none" in path else 200)
+    assert (head.content, head.headers["content-length"]) == (b"", str(len(get.content)))
+    assert head.headers.keys() == get.headers.keys()
 
 
 async def test_protocol_metadata(client: httpx.AsyncClient) -> None:

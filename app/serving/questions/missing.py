@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from typing import Final
 
 from app import questions
@@ -56,7 +55,6 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         faults.add(Reason.INVALID, ("top_k",), message)
     candidates = at = None
     if asked.candidates is not None:
-        reading = replace(reading, unknown=reading.unknown.copy())
         candidates = _candidates(asked.candidates, model, reading, faults)
     if asked.at is not None:
         at = _place(asked.at, model, reading, faults)
