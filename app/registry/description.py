@@ -62,12 +62,6 @@ class Slope(Frozen):
     slope: float = 1.0
 
 
-_RETIRED = frozenset(
-    {"placed", "missing_temperature", "placed_temperature", "placed_relation_weight"}
-    | {"outlier_threshold"}
-)
-
-
 class Thresholds(Frozen):
     """Minimum probability at which the service reports an outlier or a misplaced relation.
 
@@ -130,12 +124,11 @@ class Calibration(Frozen):
         outlier: calibration that converts a class's log-odds of presence to the log-odds that its
             object is an intruder. n is the number of classes in the scene.
         relation: calibration of each canonical relation in scenes without observed relations.
-        relation_given: calibration of each canonical relation in scenes with observed relations. If
-            the tuple is empty, `relation` applies.
+        relation_given: calibration of each canonical relation in scenes with observed relations.
         placement: calibration of each canonical relation for a missing object at its most probable
-            places. If the tuple is empty, `relation` applies.
+            places.
         asked_place: calibration of each canonical relation for a missing object at the place that a
-            request names. If the tuple is empty, `placement` applies.
+            request names.
         misplaced: calibration that converts the log-odds of a stated relation to the log-odds that
             the relation is false.
     """
@@ -153,23 +146,16 @@ class Calibration(Frozen):
     room_fit: Many[float] = ()
     outlier: CountSlope = CountSlope()
     relation: PairSlopes
-    relation_given: PairSlopes = ()
-    placement: PairSlopes = ()
-    asked_place: PairSlopes = ()
+    relation_given: PairSlopes
+    placement: PairSlopes
+    asked_place: PairSlopes
     misplaced: Slope = Slope()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_retired(cls, values: Any) -> Any:
-        """Remove fields that only earlier releases used, so that their manifests stay valid."""
-        if not isinstance(values, dict):
-            return values
-        return {name: value for name, value in values.items() if name not in _RETIRED}
 
     @classmethod
     def neutral(cls, relations: int) -> Self:
         """Return the calibration with default values for A = ``relations`` canonical relations."""
-        return cls(relation=(PairSlope(),) * relations)
+        neutral = (PairSlope(),) * relations
+        return cls(relation=neutral, relation_given=neutral, placement=neutral, asked_place=neutral)
 
 
 class ClassEntry(Frozen):
@@ -272,7 +258,7 @@ class Description(Frozen):
         metrics: figures measured on scenes that training did not use.
         terms: terms of use of the weights.
         libraries: maps the name of each library used in training to its version.
-        examples: example scenes for the visual page. Artifacts of earlier releases have none.
+        examples: example scenes for the visual page.
     """
 
     name: ModelName
@@ -301,14 +287,9 @@ class Description(Frozen):
         for name, what, length in (
             ("V", "vocabulary objects", len(words.objects)),
             ("A", "vocabulary relations", len(words.relations)),
-            ("A", "calibration relations", len(self.calibration.relation)),
             *(
-                ("A", f"calibration {kind}", len(entries or self.calibration.relation))
-                for kind, entries in (
-                    ("entries of relation_given", self.calibration.relation_given),
-                    ("entries of placement", self.calibration.placement),
-                    ("entries of asked_place", self.calibration.asked_place),
-                )
+                ("A", f"entries of calibration.{name}", len(getattr(self.calibration, name)))
+                for name in ("relation", "relation_given", "placement", "asked_place")
             ),
         ):
             if self.spec.get(name) != length:

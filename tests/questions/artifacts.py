@@ -8,7 +8,7 @@ import torch
 
 from app.inference.posterior import ClosedForm
 from app.registry.artifact import Artifact
-from app.registry.description import Calibration, CountSlope, PairSlope, Slope, Thresholds
+from app.registry.description import Calibration, CountSlope, Slope, Thresholds
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL
 from training.machines import BoltzmannMachine, MachineSpec, build
@@ -51,7 +51,7 @@ def calibration(relations: int, **changes: object) -> Calibration:
     Nothing raises an alarm, so that every drawn scene stands.
     """
     neutral = {
-        "relation": (PairSlope(),) * relations,
+        **dict(Calibration.neutral(relations)),
         "outlier": CountSlope(slope=-1.0),
         "outlier_thresholds": Thresholds(low=1.0, medium=1.0, high=1.0),
         "misplaced": Slope(slope=-1.0),
