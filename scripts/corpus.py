@@ -37,7 +37,7 @@ SEED: Final = 20261123
 QUESTIONS: Final = ("relations", "missing", "outliers")
 MODELS: Final = (
     "default", "indoor-triway", "indoor-gbm", "indoor-rbm", "indoor-triway-deep", "open-triway",
-    "everyday-triway", "procthor-triway", "indoor-triway@2.4.0",
+    "everyday-triway", "indoor-triway@2.4.0",
 )  # fmt: skip
 RELATIONS: Final = ("left", "right", "front", "behind", "on-top", "under", "above", "below")
 HEADERS: Final = ("content-type", "retry-after", "www-authenticate", "allow", "location")
@@ -189,7 +189,7 @@ def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Js
         likely = [scene["objects"] for scene in drawn["scenes"] if scene["objects"]]
         labels = [entry["label"] for entry in words["objects"]]
         scenes = Scenes(rng, labels, words["room_types"], likely)
-        count = 60 if model in {"procthor-triway", "indoor-triway@2.4.0"} else 210
+        count = 60 if model == "indoor-triway@2.4.0" else 210
         for k in range(count):
             question = QUESTIONS[k % 3]
             body = scenes.scene() | {"model": model}
@@ -253,7 +253,7 @@ def pages(client: httpx.Client) -> Iterator[dict[str, Json]]:
     listing = client.get("/problems").text.split('"/problems/')[1:]
     paths += ["/problems/" + entry.partition('"')[0] for entry in listing]
     names = [model["name"] for model in listed["models"]]
-    for name in [*names, "default", "procthor-triway"]:
+    for name in [*names, "default"]:
         paths += [f"/models/{name}", f"/models/{name}/vocabulary", f"/models/{name}/contexts"]
         paths += [f"/v2/models/{name}", f"/v2/models/{name}/ready"]
     for model in listed["models"]:

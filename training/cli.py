@@ -20,7 +20,6 @@ from rich.console import Console
 from rich.table import Table
 
 from app.registry import Artifact, RegistryError, Store, load_model_set
-from app.registry.location import open_for_publisher
 from app.registry.references import AliasTarget
 from training.batches import subset
 from training.config import (
@@ -87,7 +86,7 @@ StoredData = Annotated[
     ),
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
-StorePath = Annotated[str, typer.Option("--store", help="the model store: a folder or a URL")]
+StorePath = Annotated[str, typer.Option("--store", help="folder of the model store")]
 _RUNS, _STORE = Path("runs"), "model_store"
 _ALIAS = "`python -m app.registry alias` moves an alias without a comparison"
 
@@ -120,7 +119,7 @@ def train(
             console.quiet = not first
             config = load_config(configuration, seed=seed)
             if publish is not None and first:
-                open_for_publisher(store).require_new(config.name, publish)
+                Store(store).require_new(config.name, publish)
             root = data_folder(configuration, config, data)
             folder = runs / config.name / f"seed-{config.training.seed}"
             measured = None
@@ -203,7 +202,7 @@ def publish(
             _refit(folder, data or DATA, store, version)
             return
         run = load_run(Path(folder))
-        models = open_for_publisher(store)
+        models = Store(store)
         models.require_new(run.config.name, version)
         if promote and run.config.data.split == "final":
             raise ConfigError(
@@ -240,7 +239,7 @@ def evaluate_command(
     try:
         tables: dict[str, list[Row]] = {}
         for reference in models:
-            found = open_for_publisher(store)
+            found = Store(store)
             artifact = found.load(*found.resolve(reference))
             config = Config.model_validate(artifact.manifest.training["config"])
             wanted = source or [source_name(name) for name in config.data.sources]
@@ -281,7 +280,7 @@ def evaluate_command(
 def list_command(store: StorePath = _STORE) -> None:
     """List the models in the store and the shipped configurations."""
     try:
-        models = load_model_set(open_for_publisher(store))
+        models = load_model_set(Store(store))
     except RegistryError as error:
         fail(error)
     table = Table("model", "version", "variant", "state", title="Published")
@@ -345,7 +344,7 @@ def _publish(
 ) -> None:
     with console.status("publishing") as status:
         artifact = publish_run(
-            *(run, scenes, open_for_publisher(store), version),
+            *(run, scenes, Store(store), version),
             measured=measured,
             accept=accept,
             progress=status.update,
@@ -364,7 +363,7 @@ def _refused(error: RefusedError, remedy: str = "") -> NoReturn:
 
 
 def _refit(reference: str, root: Path, store: str, version: str) -> None:
-    models = open_for_publisher(store)
+    models = Store(store)
     name, old = models.resolve(reference)
     models.require_new(name, version)
     artifact = models.load(name, old)

@@ -87,8 +87,8 @@ MODEL_NOT_FOUND: Final = ProblemType(
     "model-not-found",
     404,
     "The model or version does not exist",
-    "Name a model by an alias, by its name or as name@version. A name selects the newest version. "
-    "GET /models lists all models, versions and aliases.",
+    "Name a model by an alias, by its name or as name@version. A name selects the newest usable "
+    "version. GET /models lists all models, versions and aliases.",
 )
 METHOD_NOT_ALLOWED: Final = ProblemType(
     "method-not-allowed",
@@ -122,8 +122,9 @@ STORE_NOT_WRITABLE: Final = ProblemType(
     "store-not-writable",
     409,
     "The store cannot be written",
-    "The store holds the aliases, but this service has no write access to the store. Change the "
-    "alias on a computer with write access. Then send POST /models/refresh to this service.",
+    "Either this service has no write access to the store, which holds the aliases, or the table "
+    "of aliases is full. Without write access, change the alias on a computer that has it. Then "
+    "send POST /models/refresh to this service.",
 )
 STORE_BUSY: Final = ProblemType(
     "store-busy",

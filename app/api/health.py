@@ -24,6 +24,9 @@ from scene_client.schemas import (
 router = APIRouter(tags=["health"])
 protocol = APIRouter(prefix="/v2", tags=["inference protocol"])
 
+# Maximum number of failures in an answer, because load balancers ask often and without a key.
+_FAILURES = 10
+
 _NOT_READY = problems(catalogue.NOT_READY, catalogue.DRAINING)
 _NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
 
@@ -51,10 +54,11 @@ async def health_live() -> Health:
 async def health_ready(runtime: RuntimeDep) -> Health:
     """Return status 200 if the default model is usable, else status 503.
 
-    A replica of a remote store stays ready while it cannot reach the store.
+    The answer lists refused versions and unusable aliases with their reasons.
     """
     runtime.check_ready()
-    return Health(status="ready", store=runtime.store_health)
+    failures = list(runtime.models.failures.values())[:_FAILURES]
+    return Health(status="ready", failures=failures or None)
 
 
 @protocol.get("", summary="Server metadata", responses=queued())

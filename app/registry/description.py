@@ -62,12 +62,6 @@ class Slope(Frozen):
     slope: float
 
 
-_RETIRED = frozenset(
-    {"placed", "missing_temperature", "placed_temperature", "placed_relation_weight"}
-    | {"outlier_threshold"}
-)
-
-
 class Thresholds(Frozen):
     """Minimum probability at which the service reports an outlier or a misplaced relation.
 
@@ -138,12 +132,11 @@ class Calibration(Frozen):
             object is an intruder. n is the number of classes in the scene. None means that training
             had too few scenes for the fit: the model then judges no object.
         relation: calibration of each canonical relation in scenes without observed relations.
-        relation_given: calibration of each canonical relation in scenes with observed relations. If
-            the tuple is empty, `relation` applies.
+        relation_given: calibration of each canonical relation in scenes with observed relations.
         placement: calibration of each canonical relation for a missing object at its most probable
-            places. If the tuple is empty, `relation` applies.
+            places.
         asked_place: calibration of each canonical relation for a missing object at the place that a
-            request names. If the tuple is empty, `placement` applies.
+            request names.
         misplaced: calibration that converts the log-odds of a stated relation to the log-odds that
             the relation is false. None means that training had too few scenes with relations for
             the fit: the model then judges no relation.
@@ -162,9 +155,9 @@ class Calibration(Frozen):
     room_fit: Many[float] = ()
     outlier: CountSlope | None = None
     relation: PairSlopes
-    relation_given: PairSlopes = ()
-    placement: PairSlopes = ()
-    asked_place: PairSlopes = ()
+    relation_given: PairSlopes
+    placement: PairSlopes
+    asked_place: PairSlopes
     misplaced: Slope | None = None
 
     @model_validator(mode="after")
@@ -174,18 +167,11 @@ class Calibration(Frozen):
                 raise ValueError(f"{name} and {name}_thresholds must both have a value, or neither")
         return self
 
-    @model_validator(mode="before")
-    @classmethod
-    def _without_retired(cls, values: Any) -> Any:
-        """Remove fields that only earlier releases used, so that their manifests stay valid."""
-        if not isinstance(values, dict):
-            return values
-        return {name: value for name, value in values.items() if name not in _RETIRED}
-
     @classmethod
     def neutral(cls, relations: int) -> Self:
         """Return the calibration with default values for A = ``relations`` canonical relations."""
-        return cls(relation=(PairSlope(),) * relations)
+        neutral = (PairSlope(),) * relations
+        return cls(relation=neutral, relation_given=neutral, placement=neutral, asked_place=neutral)
 
 
 class ClassEntry(Frozen):
@@ -288,7 +274,7 @@ class Description(Frozen):
         metrics: figures measured on scenes that training did not use.
         terms: terms of use of the weights.
         libraries: maps the name of each library used in training to its version.
-        examples: example scenes for the visual page. Artifacts of earlier releases have none.
+        examples: example scenes for the visual page.
     """
 
     name: ModelName
@@ -317,14 +303,9 @@ class Description(Frozen):
         for name, what, length in (
             ("V", "vocabulary objects", len(words.objects)),
             ("A", "vocabulary relations", len(words.relations)),
-            ("A", "calibration relations", len(self.calibration.relation)),
             *(
-                ("A", f"calibration {kind}", len(entries or self.calibration.relation))
-                for kind, entries in (
-                    ("entries of relation_given", self.calibration.relation_given),
-                    ("entries of placement", self.calibration.placement),
-                    ("entries of asked_place", self.calibration.asked_place),
-                )
+                ("A", f"entries of calibration.{name}", len(getattr(self.calibration, name)))
+                for name in ("relation", "relation_given", "placement", "asked_place")
             ),
         ):
             if self.spec.get(name) != length:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import Calibration, CountSlope, PairSlope, Thresholds
+from app.registry import Calibration, CountSlope, Thresholds
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
@@ -372,12 +372,13 @@ def test_a_smaller_share_of_alarms_has_a_higher_threshold():
 def test_a_model_alarms_as_its_service_does():
     """By its probability, with its prior of intruders, at the medium threshold."""
     popularity = tuple(np.linspace(-2.0, 2.0, WIDE).tolist())
-    calibration = Calibration(
-        relation=(PairSlope(),),
-        outlier=CountSlope(intercept=0.3, slope=-0.8, log_count=0.2),
-        popularity=popularity,
-        popularity_weight=0.5,
-        outlier_thresholds=Thresholds(low=0.9, medium=0.4, high=0.1),
+    calibration = Calibration.neutral(1).model_copy(
+        update={
+            "outlier": CountSlope(intercept=0.3, slope=-0.8, log_count=0.2),
+            "popularity": popularity,
+            "popularity_weight": 0.5,
+            "outlier_thresholds": Thresholds(low=0.9, medium=0.4, high=0.1),
+        }
     )
     alarm = calibrated_alarm(calibration)
     scores = intruder_scores(tensors([scene([0, 1, 2, 3])], WIDE), WIDE_STRUCTURE, smooth)
