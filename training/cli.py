@@ -51,7 +51,6 @@ from training.experiments.gate import (
     seat,
 )
 from training.experiments.tune import tune
-from training.fetch import fetch
 from training.live import Display, next_steps, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import publish_run, refit
@@ -63,7 +62,6 @@ app = typer.Typer(
 )
 app.command()(example)
 app.command()(init)
-app.command()(fetch)
 app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
@@ -75,7 +73,7 @@ Data = Annotated[
     typer.Option(
         "--data",
         help="folder with the scene files; default: the folder of your configuration file, or "
-        f"{DATA} for a shipped configuration (`fetch` says what belongs there)",
+        f"{DATA} for a shipped configuration (docs/training.md says what belongs there)",
     ),
 ]
 StoredData = Annotated[

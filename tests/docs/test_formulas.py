@@ -146,7 +146,7 @@ def rho(w: Weights, e: tuple[int, int, int], r: float, logit: float) -> float:
     r" - h_1^\top J h_2 - \sum_e g_e \, \rho_e"
 )
 def energy() -> None:
-    for w, joint, n in states([name for name in SMALL if SMALL[name].variant != "product_rbm"]):
+    for w, joint, n in states(list(SMALL)):
         v, r, h1, h2 = at(joint, n)
         E = -w.b @ v - w.c1 @ h1 - w.c2 @ h2 - v @ w.W @ h1 - h1 @ w.J @ h2
         for e, on in zip(w.units, r, strict=True):

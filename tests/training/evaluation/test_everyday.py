@@ -105,7 +105,7 @@ needs_facts = pytest.mark.skipif(facts_file(FOLDER) is None, reason="the facts a
 
 @needs_facts
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["indoor-triway", "indoor-rbm", "everyday-triway"])
+@pytest.mark.parametrize("model", ["indoor-triway", "indoor-rbm"])
 @pytest.mark.parametrize("made", [False, True], ids=["the facts", "made ones"])
 def test_the_service_gives_the_same_eleven_lines(service, model, made, folder, monkeypatch, capsys):
     place = folder if made else FOLDER
