@@ -27,6 +27,7 @@ from training.config import (
     Config,
     ConfigError,
     data_folder,
+    is_file,
     load_config,
     shipped_configs,
     source_name,
@@ -35,6 +36,7 @@ from training.config import (
 from training.datasets import DatasetError
 from training.distributed import is_first, process_group
 from training.domain.command import example, fail, init
+from training.domain.labels import outside_vocabulary
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.evaluation.tasks import in_words
@@ -295,6 +297,11 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     examples, reasons = known_examples(read_examples(config.examples, data), scenes.vocabulary)
     sizes = ", ".join(f"{len(some)} {part}" for part, some in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
+    own = {source_name(source) for source in config.data.sources if is_file(source)}
+    for named in (True, False):
+        some = (s for part in scenes.parts.values() for s in part if (s.source in own) == named)
+        if line := outside_vocabulary(some, named=named):
+            console.print(line, soft_wrap=True, markup=False, highlight=False)
     for reason in reasons:
         console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
     return replace(scenes, examples=examples)

@@ -82,7 +82,7 @@ def test_the_vocabulary_covers_the_generator(rooms: list[AnnotatedScene]) -> Non
     vocabulary = rooms_vocabulary()
     assert set(vocabulary.room_types) == set(ROOMS)
     encoded = encode(rooms, vocabulary)
-    assert all(scene.unknown == 0 and scene.room_type >= 0 for scene in encoded)
+    assert all(not scene.unknown and scene.room_type >= 0 for scene in encoded)
 
 
 def test_other_tables_make_another_domain() -> None:
