@@ -403,26 +403,6 @@ def relation_as_an_expectation() -> None:
 
 
 @formula(
-    r"\log \frac{p(r_e = 1)}{p(r_e = 0)} = \ell_e(0)"
-    r" + \sum_k \bigl[\zeta(x_k + U_{ek}) - \zeta(x_k)\bigr]"
-)
-def relation_in_closed_form() -> None:
-    for w, joint, n in states(["rbm", "gbm-one-layer", "triway-seed"]):
-        v, r, h1, _ = at(joint, n)
-        for place, e in enumerate(w.units):
-            if not w.gate(e, v):
-                continue
-            others = [(o, on) for o, on in zip(w.units, r, strict=True) if o != e]
-            x = w.c1 + v @ w.W + sum(on * w.row(o) for o, on in others)
-            U = w.row(e)
-            gain = sum(zeta(x[k] + U[k]) - zeta(x[k]) for k in range(w.spec.H1))
-            kept = torch.arange(len(w.units)) != place
-            given = same(joint.v, joint.v[n]) & same(joint.r[:, kept], joint.r[n, kept])
-            exact = joint.log_odds(joint.r[:, place] > 0, given)
-            assert exact == near(w.logit(e, v, 0 * h1) + gain)
-
-
-@formula(
     r"m_1 = \sigma\Bigl(c_1 + v^\top W + J m_2 + \sum_e \frac{\partial \rho_e}{\partial \ell_e}"
     r" U_e\Bigr), \quad m_2 = \sigma(c_2 + m_1^\top J)"
 )
