@@ -193,6 +193,19 @@ def test_missing_scenes_of_ones_own_are_looked_for_beside_the_configuration(tmp_
     assert "Pass this folder with --data" in " ".join(result.output.split())
 
 
+def test_labels_outside_the_vocabulary_are_named(tmp_path):
+    """Scenes of one's own, written as requests."""
+    scenes = [{"objects": ["bed", "pillow"]}] * 30 + [{"objects": ["bed", "perch"]}] * 3
+    (tmp_path / "own.jsonl").write_text("".join(f"{json.dumps(scene)}\n" for scene in scenes))
+    config = tmp_path / "config.toml"
+    config.write_text(
+        CONFIG.replace('"rooms"]', '"own.jsonl"]').replace("epochs = 3", "epochs = 1")
+    )
+    output = run("train", str(config), "--runs", str(tmp_path / "runs"))
+    line = '1 label in 3 scenes is not in the vocabulary: "perch" (3 scenes); it is left out'
+    assert line in output.splitlines()
+
+
 def test_a_bad_configuration_names_its_entry(tmp_path):
     config = tmp_path / "config.toml"
     config.write_text(CONFIG.replace("epochs = 3", "epochs = 0"))
