@@ -82,7 +82,7 @@ def test_jsonl(tmp_path: Path) -> None:
 
 
 def test_jsonl_takes_a_scene_as_a_request_writes_it(tmp_path: Path) -> None:
-    """Both forms of each field are one scene; what is left out has a stable value."""
+    """Both forms of each field give one scene; fields left out have stable values."""
     stated = {"subject": "cup_2", "relation": "on-top", "object": "desk"}
     desk = {
         "label": "desk",

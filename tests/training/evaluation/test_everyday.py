@@ -175,7 +175,7 @@ def test_a_card_has_the_lines_once(folder):
 
 
 def test_no_other_module_reads_the_facts():
-    """Neither the file nor its folder is named elsewhere (a domain of models has its name)."""
+    """Neither the file nor its folder is named elsewhere."""
     named = re.compile(r"facts\.json|shared/everyday|/\s*[\"']everyday\b|[\"']\S*/everyday\b")
     own = REPOSITORY / "training/evaluation/everyday.py"
     sources = [*(REPOSITORY / "training").rglob("*"), *(REPOSITORY / "app").rglob("*.py")]
