@@ -27,6 +27,7 @@ from training.config import (
     Config,
     ConfigError,
     data_folder,
+    is_file,
     load_config,
     shipped_configs,
     source_name,
@@ -35,6 +36,7 @@ from training.config import (
 from training.datasets import DatasetError
 from training.distributed import is_first, process_group
 from training.domain.command import example, fail, init
+from training.domain.labels import outside_vocabulary
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.evaluation.tasks import in_words
@@ -50,7 +52,6 @@ from training.experiments.gate import (
     seat,
 )
 from training.experiments.tune import tune
-from training.fetch import fetch
 from training.live import Display, next_steps, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import RefusedError, publish_run, refit
@@ -62,7 +63,6 @@ app = typer.Typer(
 )
 app.command()(example)
 app.command()(init)
-app.command()(fetch)
 app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
@@ -74,7 +74,7 @@ Data = Annotated[
     typer.Option(
         "--data",
         help="folder with the scene files; default: the folder of your configuration file, or "
-        f"{DATA} for a shipped configuration (`fetch` says what belongs there)",
+        f"{DATA} for a shipped configuration (docs/training.md says what belongs there)",
     ),
 ]
 StoredData = Annotated[
@@ -300,6 +300,11 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     examples, reasons = known_examples(read_examples(config.examples, data), scenes.vocabulary)
     sizes = ", ".join(f"{len(some)} {part}" for part, some in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
+    own = {source_name(source) for source in config.data.sources if is_file(source)}
+    for named in (True, False):
+        some = (s for part in scenes.parts.values() for s in part if (s.source in own) == named)
+        if line := outside_vocabulary(some, named=named):
+            console.print(line, soft_wrap=True, markup=False, highlight=False)
     for reason in reasons:
         console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
     return replace(scenes, examples=examples)

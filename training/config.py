@@ -29,14 +29,7 @@ def is_file(source: str) -> bool:
 
 def source_name(source: str) -> str:
     """Return the name of a source; for a file, the part of its name before the first dot."""
-    if is_sharded(source):
-        return Path(source).name.partition("*")[0].strip("-_.") or Path(source).parent.name
     return Path(source).name.partition(".")[0] if is_file(source) else source
-
-
-def is_sharded(source: str) -> bool:
-    """Return whether a source is a pattern of many files, see `training.shards`."""
-    return "*" in source
 
 
 class _Section(BaseModel):
@@ -59,13 +52,6 @@ class DataConfig(_Section):
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
     limit: int | None = Field(default=None, ge=10, description="maximum scenes of each source")
-    # Left out of the dump by default, so that digests of earlier runs stay valid.
-    sample: int = Field(
-        default=1,
-        ge=1,
-        exclude_if=lambda count: count == 1,
-        description="number of files of a sharded source whose scenes stay in memory",
-    )
     words: str = Field(
         default="", description="file of word vectors in the data folder; empty: no vectors"
     )
@@ -80,8 +66,6 @@ class DataConfig(_Section):
         names = [source_name(source) for source in self.sources]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two sources are called {', '.join(twice)}: rename a file")
-        if any(map(is_sharded, self.sources)) and (len(self.sources) > 1 or self.split != "stable"):
-            raise ValueError('a sharded source must be the only source, with data.split = "stable"')
         return self
 
     @property
@@ -201,8 +185,8 @@ class Config(_Section):
     examples: str = Field(
         default="",
         exclude_if=lambda name: not name,
-        description="example scenes for the visual page: indoor, everyday, or a file in the data "
-        "folder that ends in .json; empty: none",
+        description="example scenes for the visual page: indoor, or a file in the data folder that "
+        "ends in .json; empty: none",
     )
     data: DataConfig
     machine: MachineConfig

@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from app.registry import Example
 from app.scene import CANONICAL, Vocabulary
 from training.batches import SceneTensors, scene_tensors
-from training.config import DATA, Config, ConfigError, DataConfig, is_file, is_sharded, source_name
+from training.config import DATA, Config, ConfigError, DataConfig, is_file, source_name
 from training.datasets import (
     AnnotatedScene,
     EncodedScene,
@@ -31,9 +30,7 @@ from training.datasets import (
     split,
     with_typical_sizes,
 )
-from training.datasets.origins import WORDS, file_of
 from training.datasets.words import class_vectors, read_word_vectors
-from training.shards import Shards, read_shard, shard_files, shards_digest
 from training.trainer import TrainingData
 
 
@@ -48,7 +45,6 @@ class SplitScenes:
         counts, digests: number of scenes and sha256 of their contents, by source.
         shuffle: seed of the permutation of objects; None if the objects are not permuted.
         words: (V, D) unit word vectors of the classes; None without word vectors.
-        shards: files of a sharded source, of which `parts` are a sample.
         examples: example scenes for the artifact.
     """
 
@@ -59,7 +55,6 @@ class SplitScenes:
     digests: dict[str, str]
     shuffle: int | None = None
     words: torch.Tensor | None = None
-    shards: tuple[str, ...] = ()
     examples: tuple[Example, ...] = ()
 
     @property
@@ -104,17 +99,6 @@ class SplitScenes:
             room_types=len(self.vocabulary.room_types),
             digest=self.digest,
             words=self.words,
-            shards=self._sharded(annotated) if self.shards else None,
-        )
-
-    def _sharded(self, annotated: dict[str, np.ndarray]) -> Shards:
-        return Shards(
-            files=self.shards,
-            source=source_name(self.data.sources[0]),
-            sample=self.data.sample,
-            vocabulary=self.vocabulary,
-            annotated=annotated,
-            seed=self.data.split_seed,
         )
 
     def shuffled(self, seed: int) -> SplitScenes:
@@ -130,7 +114,8 @@ class SplitScenes:
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
     """Read the scenes of every data source. Return a mapping from source names to scenes.
 
-    A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`.
+    A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`
+    (`<name>.tsv.gz` for the placing priors).
 
     Raises:
         ConfigError: a file is missing.
@@ -140,16 +125,10 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     scenes: dict[str, list[AnnotatedScene]] = {}
     for source in data.sources:
         name = source_name(source)
-        if is_sharded(source):
-            found = [
-                scene
-                for file in shard_files(source, root)[: data.sample]
-                for scene in read_shard(file, name)
-            ]
-        elif source == "rooms":
+        if source == "rooms":
             found = generate_rooms(data.rooms, seed=data.split_seed)
         elif source == priors.SOURCE:
-            found = priors.read_prior_scenes(file_of(source, root))
+            found = priors.read_prior_scenes(_path(source, root))
         else:
             path = _path(source, root)
             found = [replace(scene, source=name) for scene in read_scenes(path)]
@@ -158,18 +137,18 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
 
 def _path(source: str, root: Path) -> Path:
-    return root / source if is_file(source) else file_of(source, root)
+    if is_file(source):
+        return root / source
+    file = f"{source}.tsv.gz" if source == priors.SOURCE else f"{source}.jsonl.gz"
+    extra = root / "extra" / file
+    return extra if extra.is_file() else root / file
 
 
 def _require_files(data: DataConfig, root: Path) -> None:
     """Raise ConfigError if a file of a source, or the file of word vectors, is missing."""
-    paths = {
-        source: _path(source, root)
-        for source in data.sources
-        if source != "rooms" and not is_sharded(source)
-    }
+    paths = {source: _path(source, root) for source in data.sources if source != "rooms"}
     if data.words:
-        paths[WORDS] = root / data.words
+        paths["word vectors"] = root / data.words
     missing = {source: path for source, path in paths.items() if not path.is_file()}
     if not missing:
         return
@@ -182,8 +161,8 @@ def _require_files(data: DataConfig, root: Path) -> None:
         )
     else:
         advice = (
-            "The repository does not contain the public data sets. `python -m training fetch` says "
-            "where each of them is to be had. Pass the folder of the files with --data"
+            "The repository does not contain the public data sets. docs/training.md (The "
+            "public data sets) names them and their files. Pass the folder of the files with --data"
         )
     raise ConfigError(text + advice)
 
@@ -246,18 +225,13 @@ def split_and_encode(
     parts = split(everything, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
         vocabulary = build_vocabulary(data, list(parts["train"]), root)
-    shards = shard_files(data.sources[0], root) if is_sharded(data.sources[0]) else ()
-    digests = {source: digest_of(some) for source, some in scenes.items()}
-    if shards:
-        digests = {source: shards_digest(shards) for source in scenes}
     return SplitScenes(
         data=data,
         vocabulary=vocabulary,
         parts={part: encode(some, vocabulary) for part, some in parts.items()},
         counts={source: len(some) for source, some in scenes.items()},
-        digests=digests,
+        digests={source: digest_of(some) for source, some in scenes.items()},
         words=_word_vectors(data, vocabulary, root),
-        shards=shards,
     )
 
 

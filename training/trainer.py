@@ -9,17 +9,17 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from app.inference.variants import FACTORISED
+from app.inference.variants import VARIANTS
 from training import distributed
 from training.batches import Batch, SceneTensors, seen_triples, subset
 from training.config import Config
@@ -39,9 +39,6 @@ from training.runs import (
     write_csv,
     write_plot,
 )
-
-if TYPE_CHECKING:
-    from training.shards import Shards
 
 _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
@@ -66,7 +63,6 @@ class TrainingData:
         digest: digest of the scenes, their vocabulary and split. A run resumes only if the digest
             is unchanged.
         words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
-        shards: the training scenes of a sharded source, of which `train` is a sample.
     """
 
     train: SceneTensors
@@ -77,7 +73,6 @@ class TrainingData:
     room_types: int
     digest: str = ""
     words: Tensor | None = None
-    shards: Shards | None = None
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
@@ -95,7 +90,7 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
         H1=shape.H1,
         H2=shape.H2,
         C=data.room_types,
-        K=shape.K if shape.variant in FACTORISED else 0,
+        K=shape.K if VARIANTS[shape.variant].factorised else 0,
         T=len(triples),
         G=shape.G,
         N=shape.N,
@@ -190,7 +185,7 @@ class Trainer:
                 self.machine.get_parameter(name).requires_grad_(False)
         self.loss = distributed.parallel(_Loss(self.objective, self.machine))
         self.optimiser = self._optimiser()
-        self.steps_per_epoch = self._steps()
+        self.steps_per_epoch = math.ceil(len(self.train) / config.training.batch_size)
         self.scheduler = self._scheduler()
         self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
         self.updates = 0
@@ -340,13 +335,11 @@ class Trainer:
         began = time.perf_counter()
         number = len(self.epochs)
         total, steps = 0.0, 0
-        for scenes in self._parts():
-            order = torch.randperm(len(scenes), generator=self.generator)
-            for index in order.split(self.config.training.batch_size):
-                total, steps = total + self._update(scenes, index), steps + 1
-                if progress is not None:
-                    progress(number, min(1.0, steps / self.steps_per_epoch), total / steps)
-            del scenes  # so that only one shard is in memory
+        order = torch.randperm(len(self.train), generator=self.generator)
+        for index in order.split(self.config.training.batch_size):
+            total, steps = total + self._update(index), steps + 1
+            if progress is not None:
+                progress(number, steps / self.steps_per_epoch, total / steps)
         everyone = distributed.total(torch.tensor(total, dtype=torch.float64))
         loss = float(everyone) / distributed.size() / steps
         finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
@@ -357,23 +350,9 @@ class Trainer:
             )
         self._close_epoch(number, loss, began)
 
-    def _steps(self) -> int:
-        """Return the updates of an epoch; with shards an estimate from the sample."""
-        scenes = len(self.train)
-        if self.data.shards is not None:
-            scenes = round(scenes * self.data.shards.scale)
-        return max(1, math.ceil(scenes / self.config.training.batch_size))
-
-    def _parts(self) -> Iterator[SceneTensors]:
-        """Return the scenes of an epoch, shard by shard."""
-        if self.data.shards is None:
-            return iter([self.train])
-        parts = self.data.shards.parts(self.generator)
-        return map(_with_relations, parts) if self.config.objects.epochs else parts
-
-    def _update(self, scenes: SceneTensors, index: Tensor) -> float:
-        width = max(len(scenes.scenes[k].evidence.classes) for k in index.tolist())
-        batch = scenes.batch(distributed.share(index), width).to(self.device)
+    def _update(self, index: Tensor) -> float:
+        width = max(len(self.train.scenes[k].evidence.classes) for k in index.tolist())
+        batch = self.train.batch(distributed.share(index), width).to(self.device)
         with self._placed():
             loss = self.loss(batch, self.generator)
             self.optimiser.zero_grad()

@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
 
-import numpy as np
-
 from app.inference.relations import FreeUnits, RelationUnits, SharedUnits
 
 if TYPE_CHECKING:
     from app.inference.weights import Weights
 
-Variant = Literal["rbm", "gbm", "triway", "product_rbm"]
+Variant = Literal["rbm", "gbm", "triway"]
 Form = Literal["seed", "local"]
 Shapes = dict[str, tuple[int, ...]]
 
@@ -67,31 +65,6 @@ class GBM(RBM):
         return FreeUnits(weights, weights["U"], weights["g"])
 
 
-class ProductRBM(RBM):
-    """Product RBM: an RBM with factorised weights U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k].
-
-    e is a triple (relation a, subject class i, object class j).
-    """
-
-    factorised = True
-
-    @staticmethod
-    def shapes(spec: MachineSpec) -> Shapes:
-        """See `RBM`."""
-        V, A, K, H1 = spec.V, spec.A, spec.K, spec.H1
-        return {"d": (spec.T,), "S": (V, K), "O": (V, K), "M": (A, K, H1), "P": (A, H1)}
-
-    @staticmethod
-    def units(weights: Weights) -> RelationUnits:
-        """Return the relation units."""
-        relation, subject, object_ = weights["triples"].astype(np.int64).T
-        product = weights["S"][subject] * weights["O"][object_]
-        rows = weights["P"][relation]
-        for a, shared in enumerate(weights["M"]):
-            rows[relation == a] += product[relation == a] @ shared
-        return FreeUnits(weights, rows)
-
-
 class Triway:
     """Triway: a machine with one relation unit for every triple (a, i, j).
 
@@ -129,11 +102,7 @@ VARIANTS: Final[dict[str, type[RBM | Triway]]] = {
     "rbm": RBM,
     "gbm": GBM,
     "triway": Triway,
-    "product_rbm": ProductRBM,
 }
-
-FACTORISED: Final = frozenset(name for name, variant in VARIANTS.items() if variant.factorised)
-"""Variants whose weights between relations and h1 are products of factors of rank K."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,13 +110,13 @@ class MachineSpec:
     """Sizes and form of one Boltzmann machine.
 
     Attributes:
-        variant: ``rbm``, ``gbm``, ``triway``, or ``product_rbm`` (RBM with the Triway's U).
+        variant: ``rbm``, ``gbm`` or ``triway``.
         V: number of object classes (visible units v).
         A: number of canonical relations.
         H1: number of hidden units in the first layer.
         H2: number of hidden units in the second layer. 0 means no second layer.
         C: number of room types. A known room type changes the biases of h1.
-        K: rank of the weights that relation units share (Triway, product RBM).
+        K: rank of the weights that relation units share (Triway).
         G: rank of the effect of h1 on implications between relations (Triway in the local form). An
             implication is a change of a relation's logit by other relations. 0 means no
             implications.

@@ -48,16 +48,6 @@ class Comparison:
         """Rate of the service divided by the rate of the plain app, as median over windows."""
         return median(self.ratios)
 
-    @property
-    def p99_ratio(self) -> float:
-        """99th percentile of the service's latency divided by that of the plain app."""
-        return self.service.quantile(0.99) / self.plain.quantile(0.99)
-
-    @property
-    def extra_p50(self) -> float:
-        """Median latency of the service minus median latency of the plain app, in seconds."""
-        return self.service.quantile(0.5) - self.plain.quantile(0.5)
-
 
 def concurrency(connections: int) -> Load:
     """Return a load function with this number of connections, which send without pauses."""

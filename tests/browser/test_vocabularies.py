@@ -120,20 +120,26 @@ def test_a_model_that_is_chosen_again_at_once_answers(open_board: OpenBoard) -> 
 
 
 def test_two_models_answer_about_their_common_classes(
-    open_board: OpenBoard, api: httpx.Client
+    open_board: OpenBoard, own: Callable[[str, int], LiveService], tmp_path: Path
 ) -> None:
-    scene = {"objects": ["bed", "lamp", "wardrobe"], "room_type": "bedroom"}
-    board = open_board(scene, allow=("422",))
-    models = [one["name"] for one in api.get("/models").json()["models"]]
-    (second,) = [f"{name}@1.6.0" for name in models if name == "everyday-triway"]
+    from tests.http.stores import publish
+
+    publish(tmp_path / "store", "small", "1.0.0", classes=10)
+    scene = {"objects": ["bed", "lamp", "pillow"], "room_type": "bedroom"}
+    with own("default", 16) as service:
+        board = open_board(scene, home=service.url, examples=None, allow=("422",))
+        compares_on_common_classes(board, service.client, "small@1.0.0")
+
+
+def compares_on_common_classes(board: Board, api: httpx.Client, second: str) -> None:
     board.page.get_by_label("compare with").select_option(second)
     board.settle()
-    assert notes(board, 2) == f"{second}: wardrobe not known, left out"
+    assert notes(board, 2) == f"{second}: pillow not known, left out"
     labels = [[thing["label"] for thing in board.body("missing", n)["objects"]] for n in (0, 1)]
-    assert labels == [["bed", "lamp", "wardrobe"], ["bed", "lamp"]]
+    assert labels == [["bed", "lamp", "pillow"], ["bed", "lamp"]]
     known = [
         {one["label"] for one in api.get(f"/models/{name}/vocabulary").json()["objects"]}
-        for name in ("default", "everyday-triway")
+        for name in ("default", "small")
     ]
     shared = board.body("missing")["candidates"]
     said = f"Both models answer about their {len(shared)} common classes."

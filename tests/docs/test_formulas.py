@@ -146,7 +146,7 @@ def rho(w: Weights, e: tuple[int, int, int], r: float, logit: float) -> float:
     r" - h_1^\top J h_2 - \sum_e g_e \, \rho_e"
 )
 def energy() -> None:
-    for w, joint, n in states([name for name in SMALL if SMALL[name].variant != "product_rbm"]):
+    for w, joint, n in states(list(SMALL)):
         v, r, h1, h2 = at(joint, n)
         E = -w.b @ v - w.c1 @ h1 - w.c2 @ h2 - v @ w.W @ h1 - h1 @ w.J @ h2
         for e, on in zip(w.units, r, strict=True):
@@ -400,26 +400,6 @@ def relation_as_an_expectation() -> None:
             if w.gate(e, v):
                 exact = sigma(joint.log_odds(joint.r[:, k] > 0, given))
                 assert exact == near(mean_of_sigmas(w, joint, given, k))
-
-
-@formula(
-    r"\log \frac{p(r_e = 1)}{p(r_e = 0)} = \ell_e(0)"
-    r" + \sum_k \bigl[\zeta(x_k + U_{ek}) - \zeta(x_k)\bigr]"
-)
-def relation_in_closed_form() -> None:
-    for w, joint, n in states(["rbm", "gbm-one-layer", "triway-seed"]):
-        v, r, h1, _ = at(joint, n)
-        for place, e in enumerate(w.units):
-            if not w.gate(e, v):
-                continue
-            others = [(o, on) for o, on in zip(w.units, r, strict=True) if o != e]
-            x = w.c1 + v @ w.W + sum(on * w.row(o) for o, on in others)
-            U = w.row(e)
-            gain = sum(zeta(x[k] + U[k]) - zeta(x[k]) for k in range(w.spec.H1))
-            kept = torch.arange(len(w.units)) != place
-            given = same(joint.v, joint.v[n]) & same(joint.r[:, kept], joint.r[n, kept])
-            exact = joint.log_odds(joint.r[:, place] > 0, given)
-            assert exact == near(w.logit(e, v, 0 * h1) + gain)
 
 
 @formula(

@@ -18,8 +18,6 @@ SMALL: dict[str, MachineSpec] = {
     "gbm-one-layer": MachineSpec("gbm", V=3, A=2, H1=2, T=4, C=2),
     "rbm-local": MachineSpec("rbm", V=2, A=2, H1=2, T=4, C=3, form="local"),
     "gbm-local": MachineSpec("gbm", V=2, A=2, H1=2, H2=2, T=4, form="local"),
-    "product-rbm": MachineSpec("product_rbm", V=2, A=2, H1=2, K=2, T=4),
-    "product-rbm-local": MachineSpec("product_rbm", V=3, A=2, H1=2, K=2, T=4, C=3, form="local"),
     "triway-seed": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, form="seed"),
     "triway-seed-two-layers": MachineSpec("triway", V=2, A=2, H1=2, H2=2, K=2, form="seed"),
     "triway-local": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, C=3, form="local"),

@@ -32,10 +32,6 @@ def relation_logit(machine, e, v, h1):
         if spec.variant == "gbm":
             logit += p["g"][t, 0] * v[i] + p["g"][t, 1] * v[j]
         return float(logit)
-    if spec.variant == "product_rbm":
-        return float(
-            p["d"][table.index(e)] + sum(shared(p, spec, e, x) * h[x] for x in range(spec.H1))
-        )
     w = p["s"][a, i] + p["o"][a, j]
     w += sum(p["S"][i, k] * p["R"][a, k] * p["O"][j, k] for k in range(spec.K))
     if e in table:

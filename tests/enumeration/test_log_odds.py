@@ -24,7 +24,6 @@ from training.machines.log_odds import (
     object_log_odds,
     presence_log_odds,
     relation_log_odds,
-    relation_log_odds_observed,
 )
 from training.machines.mean_field import Evidence
 
@@ -133,24 +132,6 @@ def test_object_log_odds_estimate_within_its_stated_error(name, keep):
         assert error < 0.2
 
 
-@pytest.mark.parametrize("name", [n for n in ONE_LAYER if n in SEED_FORM])
-def test_relation_log_odds_closed_form(name):
-    machine = small_machine(name)
-    joint = enumerate_joint(machine)
-    generator = torch.Generator().manual_seed(4)
-    for n in torch.randint(len(joint.v), (30,), generator=generator).tolist():
-        v, r = joint.v[n], joint.r[n]
-        observed = torch.ones(1, len(r), dtype=torch.bool)
-        evidence = Evidence(v[None], joint.edges, r[None], observed)
-        log_odds = relation_log_odds_observed(machine, evidence)
-        gate = machine.gate(joint.edges, v[None])[0]
-        for e in gate.nonzero().flatten().tolist():
-            others = torch.arange(len(r)) != e
-            given = same(joint.v, v) & same(joint.r[:, others], r[others])
-            exact = joint.log_odds(joint.r[:, e] > 0, given)
-            assert float(log_odds[0, e]) == pytest.approx(exact, abs=1e-9)
-
-
 @pytest.mark.parametrize("name", ONE_LAYER)
 @pytest.mark.parametrize("keep", [0, 3])
 def test_log_evidence_of_the_draws(name, keep):
@@ -162,7 +143,7 @@ def test_log_evidence_of_the_draws(name, keep):
         given = same(joint.v, v) & ((joint.r == r) | ~observed).all(1)
         draws = draw_hidden(machine, Evidence(v[None], joint.edges, r, observed), draws=1 << 13)
         ours = draws.log_evidence + v @ machine.b + machine.pair_offset(joint.edges, v[None])
-        tolerance = 4 / float(draws.effective_size.sqrt())
+        tolerance = 4 / float((2 * draws.log_weight).logsumexp(0).mul(-0.5).exp())
         assert float(ours) == pytest.approx(joint.log_sum(given), abs=tolerance)
 
 

@@ -19,7 +19,6 @@ from training.oracle.drawn import DrawnPosterior
 EXACT: dict[str, MachineSpec] = {
     "rbm": SMALL["rbm-three-classes"],
     "gbm": SMALL["gbm-one-layer"],
-    "product-rbm": SMALL["product-rbm-local"],
     "triway-seed": MachineSpec("triway", V=3, A=1, H1=2, K=2, T=2, form="seed"),
     "triway-local": MachineSpec("triway", V=3, A=1, H1=3, K=2, T=2, C=2, form="local"),
     "triway-implications": MachineSpec("triway", V=3, A=1, H1=3, K=2, T=2, C=2, G=2, form="local"),
@@ -28,7 +27,6 @@ EXACT: dict[str, MachineSpec] = {
 LARGER: dict[str, MachineSpec] = {
     "rbm": MachineSpec("rbm", V=9, A=4, H1=6, T=40, C=2, form="local"),
     "gbm": MachineSpec("gbm", V=9, A=4, H1=6, H2=3, T=40, form="local"),
-    "product-rbm": MachineSpec("product_rbm", V=9, A=4, H1=6, K=3, T=40, form="local"),
     "triway-seed": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, form="seed"),
     "triway-local": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, form="local"),
     # Wide enough for logits that are as good as normal, and so in closed form without relations.

@@ -69,7 +69,7 @@ def test_round_trip_is_exact_in_float32(variant: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("more", [{}, {"H2": 2, "C": 3, "N": 4, "G": 1}])
 def test_the_layout_is_that_of_the_machines(variant: str, more: dict[str, int]) -> None:
-    takes = {"rbm": {"C", "N"}, "product_rbm": {"C", "N"}, "gbm": {"H2", "C", "N"}}
+    takes = {"rbm": {"C", "N"}, "gbm": {"H2", "C", "N"}}
     sizes = {name: n for name, n in more.items() if name in takes.get(variant, more)}
     spec = MachineSpec(variant, V=40, A=4, H1=5, K=2, T=3, form="local", **sizes)
     state = build(spec).state_dict()

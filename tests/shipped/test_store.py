@@ -15,7 +15,6 @@ from training.config import load_config
 
 STORE = Store(Path(__file__).resolve().parents[2] / "model_store")
 SHIPPED = [
-    "everyday-triway",
     "indoor-gbm",
     "indoor-rbm",
     "indoor-triway",
@@ -108,7 +107,7 @@ def test_the_examples_of_its_configuration_fit_its_vocabulary(artifact):
     assert known_examples(examples, artifact.vocabulary) == (examples, [])
 
 
-@pytest.mark.parametrize("name", ["indoor-triway", "everyday-triway"])
+@pytest.mark.parametrize("name", ["indoor-triway", "indoor-rbm"])
 @pytest.mark.parametrize("relation", ["on-top", "above", "behind"])
 def test_the_best_at_a_place_are_the_first_of_all(models, name, relation):
     """Candidates that cannot be among the best are not asked."""

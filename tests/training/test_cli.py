@@ -150,8 +150,7 @@ def test_from_rooms_to_answers(tmp_path):
             ("train", "indoor-triway", "--data", "nowhere"),
             "13 of 13 files of scenes are missing in nowhere: sunrgbd.jsonl.gz",
         ),
-        (("train", "everyday-gbm", "--data", "nowhere"), "`python -m training fetch` says where"),
-        (("fetch", "nowhere"), "neither a source nor a shipped configuration"),
+        (("train", "open-triway", "--data", "nowhere"), "docs/training.md (The public data sets)"),
         (("publish", "nowhere", "1.0.0"), "no finished run"),
         (("publish", "nowhere@1.0.0", "1.0.1", "--promote"), "app.registry alias` moves"),
         (("publish", "nowhere", "1.0.0", "--alias", "lab"), "--alias belongs to --promote"),
@@ -192,6 +191,19 @@ def test_missing_scenes_of_ones_own_are_looked_for_beside_the_configuration(tmp_
     result = CliRunner().invoke(app, ["train", str(config)])
     assert result.exit_code == 1
     assert "Pass this folder with --data" in " ".join(result.output.split())
+
+
+def test_labels_outside_the_vocabulary_are_named(tmp_path):
+    """Scenes of one's own, written as requests."""
+    scenes = [{"objects": ["bed", "pillow"]}] * 30 + [{"objects": ["bed", "perch"]}] * 3
+    (tmp_path / "own.jsonl").write_text("".join(f"{json.dumps(scene)}\n" for scene in scenes))
+    config = tmp_path / "config.toml"
+    config.write_text(
+        CONFIG.replace('"rooms"]', '"own.jsonl"]').replace("epochs = 3", "epochs = 1")
+    )
+    output = run("train", str(config), "--runs", str(tmp_path / "runs"))
+    line = '1 label in 3 scenes is not in the vocabulary: "perch" (3 scenes); it is left out'
+    assert line in output.splitlines()
 
 
 def test_a_bad_configuration_names_its_entry(tmp_path):

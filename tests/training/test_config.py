@@ -28,10 +28,9 @@ def test_shipped_configurations_load(name: str) -> None:
     assert all(source in SOURCES for source in config.data.sources)
 
 
-@pytest.mark.parametrize("domain", ["indoor", "everyday"])
-def test_the_variants_of_a_domain_learn_from_the_same_scenes(domain: str) -> None:
+def test_the_indoor_variants_learn_from_the_same_scenes() -> None:
     """Only then can a benchmark compare them."""
-    variants = [load_config(f"{domain}-{variant}") for variant in ("triway", "gbm", "rbm")]
+    variants = [load_config(f"indoor-{variant}") for variant in ("triway", "gbm", "rbm")]
     assert [config.machine.variant for config in variants] == ["triway", "gbm", "rbm"]
     assert len({config.data.model_dump_json() for config in variants}) == 1
 

@@ -13,7 +13,7 @@ from app.scene import ObjectClass, Vocabulary
 from scene_client.schemas import SceneRequest
 from training.config import ConfigError
 from training.datasets import generate_rooms, source_vocabulary
-from training.datasets.rooms import WORKPLACES
+from training.datasets.rooms import DOMAINS
 from training.example_scenes import (
     choose_examples,
     examples_json,
@@ -21,7 +21,7 @@ from training.example_scenes import (
     read_examples,
 )
 
-SCENES = generate_rooms(60, 0, WORKPLACES)
+SCENES = generate_rooms(60, 0, DOMAINS["workplaces"])
 WORDS = source_vocabulary(SCENES, minimum=2)
 BOTH_LEFT = [
     {"subject": "bed", "relation": "left", "object": "cup"},

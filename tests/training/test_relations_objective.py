@@ -23,7 +23,6 @@ from training.objectives.relations import (
 CONFIG = ObjectiveConfig(name="relations", room_dropout=0.0, offset_prior=0.1, weight_prior=0.1)
 SPECS = {
     "rbm": MachineSpec("rbm", V=V, A=2, H1=4, T=6, form="local"),
-    "product-rbm": MachineSpec("product_rbm", V=V, A=2, H1=4, K=2, T=6, form="local"),
     "triway": MachineSpec("triway", V=V, A=2, H1=4, K=2, T=6, form="local"),
     "triway-implications": MachineSpec("triway", V=V, A=2, H1=4, K=2, T=6, G=2, form="local"),
 }
@@ -188,7 +187,7 @@ def vectors():
     return found
 
 
-@pytest.mark.parametrize("name", ["product-rbm", "triway", "triway-implications"])
+@pytest.mark.parametrize("name", ["triway", "triway-implications"])
 def test_the_word_prior_becomes_part_of_plain_weights(name):
     """The same logits to the last bit, and no weight but a machine's own."""
     machine, scenes = machine_of(name), scenes_of({"captions": 0.7})

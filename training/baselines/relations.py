@@ -171,9 +171,7 @@ _STEPS = 200
 _LEARNING_RATE = 0.05
 
 
-def fit_complex(
-    counts: TripleCounts, *, rank: int, penalty: float, seed: int, steps: int = _STEPS
-) -> Tensor:
+def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -> Tensor:
     """Fit ComplEx, and return the logits of all triples, (relations, classes, classes).
 
     Args:
@@ -181,7 +179,6 @@ def fit_complex(
         rank: number of complex dimensions of an embedding.
         penalty: weight of the penalty, the mean cubed modulus of the factors of each pair.
         seed: seed of the initial embeddings.
-        steps: number of Adam steps over all pairs. The learning rate falls to 0.
     """
     generator = torch.Generator().manual_seed(seed)
     A, V, _ = counts.held.shape
@@ -195,8 +192,8 @@ def fit_complex(
     i, j = counts.together.nonzero(as_tuple=True)
     trials, held = counts.together[i, j], counts.held[:, i, j]
     optimiser = torch.optim.Adam([classes, relations, bias], lr=_LEARNING_RATE)
-    cycle = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    for _ in range(steps):
+    cycle = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
+    for _ in range(_STEPS):
         optimiser.zero_grad()
         values = complex_logits(bias, relations, classes)[:, i, j]
         misfit = (trials * softplus(values) - held * values).sum()

@@ -49,8 +49,8 @@ class EncodedScene:
             instances) bool.
         instance_observed: True where the truth of the relation is known, shaped like
             `instance_holds`.
-        unknown: number of distinct labels outside the vocabulary. Objects with such a label are
-            left out.
+        unknown: distinct labels outside the vocabulary, sorted. Objects with such a label are left
+            out.
         instance_positions: centres of the instances in metres, (instances, 3). The axes are the
             viewer axes from which relations were derived. NaN means an unknown centre. None means
             that the relations do not come from positions.
@@ -66,7 +66,7 @@ class EncodedScene:
     instance_classes: NDArray[np.int64]
     instance_holds: NDArray[np.bool_]
     instance_observed: NDArray[np.bool_]
-    unknown: int
+    unknown: tuple[str, ...]
     instance_positions: NDArray[np.float64] | None = None
     weight: float = 1.0
     complete: bool = True
@@ -160,17 +160,20 @@ class _Encoder:
             instance_classes=instance_classes,
             instance_holds=holds,
             instance_observed=observed,
-            unknown=len(
-                {
-                    label_key(thing.label)
-                    for thing, index in zip(scene.objects, classes, strict=True)
-                    if index is None
-                }
-            ),
+            unknown=self._unknown(scene, classes),
             instance_positions=None if positions is None else positions[kept],
             weight=min(1.0, share),
             complete=meaning.complete_objects,
         )
+
+    def _unknown(self, scene: AnnotatedScene, classes: list[int | None]) -> tuple[str, ...]:
+        """Return the labels of the objects without a class, one spelling of each."""
+        outside = [
+            thing.label
+            for thing, index in zip(scene.objects, classes, strict=True)
+            if index is None
+        ]
+        return tuple(sorted({label_key(label): label for label in outside}.values()))
 
     def _index(self, label: str) -> int | None:
         if label not in self.indices:

@@ -1,4 +1,4 @@
-"""Read data files with size limits. Each error names the file and the position in it."""
+"""Read data files with size limits. Each error names the file, and its position or the limit."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from typing import Any, Final
 
 from training.datasets.records import DatasetError
 
+MAX_BYTES: Final = 2**30
+"""Maximum size of a text file in bytes, after decompression."""
 MAX_DIGITS: Final = 30
 
 
 def read_lines(path: Path, limit: int) -> Iterator[bytes]:
     """Yield the lines of a file as bytes. A file named ``*.gz`` is decompressed.
 
-    The lines are not decoded, so that invalid UTF-8 affects one line only. Without the limit, a
+    The lines are not decoded, so that invalid UTF-8 affects one line only. Without the limits, a
     small compressed file could fill the memory.
 
     Args:
@@ -26,14 +28,16 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
         limit: maximum length of a line in bytes, including the line end.
 
     Raises:
-        DatasetError: the file cannot be read, or a line exceeds the limit.
+        DatasetError: the file cannot be read, a line exceeds the limit, or all lines exceed
+            `MAX_BYTES`.
     """
     opener = gzip.open if path.suffix == ".gz" else open
     try:
         with opener(path, "rb") as file:
-            number = 0
+            number = size = 0
             while line := file.readline(limit + 1):
-                number += 1
+                number, size = number + 1, size + len(line)
+                check_size(path, size, MAX_BYTES)
                 if len(line) > limit:
                     raise DatasetError(
                         path, f"line {number}", f"the line is longer than {limit} bytes"
@@ -43,14 +47,23 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
 
 
+def check_size(path: Path, size: int, limit: int) -> None:
+    """Raise DatasetError if a file has more bytes than the limit, after decompression."""
+    if size > limit:
+        raise DatasetError(path, "", f"is larger than {limit // 2**20} MiB after decompression")
+
+
 def load_json(path: Path) -> Any:
     """Read a JSON file.
 
     Raises:
-        DatasetError: the file cannot be read or is not JSON.
+        DatasetError: the file cannot be read, has more than `MAX_BYTES`, or is not JSON.
     """
     try:
+        check_size(path, path.stat().st_size, MAX_BYTES)
         return json.loads(path.read_text(encoding="utf-8"), parse_int=bounded_int)
+    except DatasetError:
+        raise
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
     except json.JSONDecodeError as error:

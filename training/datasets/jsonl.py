@@ -2,10 +2,13 @@
 
 Each line contains one scene, a JSON object with these fields ("?" marks an optional field):
 
-- ``scene_id``, ``source``, ``group``, ``room_type`` (may be null);
-- ``objects``: [{``id``, ``label``, ``position``?, ``size``?, ``yaw``?, ``supported_by``?,
-  ``box2d``?}];
-- ``relations``: [[subject id, predicate, object id]], or null if relations were not annotated;
+- ``scene_id``? (default: file name and line, such as ``scenes.jsonl:3``), ``source``?, ``group``?,
+  ``room_type``? (may be null);
+- ``objects``: [{``id``?, ``label``, ``position``?, ``size``?, ``yaw``?, ``supported_by``?,
+  ``box2d``?}], or labels. Positions and sizes are [x, y, z] or {x, y, z}. An object without id gets
+  the id that it has in a request: its label, with a number if several objects have the label;
+- ``relations``?: [[subject, predicate, object]] or [{``subject``, ``relation``, ``object``}], with
+  ids or unambiguous labels; null if relations were not annotated;
 - ``false_relations``?: relations that do not hold, in the same form;
 - ``counts``?: {label: number of instances} for labels of which all instances share one entry in
   ``objects``;
@@ -67,7 +70,7 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
             continue
         where = f"line {number}"
         try:
-            scene = _scene(json.loads(line, parse_int=bounded_int))
+            scene = _scene(json.loads(line, parse_int=bounded_int), f"{path.name}:{number}")
         except json.JSONDecodeError as error:
             yield DatasetError(path, where, f"the line is not JSON: {error}")
         except (ValueError, RecursionError) as error:
@@ -115,13 +118,13 @@ def _values(scene: AnnotatedScene) -> dict[str, Any]:
     return values | ({"viewer_frame": True} if scene.viewer_frame else {})
 
 
-def _scene(values: Any) -> AnnotatedScene:
-    _check_fields("a scene", values, {"scene_id", "objects"}, _SCENE_FIELDS)
-    scene_id = _text("scene_id", values["scene_id"])
+def _scene(values: Any, default_id: str) -> AnnotatedScene:
+    _check_fields("a scene", values, {"objects"}, _SCENE_FIELDS)
+    scene_id = _text("scene_id", values.get("scene_id", default_id))
     source = _text("source", values.get("source", "jsonl"))
     if not isinstance(values["objects"], list):
         raise ValueError("objects must be a list")
-    objects = _counted(tuple(_object(entry) for entry in values["objects"]), values.get("counts"))
+    objects = _counted(_objects(values["objects"]), values.get("counts"))
     viewer_frame = values.get("viewer_frame", source in _VIEWER_SOURCES)
     if not isinstance(viewer_frame, bool):
         raise ValueError(f"viewer_frame must be true or false, not {viewer_frame!r}")
@@ -158,17 +161,36 @@ def _counted(objects: tuple[AnnotatedObject, ...], counts: Any) -> tuple[Annotat
     return tuple(replace(thing, count=counts.get(thing.label, 1)) for thing in objects)
 
 
-def _object(values: Any) -> AnnotatedObject:
-    _check_fields("an object", values, {"id", "label"}, _OBJECT_FIELDS)
+def _objects(entries: list[Any]) -> tuple[AnnotatedObject, ...]:
+    things = [{"label": entry} if isinstance(entry, str) else entry for entry in entries]
+    for thing in things:
+        _check_fields("an object", thing, {"label"}, _OBJECT_FIELDS)
+    nameless = [thing for thing in things if thing.get("id") is None]
+    repeats = Counter(_text("label", thing["label"]) for thing in nameless)
+    taken = {_id(thing["id"]) for thing in things if thing.get("id") is not None}
+    found = []
+    for thing in things:
+        name, number = thing.get("id"), 0
+        if name is None:
+            name = label = thing["label"]
+            while name in taken or (not number and repeats[label] > 1):
+                number += 1
+                name = f"{label}_{number}"
+            taken.add(name)
+        found.append(_object(thing, _id(name)))
+    return tuple(found)
+
+
+def _object(values: Mapping[str, Any], name: str) -> AnnotatedObject:
     supported_by = values.get("supported_by")
     yaw = values.get("yaw", 0.0)
     if not _is_number(yaw):
         raise ValueError(f"yaw must be a number, not {yaw!r}")
     return AnnotatedObject(
-        id=_id(values["id"]),
+        id=name,
         label=_text("label", values["label"]),
-        position=_numbers("position", values.get("position"), 3),
-        size=_numbers("size", values.get("size"), 3),
+        position=_vector("position", values.get("position")),
+        size=_vector("size", values.get("size")),
         yaw=float(yaw),
         supported_by=None if supported_by is None else _id(supported_by),
         box2d=_numbers("box2d", values.get("box2d"), 4),
@@ -182,12 +204,17 @@ def _relations(
         return None
     if not isinstance(values, list):
         raise ValueError(f"{name} must be a list or null")
-    place = {thing.id: index for index, thing in enumerate(objects)}
+    labels = Counter(thing.label for thing in objects)
+    place = {t.label: index for index, t in enumerate(objects) if labels[t.label] == 1}
+    place |= {thing.id: index for index, thing in enumerate(objects)}
     found: dict[tuple[int, str, int], None] = {}
     for entry in values:
+        if isinstance(entry, dict) and set(entry) == {"subject", "relation", "object"}:
+            entry = [entry["subject"], entry["relation"], entry["object"]]
         if not isinstance(entry, list) or len(entry) != 3:
             raise ValueError(
-                f"a relation is a list [subject id, predicate, object id], not {entry!r}"
+                "a relation is a list [subject, relation, object] or an object with these fields, "
+                f"not {entry!r}"
             )
         subject, anchor = place.get(_id(entry[0])), place.get(_id(entry[2]))
         if subject is None or anchor is None:
@@ -222,6 +249,12 @@ def _id(value: Any) -> str:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _vector(name: str, values: Any) -> Any:
+    if isinstance(values, dict) and set(values) == {"x", "y", "z"}:
+        values = [values[axis] for axis in "xyz"]
+    return _numbers(name, values, 3)
 
 
 def _numbers(name: str, values: Any, length: int) -> Any:

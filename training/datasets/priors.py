@@ -7,7 +7,7 @@ any room. The reader skips relations that the service does not have, such as ``i
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -27,20 +27,20 @@ SOURCE: Final = "placing_priors"
 """Source name of all scenes that the reader makes from rows of the table."""
 
 # Names of sources that list places of objects: VirtualHome, AI2-THOR and TidyBot.
-PLACES: Final = frozenset({"virtualhome_placing", "ithor_receptacles", "tidybot"})
-# Accepted values of the column ``source``. The three values after `PLACES` mean tables of
+_PLACES: Final = frozenset({"virtualhome_placing", "ithor_receptacles", "tidybot"})
+# Accepted values of the column ``source``. The three values after `_PLACES` mean tables of
 # locations, of votes and of part counts.
-_SOURCES: Final = PLACES | {"conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts"}
+_SOURCES: Final = _PLACES | {"conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts"}
 
 
-def read_prior_scenes(path: Path, *, sources: Collection[str] = PLACES) -> list[AnnotatedScene]:
-    """Read each row of a table as a scene of two objects and their relation.
+def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
+    """Read each row of a list of places as a scene of two objects and their relation.
 
-    All scenes have the source name `SOURCE`. Rows about the same pair of objects are in one group.
+    Rows of other sources are skipped. All scenes have the source name `SOURCE`. Rows about the same
+    pair of objects are in one group.
 
     Args:
         path: file of the table.
-        sources: values of the column ``source`` to read. The default is `PLACES`.
 
     Raises:
         DatasetError: the file is missing, invalid or too large.
@@ -50,7 +50,7 @@ def read_prior_scenes(path: Path, *, sources: Collection[str] = PLACES) -> list[
         if source not in _SOURCES:
             raise DatasetError(path, where, f"unknown source {source!r}")
         names = [_plain(subject), _plain(anchor)]
-        if source not in sources or relation not in RELATIONS:
+        if source not in _PLACES or relation not in RELATIONS:
             continue
         if not all(map(label_key, names)) or label_key(names[0]) == label_key(names[1]):
             continue

@@ -134,7 +134,6 @@ DOMAINS: Final = _Tables(tomllib.loads(_FILE.read_text(encoding="utf-8"))).rooms
 """Rooms of each domain: ``homes``, or ``workplaces`` (laboratories, workshops, storerooms)."""
 
 ROOMS: Final = DOMAINS["homes"]
-WORKPLACES: Final = DOMAINS["workplaces"]
 
 
 @dataclass(frozen=True, slots=True)

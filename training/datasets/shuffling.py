@@ -34,7 +34,7 @@ def shuffle_objects(
 
     Structure classes are exchanged only with structure classes, because their relations are
     unobserved. Counts, confidences and relations stay with their slots. Room types are permuted
-    among the scenes with a room type. Scene ids, sources, groups and the number of unknown labels
+    among the scenes with a room type. Scene ids, sources, groups and unknown labels
     stay unchanged.
 
     Args:

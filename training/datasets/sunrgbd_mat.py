@@ -10,18 +10,30 @@ for the tilt of the camera.
 from __future__ import annotations
 
 import math
+import struct
+import zlib
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from training.datasets.files import located, take
+from training.datasets.files import check_size, located, take
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 
 SOURCE = "sunrgbd-mat"
+
+MAX_BYTES: Final = 256 * 2**20
+"""Maximum size of a file in bytes, after decompression. Text needs five times its size."""
+
+# Types of elements of the file, and classes of arrays that have entries of any type.
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _STRUCT, _OBJECT = 1, 2, 3
+# Bytes that an entry of a cell or struct array counts at least. It costs so much memory.
+_ENTRY = 64
 
 # Number of consecutive frames in a group. Consecutive frames often show the same place.
 _BLOCK = 20
@@ -35,7 +47,7 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
     of 20 consecutive frames from one sensor and collection.
 
     Raises:
-        DatasetError: the file does not have the official format.
+        DatasetError: the file does not have the official format, or has more than `MAX_BYTES`.
     """
     scenes: list[AnnotatedScene] = []
     taken: Counter[str] = Counter()
@@ -69,12 +81,73 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
 
 def _load(path: Path) -> Any:
     try:
+        _check_sizes(path)
         content = loadmat(path, simplify_cells=True)
-    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
+    except DatasetError:
+        raise
+    except RecursionError as error:
+        raise DatasetError(path, "", "the arrays are nested too deeply") from error
+    except (OSError, ValueError, TypeError, MatReadError, struct.error, zlib.error) as error:
         raise DatasetError(path, "", f"is not a MATLAB 5 file: {error}") from error
     if "SUNRGBDMeta" not in content:
         raise DatasetError(path, "", "the file lacks the variable SUNRGBDMeta of SUN RGB-D")
     return content["SUNRGBDMeta"]
+
+
+def _check_sizes(path: Path) -> None:
+    """Check the size of all arrays, before `loadmat` allocates memory for them.
+
+    A file can be small in two ways: by compression, and by a header that announces many entries.
+    """
+    with path.open("rb") as file:
+        content = file.read(MAX_BYTES + 1)
+    check_size(path, len(content), MAX_BYTES)
+    orders = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}
+    if (order := orders.get(content[124:128])) is None:
+        raise ValueError("its header names another version")
+    size = 0
+
+    def check(data: memoryview) -> None:
+        nonlocal size
+        for kind, body in _elements(data, order):
+            if kind == _COMPRESSED:
+                body = memoryview(zlib.decompressobj().decompress(body, MAX_BYTES + 1))
+                size += len(body)
+                check_size(path, size, MAX_BYTES)
+                check(body)
+            elif kind == _MATRIX and body and (entries := _entries(body, order)):
+                size += _ENTRY * entries
+                check_size(path, size, MAX_BYTES)
+                check(body)
+
+    check(memoryview(content)[128:])
+
+
+def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
+    """Yield type and contents of each element."""
+    at = 0
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        if kind >> 16:  # the contents are in the tag
+            yield kind & 0xFFFF, data[at + 4 : at + 4 + (kind >> 16)]
+            at += 8
+        else:
+            yield kind, data[at + 8 : at + 8 + size]
+            at += 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
+
+
+def _entries(body: memoryview, order: str) -> int:
+    """Return the number of entries that the header of a cell or struct array announces."""
+    parts = _elements(body, order)
+    flags, shape = (next(parts, (0, body[:0]))[1] for _ in range(2))
+    kind = struct.unpack_from(f"{order}I", flags)[0] & 0xFF
+    if kind not in (_CELL, _STRUCT, _OBJECT):
+        return 0
+    count = abs(math.prod(struct.unpack(f"{order}{len(shape) // 4}i", shape)))
+    if kind == _CELL:
+        return count
+    _, (_, length), (_, names) = (next(parts, (0, body[:0])) for _ in range(3))
+    return count * (len(names) // max(1, struct.unpack_from(f"{order}i", length)[0]))
 
 
 def _structs(value: Any) -> list[Any]:

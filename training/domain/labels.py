@@ -10,7 +10,7 @@ from rapidfuzz import process
 from rapidfuzz.distance import OSA
 
 from app.scene import label_key
-from training.datasets import AnnotatedScene, Names
+from training.datasets import AnnotatedScene, EncodedScene, Names
 
 # Maximum number of names that are compared with each other, most frequent names first.
 _COMPARED = 2000
@@ -19,6 +19,10 @@ _ONE_SLIP, _TWO_SLIPS = 5, 10
 # A name is merged into a similar name if it has at least `_MERGED_LENGTH` letters and is rare. A
 # rare name has at most two objects, or at most the share `_RARE` of the objects of the other name.
 _RARE, _MERGED_LENGTH = 0.1, 6
+
+
+# Maximum number of labels in the text of `outside_vocabulary`. Further labels are only counted.
+_SHOWN = 8
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,33 @@ class Lookalike:
     mentions: tuple[int, int]
     merged: bool
     why: str
+
+
+def outside_vocabulary(scenes: Iterable[EncodedScene], *, named: bool) -> str:
+    """Return one line about the labels outside the vocabulary, "" without such labels.
+
+    Args:
+        named: True names the labels, most frequent first. False only counts them.
+    """
+    with_labels = [scene.unknown for scene in scenes if scene.unknown]
+    spellings: dict[str, Counter[str]] = {}
+    for label, count in Counter(label for labels in with_labels for label in labels).items():
+        spellings.setdefault(label_key(label), Counter())[label] += count
+    if not spellings:
+        return ""
+    counts = [(_first(found), found.total()) for found in spellings.values()]
+    ordered = sorted(counts, key=lambda entry: (-entry[1], entry[0]))
+    listed = [f'"{label}" ({_number(count, "scene")})' for label, count in ordered[:_SHOWN]]
+    listed += [f"{len(ordered) - _SHOWN:,} more"] if len(ordered) > _SHOWN else []
+    are, they = ("is", "it is") if len(ordered) == 1 else ("are", "they are")
+    return (
+        f"{_number(len(ordered), 'label')} in {_number(len(with_labels), 'scene')} {are} not in "
+        f"the vocabulary{': ' + ', '.join(listed) if named else ''}; {they} left out"
+    )
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:

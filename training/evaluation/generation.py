@@ -137,11 +137,11 @@ class Sampler(Protocol):
     def __call__(self, given: Tensor, room: Tensor, seed: int) -> Drawn: ...
 
 
-def drawn_of(scenes: SceneTensors, block: int = 64) -> Drawn:
+def drawn_of(scenes: SceneTensors) -> Drawn:
     """Return held-out scenes in the format of generated scenes."""
     parts = [
         Contradictions.of(scenes.batch(index).holds)
-        for index in torch.arange(len(scenes)).split(block)
+        for index in torch.arange(len(scenes)).split(64)
     ]
     return Drawn(scenes.v, Contradictions.joined(parts))
 

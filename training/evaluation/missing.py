@@ -358,7 +358,7 @@ def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
     found = leave_one_out(scenes, setting.structure, contender.objects)
     if not len(found.target):
         return None
-    unknown = np.array([scene.unknown for scene in scenes.scenes], dtype=np.int64)
+    unknown = np.array([len(scene.unknown) for scene in scenes.scenes], dtype=np.int64)
     metrics = found.metrics() | {"MRR, unknown labels score 0": found.with_unknown(unknown)}
     return Outcome(metrics, len(scenes), found.skipped)
 

@@ -14,19 +14,20 @@ from training.batches import Batch, SceneTensors, relation_units
 from training.machines import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
 
+# Number of scenes to reconstruct, and to reconstruct at a time.
+_SCENES, _BLOCK = 512, 64
+
 
 @torch.no_grad()
-def reconstruction_error(
-    machine: BoltzmannMachine, scenes: SceneTensors, *, limit: int = 512, block: int = 64
-) -> tuple[float, float]:
-    """Return (object error, relation error) over at most `limit` random scenes.
+def reconstruction_error(machine: BoltzmannMachine, scenes: SceneTensors) -> tuple[float, float]:
+    """Return (object error, relation error) over at most `_SCENES` random scenes.
 
     The relation error is NaN if the scenes have no observed relations.
     """
     object_sum = relation_sum = 0.0
     objects = relations = 0
-    chosen = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:limit]
-    for index in chosen.split(block):
+    chosen = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:_SCENES]
+    for index in chosen.split(_BLOCK):
         batch = scenes.batch(index)
         error, error_r, units = _errors(machine, batch)
         object_sum, objects = object_sum + error, objects + batch.v.numel()

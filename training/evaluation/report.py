@@ -114,7 +114,6 @@ def settings_by_source(
     seen: Tensor | None,
     *,
     limit: int | None = 600,
-    seed: int = 0,
 ) -> Iterator[tuple[str, Setting]]:
     """Iterate over the data sources, by name, and their evaluation settings.
 
@@ -124,11 +123,10 @@ def settings_by_source(
         structure: (classes,) bool, True for structure classes such as walls.
         seen: triples that the model may have learnt from, see `Setting`.
         limit: maximum number of scenes per data source in slow tasks.
-        seed: random seed of the questions.
     """
     training = dict(by_source(train))
     for source, some in by_source(scenes):
-        yield source, Setting(some, structure, training.get(source), seen, limit, seed)
+        yield source, Setting(some, structure, training.get(source), seen, limit)
 
 
 def digest(setting: Setting) -> str:

@@ -26,7 +26,6 @@ from training.config import (
     DataConfig,
     data_folder,
     load_config,
-    shipped_configs,
     with_settings,
 )
 from training.evaluation.everyday import EVERYDAY, facts_file
@@ -61,8 +60,8 @@ from training.experiments.rows import (
 )
 from training.pipeline import SplitScenes, prepare
 
-DOMAINS = ("indoor", "everyday")
-"""Domains that the command measures if it is called without configurations."""
+DEFAULT = ("indoor-triway", "indoor-gbm", "indoor-rbm")
+"""Configurations that the command measures if it is called without configurations."""
 
 YARDSTICKS = {
     "T1a relations": ("relation popularity", "R-precision, distinct classes"),
@@ -139,7 +138,6 @@ class Options:
         baselines: names of the baselines to measure. None means all baselines.
         limit: maximum number of scenes per data source in slow tasks.
         workers: number of processes.
-        ray: address of a Ray cluster; empty measures in local processes.
         quick: use few scenes, epochs and baselines.
         fresh: delete earlier reports.
     """
@@ -150,7 +148,6 @@ class Options:
     baselines: tuple[str, ...] | None = None
     limit: int = 300
     workers: int = 1
-    ray: str = ""
     quick: bool = False
     fresh: bool = False
 
@@ -182,7 +179,7 @@ def benchmark(
         list[str] | None,
         typer.Argument(
             help="configurations; those with the same data section are compared with each other, "
-            "and the first is the reference. Default: the indoor and everyday machines."
+            "and the first is the reference. Default: the indoor machines."
         ),
     ] = None,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
@@ -202,9 +199,6 @@ def benchmark(
         int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")
     ] = 300,
     workers: Annotated[int, typer.Option(min=1, help="processes with one thread each")] = 2,
-    ray: Annotated[
-        str, typer.Option(help="address of a Ray cluster that measures the rows; local: a new one")
-    ] = "",
     seed_protocol: Annotated[
         bool, typer.Option("--seed-protocol", help="also use the protocol of Bozcan et al. (2018)")
     ] = False,
@@ -222,7 +216,7 @@ def benchmark(
     """
     with resumable(console, ValueError, FloatingPointError):
         wanted = None if baseline is None else tuple(b for b in baseline if b != "none")
-        names = machines or default_configs()
+        names = machines or DEFAULT
         domains = read_domains(names)
         options = Options(
             root=data_folder(names[0], domains[0].configs[0], data),
@@ -231,7 +225,6 @@ def benchmark(
             baselines=QUICK_BASELINES if quick and wanted is None else wanted,
             limit=_QUICK_LIMIT if quick else limit,
             workers=workers,
-            ray=ray,
             quick=quick,
             fresh=fresh,
         )
@@ -254,12 +247,6 @@ def benchmark(
                 "plots beside them",
                 soft_wrap=True,
             )
-
-
-def default_configs() -> list[str]:
-    """Return the shipped configurations of `DOMAINS`, the Triway machine of a domain first."""
-    names = [f"{domain}-{variant}" for domain in DOMAINS for variant in ("triway", "gbm", "rbm")]
-    return [name for name in names if name in shipped_configs()]
 
 
 def read_domains(references: Sequence[str]) -> list[Domain]:
@@ -446,7 +433,6 @@ def _measured(plan: Plan, rows: Sequence[Row], options: Options, title: str) -> 
         reports, _ = measure_rows(
             *(plan, rows, progress),
             workers=options.workers,
-            ray=options.ray,
             fresh=options.fresh,
         )
     return reports

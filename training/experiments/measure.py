@@ -14,15 +14,23 @@ Several processes fill these files in parallel. One process with one thread meas
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
+import pickle  # nosec B403
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
+from multiprocessing.queues import SimpleQueue
 from pathlib import Path
+from typing import TypeAlias
 
+import torch
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
@@ -34,8 +42,17 @@ from training.evaluation.report import SourceReport, digest, measure, pooled, wr
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import ONCE, WHOLE_SET
 from training.experiments.rows import Material, Rival, Row
-from training.experiments.workers import Progress, measure_in_workers
 from training.runs import RunError
+
+# A progress function receives the row, the source, and a note on the current step.
+Progress: TypeAlias = Callable[[str, str, str], None]
+# Measures a row; returns the error of a row that failed.
+Work: TypeAlias = Callable[[Row, Progress], Exception | None]
+
+# Seconds between two checks for messages of the processes.
+_TICK = 0.2
+# Linear algebra libraries read these variables when a process loads them.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 # The last note on a row and source tells whether the report was measured now or read from a file.
 DONE, KNOWN = "done", "known"
@@ -159,17 +176,16 @@ def measure_rows(
     progress: Progress,
     *,
     workers: int = 1,
-    ray: str = "",
     fresh: bool = False,
     failures: tuple[type[Exception], ...] = (),
 ) -> tuple[Reports, dict[str, str]]:
     """Measure all rows, and skip finished reports.
 
-    KeyboardInterrupt stops the worker processes. The results of finished tasks are then already on
+    KeyboardInterrupt stops the processes. The results of finished tasks are then already on
     disk.
 
     Args:
-        workers, ray: see `measure_in_workers`.
+        workers: number of processes with one thread each. 1 measures in this process.
         fresh: delete earlier reports of these rows.
         failures: exception types that end only the row in which they occur.
 
@@ -188,11 +204,9 @@ def measure_rows(
     for row in rows:
         if row not in missing:
             plan.measure(row, progress)
-    if ray:  # tasks may start in another folder
-        plan = replace(plan, folder=plan.folder.resolve())
     work = partial(_failure, plan, failures)
-    if missing and (ray or workers > 1):
-        failed = measure_in_workers(work, missing, progress, min(workers, len(missing)), ray)
+    if missing and workers > 1:
+        failed = _measure_in_processes(work, missing, progress, min(workers, len(missing)))
     else:
         for row in missing:
             if error := work(row, progress):
@@ -210,6 +224,65 @@ def _failure(
     except failures as error:
         return error
     return None
+
+
+def _measure_in_processes(
+    work: Work, rows: Sequence[Row], progress: Progress, workers: int
+) -> dict[tuple[str, int], Exception]:
+    """Measure rows in processes; return the errors of failed rows by (name, seed)."""
+    context = multiprocessing.get_context("spawn")
+    # SimpleQueue has no sending thread, so all messages of a finished row are already in the queue.
+    messages: SimpleQueue[tuple[str, str, str]] = context.SimpleQueue()
+    # Pickling avoids the shared memory of torch, which is small in containers.
+    begin = (pickle.dumps(work), messages)
+    with _one_thread(), ProcessPoolExecutor(workers, context, _begin, begin) as pool:
+        try:
+            futures = {pool.submit(_measure_here, row): (row.name, row.seed) for row in rows}
+            while True:
+                done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
+                while not messages.empty():
+                    progress(*messages.get())
+                failed = {futures[future]: error for future in done if (error := future.result())}
+                if not waiting:
+                    return failed
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let processes that start here use one thread each."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+_work: Work
+_progress: Progress
+
+
+def _begin(material: bytes, messages: SimpleQueue[tuple[str, str, str]]) -> None:
+    global _work, _progress  # set once in each process
+    torch.set_num_threads(1)
+    # Ctrl-C reaches every process of the terminal; only the main process handles it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The main process wrote these bytes and passed them on in memory.
+    _work = pickle.loads(material)  # noqa: S301  # nosec B301
+    _progress = lambda *message: messages.put(message)  # noqa: E731
+
+
+def _measure_here(row: Row) -> Exception | None:
+    return _work(row, _progress)
 
 
 @contextmanager

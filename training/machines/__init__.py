@@ -10,7 +10,6 @@ from __future__ import annotations
 from app.inference.variants import MachineSpec
 from training.machines.gbm import GBM
 from training.machines.machine import BoltzmannMachine
-from training.machines.product_rbm import ProductRBM
 from training.machines.rbm import RBM
 from training.machines.triway import Triway
 
@@ -18,7 +17,6 @@ VARIANTS: dict[str, type[BoltzmannMachine]] = {
     "rbm": RBM,
     "gbm": GBM,
     "triway": Triway,
-    "product_rbm": ProductRBM,
 }
 
 
@@ -33,7 +31,6 @@ __all__ = [
     "VARIANTS",
     "BoltzmannMachine",
     "MachineSpec",
-    "ProductRBM",
     "Triway",
     "build",
 ]

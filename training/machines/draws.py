@@ -45,11 +45,6 @@ class HiddenDraws:
     log_evidence: Tensor
     field: MeanField
 
-    @property
-    def effective_size(self) -> Tensor:
-        """Effective sample size 1 / sum w² of each scene, (scenes,)."""
-        return (-(2 * self.log_weight).logsumexp(0)).exp()
-
     def implied(
         self, machine: BoltzmannMachine, edges: Edges, given: Tensor, *, apart: bool = False
     ) -> Tensor:

@@ -209,36 +209,3 @@ def relation_log_odds(
     error = draws.standard_error(on) / (p * (1 - p)).clamp(min=1e-12)
     gate = machine.gate(edges, evidence.v)
     return torch.where(gate > 0, p.logit(eps=1e-12), -torch.inf), error
-
-
-def relation_log_odds_observed(machine: BoltzmannMachine, evidence: Evidence) -> Tensor:
-    """Return the log-odds of each relation unit given all other units, (scenes, units).
-
-    In the seed form, the log-odds of unit e have a closed form:
-
-        ℓ⁰_e + sum_k [softplus(x_k + U_ek) - softplus(x_k)].
-
-    ℓ⁰_e is the logit at h1 = 0, and x the hidden logits without unit e. The result is exact for one
-    hidden layer. With two layers, h2 stays at its mean-field value given all relations.
-
-    Raises:
-        ValueError: the machine has the local form, or a relation is unobserved.
-    """
-    if not machine.relations_act:
-        raise ValueError(
-            "the machine has the local form; the closed form of relation log-odds needs a machine "
-            "of the seed form"
-        )
-    relations = evidence.relations(machine)
-    if relations is None or not bool(relations[2].all()):
-        raise ValueError(
-            "a relation is unobserved; the closed form of relation log-odds needs all relations "
-            "observed"
-        )
-    edges, r, _ = relations
-    field = mean_field(machine, evidence)
-    context = machine.relation_context(edges)
-    x = field.y.unsqueeze(1) - r.unsqueeze(-1) * context
-    bare = machine.relation_logits(edges, evidence.v, field.y.new_zeros(field.y.shape))
-    log_odds = bare + (softplus(x + context) - softplus(x)).sum(-1)
-    return torch.where(machine.gate(edges, evidence.v) > 0, log_odds, -torch.inf)

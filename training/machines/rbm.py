@@ -41,10 +41,6 @@ class RBM(BoltzmannMachine):
         """Set the bias d_t to the training log-odds of each relation unit t."""
         self.d.copy_(by_unit)
 
-    def context_weights(self) -> Tensor:
-        """Return the weights U between relation units and h1, (triples, hidden units)."""
-        return self.U
-
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
         """Return all relation units of the machine, whatever the classes are."""
         return triple_edges(self.triples)
@@ -84,15 +80,15 @@ class RBM(BoltzmannMachine):
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
         """Return the logit d_t + U_t·h1 of each relation unit t."""
-        return self.d + h1 @ self.context_weights().T
+        return self.d + h1 @ self.U.T
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
         """Return weight @ U, the input of the relations to the hidden units."""
-        return weight @ self.context_weights()
+        return weight @ self.U
 
     def relation_context(self, edges: Edges) -> Tensor:
         """Return the weights U with a leading scene dimension, (1, triples, hidden units)."""
-        return self.context_weights().unsqueeze(0)
+        return self.U.unsqueeze(0)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
         """Return zero, because given h1 the relations have no effect on objects."""

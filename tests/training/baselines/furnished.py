@@ -71,7 +71,7 @@ def scene(
         instance_classes=evidence.classes,
         instance_holds=holds,
         instance_observed=evidence.observed,
-        unknown=0,
+        unknown=(),
     )
 
 

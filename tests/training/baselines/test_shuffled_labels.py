@@ -14,7 +14,7 @@ from typing import get_args
 
 import pytest
 
-from app.inference.variants import FACTORISED, Form, Variant
+from app.inference.variants import VARIANTS, Form, Variant
 from tests.training.baselines.furnished import STRUCTURE, A, furnished, tensors
 from training.baselines import BASELINES, RELATIONS
 from training.baselines.fitting import missing_mrr, partial_mrr
@@ -123,7 +123,7 @@ def test_machines_fall_to_popularity(variant, form):
 def trained(variant: Variant, form: Form, train: SceneTensors, validation: SceneTensors):
     """A small machine after a few epochs, the best of them by validation."""
     shape = {"variant": variant, "form": form, "H1": 12, "H2": 0}
-    if variant in FACTORISED:
+    if VARIANTS[variant].factorised:
         shape["K"] = 4
     config = Config.model_validate(
         {

@@ -55,7 +55,7 @@ def test_classes_counts_and_unknown_labels() -> None:
     assert found.evidence.classes.tolist() == [DESK, MONITOR, WALL]
     assert found.evidence.counts.tolist() == [1, 2, 1]
     assert found.evidence.confidence.tolist() == [1.0, 1.0, 1.0]
-    assert found.unknown == 1
+    assert found.unknown == ("Goblets",)
     assert found.room_type == found.evidence.room_type == 0  # a toilet is a bathroom
     assert not found.evidence.observed.any()
 
@@ -106,7 +106,7 @@ def test_relations_of_structure_are_neither_on_nor_off() -> None:
 def test_labels_that_a_source_annotates_incompletely_are_left_out() -> None:
     found = encoded(things("wall", "desk", "floor"), source="sunrgbd")
     assert found.evidence.classes.tolist() == [DESK]
-    assert found.unknown == 0
+    assert found.unknown == ()
     assert not annotated_classes([found], VOCABULARY)["sunrgbd"][[WALL, FLOOR]].any()
     assert encoded(things("wall", "desk")).evidence.classes.tolist() == [DESK, WALL]
 
@@ -191,7 +191,7 @@ def test_world_axes_are_left_for_the_viewpoint() -> None:
 
 def test_scenes_of_nothing() -> None:
     found = encoded(things("goblet"), relations=())
-    assert found.unknown == 1
+    assert found.unknown == ("goblet",)
     assert found.evidence.classes.shape == (0,)
     assert found.evidence.holds.shape == (4, 0, 0)
     assert encode([], VOCABULARY) == []

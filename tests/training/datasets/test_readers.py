@@ -81,6 +81,37 @@ def test_jsonl(tmp_path: Path) -> None:
     assert second.viewer_frame is False
 
 
+def test_jsonl_takes_a_scene_as_a_request_writes_it(tmp_path: Path) -> None:
+    """Both forms of each field give one scene; fields left out have stable values."""
+    stated = {"subject": "cup_2", "relation": "on-top", "object": "desk"}
+    desk = {
+        "label": "desk",
+        "position": {"x": 2, "y": 0, "z": 0.4},
+        "size": {"x": 1, "y": 2, "z": 1},
+    }
+    request = {"objects": ["cup", desk, {"label": "cup"}], "relations": [stated]}
+    desk = {"id": "desk", "label": "desk", "position": [2, 0, 0.4], "size": [1, 2, 1]}
+    cups = [{"id": name, "label": "cup"} for name in ("cup_1", "cup_2")]
+    annotated = {"objects": [cups[0], desk, cups[1]], "relations": [["cup_2", "on-top", "desk"]]}
+    path = tmp_path / "own.jsonl"
+    path.write_text("".join(f"{json.dumps(line)}\n" for line in (request, annotated)))
+    first, second = read_scenes(path)
+    assert (first.scene_id, first.group, second.scene_id) == (
+        "own.jsonl:1", "own.jsonl:1", "own.jsonl:2",
+    )  # fmt: skip
+    assert (first.objects, first.relations) == (second.objects, second.relations)
+    assert first.objects[1].position == (2.0, 0.0, 0.4)
+
+
+@pytest.mark.parametrize("source", ["3dssg", "vrd", "nr3d"])
+def test_jsonl_keeps_relations_that_a_reader_translated(tmp_path: Path, source: str) -> None:
+    """The readers translate the predicates of a source already."""
+    things = tuple(AnnotatedObject(str(k), label) for k, label in enumerate(("cup", "table")))
+    read = AnnotatedScene("s", source, "g", None, things, relations=((0, "on-top", 1),))
+    jsonl.write_jsonl([read], tmp_path / "scenes.jsonl")
+    assert read_scenes(tmp_path / "scenes.jsonl") == [read]
+
+
 @pytest.mark.parametrize("name", ["again.jsonl", "again.jsonl.gz"])
 def test_jsonl_is_read_as_it_was_written(tmp_path: Path, name: str) -> None:
     scenes = [*read_scenes(write_jsonl(tmp_path)), *generate_rooms(10, 0)]
@@ -194,7 +225,7 @@ def test_sources_by_name_are_found_in_the_folder_extra(
         (json.dumps(BARE_SCENE | {"scene_id": " "}), "scene_id must be a non-empty string"),
         (json.dumps(BARE_SCENE | {"colour": "red"}), "unknown fields: colour"),
         (json.dumps(BARE_SCENE | {"objects": {}}), "objects must be a list"),
-        (json.dumps(BARE_SCENE | {"objects": ["bed"]}), "an object must be a JSON object"),
+        (json.dumps(BARE_SCENE | {"objects": [["bed"]]}), "an object must be a JSON object"),
         (json.dumps(BARE_SCENE | {"objects": [{"id": 0}]}), "an object lacks label"),
         (json.dumps(BARE_SCENE | {"objects": [{"id": 0, "label": ""}]}), "label must be"),
         (json.dumps(BARE_SCENE | {"objects": [{"id": 1.5, "label": "a"}]}), "an id must be"),
@@ -203,13 +234,19 @@ def test_sources_by_name_are_found_in_the_folder_extra(
         (json.dumps(BARE_SCENE | {"viewer_frame": "yes"}), "viewer_frame must be"),
         (json.dumps(BARE_SCENE | {"relations": {}}), "relations must be a list or null"),
         (json.dumps(BARE_SCENE | {"relations": [[0, "left"]]}), "a relation is"),
+        (json.dumps(BARE_SCENE | {"relations": [{"subject": 0, "object": 0}]}), "a relation is"),
         (json.dumps(BARE_SCENE | {"relations": [[0, "left", 7]]}), "not in the scene"),
+        (
+            '{"objects": ["cup", "cup", "bed"], "relations": [["cup", "left", "bed"]]}',
+            "not in the scene",
+        ),
         (json.dumps(DESK_SCENE | {"relations": [[0, "near", 1]]}), "unknown relation 'near'"),
         *(
             (json.dumps(BARE_SCENE | {"objects": [{"id": 0, "label": "a"} | extra]}), message)
             for extra, message in (
                 ({"position": [1, 2]}, "position must be a list of 3 numbers"),
                 ({"position": [1, 2, "3"]}, "position must be a list of 3 numbers"),
+                ({"position": {"x": 1, "y": 2}}, "position must be a list of 3 numbers"),
                 ({"position": [1, 2, math.inf]}, "position of '0' must be 3 finite"),
                 ({"size": [1, 2, 0]}, "size of '0' must be positive"),
                 ({"yaw": "north"}, "yaw must be a number"),

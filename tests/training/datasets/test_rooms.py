@@ -8,7 +8,7 @@ import pytest
 from app.scene import CANONICAL
 from app.scene.footprints import overlap_and_gap
 from training.datasets import AnnotatedScene, encode, generate_rooms, rooms_vocabulary, split
-from training.datasets.rooms import ROOMS, WORKPLACES, Beside, Piece
+from training.datasets.rooms import DOMAINS, ROOMS, Beside, Piece
 
 
 @pytest.fixture(scope="module")
@@ -82,15 +82,15 @@ def test_the_vocabulary_covers_the_generator(rooms: list[AnnotatedScene]) -> Non
     vocabulary = rooms_vocabulary()
     assert set(vocabulary.room_types) == set(ROOMS)
     encoded = encode(rooms, vocabulary)
-    assert all(scene.unknown == 0 and scene.room_type >= 0 for scene in encoded)
+    assert all(not scene.unknown and scene.room_type >= 0 for scene in encoded)
 
 
 def test_other_tables_make_another_domain() -> None:
-    found = generate_rooms(60, 0, WORKPLACES)
-    assert {scene.room_type for scene in found} == set(WORKPLACES)
+    found = generate_rooms(60, 0, DOMAINS["workplaces"])
+    assert {scene.room_type for scene in found} == set(DOMAINS["workplaces"])
     homes = {thing.label for scene in generate_rooms(60, 0) for thing in scene.objects}
     assert not homes & {thing.label for scene in found for thing in scene.objects}
-    assert generate_rooms(20, 0, WORKPLACES) == found[:20]
+    assert generate_rooms(20, 0, DOMAINS["workplaces"]) == found[:20]
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,11 @@ A = len(CANONICAL)
 
 
 def made(
-    instances: list[int], number: int, room: int = -1, source: str = "s", unknown: int = 0
+    instances: list[int],
+    number: int,
+    room: int = -1,
+    source: str = "s",
+    unknown: tuple[str, ...] = (),
 ) -> EncodedScene:
     """A scene of instances whose relations are drawn; structure has none."""
     rng = np.random.default_rng(number)

@@ -14,11 +14,11 @@ from training.cli import app
 from training.config import ConfigError, data_folder, load_config
 from training.datasets import generate_rooms
 from training.datasets.jsonl import write_jsonl
-from training.datasets.rooms import WORKPLACES
+from training.datasets.rooms import DOMAINS
 from training.domain.proposal import propose
 from training.pipeline import prepare
 
-SCENES = generate_rooms(80, 0, WORKPLACES)
+SCENES = generate_rooms(80, 0, DOMAINS["workplaces"])
 
 
 @pytest.fixture
@@ -209,7 +209,7 @@ def test_more_scenes_move_none_to_another_part(tmp_path) -> None:
         return {scene.scene_id: part for part, some in found.items() for scene in some}
 
     before = parts()
-    write_jsonl(generate_rooms(120, 0, WORKPLACES), path)
+    write_jsonl(generate_rooms(120, 0, DOMAINS["workplaces"]), path)
     after = parts()
     assert len(after) == 120
     assert before.items() <= after.items()

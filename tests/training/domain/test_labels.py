@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import pytest
+
 from tests.training.domain.scenes import scene
+from tests.training.evaluation.scenes import scene as encoded_scene
 from training.datasets.names import Names
-from training.domain.labels import count_labels, lookalikes
+from training.domain.labels import count_labels, lookalikes, outside_vocabulary
 from training.domain.proposal import propose
 
 NAMES = Names(base=("cup", "table"), aliases={"sofa": ("couch",)})
@@ -80,3 +83,35 @@ def test_every_merged_misspelling_is_an_alias() -> None:
     scenes = [scene(str(k), label, *REST) for k, label in enumerate(labels)]
     vocabulary = propose("lab", scenes, ["scenes.jsonl"], terms="").vocabulary
     assert len({vocabulary.index(label) for label in labels}) == 1
+
+
+@pytest.mark.parametrize(
+    ("unknown", "named", "line"),
+    [
+        ([(), ()], True, ""),
+        (
+            [("balcony", "sofa bed"), ("Sofa_beds",), ("sofa bed",), ()], True,
+            '2 labels in 3 scenes are not in the vocabulary: "sofa bed" (3 scenes), "balcony" '
+            "(1 scene); they are left out",
+        ),
+        (
+            [("balcony",)], True,
+            '1 label in 1 scene is not in the vocabulary: "balcony" (1 scene); it is left out',
+        ),
+        (
+            [("a", "b")] * 1200, False,
+            "2 labels in 1,200 scenes are not in the vocabulary; they are left out",
+        ),
+    ],
+)  # fmt: skip
+def test_labels_outside_the_vocabulary_are_one_line(unknown, named, line) -> None:
+    scenes = [encoded_scene([0], unknown=labels) for labels in unknown]
+    assert outside_vocabulary(scenes, named=named) == line
+
+
+def test_the_line_about_many_labels_is_bounded() -> None:
+    scenes = [encoded_scene([0], unknown=tuple(f"label {k}" for k in range(99)))]
+    line = outside_vocabulary(scenes, named=True)
+    assert '"label 0" (1 scene)' in line
+    assert "91 more; they are left out" in line
+    assert len(line) < 300

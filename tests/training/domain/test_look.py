@@ -9,7 +9,7 @@ from scene_client.schemas import MissingRequest
 from tests.training.domain.scenes import scene
 from training.datasets import generate_rooms
 from training.datasets.names import Names
-from training.datasets.rooms import WORKPLACES
+from training.datasets.rooms import DOMAINS
 from training.domain.look import LONGEST, Facts, look
 
 NAMES = Names()
@@ -117,7 +117,7 @@ def test_millimetres_are_found() -> None:
 
 
 def test_generated_scenes_contradict_nothing() -> None:
-    facts = look(generate_rooms(60, 0, WORKPLACES), NAMES)
+    facts = look(generate_rooms(60, 0, DOMAINS["workplaces"]), NAMES)
     assert not facts.findings
     assert facts.shares["viewer axes"] == 1.0
 

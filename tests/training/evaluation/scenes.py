@@ -28,7 +28,7 @@ def scene(
     triples: Sequence[tuple[int, int, int]] = (),
     *,
     source: str = "toy",
-    unknown: int = 0,
+    unknown: tuple[str, ...] = (),
     room: int = -1,
     group: str = "g",
     name: str | None = None,

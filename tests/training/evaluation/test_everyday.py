@@ -105,7 +105,7 @@ needs_facts = pytest.mark.skipif(facts_file(FOLDER) is None, reason="the facts a
 
 @needs_facts
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["indoor-triway", "indoor-rbm", "everyday-triway"])
+@pytest.mark.parametrize("model", ["indoor-triway", "indoor-rbm"])
 @pytest.mark.parametrize("made", [False, True], ids=["the facts", "made ones"])
 def test_the_service_gives_the_same_eleven_lines(service, model, made, folder, monkeypatch, capsys):
     place = folder if made else FOLDER
@@ -175,7 +175,7 @@ def test_a_card_has_the_lines_once(folder):
 
 
 def test_no_other_module_reads_the_facts():
-    """Neither the file nor its folder is named elsewhere (a domain of models has its name)."""
+    """Neither the file nor its folder is named elsewhere."""
     named = re.compile(r"facts\.json|shared/everyday|/\s*[\"']everyday\b|[\"']\S*/everyday\b")
     own = REPOSITORY / "training/evaluation/everyday.py"
     sources = [*(REPOSITORY / "training").rglob("*"), *(REPOSITORY / "app").rglob("*.py")]

@@ -42,9 +42,9 @@ name = "no-counts"
 what = "instances are not counted"
 changes = { "machine.without" = ["n"] }
 [[row]]
-name = "product-rbm"
-what = "an RBM with the same factors"
-changes = { "machine.variant" = "product_rbm" }
+name = "rbm"
+what = "an RBM"
+changes = { "machine.variant" = "rbm" }
 [[row]]
 name = "diverging"
 what = "far too fast"
@@ -87,7 +87,7 @@ def test_every_row_is_compared_with_the_full_model_on_both_parts(finished):
         for cell in found["cells"]
     }
     sources = {f"{part} {name}" for part in ("validation", "test") for name in ("rooms", "pooled")}
-    rows = {"rooms-triway", "seed-form", "no-counts", "product-rbm"}
+    rows = {"rooms-triway", "seed-form", "no-counts", "rbm"}
     # Some parts hold no pair that training tells little of.
     little = ("accuracy, unseen pairs", "accuracy, rare classes")
     metrics = {(task, name) for task, names in PRIMARY.items() for name in names} - {
@@ -126,7 +126,7 @@ def test_the_table_has_the_row_minus_the_full_model(finished):
         "weights", "validation pooled", "test pooled", "validation rooms", "test rooms",
     ]  # fmt: skip
     assert [line.split(" |")[0].strip("| ") for line in lines] == [
-        "**rooms-triway**", "seed-form", "no-counts", "product-rbm",
+        "**rooms-triway**", "seed-form", "no-counts", "rbm",
     ]  # fmt: skip
     gap = next(
         d["figure"]
@@ -154,7 +154,7 @@ def test_costs_count_trained_weights_alone(finished):
 
 def test_the_same_command_trains_nothing_again(finished, monkeypatch):
     before = results(finished)
-    rows = ("--row", "seed-form", "--row", "no-counts", "--row", "product-rbm")
+    rows = ("--row", "seed-form", "--row", "no-counts", "--row", "rbm")
     monkeypatch.setattr(Trainer, "run", None)
     code, output = run(*arguments(finished), *rows)
     assert code == 0, output

@@ -50,7 +50,7 @@ def test_the_way_to_the_full_model_is_one_step_at_a_time():
 
 def test_without_one_part_the_rest_is_as_shipped():
     rows = load_rows(shipped_ablations()["indoor-triway"], FULL)
-    own = {"local-rbm", "local-gbm", "local-product-rbm"}
+    own = {"local-rbm", "local-gbm"}
     several = {
         row.name: found
         for row in rows

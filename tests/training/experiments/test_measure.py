@@ -25,7 +25,7 @@ def plan(folder):
 
 @pytest.mark.slow
 def test_a_row_that_fails_stops_no_other(tmp_path):
-    """Workers take the failing rows and go on to the rest."""
+    """Processes take the failing rows and go on to the rest."""
     makers = {"first": diverges, "second": answers, "third": diverges, "fourth": answers}
     entries = [Row(name, 3, name, make) for name, make in makers.items()]
     said = []
