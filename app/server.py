@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Final
 
 import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from app.main import create_app
 from app.serving.errors import ServingError
@@ -29,6 +30,19 @@ KEEP_ALIVE: Final = 20
 LEAVE: Final = 0.3
 
 _logger = logging.getLogger("app.server")
+
+
+class Connection(HttpToolsProtocol):
+    """An HTTP connection that ignores the trailers of chunked bodies.
+
+    uvicorn appends trailers to the headers of the request, so a trailer could replace a header that
+    a proxy has checked or removed.
+    """
+
+    def on_headers_complete(self) -> None:
+        """Start the request with the headers so far. The parser adds trailers to `self.headers`."""
+        super().on_headers_complete()
+        self.scope["headers"] = self.headers.copy()
 
 
 class Server(uvicorn.Server):
@@ -140,7 +154,7 @@ def build(settings: Settings, began: float) -> Server:
         host=settings.host,
         port=settings.port,
         root_path=settings.root_path,
-        http="httptools",
+        http=Connection,
         ws="websockets-sansio",
         ws_max_size=settings.max_body_bytes,
         ws_ping_interval=settings.client_timeout,

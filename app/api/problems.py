@@ -119,7 +119,7 @@ def from_exception(error: Exception, *, at: Location = (), body: Any = None) -> 
                 )
                 for fault in error.faults[:MAX_ERRORS]
             ]
-            return _faulty(kind, errors, len(error.faults))
+            return invalid(kind, errors, len(error.faults))
         case UnknownModelError():
             return ProblemError(catalogue.MODEL_NOT_FOUND, str(error))
         case ModelUnavailableError():
@@ -157,7 +157,8 @@ def from_exception(error: Exception, *, at: Location = (), body: Any = None) -> 
             )
 
 
-def _faulty(kind: ProblemType, errors: list[FieldError], count: int) -> ProblemError:
+def invalid(kind: ProblemType, errors: list[FieldError], count: int) -> ProblemError:
+    """Return the problem for a request with ``count`` errors, the first of which are `errors`."""
     detail = f"The request has {count} error{'' if count == 1 else 's'}, listed in `errors`."
     if kind is catalogue.UNKNOWN_LABELS:
         detail += (
@@ -179,7 +180,7 @@ def unfit(
         at: location of ``body`` in a batch request. It is empty for other requests.
     """
     errors = field_errors(error, body, form, at=at)
-    return _faulty(catalogue.INVALID_REQUEST, errors, error.error_count())
+    return invalid(catalogue.INVALID_REQUEST, errors, error.error_count())
 
 
 def report_defect(error: Exception, request_id: str) -> None:

@@ -122,6 +122,7 @@ class Request(Ticket):
     async def ask(
         self,
         model: ServedModel,
+        name: str,
         question: Callable[Concatenate[Artifact, Scene, P], T],
         scene: Scene,
         *args: P.args,
@@ -131,14 +132,14 @@ class Request(Ticket):
 
         Args:
             model: the model that computes the answer.
-            question: function of `app.questions` that computes the answer.
+            name: name of the question, for log and metrics.
+            question: function that computes the answer.
             scene: the scene with the class indices of the model.
             *args, **kwargs: further arguments of ``question``.
 
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
         """
-        name = question.__name__
         call = partial(question, model.artifact, scene, *args, **kwargs)
         rows = 0 if self.holding else 1
         model.queue.take(rows)

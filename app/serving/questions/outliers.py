@@ -41,6 +41,7 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
     model, reading = request.read(asked)
     found = await request.ask(
         model,
+        "outliers",
         questions.outliers,
         reading.scene,
         sensitivity=asked.sensitivity,

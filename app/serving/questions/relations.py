@@ -34,6 +34,7 @@ async def relations(request: Request, asked: RelationsRequest) -> Answer:
     model, reading = request.read(asked)
     found, disagreements = await request.ask(
         model,
+        "relations",
         questions.relations,
         reading.scene,
         top_k=asked.top_k,
