@@ -152,7 +152,7 @@ UNFIT: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"objects": [BED | {"confidence": True}]}, "objects/0/confidence"),
         ({"objects": [BED | {"position": {"x": 1, "y": 2}}]}, "objects/0/position/z"),
         ({"objects": [BED | {"position": POINT | {"x": 10**400}}]}, "objects/0/position/x"),
-        ({"objects": [BED | {"size": POINT | {"x": 0}}]}, "objects/0/size/x"),
+        ({"objects": [BED | {"size": POINT | {"x": -1}}]}, "objects/0/size/x"),
         ({"objects": [BED | {"orientation": POINT | {"w": 2}}]}, "objects/0/orientation"),
         ({"relations": [{}]}, "relations/0/subject"),
         ({"relations": [LEFT | {"relation": "near"}]}, "relations/0/relation"),

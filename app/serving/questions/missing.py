@@ -115,9 +115,7 @@ def _missing_and_more(
     )
     if at is not None:
         return found, ()
-    further = questions.more(
-        artifact, scene, top_k=top_k, candidates=candidates, coverage=coverage
-    )
+    further = questions.more(artifact, scene, top_k=top_k, candidates=candidates, coverage=coverage)
     return found, further
 
 

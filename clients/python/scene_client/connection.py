@@ -64,7 +64,9 @@ class Options:
             raise _refused("the URL must start with http:// or https:// and contain a host")
         if parts.query or parts.fragment:
             raise _refused("the URL must not have a query or a fragment")
-        if not all("!" <= letter <= "~" for letter in (self.api_key or "") + (self.admin_key or "")):
+        if not all(
+            "!" <= letter <= "~" for letter in (self.api_key or "") + (self.admin_key or "")
+        ):
             raise _refused("a key must have only ASCII characters, without spaces or line breaks")
         if self.retries < 0:
             raise _refused("the number of retries must not be negative")

@@ -77,7 +77,7 @@ def field_errors(
         at: location of ``body`` in the request.
     """
     found = []
-    # The limit also bounds the time, because suggestions for thousands of unknown members take seconds.
+    # The limit also bounds the time: suggestions for thousands of unknown members take seconds.
     for fault in error.errors(include_url=False)[:MAX_ERRORS]:
         location = fault["loc"]
         message, suggestions = _worded(fault, form)

@@ -35,9 +35,11 @@ class GenerateRequest(SceneRequest):
         float,
         Field(
             ge=0.05,
-            le=20,
+            # At 2, a scene has 70 objects and 1,000 relations, and 64 scenes take up to 46 s.
+            le=1.5,
             allow_inf_nan=False,
-            description="sampling temperature; values above 1 give more varied scenes",
+            description="sampling temperature, from 0.05 to 1.5; values above 1 give more varied "
+            "scenes",
         ),
     ] = 1.0
     context: Annotated[
