@@ -139,7 +139,7 @@ def validated(value: Any, form: type[FormT], *, at: Location = ()) -> FormT:
         if isinstance(value, dict) and isinstance(value.get(name), list) and len(value[name]) > most
     ]
     if errors:
-        raise invalid(catalogue.INVALID_REQUEST, errors, len(errors))
+        raise invalid(catalogue.INVALID_REQUEST, errors)
     try:
         return form.model_validate(value)
     except ValidationError as error:

@@ -24,6 +24,13 @@ T = TypeVar("T")
 
 SUCCESS: Final = "success"
 
+MANY_OBJECTS: Final = 64
+MANY_RELATIONS: Final = 256
+"""Largest scene that the event loop reads without a look at its expected time.
+
+To read such a scene takes about 1 ms: the service derives the relations from the poses.
+"""
+
 
 @dataclass(slots=True)
 class Record:
@@ -118,6 +125,31 @@ class Request(Ticket):
         return model, read_scene(
             scene, model.vocabulary, self.limits, self.look_ups, may_be_empty=may_be_empty
         )
+
+    async def reading(
+        self, scene: SceneRequest, *, may_be_empty: bool = False
+    ) -> tuple[ServedModel, Reading]:
+        """Return the result of `read`. The queue of the model reads large scenes.
+
+        Raises:
+            DeadlinePassedError, DisconnectedError: see `WorkQueue`.
+            UnknownModelError, ModelUnavailableError, RequestError: see `read`.
+        """
+        relations = len(scene.relations or ())
+        if len(scene.objects) <= MANY_OBJECTS and relations <= MANY_RELATIONS:
+            return self.read(scene, may_be_empty=may_be_empty)
+        posed = sum(
+            not isinstance(thing, str) and thing.position is not None for thing in scene.objects
+        )
+        # The time for the relations from poses grows with the number of pairs of objects.
+        done = await self.models.resolve(scene.model).queue.run(
+            partial(self.read, scene, may_be_empty=may_be_empty),
+            self,
+            kind=f"read {posed.bit_length()}",
+            size=len(scene.objects) + relations + posed**2,
+            low_priority=self.low_priority,
+        )
+        return done.result
 
     async def ask(
         self,

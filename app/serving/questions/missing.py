@@ -48,7 +48,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
     The list `more` contains listed classes that probably have further instances, such as a second
     nightstand. It is empty for questions about a place.
     """
-    model, reading = request.read(asked)
+    model, reading = await request.reading(asked)
     faults = Faults()
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:

@@ -24,7 +24,11 @@ class GenerateRequest(SceneRequest):
 
     objects: Annotated[
         list[SceneObject],
-        Field(max_length=256, description="objects in every sampled scene; [] is allowed"),
+        Field(
+            max_length=256,
+            fail_fast=True,
+            description="objects in every sampled scene; [] is allowed",
+        ),
     ] = []
     count: Annotated[int, Field(ge=1, le=64, description="number of scenes to sample")] = 1
     steps: Annotated[
