@@ -92,8 +92,8 @@ def _first_errors(error: ValidationError, body: Any, form: type[Request]) -> lis
     errors = later = error.errors(include_url=False)
     while len(errors) < MAX_ERRORS:
         # Only errors of entries have a location of more than one step.
-        place = next(
-            (fault["loc"][1] for fault in later if fault["loc"][1:] and _is_object(fault)), None
+        place: Any = next(
+            (one["loc"][1] for one in later if one["loc"][1:] and _is_object(one)), None
         )
         if place is None:
             break
