@@ -84,10 +84,9 @@ format: $(EVERYTHING)  ## format the sources and generate the blocking client
 	$(BIN)/python -m ruff format .
 	$(BIN)/python scripts/sync_client.py
 
-bench: $(EVERYTHING)  ## run the benchmarks, then load tests of the service, a plain FastAPI app, a stream and DDS
+bench: $(EVERYTHING)  ## run the benchmarks, then load tests of the service, a plain FastAPI app and DDS
 	$(BIN)/python -m benchmarks $(ARGS)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.load)
-	$(if $(ARGS),,$(BIN)/python -m benchmarks.stream)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.dds)
 
 lock: $(BIN)/python  ## resolve the dependencies of pyproject.toml into requirements*.lock

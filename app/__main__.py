@@ -134,14 +134,9 @@ def serve(settings: Settings, began: float) -> int:
     except OSError as error:
         return _refuse_address(settings, error)
     tune()
-    from app.registry import StoreError
     from app.server import build
 
-    try:
-        server = build(settings, began)
-    except StoreError as error:
-        sys.stderr.write(f"SCENE_STORE: {error.reason}\n")
-        return 3
+    server = build(settings, began)
     # On Ctrl-C, the server finishes its shutdown and then raises KeyboardInterrupt.
     with suppress(KeyboardInterrupt):
         try:

@@ -128,8 +128,8 @@ def _make_private(folder: Path) -> None:
         raise PermissionError(f"{folder} or its parent belongs to another user")
     # A parent with the sticky bit, such as /tmp, is safe. Other users can add files to this parent,
     # but they cannot replace files of this user.
-    is_open = root.st_mode & stat.S_IWOTH and not root.st_mode & stat.S_ISVTX
-    if is_open or own.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+    others = stat.S_IWGRP | stat.S_IWOTH
+    if own.st_mode & others or (root.st_mode & others and not root.st_mode & stat.S_ISVTX):
         raise PermissionError(f"other users can write to {folder} or to its parent")
     tempfile.TemporaryFile(dir=folder).close()
     os.utime(folder)

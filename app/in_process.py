@@ -54,7 +54,7 @@ class InProcess(httpx.BaseTransport):
         self.admin_key = secrets.token_hex()
         try:
             settings = _Given(
-                store=str(store),
+                store=store,
                 admin_key=SecretStr(self.admin_key),
                 metrics=False,
                 access_log=False,

@@ -15,8 +15,7 @@ _DESCRIPTION = """
 Ask a Boltzmann machine four questions about a scene: which relations hold between its objects,
 which objects are missing, which objects do not belong, and what a similar scene looks like.
 Positions are in metres, in the axes of `frame_id`. Objects are named by their ids, or by their
-labels if only one object has the label. Robots with frequent scene changes can open a stream: the
-WebSocket `GET /stream` accepts updates and sends the newest answers (docs/stream.md).
+labels if only one object has the label.
 Every failure is a problem document (RFC 9457). Its `type` identifies the problem type.
 The figures in the examples are illustrations. Real figures depend on the model.
 """

@@ -18,16 +18,12 @@ from app.main import create_app
 from app.serving.errors import ServingError
 from app.serving.logs import log_config
 from app.serving.runtime import Runtime
-from app.serving.stream import Streams
 from app.settings import Settings
 
 # The server closes a connection after this idle time in seconds. A proxy must close its idle
 # connections earlier. Otherwise the proxy may send a request while the server closes the
 # connection.
 KEEP_ALIVE: Final = 20
-
-# Minimum time in seconds that the server leaves to each stream for its last message at shutdown.
-LEAVE: Final = 0.3
 
 _logger = logging.getLogger("app.server")
 
@@ -48,7 +44,7 @@ class Connection(HttpToolsProtocol):
 class Server(uvicorn.Server):
     """A server that shuts down in three steps on SIGTERM.
 
-    1. The server refuses new requests, answers readiness checks with 503 and closes the streams.
+    1. The server answers readiness checks with 503 and closes each connection after its answer.
        This step takes ``drain_seconds``, so that load balancers notice the failing readiness check.
        A second signal, or Ctrl-C, ends this step at once.
     2. The server closes the listening socket.
@@ -56,8 +52,7 @@ class Server(uvicorn.Server):
 
     Args:
         config: configuration of uvicorn.
-        runtime: the runtime of the service. It refuses new requests during the shutdown.
-        streams: the open streams. The server closes them in the first step.
+        runtime: the runtime of the service. It is not ready during the shutdown.
         drain_seconds: time in seconds from SIGTERM until the server closes the listening socket.
         began: `time.monotonic()` at the start of the process.
     """
@@ -66,13 +61,11 @@ class Server(uvicorn.Server):
         self,
         config: uvicorn.Config,
         runtime: Runtime,
-        streams: Streams,
         drain_seconds: float,
         began: float,
     ) -> None:
         super().__init__(config)
         self._runtime = runtime
-        self._streams = streams
         self._drain_seconds = drain_seconds
         self._closing_at: float | None = None
         self._began = began
@@ -111,17 +104,13 @@ class Server(uvicorn.Server):
         """Start the shutdown. A second signal ends the first step of the shutdown at once."""
         if sig == signal.SIGTERM and not self._runtime.draining:
             self._runtime.drain()
-            self._closing_at = monotonic() + max(self._drain_seconds, LEAVE)
+            self._closing_at = monotonic() + self._drain_seconds
             return
         self._runtime.drain()
         super().handle_exit(sig, frame)
 
     async def on_tick(self, counter: int) -> bool:
         """Return whether the server must stop. uvicorn calls this method ten times per second."""
-        # This method closes the streams, because handle_exit() can interrupt the event loop at any
-        # point.
-        if self._runtime.draining:
-            self._streams.drain()
         if self._closing_at is not None and monotonic() >= self._closing_at:
             self._closing_at = None
             super().handle_exit(signal.SIGTERM, None)
@@ -155,11 +144,7 @@ def build(settings: Settings, began: float) -> Server:
         port=settings.port,
         root_path=settings.root_path,
         http=Connection,
-        ws="websockets-sansio",
-        ws_max_size=settings.max_body_bytes,
-        ws_ping_interval=settings.client_timeout,
-        ws_ping_timeout=settings.client_timeout,
-        ws_per_message_deflate=False,
+        ws="none",
         limit_concurrency=settings.max_connections,
         timeout_keep_alive=KEEP_ALIVE,
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
@@ -175,4 +160,4 @@ def build(settings: Settings, began: float) -> Server:
             "that reaches port %d can use the service",
             settings.port,
         )
-    return Server(config, app.state.runtime, app.state.streams, settings.drain_seconds, began)
+    return Server(config, app.state.runtime, settings.drain_seconds, began)

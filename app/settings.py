@@ -161,45 +161,7 @@ class Settings(BaseSettings):
     port: Annotated[
         int, Field(ge=0, le=65535, description="port to listen on; 0 = any free port")
     ] = 8000
-    store: Annotated[
-        str,
-        BeforeValidator(str),
-        Field(
-            description="folder of published models, or the URL of a remote store: s3://, gs:// or "
-            "az://"
-        ),
-    ] = "model_store"
-    store_cache: Annotated[
-        Path | None,
-        Field(
-            description="folder for the local copy of a remote store; default: a folder in the "
-            "user's cache folder"
-        ),
-    ] = None
-    store_cache_bytes: Annotated[
-        int, Field(ge=2**20, le=2**44, description="maximum size of this local copy in bytes")
-    ] = 8 * 2**30
-    store_max_age: Annotated[
-        float,
-        Field(
-            ge=0,
-            allow_inf_nan=False,
-            description="seconds without contact to a remote store after which the service is not "
-            "ready; 0 = no limit",
-        ),
-    ] = 0
-    trusted_keys: Annotated[
-        tuple[str, ...],
-        NoDecode,
-        BeforeValidator(_words),
-        Field(
-            description="public keys that may sign the index of a remote store, in base64, "
-            "separated by commas"
-        ),
-    ] = ()
-    unsigned_store: Annotated[
-        bool, Field(description="accept a remote store without a signature")
-    ] = False
+    store: Annotated[Path, Field(description="folder of published models")] = Path("model_store")
     store_poll: Annotated[
         float,
         Field(
@@ -309,18 +271,6 @@ class Settings(BaseSettings):
             description="maximum time limit in milliseconds that a client may choose",
         ),
     ] = 60_000
-    max_streams: Annotated[
-        int, Field(ge=0, le=4096, description="maximum number of open streams of a process")
-    ] = 64
-    stream_idle: Annotated[
-        float,
-        Field(
-            ge=1,
-            le=86_400,
-            allow_inf_nan=False,
-            description="seconds without a message after which the service closes a stream",
-        ),
-    ] = 300
     drain_seconds: Annotated[
         float,
         Field(
@@ -344,8 +294,8 @@ class Settings(BaseSettings):
             ge=0.1,
             le=3600,
             allow_inf_nan=False,
-            description="seconds that a client may take to send a request body, to acknowledge an "
-            "answer, and to answer the ping of a stream",
+            description="seconds that a client may take to send a request body, and to acknowledge "
+            "an answer",
         ),
     ] = 20
     retry_after: Annotated[
@@ -439,20 +389,9 @@ class Settings(BaseSettings):
 
     @field_validator("store")
     @classmethod
-    def _is_location(cls, value: str) -> str:
-        if "://" not in value and not Path(value).is_dir():
-            raise ValueError(f"SCENE_STORE must be an existing directory or a URL, but is {value}")
-        return value
-
-    @field_validator("unsigned_store")
-    @classmethod
-    def _is_signed_or_allowed(cls, value: bool, info: ValidationInfo) -> bool:
-        is_remote = "://" in info.data.get("store", "")
-        if is_remote and not value and not info.data.get("trusted_keys"):
-            raise ValueError(
-                "a remote store needs SCENE_TRUSTED_KEYS, or SCENE_UNSIGNED_STORE=true to accept "
-                "an index without a signature"
-            )
+    def _is_directory(cls, value: Path) -> Path:
+        if not value.is_dir():
+            raise ValueError(f"SCENE_STORE must be an existing directory, but is {value}")
         return value
 
     @field_validator("max_request_timeout_ms")

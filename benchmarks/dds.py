@@ -31,7 +31,6 @@ from rich.table import Table
 
 from benchmarks.load import servers
 from benchmarks.report import describe_machine
-from benchmarks.stream import room
 from scene_client import Client
 from scene_client.vision_msgs import from_detection3d_array
 
@@ -114,6 +113,21 @@ def bridge(topic: str, service: str, errors: IO[str] | None = None) -> Iterator[
     finally:
         process.terminate()
         process.wait(timeout=_PATIENCE)
+
+
+def room(labels: list[str], objects: int) -> list[dict[str, Any]]:
+    """Return objects with random positions in a cube of three metres."""
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(labels), objects, replace=False)
+    return [
+        {
+            "id": f"object_{k}",
+            "label": labels[label],
+            "position": dict(zip("xyz", rng.uniform(0, 3, 3).round(3).tolist(), strict=True)),
+            "size": {"x": 0.5, "y": 0.5, "z": 0.5},
+        }
+        for k, label in enumerate(chosen)
+    ]
 
 
 def detections(things: list[dict[str, Any]], number: int) -> ros.Detection3DArray:

@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import httpx
-from websockets.sync.client import connect
 
 from tests.chaos import corpus as hostile
 
@@ -38,7 +37,7 @@ SEED: Final = 20261123
 QUESTIONS: Final = ("relations", "missing", "outliers")
 MODELS: Final = (
     "default", "indoor-triway", "indoor-gbm", "indoor-rbm", "indoor-triway-deep", "open-triway",
-    "everyday-triway", "procthor-triway", "indoor-triway@2.4.0",
+    "everyday-triway", "indoor-triway@2.4.0",
 )  # fmt: skip
 RELATIONS: Final = ("left", "right", "front", "behind", "on-top", "under", "above", "below")
 HEADERS: Final = ("content-type", "retry-after", "www-authenticate", "allow", "location")
@@ -190,7 +189,7 @@ def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Js
         likely = [scene["objects"] for scene in drawn["scenes"] if scene["objects"]]
         labels = [entry["label"] for entry in words["objects"]]
         scenes = Scenes(rng, labels, words["room_types"], likely)
-        count = 60 if model in {"procthor-triway", "indoor-triway@2.4.0"} else 210
+        count = 60 if model == "indoor-triway@2.4.0" else 210
         for k in range(count):
             question = QUESTIONS[k % 3]
             body = scenes.scene() | {"model": model}
@@ -248,13 +247,13 @@ def pages(client: httpx.Client) -> Iterator[dict[str, Json]]:
     listed = client.get("/models").json()
     paths = [
         "/", "/docs", "/redoc", "/openapi.json", "/models", "/health/live", "/health/ready", "/v2",
-        "/v2/health/live", "/v2/health/ready", "/problems", "/nowhere", "/stream", "/models/none",
+        "/v2/health/live", "/v2/health/ready", "/problems", "/nowhere", "/models/none",
         "/models/none/vocabulary", "/v2/models/none", "/v2/models/none/ready",
     ]  # fmt: skip
     listing = client.get("/problems").text.split('"/problems/')[1:]
     paths += ["/problems/" + entry.partition('"')[0] for entry in listing]
     names = [model["name"] for model in listed["models"]]
-    for name in [*names, "default", "procthor-triway"]:
+    for name in [*names, "default"]:
         paths += [f"/models/{name}", f"/models/{name}/vocabulary", f"/models/{name}/contexts"]
         paths += [f"/v2/models/{name}", f"/v2/models/{name}/ready"]
     for model in listed["models"]:
@@ -276,38 +275,6 @@ def pages(client: httpx.Client) -> Iterator[dict[str, Json]]:
             yield request | {"method": "PUT"}
             yield request | {"method": "PUT", "path": "/models/aliases/indoor-rbm"}
     yield post("/missing", {"objects": ["bed", "lamp"], "model": "candidate"})
-
-
-def streams(rng: random.Random) -> Iterator[list[dict[str, Json]]]:
-    """Generate the messages of streams. Each stream changes a scene, with some invalid messages."""
-    labels = ["bed", "lamp", "pillow", "nightstand", "stove", "desk", "chair", "toilet", "sofa"]
-    for number in range(24):
-        ask = [{"missing": {"top_k": 5}, "outliers": {}}, {"relations": {"top_k": 5}}][number % 2]
-        talk: list[dict[str, Json]] = [{"type": "open", "ask": ask}]
-        if number % 3 == 0:
-            talk[0]["model"] = rng.choice(MODELS[:6])
-        present: list[str] = []
-        for seq in range(1, 9):
-            kind = rng.random()
-            if kind < 0.15 and len(present) > 1:
-                gone = present.pop(rng.randrange(len(present)))
-                talk.append({"type": "update", "seq": seq, "remove": [gone]})
-            elif kind < 0.25:
-                talk.append({"type": "update", "seq": seq, "objects": ["bedd"]})
-            elif kind < 0.35:
-                present = rng.sample(labels, 4)
-                talk.append({"type": "scene", "seq": seq, "objects": present[:]})
-            else:
-                new = rng.choice(labels)
-                entry: Json = new
-                if rng.random() < 0.5:
-                    entry = {"id": new, "label": new}
-                    entry["position"] = {k: round(rng.uniform(0, 2), 2) for k in "xyz"}
-                if new not in present:
-                    present.append(new)
-                talk.append({"type": "update", "seq": seq, "objects": [entry]})
-        talk += [{"type": "update", "seq": 3, "objects": ["bed"]}, {"type": "nonsense"}]
-        yield talk
 
 
 # ------------------------------------------------------------------------------------- asking
@@ -332,38 +299,6 @@ def ask(client: httpx.Client, request: dict[str, Json], key: str) -> dict[str, J
 def _in_order(header: str) -> str:
     """Sort the values of a header such as `Allow`, because their order has no meaning."""
     return ", ".join(sorted(header.split(", ")))
-
-
-def converse(url: str, talk: list[dict[str, Json]]) -> list[Json]:
-    """Send messages over a stream, and return the event that answers each message."""
-    events = []
-    with connect(url.replace("http", "ws", 1) + "/stream", max_size=2**24) as socket:
-        for message in talk:
-            socket.send(json.dumps(message))
-            events.append(comparable(json.loads(socket.recv(timeout=30))))
-    return events
-
-
-def comparable(event: dict[str, Json]) -> dict[str, Json]:
-    """Convert an event of a stream to one format, because the format differs between versions.
-
-    The field `lists` contains the lists of the answers. All other fields are at the top level.
-    """
-    event = {k: v for k, v in event.items() if k not in {"alarms", "superseded"}}
-    if event["type"] == "opened":
-        return {"type": "opened", "seq": event["seq"]}
-    if event["type"] == "problem" and event["problem"].get("errors"):
-        # This error message lists the known message types, which differ between versions.
-        for error in event["problem"]["errors"]:
-            error["message"] = error["message"].partition("must be open, ")[0]
-    if event["type"] == "answer" and "lists" not in event:
-        lists: dict[str, Json] = {}
-        for answer in [event.pop(name) for name in QUESTIONS if name in event]:
-            for name, value in answer.items():
-                is_list = isinstance(value, list) and name not in NOTES
-                (lists if is_list else event)[name] = value
-        event = {"problems": {}, **event, "lists": lists}
-    return event
 
 
 # ---------------------------------------------------------------------------------- comparing
@@ -489,37 +424,33 @@ def record(url: str, file: Path, key: str) -> int:
         ):  # fmt: skip
             for request in requests:
                 keep(kind, request, ask(client, request, key))
-        for talk in streams(rng):
-            keep("stream", talk, converse(url, talk))
     sys.stdout.write(f"{sum(asked.values())} recorded: {dict(asked)}\n")
     return 0
 
 
 def compare(url: str, file: Path, key: str) -> int:
-    """Send all recorded requests again. Return exit status 1 if an answer differs, else 0."""
+    """Send all recorded requests again. Return exit status 1 if an answer differs, else 0.
+
+    Entries of the kind "stream" in older recordings are skipped.
+    """
     with gzip.open(file, "rt") as lines:
-        entries = [json.loads(line) for line in lines]
+        entries = [entry for entry in map(json.loads, lines) if entry["kind"] != "stream"]
     tests = 400 * sum(entry["kind"] == "drawn" for entry in entries)
     differing = 0
     with httpx.Client(base_url=url, timeout=60) as client:
         for entry in entries:
             request, old = entry["request"], entry["answer"]
-            if entry["kind"] == "stream":
-                found = list(differences(list(map(comparable, old)), converse(url, request)))
+            new = ask(client, request, key)
+            if entry["kind"] == "drawn" and old["status"] == new["status"] == 200:
+                found = list(shares(old, new, tests))
+            elif request["path"] == "/generate":
+                found = list(differences(undrawn(old), undrawn(new)))
             else:
-                new = ask(client, request, key)
-                if entry["kind"] == "drawn" and old["status"] == new["status"] == 200:
-                    found = list(shares(old, new, tests))
-                elif request["path"] == "/generate":
-                    found = list(differences(undrawn(old), undrawn(new)))
-                else:
-                    found = list(differences(old, new))
+                found = list(differences(old, new))
             if found:
                 differing += 1
-                what = request[0] if entry["kind"] == "stream" else request
-                body = base64.b64decode(what.get("body", ""))[:300].decode("latin-1")
-                name = what.get("method", "stream"), what.get("path", ""), body
-                sys.stdout.write(f"{' '.join(map(str, name))}\n")
+                body = base64.b64decode(request["body"])[:300].decode("latin-1")
+                sys.stdout.write(f"{request['method']} {request['path']} {body}\n")
                 sys.stdout.writelines(f"    {line}\n" for line in found[:6])
     sys.stdout.write(f"{differing} of {len(entries)} answers differ\n")
     return int(differing > 0)

@@ -51,7 +51,7 @@ def resolve(requirements: list[str], pins: Path | None, pip_arguments: list[str]
 
 def with_markers(locked: dict[str, str], requirements: list[str]) -> list[str]:
     """Return the sorted lines of a lock file, with the environment markers of pyproject.toml."""
-    markers = {"uvloop": "sys_platform != 'win32'"}
+    markers: dict[str, str] = {}
     for requirement in requirements:
         name, _, marker = requirement.partition(";")
         if marker:

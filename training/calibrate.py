@@ -1,12 +1,15 @@
 """Fit the calibration, which turns log-odds into the probabilities that the service returns.
 
-All fits use validation scenes. The calibration has these entries:
+All fits use validation scenes. Without enough scenes for `outlier` or `misplaced`, the entry is
+None and the model gives no judgement. An unfitted entry of another question keeps the model's own
+probability. The calibration has these entries:
 
     missing, outlier   See `training.calibrate_objects`.
     relation   Probability that a relation holds between two instances. A first fit uses scenes
                without observed relations. A second fit uses scenes with half of the pairs observed.
     placement  Probability that a relation holds between a removed object and another object.
-    misplaced  Probability that a relation is false. Half of the scenes contain one false relation.
+    misplaced  Probability that a relation is false. Each scene takes part untouched and with one
+               false relation.
 
 All fits are logistic regressions (Platt scaling) on relations that a data source annotates as true
 or false. Other relations are left out. One source of generated rooms has more examples than all
@@ -28,25 +31,27 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from app.questions import misplaced
 from app.questions.missing import PLACES
+from app.questions.outliers import stated_log_odds
 from app.questions.posterior import posterior
 from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
-from app.scene import CANONICAL
+from app.scene import Scene
 from training.batches import SceneTensors, subset
-from training.calibrate_objects import ALARMS, calibrate_objects, recalibrated
+from training.calibrate_objects import LEAST, calibrate_objects, recalibrated
 from training.cases import (
     RIDGE,
     Triple,
-    altered_case,
+    altered_scene,
     known_relations,
     logistic,
     scene_of,
+    stated_relations,
     taken_away,
     told_pairs,
 )
 from training.datasets import EncodedScene
 from training.datasets.sources import meaning_of
+from training.evaluation.alarms import ALARMS
 from training.evaluation.outliers import kept_in_each_source
 from training.oracle.units import NO_UNIT
 
@@ -74,6 +79,8 @@ _UNKNOWN = -1.0
 # Number of objects that are removed from each scene in turn to fit placements. With one removed
 # object, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
+# Minimum number of scenes with relations for a judgement of relations.
+_JUDGED_SCENES = 20
 
 
 def calibrate(
@@ -103,14 +110,12 @@ def calibrate(
     if not len(related):
         return objects
     alone = fit_relations(artifact, related)
-    entry, limits = fit_misplaced(artifact, related, seed)
     return recalibrated(
         artifact,
         relation=alone,
         **fit_placements(artifact, related, seed),
         relation_given=fit_given(artifact, related, alone, seed),
-        misplaced=entry,
-        misplaced_thresholds=limits,
+        **fit_misplaced(artifact, related, seed),
     ).calibration
 
 
@@ -406,39 +411,52 @@ def _fit_relation(examples: NDArray[np.float64], weight: NDArray[np.float64]) ->
 
 def fit_misplaced(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
-) -> tuple[Slope, Thresholds]:
+) -> dict[str, Any]:
     """Fit the probability that an observed relation is false, and the thresholds for an alarm.
 
-    The input is the log-odds of the relation given the rest of the scene. A threshold gives an
-    alarm in a fixed share of unaltered scenes (`ALARMS`), measured on the data source with the most
-    alarms.
+    The input is the log-odds of the relation given the rest of the scene. Each scene takes part
+    twice, untouched and with one false relation. A threshold gives an alarm in a fixed share of
+    untouched scenes (`ALARMS`), measured on the data source with the most alarms, and is at least
+    the minimum of `LEAST`.
+
+    Returns:
+        The entries `misplaced` and `misplaced_thresholds`. Both are None if fewer than
+        `_JUDGED_SCENES` scenes have relations, or if false relations are not less likely than true
+        relations. The model then judges no relation.
     """
     rng = np.random.default_rng(seed)
+    structure = artifact.vocabulary.structure
     rows: list[tuple[float, bool]] = []
-    untouched: list[tuple[EncodedScene, list[float]]] = []
+    untouched: list[tuple[EncodedScene, float]] = []
     for encoded in scenes:
-        case = altered_case(encoded, artifact.vocabulary.structure, rng)
-        if case is None:
+        triples = stated_relations(encoded, structure, rng)
+        altered = triples and altered_scene(encoded, structure, triples, rng)
+        if not triples or not altered:
             continue
-        scene, false = case
-        logits = []
-        for answer in misplaced(artifact, scene):
-            p = np.clip(answer.probability, 1e-9, 1 - 1e-9)
-            triple = (CANONICAL.index(answer.relation), answer.subject, answer.object)
-            logits.append(float(np.log(p / (1 - p))))
-            rows.append((logits[-1], triple == false))
-        if false is None:
-            untouched.append((encoded, logits))
+        scene, false = altered
+        own = _log_odds(artifact, replace(scene, relations=tuple(triples)))
+        untouched.append((encoded, min(own.values())))
+        rows += [(z, False) for z in own.values()]
+        rows += [(z, triple == false) for triple, z in _log_odds(artifact, scene).items()]
+    unfitted: dict[str, Any] = {"misplaced": None, "misplaced_thresholds": None}
+    if len(untouched) < _JUDGED_SCENES:
+        return unfitted
     examples = np.array(rows)
-    if len(examples) < 20 or len(np.unique(examples[:, 1])) < 2 or not untouched:
-        return Slope(), Thresholds()
     slope, intercept = logistic(examples[:, :1], examples[:, 1] > 0, C=RIDGE)
+    if slope >= 0:
+        return unfitted
     group = np.array([encoded.group for encoded, _ in untouched])
     _, source = np.unique([encoded.source for encoded, _ in untouched], return_inverse=True)
-    worst = np.array([max(intercept + slope * z for z in logits) for _, logits in untouched])
-    worst = 1 / (1 + np.exp(-worst))
+    worst = expit(intercept + slope * np.array([least for _, least in untouched]))
     limits = {
-        name: kept_in_each_source(worst, group, source, rng, share)
+        name: max(LEAST[name], kept_in_each_source(worst, group, source, rng, share))
         for name, share in ALARMS.items()
     }
-    return Slope(intercept=intercept, slope=slope), Thresholds(**limits)
+    entry = Slope(intercept=intercept, slope=slope)
+    return {"misplaced": entry, "misplaced_thresholds": Thresholds(**limits)}
+
+
+def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
+    """Return the log-odds of each stated relation given the rest of the scene."""
+    triples, log_odds = stated_log_odds(artifact, posterior(artifact, scene), scene)
+    return dict(zip(map(tuple, triples.T.tolist()), log_odds.tolist(), strict=True))

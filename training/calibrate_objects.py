@@ -29,10 +29,11 @@ from torch import Tensor
 
 from app.questions.generate import room_fit
 from app.questions.posterior import posterior
-from app.registry import Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
+from app.registry import NEVER, Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
 from app.scene import Scene, SceneObject
 from training.batches import SceneTensors, subset
 from training.cases import RIDGE, logistic
+from training.evaluation.alarms import ALARMS
 from training.evaluation.evidence import removals
 from training.evaluation.intruders import (
     IntruderScores,
@@ -53,12 +54,10 @@ WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
 # from .47 to .35.
 ALPHAS = (0.0, 0.125, 0.25, 0.375)
 PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
-ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
-"""Maximum shares of unaltered scenes with an alarm, on the large source with the most alarms."""
 
 # Minimum thresholds. If the scores of intruders and other objects do not overlap, as in scenes that
 # hardly vary, the target shares would need alarms for objects that probably belong to the scene.
-_LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
+LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
 # Lists of up to `_SHORT_LISTS` classes have separate thresholds, until the threshold of whole
 # scenes raises alarms in at most `_ENOUGH` times the target share of the shortened lists. Each
 # threshold is fitted to at least `_SHORTENED` shortened lists; few scenes are shortened several
@@ -66,7 +65,6 @@ _LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
 _SHORT_LISTS = 8
 _ENOUGH = 1.5
 _SHORTENED = 200
-_NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 # Number of scenes used from each source.
 _PARTIAL_SCENES = 120
 # Number of times that the hidden class is drawn, for scenes that show all but one class.
@@ -376,6 +374,8 @@ def fit_outliers(
         parts.append(np.column_stack([features, found.intruder[used]]))
     examples = np.concatenate(parts)
     slope, size, intercept = logistic(examples[:, :2], examples[:, 2] > 0, C=RIDGE)
+    if slope >= 0:
+        return {}
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
     limits = thresholds([(next(iter(judged.values())), scenes)], entry, rng)
     fitted: dict[str, Any] = {
@@ -398,7 +398,7 @@ def fit_outliers(
         if _limit(parts_scored, entry, np.random.default_rng(seed), share) <= limits.medium:
             break
         own = thresholds(parts_scored, entry, rng)
-        short.append(_between(limits, own, short[-1] if short else _NEVER))
+        short.append(_between(limits, own, short[-1] if short else NEVER))
     return fitted | {"short_list_thresholds": tuple(short)}
 
 
@@ -426,7 +426,7 @@ def thresholds(untouched: Scored, entry: CountSlope, rng: np.random.Generator) -
     """Return the thresholds with the target shares of alarms, and at least the minimum."""
     return Thresholds(
         **{
-            name: max(_LEAST[name], _limit(untouched, entry, rng, share))
+            name: max(LEAST[name], _limit(untouched, entry, rng, share))
             for name, share in ALARMS.items()
         }
     )
@@ -492,10 +492,11 @@ def fit_evidence(
 ) -> EvidenceWeights:
     """Choose the weights of relations and poses in answers about objects.
 
-    The criterion is the mean reciprocal rank (MRR) of removed objects.
+    The criterion is the mean reciprocal rank (MRR) of removed objects. Evidence without validation
+    scenes has no effect on answers about objects.
     """
     plain = structure.numpy()
-    found = artifact.calibration.evidence
+    found = EvidenceWeights(relations_on_objects=0.0, poses_on_objects=0.0)
     scenes = complete_scenes(validation, seed)
     related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
     rng = np.random.default_rng(seed)

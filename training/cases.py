@@ -179,23 +179,45 @@ def occupied_place(
 
 def altered_case(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[Scene, tuple[int, int, int] | None] | None:
+) -> tuple[Scene, Triple | None] | None:
     """Return a scene with observed relations, of which one may be false, and the false relation.
 
     Half of the scenes have a false triple (relation, subject, object) in place of a true triple. In
     the other half, all triples are true, and the false triple is None.
     """
+    triples = stated_relations(encoded, structure, rng)
+    if triples is None:
+        return None
+    if rng.random() < 0.5:
+        return scene_of(encoded, range(len(encoded.instance_classes)), triples), None
+    return altered_scene(encoded, structure, triples, rng)
+
+
+def stated_relations(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> list[Triple] | None:
+    """Return at most 40 true relations of a scene, or None if fewer than two are known."""
     usable = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds & usable[:, None] & usable[None, :]
     triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(holds)]
-    if len(triples) < 2:
-        return None
     if len(triples) > 40:
         chosen = sorted(rng.choice(len(triples), 40, replace=False).tolist())
         triples = [triples[k] for k in chosen]
-    everything = range(len(encoded.instance_classes))
-    if rng.random() < 0.5:
-        return scene_of(encoded, everything, triples), None
+    return triples if len(triples) > 1 else None
+
+
+def altered_scene(
+    encoded: EncodedScene,
+    structure: NDArray[np.bool_],
+    triples: Sequence[Triple],
+    rng: np.random.Generator,
+) -> tuple[Scene, Triple] | None:
+    """Return a scene in which a false triple replaces one of `triples`, and the false triple.
+
+    The result is None if 50 draws find no false triple.
+    """
+    usable = ~structure[encoded.instance_classes]
+    holds = encoded.instance_holds
     place = int(rng.integers(len(triples)))
     for _ in range(50):
         a, i, j = triples[place]
@@ -206,7 +228,7 @@ def altered_case(
         if i == j or not usable[j] or holds[a, i, j] or holds[a, j, i]:
             continue
         altered = [*triples[:place], (a, i, j), *triples[place + 1 :]]
-        return scene_of(encoded, everything, altered), (a, i, j)
+        return scene_of(encoded, range(len(usable)), altered), (a, i, j)
     return None
 
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import torch
 import typer
@@ -19,7 +20,6 @@ from rich.console import Console
 from rich.table import Table
 
 from app.registry import Artifact, RegistryError, Store, load_model_set
-from app.registry.location import open_for_publisher
 from app.registry.references import AliasTarget
 from training.batches import subset
 from training.config import (
@@ -44,7 +44,6 @@ from training.experiments.benchmark import benchmark
 from training.experiments.compare import compare_command, show
 from training.experiments.gate import (
     MARGIN,
-    RefusedError,
     compare_with_served,
     losses,
     measure_usefulness,
@@ -54,7 +53,7 @@ from training.experiments.tune import tune
 from training.fetch import fetch
 from training.live import Display, next_steps, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
-from training.publish import publish_run, refit
+from training.publish import RefusedError, publish_run, refit
 from training.runs import FinishedRun, RunError, load_run, save_run
 from training.trainer import Trainer
 
@@ -87,7 +86,7 @@ StoredData = Annotated[
     ),
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
-StorePath = Annotated[str, typer.Option("--store", help="the model store: a folder or a URL")]
+StorePath = Annotated[str, typer.Option("--store", help="folder of the model store")]
 _RUNS, _STORE = Path("runs"), "model_store"
 _ALIAS = "`python -m app.registry alias` moves an alias without a comparison"
 
@@ -120,7 +119,7 @@ def train(
             console.quiet = not first
             config = load_config(configuration, seed=seed)
             if publish is not None and first:
-                open_for_publisher(store).require_new(config.name, publish)
+                Store(store).require_new(config.name, publish)
             root = data_folder(configuration, config, data)
             folder = runs / config.name / f"seed-{config.training.seed}"
             measured = None
@@ -136,6 +135,8 @@ def train(
                 next_steps(folder, console)
         if publish is not None and first:
             _publish(load_run(folder), scenes, store, publish, measured)
+    except RefusedError as error:
+        _refused(error)
     except (
         *(ConfigError, DatasetError, RegistryError, RunError),
         FloatingPointError,
@@ -170,7 +171,7 @@ def publish(
         float, typer.Option(min=0, help="with --promote: maximum accepted loss of a metric")
     ] = MARGIN,
     even_if_worse: Annotated[
-        bool, typer.Option("--even-if-worse", "--force", help="promote even a worse version")
+        bool, typer.Option("--even-if-worse", "--force", help="publish even a refused version")
     ] = False,
     limit: Annotated[
         int, typer.Option(min=2, help="with --promote: number of scenes for the comparison")
@@ -181,12 +182,16 @@ def publish(
     With name@version, the command fits the offsets and the counts of instances again. The new
     version keeps weights, calibration and metrics of the old version.
 
-    With --promote, the command first compares the new version with two baselines on the test scenes
+    The command asks the model about untouched validation scenes, and refuses a model that certainly
+    raises more alarms than its sensitivities promise. A refused version is not published, and the
+    exit code is 3.
+
+    With --promote, the command also compares the new version with two baselines on the test scenes
     of the run: it must rank missing objects better than popularity, and not worse than EASE
     (co-occurrence). Then it compares the new version with the version that the alias serves, on
     test scenes that neither version was trained on. The command refuses the new version if the
     whole 95 % interval of the loss in a primary metric exceeds the margin, or if only the served
-    version has results for relations. A refused version is not published, and the exit code is 3.
+    version has results for relations.
     """
     try:
         if alias is not None and not promote:
@@ -197,7 +202,7 @@ def publish(
             _refit(folder, data or DATA, store, version)
             return
         run = load_run(Path(folder))
-        models = open_for_publisher(store)
+        models = Store(store)
         models.require_new(run.config.name, version)
         if promote and run.config.data.split == "final":
             raise ConfigError(
@@ -211,11 +216,9 @@ def publish(
             command = f"SCENE_STORE={shlex.quote(store)} SCENE_PORT=8055 python -m app"
             console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)
         else:
-            _publish(run, scenes, store, version)
+            _publish(run, scenes, store, version, accept=_accept if even_if_worse else None)
     except RefusedError as error:
-        console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
-        console.print("nothing was published; --even-if-worse publishes and promotes it anyway")
-        raise typer.Exit(3) from None
+        _refused(error, "; --even-if-worse publishes the version all the same")
     except (RunError, ConfigError, DatasetError, RegistryError) as error:
         fail(error)
 
@@ -236,7 +239,7 @@ def evaluate_command(
     try:
         tables: dict[str, list[Row]] = {}
         for reference in models:
-            found = open_for_publisher(store)
+            found = Store(store)
             artifact = found.load(*found.resolve(reference))
             config = Config.model_validate(artifact.manifest.training["config"])
             wanted = source or [source_name(name) for name in config.data.sources]
@@ -277,7 +280,7 @@ def evaluate_command(
 def list_command(store: StorePath = _STORE) -> None:
     """List the models in the store and the shipped configurations."""
     try:
-        models = load_model_set(open_for_publisher(store))
+        models = load_model_set(Store(store))
     except RegistryError as error:
         fail(error)
     table = Table("model", "version", "variant", "state", title="Published")
@@ -337,18 +340,30 @@ def _publish(
     store: str,
     version: str,
     measured: tuple[FinishedRun, SplitScenes] | None = None,
+    accept: Callable[[str], None] | None = None,
 ) -> None:
     with console.status("publishing") as status:
         artifact = publish_run(
-            *(run, scenes, open_for_publisher(store), version),
+            *(run, scenes, Store(store), version),
             measured=measured,
+            accept=accept,
             progress=status.update,
         )
     _published(artifact, store)
 
 
+def _accept(reason: str) -> None:
+    console.print(f"accepted by --even-if-worse: {reason}", soft_wrap=True)
+
+
+def _refused(error: RefusedError, remedy: str = "") -> NoReturn:
+    console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
+    console.print(f"nothing was published{remedy}")
+    raise typer.Exit(3) from None
+
+
 def _refit(reference: str, root: Path, store: str, version: str) -> None:
-    models = open_for_publisher(store)
+    models = Store(store)
     name, old = models.resolve(reference)
     models.require_new(name, version)
     artifact = models.load(name, old)
@@ -383,7 +398,7 @@ def _promote(
     before = seat(store, gate.alias)
     with console.status("publishing") as status:
 
-        def judged(artifact: Artifact) -> None:
+        def judged(artifact: Artifact) -> list[str]:
             limit, say = gate.limit, status.update
             useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
             for line in useful.lines():
@@ -400,12 +415,14 @@ def _promote(
                     if not gate.even_if_worse:
                         raise
                     console.print(f"the versions were not compared: {error}", soft_wrap=True)
-            if reasons and not gate.even_if_worse:
-                raise RefusedError(reasons)
-            for reason in reasons:
-                console.print(f"accepted by --even-if-worse: {reason}", soft_wrap=True)
+            return reasons
 
-        artifact = publish_run(run, scenes, store, version, judge=judged, progress=status.update)
+        artifact = publish_run(
+            *(run, scenes, store, version),
+            judge=judged,
+            accept=_accept if gate.even_if_worse else None,
+            progress=status.update,
+        )
     if before.note:
         console.print(before.note, soft_wrap=True)
     _published(artifact)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,6 +28,7 @@ from training.config import Config, DataConfig, load_config, shipped_configs
 from training.counts import fit_counts
 from training.datasets.sources import SOURCES
 from training.datasets.vocabulary import with_room_aliases
+from training.evaluation.alarms import untouched_alarms
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.evaluation.tasks import STATISTICS
@@ -43,6 +44,13 @@ from training.trainer import TrainingData
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
 
 
+class RefusedError(RuntimeError):
+    """The new version is refused. The text gives the reasons."""
+
+    def __init__(self, reasons: Sequence[str]) -> None:
+        super().__init__("; ".join(reasons))
+
+
 def publish_run(
     run: FinishedRun,
     scenes: SplitScenes,
@@ -50,10 +58,14 @@ def publish_run(
     version: str,
     *,
     measured: tuple[FinishedRun, SplitScenes] | None = None,
-    judge: Callable[[Artifact], None] | None = None,
+    judge: Callable[[Artifact], Sequence[str]] = lambda _: (),
+    accept: Callable[[str], None] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Artifact:
     """Calibrate on validation scenes, fit statistics, evaluate on test scenes, and publish.
+
+    The calibrated model answers `/outliers` about untouched validation scenes. It is refused if it
+    certainly raises too many alarms; see `training.evaluation.alarms`.
 
     The store keeps weights in half precision. Calibration and evaluation use the same precision.
 
@@ -65,11 +77,13 @@ def publish_run(
         measured: second run of the same configuration, and its scenes, for a `run` that was trained
             on test scenes. The second run did not use test scenes. Its test results and chosen
             calibration values are published.
-        judge: function that is called with the calibrated model. An exception stops the
-            publication.
+        judge: function that returns further reasons against the calibrated model.
+        accept: function that is called with each reason against the model, which is published all
+            the same. None refuses a model with such a reason.
         progress: function that is called with messages about the progress.
 
     Raises:
+        RefusedError: there is a reason against the model.
         RunError: the run was trained on other scenes than `scenes`.
         StoreError, ArtifactError: see `Store.publish`.
     """
@@ -88,8 +102,12 @@ def publish_run(
         asked = calibrated_draft(other, kept_back.vocabulary, test)
         calibrated = calibrated_draft(run, scenes.vocabulary, data, asked.calibration)
         asked, calibrated = with_statistics(asked, kept_back), with_statistics(calibrated, scenes)
-    if judge is not None:
-        judge(calibrated)
+    untouched = untouched_alarms(calibrated, scenes.parts["validation"])
+    reasons = [*filter(None, (one.objection() for one in untouched)), *judge(calibrated)]
+    for reason in reasons:
+        if accept is None:
+            raise RefusedError(reasons)
+        accept(reason)
     rows = _measure(asked, test, progress)
     progress("publishing")
     description = Description(

@@ -17,13 +17,11 @@ from app.api import (
     pages,
     problems,
     questions,
-    stream,
     telemetry,
 )
 from app.api.body import Bodies, JSONRoute
 from app.api.gateway import Gateway
 from app.serving.runtime import Runtime
-from app.serving.stream import Streams
 from app.settings import Settings
 
 
@@ -52,7 +50,6 @@ def build(
     app.state.settings = settings
     app.state.runtime = runtime
     app.state.bodies = Bodies(settings)
-    app.state.streams = Streams(settings.max_streams, runtime.metrics)
     problems.install(app)
     routes = (*questions.router.routes, *batches.router.routes)
     asked = [route for route in routes if isinstance(route, JSONRoute)]
@@ -65,7 +62,6 @@ def build(
     app.add_middleware(Gateway, settings=settings, runtime=runtime, direct=direct)
     app.router.routes.extend(asked)
     routers = [
-        stream.router,
         # `models.administration` stands before `models.router`, because both have the same paths.
         # The first route with a path sets the Allow header of a 405 response.
         models.administration,
@@ -79,5 +75,5 @@ def build(
         app.include_router(router)
     pages.install(app, docs=settings.docs)
     every = itertools.chain(app.routes, *(router.routes for router in routers))
-    app.state.paths = [route.path for route in every if hasattr(route, "path")]
+    app.state.paths = {route.path for route in every if hasattr(route, "path")}
     return app

@@ -87,8 +87,8 @@ MODEL_NOT_FOUND: Final = ProblemType(
     "model-not-found",
     404,
     "The model or version does not exist",
-    "Name a model by an alias, by its name or as name@version. A name selects the newest version. "
-    "GET /models lists all models, versions and aliases.",
+    "Name a model by an alias, by its name or as name@version. A name selects the newest usable "
+    "version. GET /models lists all models, versions and aliases.",
 )
 METHOD_NOT_ALLOWED: Final = ProblemType(
     "method-not-allowed",
@@ -122,8 +122,9 @@ STORE_NOT_WRITABLE: Final = ProblemType(
     "store-not-writable",
     409,
     "The store cannot be written",
-    "The store holds the aliases, but this service has no write access to the store. Change the "
-    "alias on a computer with write access. Then send POST /models/refresh to this service.",
+    "Either this service has no write access to the store, which holds the aliases, or the table "
+    "of aliases is full. Without write access, change the alias on a computer that has it. Then "
+    "send POST /models/refresh to this service.",
 )
 STORE_BUSY: Final = ProblemType(
     "store-busy",
@@ -207,8 +208,8 @@ DRAINING: Final = ProblemType(
     "draining",
     503,
     "The service is shutting down",
-    "The service soon closes its socket. It opens no more streams. Use another instance, or send "
-    "the request again after the time in Retry-After.",
+    "The service soon closes its socket. Use another instance, or send the request again after the "
+    "time in Retry-After.",
 )
 NOT_READY: Final = ProblemType(
     "not-ready",
@@ -230,22 +231,6 @@ INTERNAL_ERROR: Final = ProblemType(
     "The service failed",
     "This is a defect of the service. Search the log of the service for the request id to find the "
     "details.",
-)
-
-UPGRADE_REQUIRED: Final = ProblemType(
-    "upgrade-required",
-    426,
-    "This route is for WebSockets",
-    "GET /stream opens a WebSocket of version 13. Send its handshake as the first request of a "
-    "connection, or after the answers to all earlier requests. docs/stream.md describes the "
-    "protocol.",
-)
-TOO_MANY_STREAMS: Final = ProblemType(
-    "too-many-streams",
-    503,
-    "Too many streams are open",
-    "The process already has SCENE_MAX_STREAMS open streams. Try again after the time in "
-    "Retry-After. Until then, send the questions as POST requests.",
 )
 
 PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
@@ -278,7 +263,5 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         DRAINING,
         QUEUE_FULL,
         DEADLINE_PASSED,
-        UPGRADE_REQUIRED,
-        TOO_MANY_STREAMS,
     )
 }

@@ -6,7 +6,6 @@ import hmac
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from time import monotonic, perf_counter
 from typing import Any, Final
 from uuid import uuid4
@@ -71,9 +70,6 @@ _HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{1,5})?")
 _METHODS: Final = frozenset(
     ("GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH")
 )
-_SWITCHED: Final = 101
-# WebSocket close code (RFC 6455) for an internal error.
-_DEFECT: Final = 1011
 
 # These headers stop browsers from guessing the media type and from sending a Referer.
 _ALWAYS: Final = (
@@ -125,8 +121,8 @@ class Gateway:
         self._admitted: ASGIApp = CrossOrigin(self._admit, origins) if origins else self._admit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request or stream."""
-        if scope["type"] == "lifespan":
+        """Serve one request."""
+        if scope["type"] != "http":  # lifespan, or a WebSocket: no route accepts one
             await self._app(scope, receive, send)
             return
         began = perf_counter()
@@ -139,16 +135,12 @@ class Gateway:
         state["record"] = record
 
         async def send_completed(message: Message) -> None:
-            kind = message["type"]
-            if kind.endswith("response.start"):
+            if message["type"] == "http.response.start":
                 record.begin(message["status"])
                 message["headers"] = _completed(message.get("headers", ()), request_id)
                 if self._backlog.draining:
                     # The client's next request must go to another replica.
                     message["headers"].append((b"connection", b"close"))
-            elif kind == "websocket.accept":
-                record.begin(_SWITCHED)
-                message["headers"] = [*message.get("headers", ()), (b"x-request-id", request_id)]
             await send(message)
 
         try:
@@ -183,21 +175,20 @@ class Gateway:
                     "This service needs its API key, or the admin key for administration.",
                     headers={"WWW-Authenticate": "Bearer"},
                 )
-            if scope["type"] == "http":
-                allowed = size = None
-                for name, value in scope["headers"]:
-                    if name == b"x-request-timeout-ms":
-                        allowed = allowed or value
-                    elif name == b"content-length":
-                        size = value
-                if not scope["path"].endswith(_NOT_QUEUED):
-                    seconds = self._timeout if allowed is None else self._chosen(allowed)
-                    deadline = scope["state"]["deadline"] = monotonic() + seconds
-                    await self._backlog.enter(seconds, deadline)
-                if size is not None:
-                    self._check_size(size)
+            allowed = size = None
+            for name, value in scope["headers"]:
+                if name == b"x-request-timeout-ms":
+                    allowed = allowed or value
+                elif name == b"content-length":
+                    size = value
+            if not scope["path"].endswith(_NOT_QUEUED):
+                seconds = self._timeout if allowed is None else self._chosen(allowed)
+                deadline = scope["state"]["deadline"] = monotonic() + seconds
+                await self._backlog.enter(seconds, deadline)
+            if size is not None:
+                self._check_size(size)
             route = self._direct.get(scope["path"])
-            if route is not None and scope["type"] == "http":
+            if route is not None:
                 scope["route"], scope["path_params"] = route, {}
                 await route.handle(scope, receive, send)
             else:
@@ -215,13 +206,10 @@ class Gateway:
             await answer(problem, scope, receive, send)
             return
         record.outcome = problem.kind.slug
-        if scope["type"] == "http":
-            # A part of the response has been sent already. The raised error makes the server close
-            # the connection.
-            record.status = 500
-            raise error
-        with suppress(OSError):  # the client has closed the connection
-            await send({"type": "websocket.close", "code": _DEFECT})
+        # A part of the response has been sent already. The raised error makes the server close the
+        # connection.
+        record.status = 500
+        raise error
 
     def _may_enter(self, scope: Scope) -> bool:
         path: str = scope["path"].removeprefix(scope.get("root_path", ""))
@@ -250,12 +238,10 @@ class Gateway:
         status = record.status or 500
         if status >= 400 and record.outcome == SUCCESS:
             record.outcome = OTHER
-        asked = scope.get("method", "GET")
-        method = asked if asked in _METHODS else "-"
+        method = scope["method"] if scope["method"] in _METHODS else "-"
         # The log contains the template of the route, because a raw path may contain private data.
         route = getattr(scope.get("route"), "path", "-")
-        took = None if status == _SWITCHED else seconds
-        self._metrics.answered(route, method, record.outcome, took, record.serialise_seconds)
+        self._metrics.answered(route, method, record.outcome, seconds, record.serialise_seconds)
         if self._settings.access_log and _access.isEnabledFor(logging.INFO):
             entry = {
                 "request_id": scope["state"]["request_id"],
@@ -348,24 +334,3 @@ class CrossOrigin(CORSMiddleware):
                 headers={"Vary": response.headers["vary"]},
             )
         return response
-
-
-def may_connect(headers: Headers, origins: Sequence[str]) -> bool:
-    """Return whether a client may open a WebSocket.
-
-    The function accepts pages of the service, pages of the listed origins, and clients without an
-    Origin header. Browsers send no preflight request before they open a WebSocket. So the service
-    must check the Origin header, which a page cannot change.
-
-    Args:
-        headers: headers of the handshake.
-        origins: allowed values of the Origin header.
-    """
-    origin = headers.get("origin")
-    if origin is None or origin in origins:
-        return True
-    scheme, _, host = origin.partition("://")
-    usual = {"http": ":80", "https": ":443"}.get(scheme)
-    if usual is None or not host:
-        return False
-    return host == headers.get("host", "").lower().removesuffix(usual)

@@ -24,10 +24,15 @@ from scene_client.schemas import (
 router = APIRouter(tags=["health"])
 protocol = APIRouter(prefix="/v2", tags=["inference protocol"])
 
+# Maximum number of failures in an answer, because load balancers ask often and without a key.
+_FAILURES = 10
+
 _NOT_READY = problems(catalogue.NOT_READY, catalogue.DRAINING)
 _NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
 
 
+# Load balancers may check health with HEAD. OpenAPI describes only GET.
+@router.head("/health/live", include_in_schema=False, response_model_exclude_none=True)
 @router.get(
     "/health/live",
     summary="Is the process alive?",
@@ -39,6 +44,7 @@ async def health_live() -> Health:
     return Health(status="live")
 
 
+@router.head("/health/ready", include_in_schema=False, response_model_exclude_none=True)
 @router.get(
     "/health/ready",
     summary="Is the default model usable?",
@@ -48,10 +54,11 @@ async def health_live() -> Health:
 async def health_ready(runtime: RuntimeDep) -> Health:
     """Return status 200 if the default model is usable, else status 503.
 
-    A replica of a remote store stays ready while it cannot reach the store.
+    The answer lists refused versions and unusable aliases with their reasons.
     """
     runtime.check_ready()
-    return Health(status="ready", store=runtime.store_health)
+    failures = list(runtime.models.failures.values())[:_FAILURES]
+    return Health(status="ready", failures=failures or None)
 
 
 @protocol.get("", summary="Server metadata", responses=queued())
@@ -60,12 +67,14 @@ async def server_metadata() -> ServerMetadata:
     return ServerMetadata(name="scene-boltzmann", version=__version__, extensions=[])
 
 
+@protocol.head("/health/live", include_in_schema=False)
 @protocol.get("/health/live", summary="Is the process alive?", responses=problems())
 async def server_live() -> ServerLive:
     """Run the same check as `GET /health/live`."""
     return ServerLive(live=True)
 
 
+@protocol.head("/health/ready", include_in_schema=False)
 @protocol.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
 async def server_ready(runtime: RuntimeDep) -> ServerReady:
     """Run the same check as `GET /health/ready`."""
@@ -85,6 +94,7 @@ async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
     )
 
 
+@protocol.head("/models/{name}/ready", include_in_schema=False)
 @protocol.get("/models/{name}/ready", summary="Is this model usable?", responses=_NO_MODEL)
 async def model_ready(name: Reference, runtime: RuntimeDep) -> ModelReady:
     """Return status 200 if the model is usable, 404 if it does not exist, or else 503."""

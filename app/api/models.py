@@ -32,7 +32,7 @@ _USABLE: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogu
 Reference = Annotated[
     str,
     Path(
-        description="an alias, `name` (the newest version of a model) or `name@version`",
+        description="an alias, `name` (the newest usable version of a model) or `name@version`",
         openapi_examples={"alias": {"summary": "the default model", "value": "default"}},
     ),
 ]

@@ -13,7 +13,7 @@ from typing import Any, Final
 from fastapi import FastAPI
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
@@ -42,10 +42,6 @@ from scene_client.schemas import Request as Form
 from scene_client.validation import MAX_ERRORS, field_errors, pointer
 
 MEDIA_TYPE: Final = "application/problem+json"
-
-# With this ASGI extension, the server can answer a refused WebSocket handshake with any response.
-# Without the extension, the server always answers a refused handshake with status 403.
-_DENIAL: Final = "websocket.http.response"
 
 _logger = logging.getLogger("app.api")
 
@@ -189,11 +185,11 @@ def report_defect(error: Exception, request_id: str) -> None:
     _logger.error("request failed", exc_info=error, extra={"request_id": request_id})
 
 
-def _request_id(request: HTTPConnection) -> str:
+def _request_id(request: Request) -> str:
     return str(request.scope.get("state", {}).get("request_id", ""))
 
 
-def respond(request: HTTPConnection, problem: ProblemError) -> Response:
+def respond(request: Request, problem: ProblemError) -> Response:
     """Return a response with the problem. Store the problem's slug in the request's record."""
     record = request.scope.get("state", {}).get("record")
     if record is not None:
@@ -210,12 +206,8 @@ def respond(request: HTTPConnection, problem: ProblemError) -> Response:
 
 
 async def answer(problem: ProblemError, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer a request, or the handshake of a WebSocket, with a problem."""
-    if scope["type"] == "websocket" and _DENIAL not in scope.get("extensions", {}):
-        # A close message before the stream is accepted makes the server answer with status 403.
-        await send({"type": "websocket.close", "code": 1008})
-    else:
-        await respond(HTTPConnection(scope), problem)(scope, receive, send)
+    """Answer a request with a problem."""
+    await respond(Request(scope), problem)(scope, receive, send)
 
 
 async def _handle(request: Request, error: Exception) -> Response:

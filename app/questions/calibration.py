@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled, inlined
 from app.inference.elementary import logistic
-from app.registry.description import Calibration
+from app.registry.description import Calibration, CountSlope, Slope
 
 Floats = NDArray[np.floating[Any]]
 
@@ -108,17 +108,18 @@ def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, lis
     return found
 
 
-def intruder_line(calibration: Calibration, classes: int) -> tuple[float, float]:
+def intruder_line(entry: CountSlope, classes: int) -> tuple[float, float]:
     """Return intercept and slope that convert log-odds of presence to log-odds of an intruder.
 
     An intruder is an object that does not belong to the scene. The scene has `classes` distinct
-    classes.
+    classes. `entry` is `Calibration.outlier`.
     """
-    entry = calibration.outlier
     return entry.intercept + entry.log_count * math.log(classes), entry.slope
 
 
-def false_log_odds(calibration: Calibration, log_odds: Floats) -> Floats:
-    """Convert the log-odds that stated relations hold to the log-odds that they are false."""
-    entry = calibration.misplaced
+def false_log_odds(entry: Slope, log_odds: Floats) -> Floats:
+    """Convert the log-odds that stated relations hold to the log-odds that they are false.
+
+    `entry` is `Calibration.misplaced`.
+    """
     return entry.intercept + entry.slope * log_odds

@@ -25,8 +25,8 @@ from app.compiling import compiled
 from app.inference import MachineSpec, Weights
 from app.inference.chains import ConditionedChains, Conditions, Drawn, random_stream
 from app.inference.elementary import softplus
-from app.questions.outliers import intruder_probability
-from app.questions.posterior import given_relations, posterior, present
+from app.questions.outliers import intruders
+from app.questions.posterior import given_relations, present
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
 from app.scene.scene import Scene, SceneObject
@@ -301,12 +301,7 @@ class Plausible:
         labels = self._artifact.vocabulary.labels
         objects = [SceneObject(labels[index], labels[index], index) for index in classes]
         judged = Scene(tuple(objects), room_type=self._room)
-        # A drawn scene lists all its objects. So the thresholds for short lists, which are often
-        # incomplete, do not apply.
-        whole = self._artifact.calibration.outlier_thresholds.medium
-        given = posterior(self._artifact, judged)
-        is_intruder = intruder_probability(self._artifact, given) >= whole
-        return self._given.issuperset(given.present.classes[is_intruder].tolist())
+        return self._given.issuperset(intruders(self._artifact, judged).tolist())
 
     def _suits_room(self, classes: list[int]) -> bool:
         limits = self._artifact.calibration.room_fit

@@ -31,7 +31,7 @@ from app.questions.calibration import false_log_odds, intruder_line
 from app.questions.posterior import Posterior, posterior
 from app.questions.ranking import EXPLAINED, Because, best, entries, strongest_reasons
 from app.registry.artifact import Artifact
-from app.registry.description import Calibration, Thresholds
+from app.registry.description import CountSlope, Thresholds
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
 
@@ -94,12 +94,15 @@ class OutliersFound(NamedTuple):
     """The objects and the stated relations of a scene, with their probabilities.
 
     Attributes:
-        threshold: minimum probability of an outlier.
-        outliers: every object of the scene, probable intruders first.
-        misplaced: every stated relation, probably false relations first.
+        threshold: minimum probability of an outlier. None if the model judges no object and the
+            caller states no threshold.
+        outliers: every object of the scene, probable intruders first. The tuple is empty if the
+            model judges no object.
+        misplaced: every stated relation, probably false relations first. The tuple is empty if the
+            model judges no relation.
     """
 
-    threshold: float
+    threshold: float | None
     outliers: tuple[OutlierAnswer, ...]
     misplaced: tuple[MisplacedAnswer, ...]
 
@@ -135,19 +138,26 @@ def outliers(
     Raises:
         ValueError: the threshold is outside [0, 1].
     """
-    calibration = artifact.calibration
+    entry, presets = artifact.calibration.outlier, artifact.calibration.outlier_thresholds
     if threshold is not None and not 0 <= threshold <= 1:
         raise ValueError(f"threshold must be in [0, 1], not {threshold}")
     if not scene.objects:
-        limit = _threshold(calibration.outlier_thresholds, sensitivity)
-        return OutliersFound(limit if threshold is None else threshold, (), ())
+        if threshold is None and presets is not None:
+            threshold = _threshold(presets, sensitivity)
+        return OutliersFound(threshold, (), ())
     given = posterior(artifact, scene)
+    wrong = _misplaced(artifact, given, scene, sensitivity)
+    if entry is None or presets is None:
+        return OutliersFound(threshold, (), wrong)
     classes = given.present.classes
     if threshold is None:
         listed = int((~artifact.vocabulary.structure[classes]).sum())
-        threshold = _threshold(_presets(calibration, listed), sensitivity)
+        short = artifact.calibration.short_list_thresholds
+        if 0 < listed <= len(short):
+            presets = short[listed - 1]
+        threshold = _threshold(presets, sensitivity)
     log_odds = given.log_odds_given_rest()
-    logits = _intruder_logits(artifact, classes, log_odds)
+    logits = _intruder_logits(artifact, entry, classes, log_odds)
     # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
     order = np.argsort(-logits[given.present.row], kind="stable")
     p = _probability(logits)
@@ -168,7 +178,7 @@ def outliers(
         [reasons.get(one, ()) for one in rows],
         [company.get(one, ()) for one in rows],
     )
-    return OutliersFound(threshold, tuple(found), _misplaced(artifact, given, scene, sensitivity))
+    return OutliersFound(threshold, tuple(found), wrong)
 
 
 def misplaced(
@@ -180,20 +190,32 @@ def misplaced(
     return _misplaced(artifact, posterior(artifact, scene), scene, sensitivity)
 
 
-def intruder_probability(artifact: Artifact, given: Posterior) -> NDArray[np.float64]:
-    """Return the probability that each class of the scene is an intruder, (n,); see `outliers`."""
-    log_odds = given.log_odds_given_rest()
-    return _probability(_intruder_logits(artifact, given.present.classes, log_odds))
+def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
+    """Return the classes that do not belong to a whole scene, at medium sensitivity.
+
+    A whole scene lists all its objects. So the thresholds for short lists, which are often
+    incomplete, do not apply.
+    """
+    entry, presets = artifact.calibration.outlier, artifact.calibration.outlier_thresholds
+    given = posterior(artifact, scene)
+    classes = given.present.classes
+    if entry is None or presets is None:
+        return classes[:0]
+    logits = _intruder_logits(artifact, entry, classes, given.log_odds_given_rest())
+    return classes[_probability(logits) >= presets.medium]
 
 
 def _intruder_logits(
-    artifact: Artifact, classes: NDArray[np.int64], log_odds: NDArray[np.floating[Any]]
+    artifact: Artifact,
+    entry: CountSlope,
+    classes: NDArray[np.int64],
+    log_odds: NDArray[np.floating[Any]],
 ) -> NDArray[np.float64]:
     """Return the logit of each class's probability of being an intruder, (n,).
 
     The logit of a structural class is -inf.
     """
-    intercept, slope = intruder_line(artifact.calibration, len(log_odds))
+    intercept, slope = intruder_line(entry, len(log_odds))
     logits = intercept + slope * _adjusted(artifact, classes, log_odds).astype(np.float64)
     logits[artifact.vocabulary.structure[classes]] = -np.inf
     return logits
@@ -201,13 +223,6 @@ def _intruder_logits(
 
 def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isinf(logits), 0.0, sigmoid(logits))
-
-
-def _presets(calibration: Calibration, listed: int) -> Thresholds:
-    """Return the thresholds for a scene with `listed` classes. Structural classes do not count."""
-    if 0 < listed <= len(calibration.short_list_thresholds):
-        return calibration.short_list_thresholds[listed - 1]
-    return calibration.outlier_thresholds
 
 
 def _threshold(presets: Thresholds, sensitivity: Sensitivity) -> float:
@@ -253,6 +268,23 @@ def _reasons(
     }
 
 
+def stated_log_odds(
+    artifact: Artifact, given: Posterior, scene: Scene
+) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]]]:
+    """Return the n stated relations that the machine knows, and their log-odds.
+
+    Returns:
+        The triples (relation, subject, object), (3, n), and the log-odds that each relation holds,
+        given the rest of the scene, (n,).
+    """
+    stated = [triple for triple in scene.relations or () if triple[0] < artifact.spec.A]
+    relation, subject, object_ = triples = np.array(stated, dtype=np.int64).reshape(-1, 3).T.copy()
+    if not stated:
+        return triples, np.zeros(0)
+    row = given.present.row
+    return triples, given.unit_log_odds(relation, row[subject], row[object_])
+
+
 def _misplaced(
     artifact: Artifact, given: Posterior, scene: Scene, sensitivity: Sensitivity
 ) -> tuple[MisplacedAnswer, ...]:
@@ -260,14 +292,12 @@ def _misplaced(
 
     Relations with equal log-odds keep the order of `Scene.relations`.
     """
-    stated = [triple for triple in scene.relations or () if triple[0] < artifact.spec.A]
-    if not stated:
+    entry, presets = artifact.calibration.misplaced, artifact.calibration.misplaced_thresholds
+    (relation, subject, object_), log_odds = stated_log_odds(artifact, given, scene)
+    if entry is None or presets is None or not len(log_odds):
         return ()
-    calibration, row = artifact.calibration, given.present.row
-    relation, subject, object_ = np.array(stated).T.copy()
-    log_odds = given.unit_log_odds(relation, row[subject], row[object_])
     order = np.argsort(log_odds, kind="stable")
-    p = sigmoid(false_log_odds(calibration, log_odds[order]))
+    p = sigmoid(false_log_odds(entry, log_odds[order]))
     return tuple(
         entries(
             MisplacedAnswer,
@@ -275,7 +305,7 @@ def _misplaced(
             [CANONICAL[number] for number in relation[order].tolist()],
             object_[order].tolist(),
             p.tolist(),
-            (p >= _threshold(calibration.misplaced_thresholds, sensitivity)).tolist(),
+            (p >= _threshold(presets, sensitivity)).tolist(),
         )
     )
 

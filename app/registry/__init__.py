@@ -3,6 +3,7 @@
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.counts import Counts
 from app.registry.description import (
+    NEVER,
     Calibration,
     CountSlope,
     DataSource,
@@ -16,7 +17,6 @@ from app.registry.description import (
 )
 from app.registry.errors import ArtifactError, RegistryError, StoreError
 from app.registry.examples import Example
-from app.registry.location import open_store
 from app.registry.manifest import Manifest
 from app.registry.models import ArtifactFailure, ModelSet, StoreFailure, load_model_set
 from app.registry.offsets import Offsets
@@ -24,6 +24,7 @@ from app.registry.references import AliasTarget
 from app.registry.store import Store, StoreState
 
 __all__ = [
+    "NEVER",
     "AliasTarget",
     "Artifact",
     "ArtifactError",
@@ -50,6 +51,5 @@ __all__ = [
     "VocabularyEntry",
     "load_artifact",
     "load_model_set",
-    "open_store",
     "write_artifact",
 ]

@@ -2,7 +2,7 @@
 
 Each change of an alias replaces the whole file. Format of the file:
 
-    {"default": {"name": "...", "version": "..." or null for the latest version}}
+    {"default": {"name": "...", "version": "..." or null for the newest usable version}}
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Final
 
 from pydantic import TypeAdapter, ValidationError
 
-from app.registry.durable import replace_file
 from app.registry.errors import StoreError, cause
 from app.registry.references import AliasTarget, ModelName
 
@@ -50,16 +49,17 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
         ) from None
 
 
-def write_aliases(path: Path, aliases: Mapping[str, AliasTarget], *, prefix: str) -> None:
-    """Replace the table of aliases.
+def aliases_to_bytes(aliases: Mapping[str, AliasTarget]) -> bytes:
+    """Return the contents of the file for a table of aliases.
 
-    The function writes a temporary file and renames it. A crash may leave the temporary file
-    behind.
-
-    Args:
-        path: the file of the table.
-        aliases: maps each alias to its target.
-        prefix: start of the temporary file's name.
+    Raises:
+        StoreError: `not_writable` if `read_aliases` would refuse the size of the file.
     """
-    table = dict(sorted(aliases.items()))
-    replace_file(path, _TABLE.dump_json(table, indent=2) + b"\n", prefix=prefix)
+    text = _TABLE.dump_json(dict(sorted(aliases.items())), indent=2) + b"\n"
+    if len(text) > MAX_ALIASES_BYTES:
+        raise StoreError(
+            "not_writable",
+            f"the table of aliases would have more than the maximum of {MAX_ALIASES_BYTES} bytes; "
+            "remove an alias first",
+        )
+    return text

@@ -58,14 +58,8 @@ PairSlopes = Annotated[Many[PairSlope], Field(max_length=len(CANONICAL))]
 class Slope(Frozen):
     """Calibration of a logit z that does not depend on counts: log-odds = intercept + slope·z."""
 
-    intercept: float = 0.0
-    slope: float = 1.0
-
-
-_RETIRED = frozenset(
-    {"placed", "missing_temperature", "placed_temperature", "placed_relation_weight"}
-    | {"outlier_threshold"}
-)
+    intercept: float
+    slope: float
 
 
 class Thresholds(Frozen):
@@ -74,9 +68,13 @@ class Thresholds(Frozen):
     A request selects the threshold by its sensitivity: low, medium or high.
     """
 
-    low: Annotated[float, Field(ge=0, le=1)] = 0.5
-    medium: Annotated[float, Field(ge=0, le=1)] = 0.5
-    high: Annotated[float, Field(ge=0, le=1)] = 0.5
+    low: Annotated[float, Field(ge=0, le=1)]
+    medium: Annotated[float, Field(ge=0, le=1)]
+    high: Annotated[float, Field(ge=0, le=1)]
+
+
+NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
+"""Thresholds that raise no alarm below a probability of 1."""
 
 
 class EvidenceWeights(Frozen):
@@ -101,8 +99,9 @@ class Calibration(Frozen):
     """The conversion of a machine's log-odds into probabilities.
 
     With the default values, the calibration changes only the log-odds of unlisted classes, by
-    `coverage`. An intruder is an object that does not belong to the scene. Structural classes are
-    parts of the building (floor, wall) and vague names (object).
+    `coverage`, and the model judges neither objects nor relations. An intruder is an object that
+    does not belong to the scene. Structural classes are parts of the building (floor, wall) and
+    vague names (object).
 
     Attributes:
         coverage: probability that a request lists a class that is present in the scene. A request
@@ -117,10 +116,12 @@ class Calibration(Frozen):
             classes have the same popularity.
         popularity_weight: exponent alpha. The prior probability of an intruder's class is
             proportional to popularity^alpha, where popularity is the odds of the class.
-        outlier_thresholds: minimum probability of an outlier in a large scene.
+        outlier_thresholds: minimum probability of an outlier in a large scene. None exactly if
+            `outlier` is None.
         short_list_thresholds: minimum probability of an outlier in scenes of 1, 2, ... classes.
             Structural classes do not count. Larger scenes use `outlier_thresholds`.
-        misplaced_thresholds: minimum probability of a misplaced (probably false) relation.
+        misplaced_thresholds: minimum probability of a misplaced (probably false) relation. None
+            exactly if `misplaced` is None.
         smallest: (C + 1,) minimum number of classes in a generated scene of each room type. 90 % of
             the real rooms reach this number. The last entry is for scenes without a room type. If
             the tuple is empty, there is no minimum.
@@ -128,16 +129,17 @@ class Calibration(Frozen):
             room type. 85 % of the real rooms reach this value. If the tuple is empty, there is no
             minimum.
         outlier: calibration that converts a class's log-odds of presence to the log-odds that its
-            object is an intruder. n is the number of classes in the scene.
+            object is an intruder. n is the number of classes in the scene. None means that training
+            had too few scenes for the fit: the model then judges no object.
         relation: calibration of each canonical relation in scenes without observed relations.
-        relation_given: calibration of each canonical relation in scenes with observed relations. If
-            the tuple is empty, `relation` applies.
+        relation_given: calibration of each canonical relation in scenes with observed relations.
         placement: calibration of each canonical relation for a missing object at its most probable
-            places. If the tuple is empty, `relation` applies.
+            places.
         asked_place: calibration of each canonical relation for a missing object at the place that a
-            request names. If the tuple is empty, `placement` applies.
+            request names.
         misplaced: calibration that converts the log-odds of a stated relation to the log-odds that
-            the relation is false.
+            the relation is false. None means that training had too few scenes with relations for
+            the fit: the model then judges no relation.
     """
 
     coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -146,30 +148,30 @@ class Calibration(Frozen):
     evidence: EvidenceWeights = EvidenceWeights()
     popularity: Many[float] = ()
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
-    outlier_thresholds: Thresholds = Thresholds()
+    outlier_thresholds: Thresholds | None = None
     short_list_thresholds: Annotated[Many[Thresholds], Field(max_length=256)] = ()
-    misplaced_thresholds: Thresholds = Thresholds()
+    misplaced_thresholds: Thresholds | None = None
     smallest: Many[Count] = ()
     room_fit: Many[float] = ()
-    outlier: CountSlope = CountSlope()
+    outlier: CountSlope | None = None
     relation: PairSlopes
-    relation_given: PairSlopes = ()
-    placement: PairSlopes = ()
-    asked_place: PairSlopes = ()
-    misplaced: Slope = Slope()
+    relation_given: PairSlopes
+    placement: PairSlopes
+    asked_place: PairSlopes
+    misplaced: Slope | None = None
 
-    @model_validator(mode="before")
-    @classmethod
-    def _without_retired(cls, values: Any) -> Any:
-        """Remove fields that only earlier releases used, so that their manifests stay valid."""
-        if not isinstance(values, dict):
-            return values
-        return {name: value for name, value in values.items() if name not in _RETIRED}
+    @model_validator(mode="after")
+    def _has_fits_with_thresholds(self) -> Self:
+        for name in ("outlier", "misplaced"):
+            if (getattr(self, name) is None) != (getattr(self, f"{name}_thresholds") is None):
+                raise ValueError(f"{name} and {name}_thresholds must both have a value, or neither")
+        return self
 
     @classmethod
     def neutral(cls, relations: int) -> Self:
         """Return the calibration with default values for A = ``relations`` canonical relations."""
-        return cls(relation=(PairSlope(),) * relations)
+        neutral = (PairSlope(),) * relations
+        return cls(relation=neutral, relation_given=neutral, placement=neutral, asked_place=neutral)
 
 
 class ClassEntry(Frozen):
@@ -272,7 +274,7 @@ class Description(Frozen):
         metrics: figures measured on scenes that training did not use.
         terms: terms of use of the weights.
         libraries: maps the name of each library used in training to its version.
-        examples: example scenes for the visual page. Artifacts of earlier releases have none.
+        examples: example scenes for the visual page.
     """
 
     name: ModelName
@@ -301,14 +303,9 @@ class Description(Frozen):
         for name, what, length in (
             ("V", "vocabulary objects", len(words.objects)),
             ("A", "vocabulary relations", len(words.relations)),
-            ("A", "calibration relations", len(self.calibration.relation)),
             *(
-                ("A", f"calibration {kind}", len(entries or self.calibration.relation))
-                for kind, entries in (
-                    ("entries of relation_given", self.calibration.relation_given),
-                    ("entries of placement", self.calibration.placement),
-                    ("entries of asked_place", self.calibration.asked_place),
-                )
+                ("A", f"entries of calibration.{name}", len(getattr(self.calibration, name)))
+                for name in ("relation", "relation_given", "placement", "asked_place")
             ),
         ):
             if self.spec.get(name) != length:

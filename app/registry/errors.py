@@ -21,8 +21,8 @@ ArtifactCode = Literal[
     "invalid_tensor",
     "unsupported",
     "wrong_place",
-    "revoked",
     "unexpected_error",
+    "warm_up_failed",
 ]
 StoreCode = Literal[
     "invalid_reference",
@@ -37,12 +37,6 @@ StoreCode = Literal[
     "unreadable",
     "not_writable",
     "locked",
-    "unreachable",
-    "empty",
-    "invalid_index",
-    "untrusted_index",
-    "rolled_back",
-    "invalid_key",
 ]
 
 

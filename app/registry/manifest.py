@@ -23,9 +23,6 @@ from app.registry.fields import Count, Frozen, Many, Sha256, to_json
 from app.registry.offsets import PREFIX as OFFSETS
 
 FORMAT: Final = 3
-READABLE: Final = (1, 2, FORMAT)
-"""Manifest formats that this release reads. Format 1 has no offsets between related objects. In
-format 2, offsets are optional. In format 3, counts of instances are optional too."""
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -57,7 +54,7 @@ class FileEntry(Frozen):
 class Manifest(Description):
     """The description of a model, its stored tensors and the checksums of its other files."""
 
-    format: Literal[1, 2, 3] = FORMAT
+    format: Literal[3] = FORMAT
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
     files: dict[str, FileEntry]
 
@@ -95,11 +92,11 @@ class Manifest(Description):
                 "checksum_mismatch", f"{MANIFEST} does not match its own checksum: it was altered"
             )
         members = _parse(data, complete=trailer is not None)
-        if not _is_known_format(members.get("format")):
-            known = f"{READABLE[0]} to {READABLE[-1]}"
+        if type(found := members.get("format")) is not int or found != FORMAT:
             raise ArtifactError(
                 "unknown_format",
-                f"{MANIFEST} has an unknown format; this release reads only formats {known}",
+                f"{MANIFEST} does not have format {FORMAT}, the only format of this release; "
+                "train or publish the model again",
             )
         if not trailer:
             raise ArtifactError(
@@ -124,10 +121,6 @@ def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
     if not isinstance(members, dict):
         raise ArtifactError("invalid_manifest", f"{MANIFEST} is not a JSON object")
     return members
-
-
-def _is_known_format(value: object) -> bool:
-    return type(value) is int and value in READABLE
 
 
 def _first(error: ValidationError) -> str:

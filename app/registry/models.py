@@ -18,7 +18,7 @@ _logger = logging.getLogger("app.registry")
 
 @dataclass(frozen=True, slots=True)
 class ArtifactFailure:
-    """The reason why a version of a model was not loaded.
+    """The reason why a version of a model is not usable.
 
     Unlike an exception, this object does not keep stack frames or weights in memory.
     """
@@ -41,7 +41,7 @@ class ModelSet:
 
     Attributes:
         entries: maps each published (name, version) to its artifact, or to the reason why the
-            version was not loaded.
+            version is not usable.
         aliases: maps each alias to its target.
         failure: reason why the store or its aliases could not be read. None means that they could
             be read.
@@ -53,7 +53,7 @@ class ModelSet:
 
     @cached_property
     def versions(self) -> Mapping[str, tuple[str, ...]]:
-        """Maps each model to its versions in ascending order, including versions not loaded."""
+        """Maps each model to its versions in ascending order, including unusable versions."""
         found: dict[str, list[str]] = {}
         for name, version in sorted(self.entries, key=lambda key: (key[0], version_key(key[1]))):
             found.setdefault(name, []).append(version)
@@ -61,7 +61,7 @@ class ModelSet:
 
     @cached_property
     def failures(self) -> Mapping[tuple[str, str], ArtifactFailure]:
-        """Maps each (name, version) that was not loaded to the reason."""
+        """Maps each unusable (name, version) to the reason."""
         return MappingProxyType(
             {key: e for key, e in self.entries.items() if isinstance(e, ArtifactFailure)}
         )
@@ -69,17 +69,16 @@ class ModelSet:
     def resolve(self, reference: str) -> Artifact:
         """Return the model that an alias, `name` or `name@version` points at.
 
-        If this version was not loaded, the method does not return an older version instead.
+        A name, or an alias without a version, points at the newest usable version.
 
         Raises:
-            ArtifactError: the version was not loaded. The exception has the reason.
+            ArtifactError: the version is not usable, or no version of the model is. The exception
+                has the reason of this version or of the newest version.
             StoreError: the reference does not resolve (see `resolve_reference`), or the store could
                 not be read.
         """
         try:
-            key = resolve_reference(
-                reference, self.aliases, lambda name: self.versions.get(name, ())
-            )
+            key = resolve_reference(reference, self.aliases, self._by_preference)
         except StoreError as error:
             if self.failure is not None and error.code == "unknown_model":
                 raise StoreError(self.failure.code, self.failure.reason) from None
@@ -89,6 +88,10 @@ class ModelSet:
             name, version = key
             raise ArtifactError(entry.code, f"{name}@{version}: {entry.reason}")
         return entry
+
+    def _by_preference(self, name: str) -> list[str]:
+        """Return the versions of a model in ascending order, unusable versions first."""
+        return sorted(self.versions.get(name, ()), key=lambda v: (name, v) not in self.failures)
 
     @cached_property
     def default_failure(self) -> str | None:

@@ -1,7 +1,7 @@
 """Names, versions and aliases: the valid spellings, the order of versions, and references.
 
-A reference is an alias, `name` (the latest version of the model) or `name@version`. Every valid
-name is also a safe file name, because it is in lower case, without path separators or dots.
+A reference is an alias, `name` (the newest usable version of the model) or `name@version`. Every
+valid name is also a safe file name, because it is in lower case, without path separators or dots.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Version = Annotated[str, AfterValidator(_require_version)]
 class AliasTarget(BaseModel):
     """The target of an alias: a version of a model.
 
-    If `version` is None (null in JSON), the target is the latest version.
+    If `version` is None (null in JSON), the target is the newest usable version.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -105,8 +105,9 @@ def resolve_reference(
         reference: alias, `name`, or `name@version`.
         aliases: maps each alias to its target. An alias takes precedence over a model of the same
             name.
-        versions: function that returns the versions of a model in ascending order. For an unknown
-            model, the function returns an empty sequence.
+        versions: function that returns the versions of a model. A reference without a version
+            points at the last of them. For an unknown model, the function returns an empty
+            sequence.
 
     Raises:
         StoreError: the reference does not resolve. The code is `invalid_reference`,

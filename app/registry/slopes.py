@@ -33,17 +33,12 @@ class RelationSlopes:
 
     @classmethod
     def of(cls, calibration: Calibration) -> RelationSlopes:
-        """Build the tables of a calibration.
-
-        `Calibration` describes which values replace an empty field.
-        """
-        alone = calibration.relation
-        placement = calibration.placement or alone
+        """Build the tables of a calibration."""
         return cls(
-            _table(alone),
-            _table(calibration.relation_given or alone),
-            _table(placement),
-            _table(calibration.asked_place or placement),
+            _table(calibration.relation),
+            _table(calibration.relation_given),
+            _table(calibration.placement),
+            _table(calibration.asked_place),
         )
 
 

@@ -23,10 +23,10 @@ from typing import Final, Literal, TypeAlias
 
 from numpy.typing import ArrayLike
 
-from app.registry.aliases import read_aliases, write_aliases
-from app.registry.artifact import Artifact, load_artifact, write_artifact
+from app.registry.aliases import aliases_to_bytes, read_aliases
+from app.registry.artifact import MAX_WEIGHTS_BYTES, Artifact, load_artifact, write_artifact
 from app.registry.description import Description
-from app.registry.durable import make_directory, rename
+from app.registry.durable import make_directory, rename, replace_file
 from app.registry.errors import ArtifactError, StoreError, cause
 from app.registry.locking import exclusive
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS
@@ -40,7 +40,6 @@ from app.registry.references import (
     version_key,
 )
 from app.registry.tensors import StorageDtype
-from app.registry.verified import MAX_WEIGHTS_BYTES
 
 ALIASES: Final = "aliases.json"
 _LOCK: Final = ".lock"
@@ -57,12 +56,7 @@ class Store:
         root: directory of the store. The first publication creates it.
         lock_timeout: time in seconds that a writer waits for another writer.
         max_weights_bytes: maximum size in bytes of the weights file of a version.
-
-    Attributes:
-        error: the reason why the last `sync` with a remote store failed, or None.
     """
-
-    error: StoreError | None = None
 
     def __init__(
         self,
@@ -74,14 +68,6 @@ class Store:
         self.root = Path(root)
         self._lock_timeout = lock_timeout
         self._max_weights_bytes = max_weights_bytes
-
-    def sync(self) -> None:
-        """Bring the local copy of a remote store up to date. A store in a folder has no copy."""
-
-    @property
-    def age(self) -> float | None:
-        """Seconds since the last successful `sync`, or None for a store in a folder."""
-        return None
 
     # -- reading --------------------------------------------------------------------------------
 
@@ -114,16 +100,6 @@ class Store:
             ) from None
         return tuple(sorted(filter(is_version, found), key=version_key))
 
-    def latest(self, name: str) -> str:
-        """Return the highest published version of a model.
-
-        Raises:
-            StoreError: `invalid_reference`, `unreadable`, or `unknown_model`.
-        """
-        if not (found := self.versions(name)):
-            raise StoreError("unknown_model", f"no model has the name '{name}'")
-        return found[-1]
-
     def aliases(self) -> Mapping[str, AliasTarget]:
         """Return the target of each alias.
 
@@ -151,11 +127,12 @@ class Store:
         Raises:
             ArtifactError: the artifact is not valid. The code is `wrong_place` if the manifest has
                 another name or version than the folder.
-            StoreError: `invalid_reference`, `unreadable`, or `unknown_version`.
+            StoreError: `invalid_reference`, or `unknown_version`.
         """
-        if check_version(version) not in self.versions(name):
+        folder = self.root / check_name(name) / check_version(version)
+        is_known = _is_directory(folder.parent) and os.path.lexists(folder)
+        if not is_known or _is_unfinished(folder):
             raise StoreError("unknown_version", f"model '{name}' does not have version {version}")
-        folder = self.root / name / version
         artifact = load_artifact(folder, previous, self._max_weights_bytes)
         manifest = artifact.manifest
         if (manifest.name, manifest.version) != (name, version):
@@ -237,8 +214,10 @@ class Store:
             check_name(alias, "alias")
         with self._writing():
             self.require_new(name, version, alias)
+            table = None
             if alias is not None:
                 self._require_no_model(alias)
+                table = self._changed_table(alias, AliasTarget(name=name, version=version))
             folder = self._prepare_folder(name)
             place = folder / version
             if os.path.lexists(place):
@@ -254,8 +233,8 @@ class Store:
                 rename(temporary, place)
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
-            if alias is not None:
-                self._write_alias(alias, AliasTarget(name=name, version=version))
+            if table is not None:
+                self._replace_table(table)
         return dataclasses.replace(artifact, path=place)
 
     def set_alias(
@@ -265,7 +244,7 @@ class Store:
         *,
         expected: AliasTarget | Literal["any"] | None = "any",
     ) -> None:
-        """Point an alias at a version, or at the latest version of a model.
+        """Point an alias at a version, or at the newest usable version of a model.
 
         Args:
             alias: name of the alias. The method creates a missing alias.
@@ -283,7 +262,7 @@ class Store:
             self._require_no_model(alias)
             self._require_expected(alias, expected)
             resolve_reference(str(target), {}, self.versions)
-            self._write_alias(alias, target)
+            self._replace_table(self._changed_table(alias, target))
 
     def remove_alias(self, alias: str, *, expected: AliasTarget | Literal["any"] = "any") -> None:
         """Remove an alias.
@@ -301,7 +280,7 @@ class Store:
             if alias not in self.aliases():
                 raise StoreError("unknown_model", f"no alias has the name '{alias}'")
             self._require_expected(alias, expected)
-            self._write_alias(alias, None)
+            self._replace_table(self._changed_table(alias, None))
 
     # -- inside ---------------------------------------------------------------------------------
 
@@ -324,11 +303,14 @@ class Store:
         make_directory(folder)
         return folder
 
-    def _write_alias(self, alias: str, target: AliasTarget | None) -> None:
+    def _changed_table(self, alias: str, target: AliasTarget | None) -> bytes:
         table = {name: entry for name, entry in self.aliases().items() if name != alias}
         if target is not None:
             table[alias] = target
-        write_aliases(self.root / ALIASES, table, prefix=TEMPORARY)
+        return aliases_to_bytes(table)
+
+    def _replace_table(self, table: bytes) -> None:
+        replace_file(self.root / ALIASES, table, prefix=TEMPORARY)
 
     def _require_no_model(self, alias: str) -> None:
         if self.versions(alias):

@@ -13,8 +13,8 @@ cheap question runs on the event loop, because a change of thread costs as much 
 question is costly if its expected time exceeds `CHEAP`, or if its kind was never measured. A costly
 question runs on the worker thread of its model. Compiled kernels release the interpreter lock, so
 the event loop can continue. Sampling of scenes may take seconds, so all models share another thread
-for sampling. Questions of streams run one at a time, at most one per tick. The queue drops a
-question if its deadline passes or its client disconnects before the question starts.
+for sampling. The queue drops a question if its deadline passes or its client disconnects before
+the question starts.
 """
 
 from __future__ import annotations
@@ -22,9 +22,8 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic, thread_time
@@ -75,8 +74,8 @@ class Backlog:
         limit: maximum number of waiting requests.
 
     Attributes:
-        pending: number of started questions without a result. Questions of streams and requests
-            that sample scenes are not counted.
+        pending: number of started questions without a result. Requests that sample scenes are not
+            counted.
         draining: whether the service is shutting down.
     """
 
@@ -302,8 +301,6 @@ class WorkQueue:
     rows: int = 0
     _costs: _Costs = field(default_factory=_Costs)
     _costly: Executor = field(init=False)
-    # Questions of streams run one at a time, so a request waits for at most one such question.
-    _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
         self._costly = self.threads.for_model()
@@ -322,15 +319,7 @@ class WorkQueue:
         """Release reserved rows."""
         self.rows -= rows
 
-    async def run(
-        self,
-        call: Callable[[], T],
-        ticket: Ticket,
-        *,
-        kind: str,
-        size: int,
-        low_priority: bool = False,
-    ) -> Done[T]:
+    async def run(self, call: Callable[[], T], ticket: Ticket, *, kind: str, size: int) -> Done[T]:
         """Compute the answer to a question.
 
         Args:
@@ -338,8 +327,6 @@ class WorkQueue:
             ticket: deadline and connection check of the request.
             kind: kind of the question. The expected computation time depends on kind and size.
             size: size of the question, at least 1.
-            low_priority: whether the question belongs to a stream. Between two questions of
-                streams, other questions can run.
 
         Raises:
             DeadlinePassedError: the deadline passed before the end of the computation.
@@ -356,21 +343,14 @@ class WorkQueue:
             self._costs.learn(kind, size, done.processor)
             return done
 
-        async def compute() -> Done[T]:
+        self.backlog.pending += 1
+        try:
             if self._costs.expected(kind, size) > CHEAP:
                 return await _in_thread(measured, ticket, self._costly)
             ticket.check()
             done = measured()
             ticket.check()
             return done
-
-        if low_priority:
-            async with _turn(self._turn, ticket):
-                await asyncio.sleep(0)
-                return await compute()
-        self.backlog.pending += 1
-        try:
-            return await compute()
         finally:
             self.backlog.pending -= 1
 
@@ -393,24 +373,6 @@ class WorkQueue:
             return Done(result, began - came, monotonic() - began, thread_time() - busy)
 
         return await _in_thread(drawn, ticket, self.threads.drawing)
-
-
-@asynccontextmanager
-async def _turn(lock: asyncio.Lock, ticket: Ticket) -> AsyncIterator[None]:
-    """Hold the lock for questions of streams inside the ``with`` block.
-
-    Raises:
-        DeadlinePassedError: the deadline passed before the lock was free.
-    """
-    left = ticket.deadline - monotonic()
-    try:
-        await asyncio.wait_for(lock.acquire(), left if left < math.inf else None)
-    except TimeoutError:
-        raise DeadlinePassedError("The deadline passed before the computation started.") from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 async def _in_thread(

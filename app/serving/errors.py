@@ -85,7 +85,7 @@ class DisconnectedError(ServingError):
 
 
 class DrainingError(ServingError):
-    """The service is shutting down and refuses new requests."""
+    """The service is shutting down, so it is not ready."""
 
 
 class AliasConflictError(ServingError):

@@ -67,12 +67,12 @@ class PlainFormatter(logging.Formatter):
         return _masked(super().format(record), self.secrets)
 
 
-class NoHandshakes(logging.Filter):
-    """Drop uvicorn's log lines about WebSocket handshakes, because these contain raw paths."""
+def _is_useful(record: logging.LogRecord) -> bool:
+    """Return False for uvicorn's advice to install a WebSocket library.
 
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Return False for a log record about a WebSocket handshake, else True."""
-        return not (record.name == "uvicorn.error" and '"WebSocket %s"' in str(record.msg))
+    The service answers each upgrade request as plain HTTP.
+    """
+    return not str(record.msg).startswith("No supported WebSocket library")
 
 
 def log_config(
@@ -81,8 +81,8 @@ def log_config(
     """Return the log configuration of the service and uvicorn for `logging.config.dictConfig`.
 
     The access log of uvicorn is off, because it would contain raw paths. The service writes its own
-    access log. The log level of libraries is at least `info`, because at `debug` uvicorn would log
-    the headers of WebSocket handshakes, including keys.
+    access log. The log level of libraries is at least `info`, because at `debug` numba would log
+    each step of a compilation.
 
     Args:
         level: log level of the service.
@@ -101,15 +101,12 @@ def log_config(
             "stderr": {
                 "class": "logging.StreamHandler",
                 "formatter": style,
-                "filters": ["no handshakes"],
+                "filters": [_is_useful],
             },
         },
-        "filters": {"no handshakes": {"()": NoHandshakes}},
         "root": {"handlers": ["stderr"], "level": max(known[level.upper()], logging.INFO)},
         "loggers": {
             "app": {"level": level.upper()},
             "uvicorn.access": {"level": "CRITICAL"},
-            # At level "info", the library `websockets` would log each connection.
-            "websockets": {"level": "WARNING"},
         },
     }

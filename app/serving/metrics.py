@@ -105,28 +105,6 @@ class Metrics:
             _MODEL,
             registry=registry,
         )
-        self._streams = Gauge(
-            "scene_streams",
-            "Open streams",
-            registry=registry,
-        )
-        self._messages = Counter(
-            "scene_stream_messages_total",
-            "Messages of streams",
-            ("type", "outcome"),
-            registry=registry,
-        )
-        self._answers = Counter(
-            "scene_stream_answers_total",
-            "Answers to streams",
-            ("outcome",),
-            registry=registry,
-        )
-        self._superseded = Counter(
-            "scene_stream_superseded_total",
-            "Stream updates that a newer update replaced before an answer",
-            registry=registry,
-        )
         self._info = Gauge(
             _INFO,
             "1 for each served model, with one series per alias",
@@ -196,7 +174,7 @@ class Metrics:
         route: str,
         method: str,
         outcome: str,
-        seconds: float | None,
+        seconds: float,
         serialised: float | None = None,
     ) -> None:
         """Count one answered request.
@@ -205,8 +183,7 @@ class Metrics:
             route: template of the route, or "-" if no route has the requested path.
             method: HTTP method, or "-" for a method that HTTP does not define.
             outcome: "success" or the slug (short name) of the problem type.
-            seconds: duration of the request in seconds. It is None for a stream, because the client
-                chooses the duration of a stream.
+            seconds: duration of the request in seconds.
             serialised: time in seconds from the last answer of a model to the response. It is None
                 if no model has answered.
         """
@@ -215,41 +192,16 @@ class Metrics:
         if counter is None:
             counter = self._of_request[key] = self._requests.labels(*key)
         counter.inc()
-        if seconds is not None:
-            histogram = self._of_route.get(route)
-            if histogram is None:
-                histogram = self._of_route[route] = self._latency.labels(route)
-            histogram.observe(seconds)
+        histogram = self._of_route.get(route)
+        if histogram is None:
+            histogram = self._of_route[route] = self._latency.labels(route)
+        histogram.observe(seconds)
         if serialised is not None:
             self._serialisation.observe(serialised)
 
     def entry_answered(self, question: str, outcome: str) -> None:
         """Count one scene of a batch. Its outcome is "success" or the slug of the problem type."""
         self._entries.labels(question, outcome).inc()
-
-    def streams(self, count: int) -> None:
-        """Set the number of open streams."""
-        self._streams.set(count)
-
-    def stream_message(self, kind: str, outcome: str) -> None:
-        """Count one message of a stream.
-
-        Args:
-            kind: type of the message, or "-" for an unknown type.
-            outcome: "success" or the slug (short name) of the problem type.
-        """
-        self._messages.labels(kind, outcome).inc()
-
-    def stream_answered(self, outcome: str, superseded: int) -> None:
-        """Count one answer on a stream.
-
-        Args:
-            outcome: "success" or the slug (short name) of the problem type.
-            superseded: number of older updates that have no answer of their own, because this
-                answer covers them.
-        """
-        self._answers.labels(outcome).inc()
-        self._superseded.inc(superseded)
 
     def computed(self, key: Key, question: str, rows: int, waited: float, seconds: float) -> None:
         """Record one question that a model has computed.

@@ -1,8 +1,8 @@
 """The served models: the registry has verified them, and the service has warmed them up.
 
 A snapshot of the models never changes, so a request uses the same models from beginning to end. The
-snapshot lists each refused version with the reason. An older version never replaces a refused
-version.
+snapshot lists each refused version with the reason. A name without a version means the newest
+usable version.
 """
 
 from __future__ import annotations
@@ -88,16 +88,13 @@ class ServedModels:
     """A snapshot of served models, refused versions and aliases.
 
     Attributes:
-        store: snapshot of the registry, with all versions and aliases.
-        served: dictionary from (name, version) to the served model. It contains the models that
-            have passed their warm-up.
-        warm_up_failures: dictionary from (name, version) to the failure. It contains the verified
-            models that failed their warm-up.
+        store: snapshot of the registry, with all versions and aliases. The models that failed
+            their warm-up are among its failures.
+        served: dictionary from (name, version) to the served model. It contains all usable models.
     """
 
     store: ModelSet
     served: Mapping[Key, ServedModel]
-    warm_up_failures: Mapping[Key, Failure]
 
     def resolve(self, reference: str) -> ServedModel:
         """Return the model that an alias, `name` or `name@version` points at.
@@ -116,7 +113,7 @@ class ServedModels:
             found = self.served[artifact.manifest.name, artifact.manifest.version]
             self._resolved[reference] = found
             return found
-        except (StoreError, ArtifactError, KeyError) as error:
+        except (StoreError, ArtifactError) as error:
             if reference == DEFAULT:
                 raise NotReadyError("The default model is not usable.") from None
             if isinstance(error, StoreError) and error.code in _UNKNOWN:
@@ -177,23 +174,13 @@ class ServedModels:
             )
             for (name, version), refused in self.store.failures.items()
         }
-        found |= {failure.subject: failure for failure in self.warm_up_failures.values()}
         for alias in sorted({DEFAULT, *self.store.aliases}):
             try:
-                self.resolve(alias)
-            except (UnknownModelError, ModelUnavailableError, NotReadyError):
-                found[alias] = self._alias_failure(alias)
+                self.store.resolve(alias)
+            except (StoreError, ArtifactError) as error:
+                found[alias] = Failure(subject=alias, reason=error.code, detail=error.reason)
         if self.store.failure is not None:
             found["store"] = Failure(
                 subject="store", reason=self.store.failure.code, detail=self.store.failure.reason
             )
         return found
-
-    def _alias_failure(self, alias: str) -> Failure:
-        try:
-            artifact = self.store.resolve(alias)
-        except (StoreError, ArtifactError) as error:
-            return Failure(subject=alias, reason=error.code, detail=error.reason)
-        name, version = artifact.manifest.name, artifact.manifest.version
-        cause = self.warm_up_failures[name, version]
-        return Failure(subject=alias, reason=cause.reason, detail=f"{name}@{version}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
@@ -191,10 +191,6 @@ class Unknown:
         faults.add(Reason.UNKNOWN_LABELS, location, message, suggestions)
         return None
 
-    def copy(self) -> Unknown:
-        """Return a copy. A question with further labels changes only its own copy."""
-        return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
-
     def _nearest(self, label: str, *, is_room: bool) -> tuple[Match, ...]:
         key = label, is_room
         if key not in self._looked_up:
@@ -210,7 +206,7 @@ class Unknown:
 
 @dataclass
 class Reading:
-    """The scene of a request, with the class indices of a model. It is constant after `read_scene`.
+    """The scene of a request, with the class indices of a model.
 
     Attributes:
         scene: objects of known classes, their relations and the room type.
@@ -345,7 +341,6 @@ def read_scene(
     look_ups: LookUps | None = None,
     *,
     may_be_empty: bool = False,
-    derive: bool = True,
 ) -> Reading:
     """Convert the scene of a request: find the class of each label, and derive relations.
 
@@ -356,8 +351,6 @@ def read_scene(
         look_ups: searches for similar classes, shared by all scenes of a batch. None means that the
             request has only this scene.
         may_be_empty: whether a scene without objects of known classes is valid.
-        derive: whether to derive relations and warnings from poses. False means that the function
-            only checks the scene.
 
     Raises:
         RequestError: the scene is invalid; see `Faults.raise_any`.
@@ -400,7 +393,7 @@ def read_scene(
         triples, reading.flipped = _triples(request.relations, reading, faults)
         faults.raise_any()
         reading.scene = Scene(reading.scene.objects, triples, request.relations_complete, room)
-    if derive and has_detections:
+    if has_detections:
         _derive(request, reading, vocabulary, has_poses=has_poses)
     return reading
 

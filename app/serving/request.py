@@ -47,8 +47,6 @@ class Record:
             used no model.
         answered_at: time of the last answer of a model, as a value of `time.perf_counter`.
         serialise_seconds: time in seconds from the last answer of a model to the response.
-        stream: dictionary with the numbers of messages, answers and superseded updates of a stream,
-            and its close code. It is None for other requests.
     """
 
     outcome: str = SUCCESS
@@ -58,7 +56,6 @@ class Record:
     compute_seconds: float | None = None
     answered_at: float | None = None
     serialise_seconds: float | None = None
-    stream: dict[str, int] | None = None
 
     def begin(self, status: int) -> None:
         """Record that the response starts."""
@@ -71,7 +68,7 @@ class Record:
 
         The dictionary contains the model only if the request used exactly one model.
         """
-        entry: dict[str, str | float] = {"outcome": self.outcome, **(self.stream or {})}
+        entry: dict[str, str | float] = {"outcome": self.outcome}
         if len(self.models) == 1:
             ((entry["model"], entry["version"]),) = self.models
         if self.queue_seconds is not None:
@@ -92,8 +89,6 @@ class Request(Ticket):
         metrics: metrics of the service.
         record: values for the log and the metrics.
         holding: whether the request has already reserved rows (scenes) in the queues of the models.
-        known: stored result of `read`, if several questions concern the same scene.
-        low_priority: whether other requests take precedence, because this one belongs to a stream.
         look_ups: searches for classes similar to unknown labels, shared by all scenes of the
             request.
     """
@@ -104,52 +99,45 @@ class Request(Ticket):
     metrics: Metrics = field(kw_only=True)
     record: Record = field(default_factory=Record)
     holding: bool = False
-    known: tuple[ServedModel, Reading] | None = None
-    low_priority: bool = False
     look_ups: LookUps = field(default_factory=LookUps)
 
-    def read(
+    async def read(
         self, scene: SceneRequest, *, may_be_empty: bool = False
     ) -> tuple[ServedModel, Reading]:
         """Return the model in the field `model` of a scene, and the scene converted for this model.
+
+        The queue of the model reads large scenes.
 
         Raises:
             UnknownModelError: the model does not exist.
             ModelUnavailableError: the service refused to load the model.
             RequestError: the scene is invalid; see `read_scene`.
+            DeadlinePassedError, DisconnectedError: see `WorkQueue`.
         """
-        if self.known is not None:
-            return self.known
         model = self.models.resolve(scene.model)
         self.record.models.add(model.key)
-        return model, read_scene(
-            scene, model.vocabulary, self.limits, self.look_ups, may_be_empty=may_be_empty
+        read = partial(
+            read_scene,
+            scene,
+            model.vocabulary,
+            self.limits,
+            self.look_ups,
+            may_be_empty=may_be_empty,
         )
-
-    async def reading(
-        self, scene: SceneRequest, *, may_be_empty: bool = False
-    ) -> tuple[ServedModel, Reading]:
-        """Return the result of `read`. The queue of the model reads large scenes.
-
-        Raises:
-            DeadlinePassedError, DisconnectedError: see `WorkQueue`.
-            UnknownModelError, ModelUnavailableError, RequestError: see `read`.
-        """
         relations = len(scene.relations or ())
         if len(scene.objects) <= MANY_OBJECTS and relations <= MANY_RELATIONS:
-            return self.read(scene, may_be_empty=may_be_empty)
+            return model, read()
         posed = sum(
             not isinstance(thing, str) and thing.position is not None for thing in scene.objects
         )
         # The time for the relations from poses grows with the number of pairs of objects.
-        done = await self.models.resolve(scene.model).queue.run(
-            partial(self.read, scene, may_be_empty=may_be_empty),
+        done = await model.queue.run(
+            read,
             self,
             kind=f"read {posed.bit_length()}",
             size=len(scene.objects) + relations + posed**2,
-            low_priority=self.low_priority,
         )
-        return done.result
+        return model, done.result
 
     async def ask(
         self,
@@ -182,7 +170,6 @@ class Request(Ticket):
                 kind=_kind_of_cost(name, scene, kwargs),
                 # The time for relations grows with the number of pairs of objects.
                 size=(1 + len(scene.objects)) ** 2,
-                low_priority=self.low_priority,
             )
         finally:
             model.queue.give_back(rows)

@@ -6,14 +6,13 @@ import asyncio
 import ctypes
 import gc
 import logging
-import random
 import sys
 from collections.abc import Awaitable, Callable, Iterable
 from functools import wraps
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 from app.compiling import check_cache, progress
-from app.registry import AliasTarget, StoreError, StoreState, load_model_set, open_store
+from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.serving.admission import Backlog, Threads, WorkQueue
 from app.serving.errors import (
     AliasConflictError,
@@ -37,7 +36,7 @@ from app.serving.reading import Limits
 from app.serving.request import Record, Request
 from app.serving.warm_up import prepare
 from app.settings import Settings
-from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer, StoreHealth
+from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -46,9 +45,6 @@ _logger = logging.getLogger("app.serving")
 
 # Maximum time in seconds that an administration request waits for the lock of the store.
 _LOCK_TIMEOUT = 5.0
-
-# While a remote store is unreachable, the time between two polls doubles up to so many times.
-_MAX_DOUBLINGS = 4
 
 # Time in seconds after which the interpreter switches from a worker thread to the event loop.
 # Python's default of 5 ms would delay answers by a quarter of a robot's control cycle (20 ms).
@@ -98,15 +94,11 @@ class Runtime:
     def __init__(self, settings: Settings) -> None:
         self.metrics = Metrics()
         self.backlog = Backlog(settings.queue_requests)
-        self._store = open_store(
+        self._store = Store(
             settings.store,
-            trusted=None if settings.unsigned_store else settings.trusted_keys,
-            cache=settings.store_cache,
             lock_timeout=_LOCK_TIMEOUT,
             max_weights_bytes=settings.max_weights_bytes,
-            max_cache_bytes=settings.store_cache_bytes,
         )
-        self._max_age = settings.store_max_age
         self._limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
@@ -117,8 +109,6 @@ class Runtime:
         self._changing = asyncio.Lock()
         self._models: ServedModels | None = None
         self._seen: StoreState | None = None
-        self._failed_polls = 0
-        self._random = random.Random()  # noqa: S311 # nosec B311
 
     @property
     def models(self) -> ServedModels:
@@ -160,34 +150,22 @@ class Runtime:
 
     @property
     def draining(self) -> bool:
-        """Whether the service refuses new requests."""
+        """Whether the service is shutting down."""
         return self.backlog.draining
 
     def check_ready(self) -> None:
         """Check that the service accepts requests and that its default model is usable.
 
         Raises:
-            NotReadyError: the default model is not usable, or the local copy of a remote store is
-                too old.
+            NotReadyError: the default model is not usable.
             DrainingError: the service is shutting down.
         """
         if self.draining:
             raise DrainingError("The service is shutting down.")
-        age = self._store.age
-        if self._max_age and age is not None and age > self._max_age:
-            raise NotReadyError(f"The service has not reached the model store for {age:.0f} s.")
         self.models.resolve(DEFAULT)
 
-    @property
-    def store_health(self) -> StoreHealth | None:
-        """The state of the contact to a remote store, or None for a store in a folder."""
-        if (age := self._store.age) is None:
-            return None
-        error = self._store.error
-        return StoreHealth(age_s=round(age, 1), reason=None if error is None else error.code)
-
     def drain(self) -> None:
-        """Answer readiness checks with 503, refuse streams, and close connections after answers."""
+        """Answer readiness checks with 503, and close connections after answers."""
         self.backlog.draining = True
 
     async def start(self) -> None:
@@ -268,10 +246,10 @@ class Runtime:
     async def _follow(self) -> None:
         """Check the store regularly for changes by other processes, and serve the new state."""
         while True:
-            await asyncio.sleep(self._wait())
+            await asyncio.sleep(self._poll)
             try:
                 async with self._changing:
-                    changed = await asyncio.to_thread(self._look)
+                    changed = await asyncio.to_thread(self._store.state) != self._seen
                 if changed:
                     await self._take_over_changes()
             except RefreshRefusedError as error:
@@ -282,20 +260,6 @@ class Runtime:
                     )
             except Exception:
                 _logger.exception("the service could not load the changes in the store")
-
-    def _wait(self) -> float:
-        """Return the time in seconds until the next poll. It grows while the store is unreachable.
-
-        The time is random within 10 %, so that replicas do not poll a remote store all at once.
-        """
-        self._failed_polls = 0 if self._store.error is None else self._failed_polls + 1
-        longer = 1 << min(self._failed_polls, _MAX_DOUBLINGS)
-        return self._poll * longer * self._random.uniform(0.9, 1.1)
-
-    def _look(self) -> bool:
-        """Bring the local copy of the store up to date. Return whether its state has changed."""
-        self._store.sync()
-        return self._store.state() != self._seen
 
     @_counted("poll")
     async def _take_over_changes(self) -> None:
@@ -323,11 +287,7 @@ class Runtime:
         """
         # `_load` runs in a thread, so that the event loop can answer from the old snapshot.
         new = await asyncio.to_thread(self._load, self.models)
-        worse = [
-            failure
-            for subject, failure in new.failures.items()
-            if matters(subject) and failure.reason != "revoked"
-        ]
+        worse = [failure for subject, failure in new.failures.items() if matters(subject)]
         if worse:
             raise RefreshRefusedError(worse)
         self._serve(new)
@@ -346,7 +306,6 @@ class Runtime:
             _settle_memory()
 
     def _load(self, previous: ServedModels | None) -> ServedModels:
-        self._store.sync()
         # Read the state before the files. So the next check of the store finds changes that other
         # processes make during the load.
         self._seen = self._store.state()
@@ -364,7 +323,7 @@ class Runtime:
             raise ModelUnusableError(
                 f"The service refused to load {reference}; GET /models gives the reason."
             ) from None
-        # If the reference is a name without a version, the alias follows the newest version.
+        # If the reference is a name without a version, the alias follows the newest usable version.
         newest = reference == found.name
         return AliasTarget(name=found.name, version=None if newest else found.version)
 

@@ -9,14 +9,13 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from app.questions.ranking import significant
-from app.registry import Artifact, ModelSet
+from app.registry import Artifact, ArtifactFailure, ModelSet
 from app.scene.observe import observe
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import WorkQueue
 from app.serving.models import Key, ServedModel, ServedModels
 from app.serving.questions import QUESTIONS
-from scene_client.schemas import Failure
 
 _logger = logging.getLogger("app.serving")
 
@@ -24,13 +23,13 @@ _logger = logging.getLogger("app.serving")
 def prepare(
     store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels | None = None
 ) -> ServedModels:
-    """Warm up every verified model. Return the models that can be served, and the failures.
+    """Warm up every verified model. Return the models that can be served, and all failures.
 
     If ``previous`` already serves a model from the same artifact, the function skips the warm-up of
     this model and keeps its queue.
     """
     served: dict[Key, ServedModel] = {}
-    failures: dict[Key, Failure] = {}
+    entries = dict(store.entries)
     for key, artifact in store.entries.items():
         if not isinstance(artifact, Artifact):
             continue
@@ -42,16 +41,13 @@ def prepare(
             warm_up(artifact)
         except Exception:
             # A broken model may raise any exception. The service must still serve other models.
-            subject = f"{key[0]}@{key[1]}"
-            _logger.exception("the warm-up of model %s failed", subject)
-            failures[key] = Failure(
-                subject=subject,
-                reason="warm_up_failed",
-                detail="the files are valid, but the model could not answer a question",
+            _logger.exception("the warm-up of model %s failed", "@".join(key))
+            entries[key] = ArtifactFailure(
+                "warm_up_failed", "the files are valid, but the model could not answer a question"
             )
         else:
             served[key] = ServedModel(artifact, new_queue())
-    return ServedModels(store, MappingProxyType(served), MappingProxyType(failures))
+    return ServedModels(replace(store, entries=MappingProxyType(entries)), MappingProxyType(served))
 
 
 def warm_up(artifact: Artifact) -> None:

@@ -14,8 +14,8 @@ class Unchanged:
     """Pass requests and answers of the service through Ray Serve unchanged.
 
     Ray Serve would read all messages of a client into an unlimited queue, to notice that the client
-    disconnects. The service checks this itself, and reads a body or stream only as fast as it can
-    process it. Ray Serve also adds a second request id to each answer. Clients cannot change these
+    disconnects. The service checks this itself, and reads a body only as fast as it can process
+    it. Ray Serve also adds a second request id to each answer. Clients cannot change these
     settings by headers.
 
     Args:

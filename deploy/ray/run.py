@@ -115,7 +115,7 @@ class Engine:
     def end(self) -> None:
         """Finish the requests in progress, stop the cluster and end every process of it."""
         deadline = time.monotonic() + STOP_TIMEOUT
-        # HAProxy stays until all replicas have ended. So each stream gets its close frame.
+        # HAProxy stays until all replicas have ended. So each request in progress gets its answer.
         if self.runs() and self.request("PUT", json.dumps(self._config | {"applications": []})):
             while self._has_replicas() and time.monotonic() < deadline:
                 time.sleep(0.2)

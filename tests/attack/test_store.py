@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import os
 import tracemalloc
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from app.registry import ArtifactError, Store, StoreError, load_model_set
-from app.registry.artifact import load_artifact
+from app.registry.aliases import MAX_ALIASES_BYTES
+from app.registry.artifact import MAX_MANIFEST_BYTES, load_artifact
 from app.registry.tensors import MAX_HEADER_BYTES, unpack
-from app.registry.verified import MAX_MANIFEST_BYTES
 from tests.registry.small_artifacts import (
     description,
     replace_file,
@@ -168,6 +170,59 @@ def test_sizes_are_checked_before_files_are_read(
 def test_the_operator_limits_the_weights(published: Path) -> None:
     models = load_model_set(Store(published, max_weights_bytes=100))
     assert {failure.code for failure in models.failures.values()} == {"too_large"}
+
+
+def test_a_refresh_is_linear_in_the_number_of_junk_versions(
+    published: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = Counter[str]()
+
+    def counted(name: str) -> None:
+        function = getattr(os, name)
+
+        def call(*args: Any, **keywords: Any) -> Any:
+            calls[name] += 1
+            return function(*args, **keywords)
+
+        monkeypatch.setattr(os, name, call)
+
+    for name in ("stat", "lstat", "open", "listdir", "scandir"):
+        counted(name)
+    store, totals = Store(published), []
+    for size in (50, 100):
+        for number in range(size):
+            junk = published / "hostile" / f"9.9.{number}"
+            junk.mkdir(parents=True, exist_ok=True)
+            (junk / "manifest.json").write_bytes(b"{}")
+        calls.clear()
+        store.state()
+        assert len(load_model_set(store).failures) == size
+        totals.append(calls.total())
+    assert 0 < totals[1] <= 2 * totals[0]
+
+
+@pytest.mark.anyio
+async def test_a_full_alias_table_refuses_another_alias_and_stays_readable(published: Path) -> None:
+    table = {f"a{number:063}": {"name": "healthy", "version": None} for number in range(3000)}
+    file = published / "aliases.json"
+
+    def text() -> str:
+        return json.dumps(table | {"default": {"name": "healthy", "version": "1.0.0"}}, indent=2)
+
+    while len(text()) > MAX_ALIASES_BYTES:
+        table.popitem()
+    file.write_text(before := text())
+    async with serve(published, store_poll=0) as client:
+        answer = await client.put(
+            f"/models/aliases/{'b' * 64}", json={"model": "hostile"}, headers=ADMIN
+        )
+        assert (answer.status_code, answer.json()["type"]) == (409, "/problems/store-not-writable")
+        assert "the table of aliases would have more than" in answer.json()["detail"]
+        assert file.read_text() == before
+        assert (await client.post("/models/refresh", headers=ADMIN)).status_code == 200
+    with pytest.raises(StoreError, match="table of aliases"):
+        Store(published).publish(description("healthy", "2.0.0"), state(), alias="b" * 64)
+    assert Store(published).versions("healthy") == ("1.0.0",)
 
 
 def test_a_large_alias_table_is_not_read(published: Path) -> None:

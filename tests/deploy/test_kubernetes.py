@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,10 @@ import pytest
 import yaml
 
 from app.main import create_app
+from app.registry import AliasTarget, Store, load_model_set
 from app.settings import Settings
+from tests.http.stores import make_store
+from tests.services import wait_until
 from tests.system.test_container import split_stages
 
 pytestmark = pytest.mark.system
@@ -23,7 +28,7 @@ pytestmark = pytest.mark.system
 FindTool = Callable[[str], Path]
 Manifests = dict[tuple[str, str], dict[str, Any]]
 
-OVERLAYS = ("local", "s3", "autoscaled", "everything")
+OVERLAYS = ("local", "bucket", "autoscaled", "everything")
 SETTINGS = {f"SCENE_{name.upper()}" for name in Settings.model_fields}
 UNITS = {"Mi": 2**20, "Gi": 2**30}
 # Of kinds without a built-in schema, the tests check the important keys.
@@ -39,13 +44,13 @@ def folder(repository: Path) -> Path:
 def rendered(
     folder: Path, require_system_tool: FindTool, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, str]:
-    """Each overlay, and `everything`: s3, autoscaled and monitoring together."""
+    """Each overlay, and `everything`: bucket, autoscaled and monitoring together."""
     kubectl = require_system_tool("kubectl")
     copy = tmp_path_factory.mktemp("kubernetes") / "copy"
     shutil.copytree(folder, copy)
     shutil.copytree(copy / "overlays" / "autoscaled", copy / "overlays" / "everything")
     edited = copy / "overlays" / "everything" / "kustomization.yaml"
-    text = edited.read_text("utf-8").replace("../../base", "../s3")
+    text = edited.read_text("utf-8").replace("../../base", "../bucket")
     edited.write_text(text + "components: [../../monitoring]\n", "utf-8")
 
     def render(name: str) -> str:
@@ -88,7 +93,7 @@ def by_name(text: str) -> Manifests:
 
 
 def config(manifests: Manifests) -> dict[str, str]:
-    (found,) = [one["data"] for (kind, _), one in manifests.items() if kind == "ConfigMap"]
+    (found,) = [one["data"] for one in manifests.values() if "SCENE_STORE" in one.get("data", {})]
     return found
 
 
@@ -155,12 +160,8 @@ def test_the_values_are_valid_settings(
     container: dict[str, Any],
 ) -> None:
     environment = environment_of(manifests, container)
-    if environment["SCENE_STORE"].startswith("/"):
-        assert environment["SCENE_STORE"] in {"/srv/scene/model_store", "/srv/scene/models"}
-        environment["SCENE_STORE"] = str(repository / "model_store")
-    else:
-        assert environment["SCENE_TRUSTED_KEYS"] == ""
-        environment["SCENE_TRUSTED_KEYS"] = "AAAA"
+    assert environment["SCENE_STORE"] in {"/srv/scene/model_store", "/srv/scene/models"}
+    environment["SCENE_STORE"] = str(repository / "model_store")
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     settings = Settings()
@@ -253,24 +254,21 @@ def test_containers_have_no_privileges_and_a_read_only_root(
 
 
 def test_writable_folders_have_a_limit(
-    manifests: Manifests, pod: dict[str, Any], container: dict[str, Any]
+    manifests: Manifests, pod: dict[str, Any], container: dict[str, Any], overlay: str
 ) -> None:
     volumes = {volume.pop("name"): volume for volume in pod["volumes"]}
     mounts = {mount["mountPath"]: volumes[mount["name"]] for mount in container["volumeMounts"]}
     assert size(mounts["/tmp"]["emptyDir"]["sizeLimit"]) <= 2**30
     assert "hostPath" not in {kind for volume in volumes.values() for kind in volume}
-    data = config(manifests)
-    if "://" in data["SCENE_STORE"]:
-        # The service makes this folder itself, because it needs a folder of its own.
-        cache = Path(data["SCENE_STORE_CACHE"])
-        limit = size(mounts[str(cache.parent)]["emptyDir"]["sizeLimit"])
-        assert limit > int(data["SCENE_STORE_CACHE_BYTES"])
-    elif data["SCENE_STORE"] != "/srv/scene/model_store":
-        assert "persistentVolumeClaim" in mounts[data["SCENE_STORE"]]
+    store = mounts.get(config(manifests)["SCENE_STORE"], {})
+    if overlay == "local":
+        assert "persistentVolumeClaim" in store
+    elif store:
+        assert size(store["emptyDir"]["sizeLimit"]) <= 8 * 2**30
 
 
 def test_the_network_policy_opens_the_ports_in_use(
-    manifests: Manifests, container: dict[str, Any]
+    manifests: Manifests, pod: dict[str, Any], container: dict[str, Any]
 ) -> None:
     policy = manifests["NetworkPolicy", "scene"]["spec"]
     assert set(policy["policyTypes"]) == {"Ingress", "Egress"}
@@ -278,8 +276,61 @@ def test_the_network_policy_opens_the_ports_in_use(
     assert [port["port"] for port in entry["ports"]] == [container["ports"][0]["containerPort"]]
     out = {(port["port"], port["protocol"]) for rule in policy["egress"] for port in rule["ports"]}
     dns = {(53, "UDP"), (53, "TCP")}
-    is_remote = "://" in config(manifests)["SCENE_STORE"]
-    assert out == (dns | {(443, "TCP")} if is_remote else dns)
+    has_bucket = any(one["name"] == "bucket" for one in pod.get("initContainers", ()))
+    assert out == (dns | {(443, "TCP")} if has_bucket else dns)
+
+
+def test_the_bucket_is_for_the_sidecar_alone(rendered: dict[str, str], folder: Path) -> None:
+    manifests = by_name(rendered["bucket"])
+    pod = manifests["Deployment", "scene"]["spec"]["template"]["spec"]
+    (sidecar,), (service,) = pod["initContainers"], pod["containers"]
+    assert sidecar["restartPolicy"] == "Always"
+    assert sidecar["envFrom"] == [{"secretRef": {"name": "scene-bucket"}}]
+    assert all("secretRef" not in source for source in service["envFrom"])
+    # The service starts after the first copy, and only reads it.
+    path = config(manifests)["SCENE_STORE"]
+    assert sidecar["command"][-1] == path
+    assert sidecar["startupProbe"]["exec"]["command"][-1] == f"{path}/aliases.json"
+    (mount,) = [mount for mount in service["volumeMounts"] if mount["mountPath"] == path]
+    assert mount["readOnly"] is True
+    script = (folder / "overlays" / "bucket" / "copy.sh").read_text("utf-8")
+    assert script in [one["data"].get("copy.sh") for one in manifests.values() if "data" in one]
+
+
+def test_the_sidecar_copies_what_the_service_loads(
+    folder: Path, require_system_tool: FindTool, tmp_path: Path
+) -> None:
+    """A version arrives whole, without its upload's leftovers, and aliases follow the bucket."""
+    rclone = require_system_tool("rclone")
+    bucket, copied = Store(make_store(tmp_path / "bucket")), Store(tmp_path / "copied")
+    (copied.root / "home" / "1.0.0").mkdir(parents=True)
+    (copied.root / "home" / "1.0.0" / "card.md.0.partial").touch()  # of a killed container
+    shutil.copytree(bucket.root / "home" / "1.0.0", bucket.root / "home" / "2.0.0")
+    (bucket.root / "home" / "2.0.0" / "manifest.json").unlink()
+    (bucket.root / "home" / "1.0.0" / "notes.txt").touch()
+    variables = {"BUCKET": str(bucket.root), "INTERVAL": "0.1", "RCLONE_CONFIG": "/notfound"}
+    command = ["sh", folder / "overlays" / "bucket" / "copy.sh", copied.root]
+    path = f"{rclone.parent}:{os.environ['PATH']}"
+    process = subprocess.Popen(command, env=os.environ | variables | {"PATH": path})
+    try:
+        wait_until(lambda: "default" in copied.aliases())
+        models = load_model_set(copied)
+        assert not models.failures
+        assert models.versions == {
+            "deep": ("0.1.0",),
+            "home": ("1.0.0", "1.1.0"),
+            "plain": ("1.0.0",),
+        }
+        before = copied.state()
+        bucket.set_alias("default", AliasTarget(name="home"))
+        wait_until(lambda: copied.aliases() == bucket.aliases())
+        assert copied.state() != before
+        before = copied.state()
+        time.sleep(1)
+        assert copied.state() == before  # else each replica would load everything again
+    finally:
+        process.terminate()
+        assert process.wait(timeout=10) is not None
 
 
 def test_an_update_and_a_drained_node_leave_replicas(manifests: Manifests) -> None:
@@ -290,6 +341,7 @@ def test_an_update_and_a_drained_node_leave_replicas(manifests: Manifests) -> No
 
 def test_images_have_a_digest_except_on_a_laptop(pod: dict[str, Any], overlay: str) -> None:
     images = {one["image"] for one in [*pod["containers"], *pod.get("initContainers", ())]}
+    images = {image for image in images if not re.fullmatch(r"rclone/rclone:\d+\.\d+\.\d+", image)}
     (image,) = images
     if overlay == "local":
         assert image == "scene-boltzmann:local"

@@ -22,11 +22,9 @@ import yaml
 
 from app.settings import Settings
 from deploy.ray.run import descendants, environment
-from tests.http.streams import ASK, answered, opened, posted, talk
 from tests.services import LiveService
 
 SCENE = {"objects": ["bed", "lamp"]}
-STREAMED = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}]}
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +75,6 @@ def test_the_configuration_agrees_with_the_application(
     # The service answers with its own problems before Ray Serve refuses requests.
     most = deployment["max_ongoing_requests"] + deployment["max_queued_requests"]
     assert most >= fields["max_connections"].default
-    assert deployment["max_ongoing_requests"] > fields["max_streams"].default
     assert deployment["graceful_shutdown_timeout_s"] > fields["drain_timeout"].default
 
 
@@ -284,14 +281,6 @@ def test_a_body_above_the_limit_is_refused_by_the_service(service: LiveService) 
     response = service.client.post("/missing", content=b" " * (3 * 2**20))
     assert response.status_code == 413
     assert response.headers["content-type"] == "application/problem+json"
-
-
-@pytest.mark.slow
-def test_a_stream_gives_the_answers_of_requests(service: LiveService, shipped: LiveService) -> None:
-    with opened(service) as stream:
-        assert talk(stream, "open", ask=ASK)["type"] == "opened"
-        message = talk(stream, "scene", seq=1, **STREAMED)
-    assert answered(message) == posted(shipped.client, STREAMED, ASK)
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from app.questions.calibration import (
 )
 from app.questions.counts import distribution
 from app.registry import Calibration
-from app.registry.description import CountSlope
+from app.registry.description import CountSlope, Slope
 from tests.conftest import REPOSITORY
 from tests.enumeration.implied import features_by_hand
 from tests.enumeration.small_machines import (
@@ -584,19 +584,17 @@ def numbers_of_instances() -> None:
 
 @formula(r"p(\text{intruder}) = \sigma(\alpha + \beta \lambda_i + \gamma \log n)")
 def intruders() -> None:
-    found = calibration()
-    intercept, slope = intruder_line(found, 7)
-    entry = found.outlier
+    entry = CountSlope(intercept=-0.4, slope=-0.7, log_count=0.3)
+    intercept, slope = intruder_line(entry, 7)
     assert intercept == near(entry.intercept + entry.log_count * math.log(7))
     assert slope == near(entry.slope)
 
 
 @formula(r"p(\text{false}) = \sigma(\alpha + \beta \lambda_e)")
 def false_relations() -> None:
-    found = calibration()
     odds = np.array([-1.0, 0.5])
-    entry = found.misplaced
-    assert false_log_odds(found, odds) == near([entry.intercept + entry.slope * x for x in odds])
+    entry = Slope(intercept=-0.4, slope=-0.7)
+    assert false_log_odds(entry, odds) == near([entry.intercept + entry.slope * x for x in odds])
 
 
 @formula(r"\text{score} = -F(v) + \log p(r \mid v, h_1)")

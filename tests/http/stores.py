@@ -21,6 +21,7 @@ from app.registry import (
 )
 from app.scene.relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
+from tests.registry.small_artifacts import JUDGING
 from training.machines import BoltzmannMachine, MachineSpec, build
 
 VOCABULARY = Vocabulary(
@@ -88,6 +89,7 @@ def publish(
     alias: str | None = None,
     offsets: Offsets | None = None,
     counts: Counts | None = None,
+    judges: bool = True,
 ) -> None:
     """Publish a machine with random weights for the first ``classes`` classes."""
     machine = random_machine(variant, seed, classes)
@@ -99,7 +101,7 @@ def publish(
             created=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
             spec=machine.spec.to_dict(),
             vocabulary=VocabularyEntry.of(vocabulary),
-            calibration=Calibration.neutral(A),
+            calibration=Calibration.neutral(A).model_copy(update=JUDGING if judges else {}),
             training={"objective": "none: random weights", "seed": seed},
             data=(
                 DataSource(

@@ -53,6 +53,24 @@ def is_problem(answer: Answer, status: int, slug: str) -> None:
     assert json.loads(answer.body)["type"] == f"/problems/{slug}"
 
 
+@pytest.mark.parametrize(
+    ("path", "status"), [(b"/health/live", 200), (b"/missing", 405), (b"/stream", 404)]
+)
+def test_an_upgrade_request_gets_a_plain_answer(
+    service: LiveService, path: bytes, status: int
+) -> None:
+    upgrade = (
+        b"Host: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
+    )
+    request = LIVE.replace(b"/health/live", path).replace(b"Host: localhost", upgrade)
+    (answer,), _ = exchange(service.port, Wire("", [request], (status,)))
+    assert answer.status == status
+    assert "upgrade" not in answer.headers
+    assert answer.headers["content-type"].startswith("application/")
+    assert "WebSocket" not in service.log.read_text()
+
+
 def test_a_byte_now_and_then_keeps_no_connection(service: LiveService) -> None:
     """Sixty bodies at once; others are answered meanwhile, and all sixty are ended."""
     before = service.control()

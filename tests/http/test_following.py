@@ -83,7 +83,9 @@ async def test_a_broken_new_version_keeps_nothing_else_back(store: Path) -> None
 
         await until(follows)
         failures = {entry["subject"] for entry in (await listed(client))["failures"]}
-        assert "plain@2.0.0" in failures
+        assert failures == {"plain@2.0.0"}
+        answer = await client.post("/missing", json={"objects": ["bed"], "model": "plain"})
+        assert answer.json()["model"]["version"] == "1.0.0"
 
 
 async def test_what_works_goes_on_working(store: Path) -> None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 
 from app.main import create_app
+from app.registry import AliasTarget, Store
 from app.settings import Settings
 from tests.http.stores import corrupt
 from tests.http.test_problems import problem
-from tests.services import NAMED, serve
+from tests.services import NAMED, LiveService, Replace, defect, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -30,6 +32,17 @@ async def test_a_ready_service_says_so(client: httpx.AsyncClient) -> None:
     for path, expected in answers.items():
         response = await client.get(path)
         assert (response.status_code, response.json()) == (200, expected)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    "path", ["/health/live", "/v2/health/live", *READY, "/v2/models/none/ready"]
+)
+def test_head_answers_like_get_without_a_body(live: LiveService, path: str) -> None:
+    get, head = live.client.get(path), live.client.head(path)
+    assert head.status_code == get.status_code == (404 if "none" in path else 200)
+    assert (head.content, head.headers["content-length"]) == (b"", str(len(get.content)))
+    assert head.headers.keys() == get.headers.keys()
 
 
 async def test_protocol_metadata(client: httpx.AsyncClient) -> None:
@@ -92,6 +105,40 @@ async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
             "/v2/models/plain/ready",
         ):
             problem(await client.get(path), 503, "model-unavailable")
+
+
+@pytest.mark.parametrize("fault", ["corrupt", "defect"])
+async def test_a_name_means_the_newest_usable_version(
+    store: Path, replace: Replace, fault: str
+) -> None:
+    """An alias of a name too. Health and the list of models tell which version is refused."""
+
+    def fails(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
+        if artifact.manifest.version == "1.1.0":
+            defect()
+        return outliers(artifact, scene, **parameters)
+
+    Store(store).set_alias("newest", AliasTarget(name="home"))
+    if fault == "corrupt":
+        corrupt(store, "home", "1.1.0")
+    else:
+        replace("outliers", fails)
+    async with serve(store) as client:
+        for model, status in (("home", 200), ("newest", 200), ("home@1.1.0", 503)):
+            answer = await client.post("/relations", json={"objects": ["bed"], "model": model})
+            assert answer.status_code == status
+            assert status == 503 or answer.json()["model"]["version"] == "1.0.0"
+        listed = (await client.get("/models")).json()
+        ready = await client.get("/health/ready")
+        assert ready.status_code == 200
+        reason = {"corrupt": "checksum_mismatch", "defect": "warm_up_failed"}[fault]
+        for failures in (listed["failures"], ready.json()["failures"]):
+            reasons = {failure["subject"]: failure["reason"] for failure in failures}
+            # The alias `candidate` names this very version.
+            assert reasons == {"home@1.1.0": reason, "candidate": reason}
+        newest, other = (await client.get("/models/home")).json()["versions"]
+        assert (newest["status"], newest["reason"]) == ("refused", reason)
+        assert other["aliases"] == ["default", "newest"]
 
 
 async def test_an_alias_to_a_removed_version_is_unavailable_and_not_unknown(store: Path) -> None:

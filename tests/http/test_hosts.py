@@ -7,12 +7,10 @@ from typing import Any
 
 import httpx
 import pytest
-from websockets.exceptions import InvalidStatus
 
 from app.settings import Settings
-from tests.http.streams import opened, talk
 from tests.http.test_problems import problem
-from tests.services import LiveService, serve
+from tests.services import serve
 
 SCENE = {"objects": ["bed"]}
 KEY = "incorrect-zebra-capacitor-nail"
@@ -88,18 +86,6 @@ async def test_the_document_says_which_routes_refuse_names(client: httpx.AsyncCl
     for path, operations in paths.items():
         for operation in operations.values():
             assert ("421" in operation["responses"]) == ("/health/" not in path), path
-
-
-@pytest.mark.system
-def test_no_stream_opens_under_another_name(live: LiveService) -> None:
-    origin = "http://evil.example"
-    with pytest.raises(InvalidStatus) as refused:
-        opened(live, additional_headers={"Host": "evil.example"}, origin=origin).__enter__()
-    # The client sends its own Host header as well: two are refused, whatever they name.
-    assert refused.value.response.status_code == 421
-    with opened(live) as stream:
-        assert talk(stream, "open")["type"] == "opened"
-        talk(stream, "close")
 
 
 @pytest.mark.parametrize(

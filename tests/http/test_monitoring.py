@@ -18,7 +18,6 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from tests.conftest import REPOSITORY
 from tests.http.stores import corrupt, publish
-from tests.http.streams import opened, talk
 from tests.http.test_problems import problem
 from tests.services import LiveService, Replace, defect, serve
 
@@ -275,9 +274,6 @@ async def test_a_process_without_a_default_is_not_ready(
 def test_the_documentation_lists_every_metric(live: LiveService) -> None:
     live.client.post("/missing/batch", json={"scenes": [SCENE]})
     live.client.get("/models")
-    with opened(live) as stream:
-        talk(stream, "open")
-        talk(stream, "update", seq=1, objects=["bed"])
     text = live.client.get("/metrics").text
     told = {}
     for family in text_string_to_metric_families(text):

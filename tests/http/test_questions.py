@@ -191,6 +191,23 @@ async def test_models_of_few_classes_answer(tmp_path: Path, variant: str, classe
         assert refused.status_code == 422
 
 
+async def test_a_model_of_too_few_scenes_gives_no_judgement(tmp_path: Path) -> None:
+    publish(tmp_path, "new", "1.0.0", alias="default", judges=False)
+    async with serve(tmp_path) as client:
+        for relations, parts in (
+            ([], ["objects"]),
+            ([["lamp", "on-top", "bed"]], ["objects", "relations"]),
+        ):
+            answer = await ask(client, "outliers", objects=["bed", "lamp"], relations=relations)
+            assert answer["outliers"] == answer["misplaced"] == []
+            assert "threshold" not in answer
+            assert [one["code"] for one in answer["warnings"]] == ["not-judged"] * len(parts)
+            for warning, part in zip(answer["warnings"], parts, strict=True):
+                assert f"does not judge {part}" in warning["message"]
+        assert (await ask(client, "missing", objects=["bed"]))["warnings"] == []
+        assert (await ask(client, "generate", objects=["bed"]))["scenes"]
+
+
 async def test_the_place_that_was_asked_about_comes_first(client: httpx.AsyncClient) -> None:
     """Of the very object, though another of its class comes before it; others stay as they were."""
     objects = ["bed", {"id": "a", "label": "desk"}, {"id": "b", "label": "desk"}]

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.http.streams import hear, opened, talk
 from tests.services import ADMIN_KEY, DEFECTIVE, LiveService, launch
 
 pytestmark = pytest.mark.system
@@ -73,7 +72,7 @@ def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> N
 
     # What the server itself has a word about: handshakes, broken HTTP, clients that leave.
     handshake = (
-        "GET /stream?key={key} HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
+        "GET /{key}?key={key} HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
         "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n{header}{key}\r\n\r\n"
     )
@@ -96,17 +95,6 @@ def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> N
                 with suppress(ConnectionError):
                     while connection.recv(65536):
                         pass
-    with opened(defective, additional_headers={"X-API-Key": API_KEY}) as stream:
-        for key in SECRETS:
-            stream.send(key)
-            hear(stream)
-            talk(stream, key, seq=1)
-            talk(stream, "open", model=key)
-            talk(stream, "open", **{key: key})
-        talk(stream, "open", frame_id=MISTAKEN)
-        for key in SECRETS:
-            talk(stream, "update", seq=1, objects=[key])
-            talk(stream, "update", seq=1, remove=[key])
     assert client.get("/health/live").status_code == 200
 
     log = defective.stop()

@@ -42,7 +42,7 @@ def test_settings_come_from_the_environment(
     monkeypatch.setenv("SCENE_ADMIN_KEY", "0123456789abcdef")
     monkeypatch.setenv("SCENE_LOG_LEVEL", "DEBUG")
     settings = Settings()
-    assert settings.store == str(tmp_path)
+    assert settings.store == tmp_path
     assert settings.port == 9000
     assert settings.log_level == "debug"
     assert "0123456789abcdef" not in repr(settings)

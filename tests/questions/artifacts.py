@@ -8,7 +8,7 @@ import torch
 
 from app.inference.posterior import ClosedForm
 from app.registry.artifact import Artifact
-from app.registry.description import Calibration, CountSlope, PairSlope, Slope, Thresholds
+from app.registry.description import NEVER, Calibration, CountSlope, Slope
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL
 from training.machines import BoltzmannMachine, MachineSpec, build
@@ -51,10 +51,11 @@ def calibration(relations: int, **changes: object) -> Calibration:
     Nothing raises an alarm, so that every drawn scene stands.
     """
     neutral = {
-        "relation": (PairSlope(),) * relations,
+        **dict(Calibration.neutral(relations)),
         "outlier": CountSlope(slope=-1.0),
-        "outlier_thresholds": Thresholds(low=1.0, medium=1.0, high=1.0),
-        "misplaced": Slope(slope=-1.0),
+        "outlier_thresholds": NEVER,
+        "misplaced": Slope(intercept=0.0, slope=-1.0),
+        "misplaced_thresholds": NEVER,
     }
     return Calibration(**(neutral | changes))
 

@@ -27,7 +27,8 @@ def sigmoid(x: float) -> float:
 def test_a_line_bends_where_its_entry_says(bends, log_odds):
     entry = PairSlope(intercept=0.5, slope=0.8, bends=tuple(bends))
     # An entry of fewer bends stands beside it.
-    slopes = RelationSlopes.of(Calibration(relation=(entry, PairSlope()))).alone
+    neutral = Calibration.neutral(2)
+    slopes = RelationSlopes.of(neutral.model_copy(update={"relation": (entry, PairSlope())})).alone
     values = np.array([[log_odds, log_odds]])
     p = relation_probability(slopes, values, np.zeros(len(log_odds)), 1)[0]
     for k, z in enumerate(log_odds):
@@ -46,12 +47,10 @@ def test_scenes_that_state_relations_have_entries_of_their_own():
         assert all(answer.probability == wanted for answer in relations(artifact, scene)[0])
 
 
-@pytest.mark.parametrize("own", [True, False])
-def test_placements_have_entries_of_their_own(own):
+def test_placements_have_entries_of_their_own():
     """A missing thing would be one more class; of a(x, y) and a(y, x) at most one holds."""
     entry = (PairSlope(intercept=-1.0, slope=0.0, log_classes=-0.5),) * 4
-    changes = {"placement": entry} if own else {"relation": entry}
-    artifact = larger_artifact("triway-local", **changes)
+    artifact = larger_artifact("triway-local", placement=entry)
     answers = missing(artifact, scene_of([0, 1, 2]))
     p = {place.probability for answer in answers for place in answer.placements}
     assert list(p) == [pytest.approx(sigmoid(-1 - 0.5 * math.log(4)), abs=1e-6)]

@@ -54,7 +54,7 @@ def test_unlikely_classes_are_drawn_again():
     """Fewer of what raises an alarm are left."""
     entry = CountSlope(slope=-1.0)
     counts = []
-    for limits in (NONE, Thresholds()):
+    for limits in (NONE, Thresholds(low=0.5, medium=0.5, high=0.5)):
         artifact = larger_artifact("triway-local", outlier=entry, outlier_thresholds=limits)
         scenes = drawn(artifact, scene_of([]))
         labels = artifact.vocabulary.labels

@@ -273,7 +273,7 @@ def test_the_threshold_decides(name, scene, threshold):
 
 def test_the_default_threshold_is_the_calibrated_one():
     for threshold in (0.0, 1.0):
-        presets = Thresholds(medium=threshold)
+        presets = Thresholds(low=0.5, medium=threshold, high=0.5)
         artifact = larger_artifact("triway-local", outlier_thresholds=presets)
         found = outliers(artifact, scene_of([0, 1, 2]))
         assert found.threshold == threshold

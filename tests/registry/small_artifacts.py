@@ -10,7 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from app.registry import Calibration, Description, Manifest, VocabularyEntry
+from app.registry import (
+    Calibration,
+    CountSlope,
+    Description,
+    Manifest,
+    Slope,
+    Thresholds,
+    VocabularyEntry,
+)
 from app.registry.manifest import MANIFEST
 from app.scene.vocabulary import ObjectClass, Vocabulary
 
@@ -30,6 +38,14 @@ SPECS: dict[str, dict[str, Any]] = {
     "triway": {"variant": "triway", "V": 3, "A": 4, "H1": 5, "K": 2, "T": 2, "form": "local"},
 }
 
+HALF = Thresholds(low=0.5, medium=0.5, high=0.5)
+JUDGING = {
+    "outlier": CountSlope(slope=-1.0),
+    "outlier_thresholds": HALF,
+    "misplaced": Slope(intercept=0.0, slope=-1.0),
+    "misplaced_thresholds": HALF,
+}
+
 
 def description(
     name: str = "tiny", version: str = "1.0.0", variant: str = "rbm", **changes: Any
@@ -42,7 +58,7 @@ def description(
             "created": "2020-02-02T20:20:20+00:00",
             "spec": SPECS[variant],
             "vocabulary": VocabularyEntry.of(VOCABULARY),
-            "calibration": Calibration.neutral(4),
+            "calibration": Calibration.neutral(4).model_copy(update=JUDGING),
             "training": {"objective": "pcd", "seed": 7, "rate": 0.1},
             "data": [
                 {

@@ -217,6 +217,9 @@ def test_refuses_an_unexpected_file(name: str, written: Path) -> None:
     (written / name).write_bytes(pickle.dumps({"b": [0.0]}))
     error = refusal(written)
     assert (error.code, name in error.reason) == ("unexpected_file", True)
+    for number in range(1000):
+        (written / f"x{number:0200}").touch()
+    assert len(refusal(written).reason) < 2000
 
 
 def test_refuses_what_is_no_regular_file(written: Path, tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def check_survivor(root: Path) -> ModelSet:
 def check_next_publication(root: Path) -> None:
     """The next publication works, and clears up."""
     store = Store(root, lock_timeout=5)
-    version = f"{int(store.latest('tiny').split('.')[0]) + 1}.0.0"
+    version = f"{int(store.versions('tiny')[-1].split('.')[0]) + 1}.0.0"
     store.publish(description(version=version), state(), alias="default")
     assert not leftovers(root)
     assert load_model_set(store).resolve("default").manifest.version == version

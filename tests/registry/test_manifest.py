@@ -19,6 +19,7 @@ from app.registry import (
     EvidenceWeights,
     Manifest,
     PairSlope,
+    Slope,
     Thresholds,
 )
 from app.registry.description import VocabularyEntry
@@ -78,10 +79,12 @@ changes = st.fixed_dictionaries(
             popularity_weight=share,
             outlier=count_slopes,
             outlier_thresholds=thresholds,
+            misplaced=st.builds(Slope, intercept=number, slope=number),
             misplaced_thresholds=thresholds,
-            relation=st.tuples(*[pair_slopes] * 4),
-            placement=st.just(()) | st.tuples(*[pair_slopes] * 4),
-            relation_given=st.just(()) | st.tuples(*[pair_slopes] * 4),
+            **dict.fromkeys(
+                ("relation", "relation_given", "placement", "asked_place"),
+                st.tuples(*[pair_slopes] * 4),
+            ),
         ),
         "metrics": st.lists(
             st.builds(
@@ -122,8 +125,8 @@ def test_reads_back_as_written(change: dict[str, Any]) -> None:
     assert json.loads(data)["format"] == 3
 
 
-@pytest.mark.parametrize("value", [0, 4, 1.0, "1", None, True])
-def test_refuses_an_unknown_format(value: object) -> None:
+@pytest.mark.parametrize("value", [2, 4, 3.0, "3", None, True])
+def test_refuses_another_format(value: object) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"]
     body = json.dumps({**members, "format": value}).encode()
@@ -132,6 +135,7 @@ def test_refuses_an_unknown_format(value: object) -> None:
         with pytest.raises(ArtifactError) as refused:
             Manifest.from_bytes(data)
         assert refused.value.code == "unknown_format"
+        assert "train or publish the model again" in refused.value.reason
 
 
 @pytest.mark.parametrize(
@@ -143,9 +147,9 @@ def test_refuses_an_unknown_format(value: object) -> None:
         (b"\xff\xfe", "truncated"),
         (b"[" * 200_000, "truncated"),
         (resign(b"{" + b'"a":[' * 100_000 + b"]" * 100_000 + b"}"), "invalid_manifest"),
-        (resign(b'{"format": 1, nonsense}'), "invalid_manifest"),
-        (b'{"format": 1}', "invalid_manifest"),
-        (resign(b'{"format": 1}'), "invalid_manifest"),
+        (resign(b'{"format": 3, nonsense}'), "invalid_manifest"),
+        (b'{"format": 3}', "invalid_manifest"),
+        (resign(b'{"format": 3}'), "invalid_manifest"),
     ],
 )
 def test_refuses_what_is_no_manifest(data: bytes, code: str) -> None:
@@ -187,6 +191,8 @@ def change_nested(members: dict[str, Any], path: str, value: object) -> None:
         ("vocabulary.objects.0.size", [1.0, 2.0]),
         ("vocabulary.objects.0.size", [1.0, 2.0, -3.0]),
         ("calibration.relation", []),
+        ("calibration.asked_place", []),
+        ("calibration.placed", {}),
         ("calibration.coverage", 1.5),
         ("calibration.coverage_weight", -0.1),
         ("calibration.popularity_weight", 2),
@@ -196,6 +202,7 @@ def change_nested(members: dict[str, Any], path: str, value: object) -> None:
         ("calibration.misplaced_thresholds.high", -0.5),
         ("calibration.outlier.slope", math.nan),
         ("calibration.outlier.slope", math.inf),
+        ("calibration.outlier", None),  # without a fit, there are no thresholds
         ("training.rate", math.nan),
         ("data.0.digest", "xyz"),
         ("data.0.scenes", -1),
@@ -267,14 +274,7 @@ def test_neutral_calibration_changes_nothing() -> None:
     assert neutral.missing == CountSlope(intercept=0, slope=1, log_count=0)
     assert set(neutral.evidence.model_dump().values()) == {1.0}
     assert (neutral.popularity, neutral.popularity_weight) == ((), 0)
-    assert neutral.misplaced.slope == 1
-    assert neutral.outlier == CountSlope(intercept=0, slope=1, log_count=0)
-
-
-def test_what_earlier_releases_calibrated_is_passed_over() -> None:
-    neutral = Calibration.neutral(4)
-    old = {"missing_temperature": 1.2, "placed": {"log_relation": 0.7}, "outlier_threshold": 0.3}
-    assert Calibration.model_validate(neutral.model_dump() | old) == neutral
+    assert neutral.misplaced is neutral.outlier is None
 
 
 def test_a_vocabulary_is_kept_whole() -> None:

@@ -60,20 +60,22 @@ def test_a_snapshot_does_not_change_with_the_store(store: Store) -> None:
         models.aliases["newest"] = AliasTarget(name="tiny")  # type: ignore[index]
 
 
-def test_a_broken_latest_version_answers_with_its_failure(store: Store) -> None:
-    (store.root / "tiny" / "2.0.0" / "model.safetensors").write_bytes(b"")
-    models = load_model_set(store)
-    assert set(models.failures) == {("tiny", "2.0.0")}
-    for reference in ("tiny", "tiny@2.0.0", "default"):
-        with pytest.raises(ArtifactError) as refused:
-            models.resolve(reference)
-        assert refused.value.code == "truncated"
-        assert "tiny@2.0.0" in refused.value.reason
-    assert not models.ready
-    assert models.default_failure is not None
-    assert "truncated" in models.default_failure
-    assert models.resolve("tiny@1.0.0").manifest.version == "1.0.0"
-    assert models.resolve("other").manifest.name == "other"
+def test_a_name_means_the_newest_usable_version(store: Store) -> None:
+    for version, wanted in (("2.0.0", "1.0.0"), ("1.0.0", None)):
+        (store.root / "tiny" / version / "model.safetensors").write_bytes(b"")
+        models = load_model_set(store)
+        assert models.failures["tiny", version].code == "truncated"
+        assert models.ready == bool(wanted)
+        assert models.resolve("other").manifest.name == "other"
+        names = ("tiny", "default")
+        if wanted:
+            assert {models.resolve(name).manifest.version for name in names} == {wanted}
+        for reference in ("tiny@2.0.0", *(() if wanted else names)):
+            with pytest.raises(ArtifactError) as refused:
+                models.resolve(reference)
+            assert refused.value.code == "truncated"
+            assert "tiny@2.0.0" in refused.value.reason
+    assert "truncated" in (models.default_failure or "")
 
 
 def test_whatever_stands_in_a_versions_place_is_reported(store: Store) -> None:

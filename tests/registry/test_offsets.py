@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.registry import Artifact, ArtifactError, Offsets, load_artifact, write_artifact
-from tests.registry.small_artifacts import description, read_manifest, rewrite_manifest, state
+from tests.registry.small_artifacts import description, state
 
 A, V = 4, 3  # as in `small_artifacts`
 BESIDE, ON_IT = (0, 1, 0.5, 0.5, 0.5, 0.25), (0, 0, 0.75, 0.5, 0.25, 0.125)
@@ -77,12 +77,9 @@ def test_they_come_back_with_the_artifact(tmp_path: Path) -> None:
     assert "| Offsets | in metres, of 2 pairs of classes |" in artifact.card
 
 
-def test_an_artifact_without_them_loads_in_either_format(tmp_path: Path) -> None:
+def test_an_artifact_may_have_none(tmp_path: Path) -> None:
     write_artifact(tmp_path / "a", description(), state())
     assert load_artifact(tmp_path / "a").offsets is None
-    rewrite_manifest(tmp_path / "a", lambda members: members.update(format=1))
-    assert load_artifact(tmp_path / "a").offsets is None
-    assert read_manifest(tmp_path / "a").format == 1
 
 
 @pytest.mark.parametrize(

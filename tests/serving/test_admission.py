@@ -9,7 +9,6 @@ import threading
 import weakref
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator
-from functools import partial
 from itertools import pairwise
 from time import monotonic, sleep, thread_time
 from typing import Any
@@ -133,68 +132,6 @@ async def test_a_failure_keeps_nothing_of_its_request(queue: WorkQueue, ask: Any
         assert found() is None
     finally:
         gc.enable()
-
-
-async def test_questions_of_streams_take_turns_after_requests(queue: WorkQueue) -> None:
-    order: list[str] = []
-    ticks: list[int] = []
-
-    async def ask(name: str, *, low_priority: bool) -> None:
-        await queue.run(
-            lambda: order.append(name), ENDLESS, kind="cheap", size=1, low_priority=low_priority
-        )
-
-    async def clock() -> None:
-        while len(order) < 4:
-            ticks.append(len(order))
-            await asyncio.sleep(0)
-
-    streams = [ask(f"stream {number}", low_priority=True) for number in range(3)]
-    await asyncio.gather(*streams, ask("request", low_priority=False), clock())
-    assert order == ["request", "stream 0", "stream 1", "stream 2"]
-    assert all(after - before <= 1 for before, after in pairwise(ticks))
-    assert queue.backlog.pending == 0
-
-
-async def test_costly_questions_of_streams_let_requests_go_first(queue: WorkQueue) -> None:
-    order: list[str] = []
-    began, release = threading.Event(), threading.Event()
-
-    def note(name: str) -> None:
-        began.set()
-        assert release.wait(30)
-        order.append(name)
-
-    def ask(name: str, *, low_priority: bool) -> asyncio.Future[Any]:
-        call = partial(note, name)
-        run = queue.run(call, ENDLESS, kind="costly", size=1, low_priority=low_priority)
-        return asyncio.ensure_future(run)
-
-    waiting = [ask(f"stream {number}", low_priority=True) for number in (1, 2, 3)]
-    await asyncio.to_thread(began.wait, 30)
-    waiting.append(ask("request", low_priority=False))
-    await asyncio.sleep(0)
-    release.set()
-    await asyncio.gather(*waiting)
-    assert order == ["stream 1", "request", "stream 2", "stream 3"]
-
-
-async def test_nobody_waits_past_the_deadline_for_a_turn(queue: WorkQueue) -> None:
-    release = threading.Event()
-
-    def ask(call: Call, ticket: Ticket) -> asyncio.Future[Any]:
-        run = queue.run(call, ticket, kind="costly", size=1, low_priority=True)
-        return asyncio.ensure_future(run)
-
-    first = ask(lambda: release.wait(30), ENDLESS)
-    await asyncio.sleep(0)
-    with pytest.raises(DeadlinePassedError):
-        await ask(lambda: pytest.fail("begun"), Ticket(monotonic() + 0.05))
-    assert not first.done()
-    release.set()
-    await first
-    # Nobody has kept the turn.
-    assert (await ask(lambda: "fine", ENDLESS)).result == "fine"
 
 
 @pytest.mark.parametrize("ask", WAYS)

@@ -24,7 +24,6 @@ from app.settings import Settings
 from scene_client import Client
 from tests.chaos.wire import BODY, Wire, exchange, wires
 from tests.http.stores import make_store
-from tests.http.streams import opened, talk
 from tests.services import ADMIN_KEY, LiveService, launch, wait_until
 
 pytestmark = pytest.mark.system
@@ -165,15 +164,6 @@ def test_an_answer_may_take_longer_than_a_client_may_pause(proxy: Proxy) -> None
         resume.join()
     assert response.status_code == 200
     assert response.elapsed.total_seconds() > 2
-
-
-@pytest.mark.slow
-def test_a_stream_passes_and_outlives_the_pauses_of_requests(proxy: Proxy) -> None:
-    with opened(proxy) as stream:  # type: ignore[arg-type]
-        assert talk(stream, "open", ask={"missing": {}})["type"] == "opened"
-        assert talk(stream, "update", seq=1, objects=["bed"])["type"] == "answer"
-        time.sleep(3)
-        assert talk(stream, "update", seq=2, objects=["lamp"])["type"] == "answer"
 
 
 def test_the_name_that_clients_use_reaches_the_service(proxy: Proxy) -> None:

@@ -27,7 +27,7 @@ from functools import partial
 import numpy as np
 
 from app.questions import misplaced, missing, outliers, relations
-from app.registry import Artifact, Calibration, CountSlope, Slope
+from app.registry import NEVER, Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, canonicalise
 from training.batches import SceneTensors
 from training.cases import (
@@ -62,7 +62,12 @@ def uncalibrated(artifact: Artifact) -> Artifact:
     relation into the log-odds that the object or relation is wrong.
     """
     plain = Calibration.neutral(artifact.spec.A).model_copy(
-        update={"outlier": CountSlope(slope=-1.0), "misplaced": Slope(slope=-1.0)}
+        update={
+            "outlier": CountSlope(slope=-1.0),
+            "outlier_thresholds": NEVER,
+            "misplaced": Slope(intercept=0.0, slope=-1.0),
+            "misplaced_thresholds": NEVER,
+        }
     )
     return replace(artifact, calibration=plain)
 
@@ -218,7 +223,7 @@ def ask_outliers(
         scene = with_intruder(artifact, scene, int(rng.choice(choice)))
     found = outliers(artifact, scene, details=False).outliers
     usable = [not structure[thing.class_index] for thing in scene.objects]
-    return [(a.probability, a.object == intruder) for a in found if usable[a.object]]
+    return [(a.probability, a.object == intruder) for a in found if usable[a.object]] or None
 
 
 def ask_misplaced(
@@ -232,7 +237,7 @@ def ask_misplaced(
     found = misplaced(artifact, replace(scene, room_type=None))
     return [
         (a.probability, (CANONICAL.index(a.relation), a.subject, a.object) == false) for a in found
-    ]
+    ] or None
 
 
 QUESTIONS: dict[str, Ask] = {

@@ -27,6 +27,7 @@ from app.scene import Scene
 from training.batches import SceneTensors, subset
 from training.cases import scene_rng, some_scenes
 from training.datasets import EncodedScene
+from training.evaluation.alarms import ALARMS, SOURCE_SCENES
 from training.evaluation.asking import (
     SENSITIVITIES,
     ask_every,
@@ -47,14 +48,10 @@ from training.evaluation.metrics import Flags, Floats, Ints, Metric, Ratio
 from training.evaluation.missing import ObjectScore
 from training.evaluation.setting import Contender, Outcome, Setting
 
-MEDIUM = 0.1
-"""Target share of clean scenes with an alarm at the default sensitivity."""
-
 _RESAMPLES = 200
 # The threshold keeps the target share of alarms in this share of the resampled sets of groups.
 _CONFIDENCE = 0.7
-# Minimum number of scenes for a threshold: of one source, and of all small sources together.
-_SOURCE_SCENES = 200
+# Minimum number of scenes of all small sources together for a threshold.
 _SMALL_SCENES = 30
 _SCENES = 1500
 
@@ -81,9 +78,14 @@ class Alarm:
         return loud
 
 
-def calibrated_alarm(calibration: Calibration) -> Alarm:
-    """Return the alarm rule of the service, with the default sensitivity."""
-    entry = calibration.outlier
+def calibrated_alarm(calibration: Calibration) -> Alarm | None:
+    """Return the alarm rule of the service, with the default sensitivity.
+
+    The result is None if the model judges no object.
+    """
+    entry, presets = calibration.outlier, calibration.outlier_thresholds
+    if entry is None or presets is None:
+        return None
     popularity = np.array(calibration.popularity)
 
     def suspicion(scores: IntruderScores) -> Floats:
@@ -92,7 +94,7 @@ def calibrated_alarm(calibration: Calibration) -> Alarm:
         return np.asarray(1 / (1 + np.exp(-entry.log_odds(scores.log_odds, scores.size))))
 
     short = tuple(limits.medium for limits in calibration.short_list_thresholds)
-    return Alarm(suspicion, calibration.outlier_thresholds.medium, short)
+    return Alarm(suspicion, presets.medium, short)
 
 
 def fitted_alarm(
@@ -116,7 +118,7 @@ def alarm_threshold(
     scores: IntruderScores,
     scenes: SceneTensors,
     rng: np.random.Generator,
-    share: float = MEDIUM,
+    share: float = ALARMS["medium"],
 ) -> float:
     """Compute the suspicion from which an object raises the alarm.
 
@@ -162,8 +164,8 @@ def kept_in_each_source(
         source: (N,) index of the source of each scene.
     """
     kinds, sizes = np.unique(source, return_counts=True)
-    large = [source == kind for kind in kinds[sizes >= _SOURCE_SCENES]]
-    small = np.isin(source, kinds[sizes < _SOURCE_SCENES])
+    large = [source == kind for kind in kinds[sizes >= SOURCE_SCENES]]
+    small = np.isin(source, kinds[sizes < SOURCE_SCENES])
     bounds = [_bound(worst[some], group[some], rng, share) for some in large]
     if small.sum() >= _SMALL_SCENES or not large:
         bounds.append(float(np.quantile(worst[small], 1 - share)))

@@ -17,7 +17,6 @@ from rich.table import Table
 from torch import Tensor
 
 from app.registry import RegistryError, Store
-from app.registry.location import open_for_publisher
 from app.scene import Vocabulary
 from training.batches import SceneTensors, scene_tensors
 from training.cases import some_scenes
@@ -151,7 +150,7 @@ def compare_command(
         Path | None, typer.Option("--data", help="folder with the scenes of the first model")
     ] = None,
     store: Annotated[
-        str, typer.Option("--store", help="the model store: a folder or a URL")
+        str, typer.Option("--store", help="folder of the model store")
     ] = "model_store",
     limit: Annotated[int, typer.Option(min=2, help="maximum number of scenes")] = 300,
     examples: Annotated[int, typer.Option(min=0, help="number of example questions to show")] = 3,
@@ -166,7 +165,7 @@ def compare_command(
     try:
         with console.status("reading") as status:
             say: Say = status.update
-            models = open_for_publisher(store)
+            models = Store(store)
             a = find(new, models, data, say)
             b = find(old or _served(models), models, data, say)
             comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)

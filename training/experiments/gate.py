@@ -12,7 +12,7 @@ refused if the served version was measured on relation tasks and the comparison 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -41,13 +41,6 @@ certain: a model that is trained on shuffled labels can lead by 0.006."""
 NEW = "the new version"
 POPULARITY, CO_OCCURRENCE = "popularity", "EASE"
 _REQUIRED = f"at least {GAIN:+.3f}, whole interval above zero"
-
-
-class RefusedError(RuntimeError):
-    """The new version is refused. The text gives the reasons."""
-
-    def __init__(self, reasons: Sequence[str]) -> None:
-        super().__init__("; ".join(reasons))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from typing import Final
 
 from app import questions
@@ -48,7 +47,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
     The list `more` contains listed classes that probably have further instances, such as a second
     nightstand. It is empty for questions about a place.
     """
-    model, reading = await request.reading(asked)
+    model, reading = await request.read(asked)
     faults = Faults()
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:
@@ -56,7 +55,6 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         faults.add(Reason.INVALID, ("top_k",), message)
     candidates = at = None
     if asked.candidates is not None:
-        reading = replace(reading, unknown=reading.unknown.copy())
         candidates = _candidates(asked.candidates, model, reading, faults)
     if asked.at is not None:
         at = _place(asked.at, model, reading, faults)

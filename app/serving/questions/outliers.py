@@ -7,7 +7,7 @@ from typing import Final
 
 from app import questions
 from app.questions.ranking import significant
-from app.registry import Artifact
+from app.registry import Artifact, Calibration
 from app.scene.relations import CANONICAL, opposite
 from app.scene.scene import Scene
 from app.serving.answers import (
@@ -29,7 +29,7 @@ from app.serving.questions.question import (
 )
 from app.serving.reading import Reading
 from app.serving.request import Request
-from scene_client.schemas import OutliersAnswer, OutliersRequest
+from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
 
 
 async def outliers(request: Request, asked: OutliersRequest) -> Answer:
@@ -38,7 +38,7 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
     The list `outliers` starts with the most probable outlier. All instances of a class have the
     same probability. The list `misplaced` starts with the relation that is most probably false.
     """
-    model, reading = await request.reading(asked)
+    model, reading = await request.read(asked)
     found = await request.ask(
         model,
         "outliers",
@@ -51,7 +51,10 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
     require_size(_size(found), reading, request.limits.answer_bytes, "objects")
     answer = envelope(asked, request.id, model.reference, reading)
     ids = reading.ids
-    answer["threshold"] = rounded(found.threshold)
+    if unjudged := _unjudged(model.artifact.calibration, reading.scene):
+        answer["warnings"] = [*reading.warnings, *unjudged]
+    if found.threshold is not None:
+        answer["threshold"] = rounded(found.threshold)
     numbers: list[float] = []
     for entry in found.outliers:
         numbers += entry.probability, entry.log_odds
@@ -97,6 +100,23 @@ def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> Ans
     if (CANONICAL.index(relation), subject, object_) in reading.flipped:
         subject, relation, object_ = object_, opposite(relation), subject
     return {"subject": ids[subject], "relation": relation, "object": ids[object_]}
+
+
+def _unjudged(calibration: Calibration, scene: Scene) -> list[SceneWarning]:
+    """Return a warning for objects, and one for relations, if the model gives no judgement."""
+    parts = {
+        "objects": bool(scene.objects) and calibration.outlier is None,
+        "relations": bool(scene.relations) and calibration.misplaced is None,
+    }
+    return [
+        SceneWarning(
+            code="not-judged",
+            message=f"the model does not judge {part}, because its calibration had too few scenes",
+            objects=[],
+        )
+        for part, is_unjudged in parts.items()
+        if is_unjudged
+    ]
 
 
 def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:

@@ -74,11 +74,6 @@ class Question(Generic[RequestT]):
         """Description of the route, for the API documentation."""
         return getdoc(self.answer) or ""
 
-    @property
-    def empty_answer(self) -> Answer:
-        """An answer with empty lists, without the common fields of answers."""
-        return {name: [] for name, part in self.example_answer.items() if isinstance(part, list)}
-
 
 LABELS: Final[dict[str, Any]] = {"objects": ["bed", "nightstand", "lamp"]}
 WITH_TOILET: Final[dict[str, Any]] = {"objects": [*LABELS["objects"], "toilet"]}

@@ -31,7 +31,7 @@ async def relations(request: Request, asked: RelationsRequest) -> Answer:
     The answer also lists disagreements: pairs of objects whose observed relation differs from the
     relation that the model expects from the rest of the scene.
     """
-    model, reading = await request.reading(asked)
+    model, reading = await request.read(asked)
     found, disagreements = await request.ask(
         model,
         "relations",

@@ -31,7 +31,8 @@ function notes({ warnings = [] }, state, column, name) {
   const names = [...new Set(state.things.map(({ label }) => label))].map((label) => reading(state, column, 'objects', label));
   return [
     ...[...names, reading(state, column, 'rooms', state.room)].map(inWords).filter(Boolean).map((words) => (words.endsWith('?') ? words : `${words}.`)),
-    ...warnings.map((one) => `Check ${one.objects.map(name).join(', ')}: ${one.message}.`),
+    ...warnings.map(({ objects, message }) =>
+      (objects.length ? `Check ${objects.map(name).join(', ')}: ${message}.` : `Note: ${message}.`)),
   ].join(' ');
 }
 

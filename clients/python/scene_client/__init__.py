@@ -19,7 +19,6 @@ if TYPE_CHECKING:
         UnreachableError,
     )
     from scene_client.offline import OfflineClient
-    from scene_client.stream import StreamClient, StreamClosedError, StreamProblemError
     from scene_client.sync import Client
 
 __version__ = "1.0.0"
@@ -33,21 +32,15 @@ __all__ = [
     "InvalidRequestError",
     "OfflineClient",
     "ProblemError",
-    "StreamClient",
-    "StreamClosedError",
-    "StreamProblemError",
     "UnreachableError",
 ]
 
 # Maps each name to the module that defines the name. The package imports the module on first use of
-# the name. So the service, which needs only the schemas, starts without httpx and websockets.
+# the name. So the service, which needs only the schemas, starts without httpx.
 _MODULES = {
     "AsyncClient": "asynchronous",
     "Client": "sync",
     "OfflineClient": "offline",
-    "StreamClient": "stream",
-    "StreamClosedError": "stream",
-    "StreamProblemError": "stream",
 }
 
 

@@ -238,7 +238,7 @@ class Client:
 
         Args:
             alias: ``default``, or any other alias.
-            model: ``name@version``, or ``name`` for the newest version.
+            model: ``name@version``, or ``name`` for the newest usable version.
             **fields: optional field ``expected``, the required current target of the alias. None
                 means that the alias must not exist yet.
         """

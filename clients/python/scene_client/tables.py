@@ -149,7 +149,8 @@ def notes(answer: BaseModel) -> list[str]:
         for entry in answer.mapped
     ]
     warnings = [
-        f"{entry.code}: {', '.join(entry.objects)}: {entry.message}" for entry in answer.warnings
+        ": ".join(filter(None, (entry.code, ", ".join(entry.objects), entry.message)))
+        for entry in answer.warnings
     ]
     return mapped + warnings
 

@@ -6,7 +6,7 @@ from functools import cache
 
 import torch
 
-from app.registry import Artifact
+from app.registry import Artifact, Calibration, CountSlope, Thresholds
 from training.batches import SceneTensors, scene_tensors
 from training.datasets import annotated_classes, encode, generate_rooms, rooms_vocabulary
 from training.machines import MachineSpec, build
@@ -33,7 +33,10 @@ def room_model() -> Artifact:
     with torch.no_grad():
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
-    calibration = draft_artifact(machine, VOCABULARY).calibration
-    slope = calibration.outlier.model_copy(update={"slope": -1.0})
-    calibration = calibration.model_copy(update={"outlier": slope})
+    calibration = Calibration.neutral(4).model_copy(
+        update={
+            "outlier": CountSlope(slope=-1.0),
+            "outlier_thresholds": Thresholds(low=0.5, medium=0.5, high=0.5),
+        }
+    )
     return draft_artifact(machine.eval().requires_grad_(False), VOCABULARY, calibration)

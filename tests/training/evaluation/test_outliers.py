@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import Calibration, CountSlope, PairSlope, Thresholds
+from app.registry import Calibration, CountSlope, Thresholds
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
@@ -19,6 +19,7 @@ from tests.training.evaluation.scenes import (
 )
 from training.datasets import shuffle_objects
 from training.evaluation import outliers
+from training.evaluation.alarms import ALARMS
 from training.evaluation.asking import (
     SENSITIVITIES,
     LeakError,
@@ -39,7 +40,6 @@ from training.evaluation.intruders import (
     signatures,
 )
 from training.evaluation.outliers import (
-    MEDIUM,
     Alarm,
     alarm_threshold,
     calibrated_alarm,
@@ -337,7 +337,7 @@ def shares(score, alarm, scenes):
 def test_the_promise_is_kept_in_every_large_source(score):
     scenes = varied([400, 400])
     found = shares(score, fitted_alarm(score, scenes, WIDE_STRUCTURE), scenes)
-    assert max(found.values()) <= MEDIUM + 0.02
+    assert max(found.values()) <= ALARMS["medium"] + 0.02
 
 
 def test_the_source_that_alarms_most_sets_the_threshold():
@@ -357,7 +357,7 @@ def test_a_smaller_share_of_alarms_has_a_higher_threshold():
     scenes = varied([400])
     scores = intruder_scores(scenes, WIDE_STRUCTURE, smooth)
     limits = []
-    for share in (0.02, MEDIUM, 0.2):
+    for share in (0.02, ALARMS["medium"], 0.2):
         alarms = []
         for suspicion in (-scores.log_odds, 1 - 2 * scores.log_odds):
             rng = np.random.default_rng(0)
@@ -372,12 +372,13 @@ def test_a_smaller_share_of_alarms_has_a_higher_threshold():
 def test_a_model_alarms_as_its_service_does():
     """By its probability, with its prior of intruders, at the medium threshold."""
     popularity = tuple(np.linspace(-2.0, 2.0, WIDE).tolist())
-    calibration = Calibration(
-        relation=(PairSlope(),),
-        outlier=CountSlope(intercept=0.3, slope=-0.8, log_count=0.2),
-        popularity=popularity,
-        popularity_weight=0.5,
-        outlier_thresholds=Thresholds(low=0.9, medium=0.4, high=0.1),
+    calibration = Calibration.neutral(1).model_copy(
+        update={
+            "outlier": CountSlope(intercept=0.3, slope=-0.8, log_count=0.2),
+            "popularity": popularity,
+            "popularity_weight": 0.5,
+            "outlier_thresholds": Thresholds(low=0.9, medium=0.4, high=0.1),
+        }
     )
     alarm = calibrated_alarm(calibration)
     scores = intruder_scores(tensors([scene([0, 1, 2, 3])], WIDE), WIDE_STRUCTURE, smooth)

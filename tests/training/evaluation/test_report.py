@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import Thresholds
+from app.registry import NEVER
 from tests.questions.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import (
     flat,
@@ -194,7 +194,7 @@ def test_what_is_published_is_the_calibrated_artifact_s():
     """Another default threshold, other alarms; and no more scenes than the limit allows."""
 
     def alarms(threshold, limit=100):
-        limits = {"outlier_thresholds": Thresholds(medium=threshold)}
+        limits = {"outlier_thresholds": NEVER.model_copy(update={"medium": threshold})}
         artifact = replace(ARTIFACT, calibration=ARTIFACT.calibration.model_copy(update=limits))
         rows = evaluate(artifact, DATA, NO_STRUCTURE, TRAIN, limit=limit)
         assert {row.source for row in rows} == {"toy"}

@@ -104,19 +104,28 @@ class Mapped(Reply):
 
 
 class SceneWarning(Reply):
-    """A probable mistake in the scene. The service still answers the question."""
+    """A probable mistake in the scene, or a limit of the model. The service still answers."""
 
     code: Annotated[
-        Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"],
+        Literal[
+            "implausible-position", "implausible-size", "flat-scene", "unknown-sizes", "not-judged"
+        ],
         Field(
             description="implausible-position: an object is more than 100 m from the viewer. "
             "implausible-size: all sides of an object are below 1 mm, or one is above 20 m. "
             "flat-scene: all objects have the same depth in an optical frame. unknown-sizes: "
-            "vertical relations of an object are unobserved, because its size is unknown"
+            "vertical relations of an object are unobserved, because its size is unknown. "
+            "not-judged: the model has too few training scenes to judge objects or relations, and "
+            "the list is empty"
         ),
     ]
     message: str
-    objects: Annotated[list[str], Field(description="ids of the objects that the warning concerns")]
+    objects: Annotated[
+        list[str],
+        Field(
+            description="ids of the objects that the warning concerns; empty for the whole scene"
+        ),
+    ]
 
 
 class Answer(Reply):

@@ -32,9 +32,10 @@ class Anchor(Request):
     object: Name
 
 
-class MissingOptions(Request):
-    """The options of `/missing`, without the fields of the scene."""
+class MissingRequest(SceneRequest):
+    """What else should be here, and where?"""
 
+    objects: SomeObjects
     coverage: Annotated[
         Probability | None,
         Field(
@@ -60,12 +61,6 @@ class MissingOptions(Request):
     detail: Annotated[
         Detail, Field(description="`scores` leaves `placements` and `because` out of the answer")
     ] = "full"
-
-
-class MissingRequest(MissingOptions, SceneRequest):
-    """What else should be here, and where?"""
-
-    objects: SomeObjects
 
 
 @dataclass(slots=True)

@@ -62,7 +62,10 @@ class ModelList(Reply):
     models: list[ModelSummary]
     aliases: Annotated[
         dict[str, str],
-        Field(description="target of each alias: `name@version`, or `name` for the newest version"),
+        Field(
+            description="target of each alias: `name@version`, or `name` for the newest usable "
+            "version"
+        ),
     ]
     failures: Annotated[
         list[Failure], Field(description="unusable entries of the store, with reasons")
@@ -190,24 +193,16 @@ class AliasAnswer(Reply):
 # ------------------------------------------------------------------------------------ health
 
 
-class StoreHealth(Reply):
-    """The contact of a replica to its remote store of models."""
-
-    age_s: Annotated[
-        Finite, Field(description="seconds since the replica last read the remote store")
-    ]
-    reason: Annotated[
-        str | None, Field(description="stable code of the reason why the last reading failed")
-    ] = None
-
-
 class Health(Reply):
     """The status of the service."""
 
     status: Literal["live", "ready"]
-    store: Annotated[
-        StoreHealth | None,
-        Field(description="contact to a remote store; absent for a store in a folder"),
+    failures: Annotated[
+        list[Failure] | None,
+        Field(
+            description="in readiness checks, up to 10 unusable entries of the store; "
+            "`GET /models` lists all"
+        ),
     ] = None
 
 

@@ -11,7 +11,6 @@ from scene_client.schemas.requests import (
     Detail,
     Finite,
     Probability,
-    Request,
     SceneFields,
     SceneRequest,
     SomeObjects,
@@ -20,9 +19,10 @@ from scene_client.schemas.requests import (
 Sensitivity = Literal["low", "medium", "high"]
 
 
-class OutliersOptions(Request):
-    """The options of `/outliers`, without the fields of the scene."""
+class OutliersRequest(SceneRequest):
+    """Which objects do not belong here, or are in the wrong place?"""
 
+    objects: SomeObjects
     sensitivity: Annotated[
         Sensitivity,
         Field(
@@ -41,12 +41,6 @@ class OutliersOptions(Request):
     detail: Annotated[
         Detail, Field(description="`scores` leaves `because` and `usually_with` out of the answer")
     ] = "full"
-
-
-class OutliersRequest(OutliersOptions, SceneRequest):
-    """Which objects do not belong here, or are in the wrong place?"""
-
-    objects: SomeObjects
 
 
 class Outlier(Reply):
@@ -87,7 +81,9 @@ class OutliersAnswer(Answer):
     """Results for all objects and for all observed relations.
 
     `outliers` starts with the most probable outlier. `misplaced` starts with the relation that is
-    most probably false. There, `probability` is the probability that the relation is false.
+    most probably false. There, `probability` is the probability that the relation is false. A
+    model that was calibrated with too few scenes gives no judgement: the list is empty, and a
+    warning says so.
     """
 
     threshold: Annotated[

@@ -29,9 +29,10 @@ class Pair(Request):
     object: Name
 
 
-class RelationsOptions(Request):
-    """The options of `/relations`, without the fields of the scene."""
+class RelationsRequest(SceneRequest):
+    """Which spatial relations hold between these objects?"""
 
+    objects: SomeObjects
     top_k: Annotated[int, Field(ge=1, le=4096, description="maximum number of relations")] = 20
     min_probability: Annotated[
         Probability, Field(description="minimum probability of the relations in the answer")
@@ -48,12 +49,6 @@ class RelationsOptions(Request):
     include_opposites: Annotated[
         bool, Field(description="also list right, behind, under and below")
     ] = False
-
-
-class RelationsRequest(RelationsOptions, SceneRequest):
-    """Which spatial relations hold between these objects?"""
-
-    objects: SomeObjects
 
 
 @dataclass(slots=True)

@@ -302,7 +302,7 @@ class AliasRequest(Request):
     """The new target of an alias."""
 
     model: Annotated[
-        ModelSpec, Field(description="`name@version`, or `name` for the newest version")
+        ModelSpec, Field(description="`name@version`, or `name` for the newest usable version")
     ]
     expected: Annotated[
         ModelSpec | None,

@@ -1,0 +1,102 @@
+"""Alarms of `/outliers` in untouched scenes, compared with the promise of each sensitivity.
+
+Every object and relation of an untouched scene is right, so each alarm is false. A sensitivity
+promises a maximum share of untouched scenes with an alarm (`ALARMS`). A model is refused only if
+its share is certainly too large: the exact 95 % lower bound must exceed `EXCESS` times the promise.
+
+Source: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of
+the binomial" (1934).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.stats import beta
+
+from app import questions
+from app.questions.outliers import Sensitivity
+from app.registry import Artifact
+from app.scene import Scene
+from training.cases import scene_of, stated_relations
+from training.datasets import EncodedScene
+
+ALARMS: dict[Sensitivity, float] = {"low": 0.02, "medium": 0.1, "high": 0.2}
+"""Maximum shares of unaltered scenes with an alarm, on the large source with the most alarms."""
+
+EXCESS = 1.5
+
+SOURCE_SCENES = 200
+"""Minimum number of scenes of a source with its own threshold, or its own count of alarms."""
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """The number of untouched scenes with an alarm.
+
+    Attributes:
+        source: data source of the scenes, or "the smaller sources".
+        sensitivity: sensitivity of the questions.
+        scenes: number of scenes, at most one of each group.
+        alarms: number of these scenes with an alarm.
+    """
+
+    source: str
+    sensitivity: Sensitivity
+    scenes: int
+    alarms: int
+
+    @property
+    def at_least(self) -> float:
+        """Exact 95 % lower bound of the share of scenes with an alarm."""
+        if not self.alarms:
+            return 0.0
+        return float(beta.ppf(0.05, self.alarms, self.scenes - self.alarms + 1))
+
+    def objection(self) -> str | None:
+        """Return the reason against the model, or None if the share may agree with the promise."""
+        promise = ALARMS[self.sensitivity]
+        if self.at_least <= EXCESS * promise:
+            return None
+        return (
+            f"/outliers raises alarms in {self.alarms} of {self.scenes} untouched scenes of "
+            f"{self.source} at {self.sensitivity} sensitivity, which promises at most "
+            f"{promise:.0%}. Check the labels and relations, or provide more scenes"
+        )
+
+
+def untouched_alarms(
+    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+) -> Iterator[Alarms]:
+    """Ask about untouched scenes with their relations, and count the scenes with an alarm.
+
+    The scenes of a group are not independent, so one random scene of each group takes part. Objects
+    count in scenes with a complete object list, and relations in all scenes. Sources with fewer
+    than `SOURCE_SCENES` scenes count together, as they do in the choice of the thresholds.
+    """
+    rng = np.random.default_rng(seed)
+    sizes = Counter(scene.source for scene in scenes)
+    drawn: dict[tuple[str, str], EncodedScene] = {}
+    for k in rng.permutation(len(scenes)).tolist():
+        drawn.setdefault((scenes[k].source, scenes[k].group), scenes[k])
+    asked: dict[str, list[tuple[Scene, bool]]] = {}
+    for scene in drawn.values():
+        triples = stated_relations(scene, artifact.vocabulary.structure, rng) or ()
+        whole = scene_of(scene, range(len(scene.instance_classes)), triples)
+        small = len(sizes) > 1 and sizes[scene.source] < SOURCE_SCENES
+        source = "the smaller sources" if small else scene.source
+        asked.setdefault(source, []).append((replace(whole, room_type=None), scene.complete))
+    for source, sensitivity in product(sorted(asked), ALARMS):
+        alarms = [_raises(artifact, *one, sensitivity) for one in asked[source]]
+        yield Alarms(source, sensitivity, len(alarms), sum(alarms))
+
+
+def _raises(artifact: Artifact, scene: Scene, complete: bool, sensitivity: Sensitivity) -> bool:
+    found = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
+    return any(one.is_misplaced for one in found.misplaced) or (
+        complete and any(one.is_outlier for one in found.outliers)
+    )
