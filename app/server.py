@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Final
 
 import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from app.main import create_app
 from app.serving.errors import ServingError
@@ -25,6 +26,19 @@ from app.settings import Settings
 KEEP_ALIVE: Final = 20
 
 _logger = logging.getLogger("app.server")
+
+
+class Connection(HttpToolsProtocol):
+    """An HTTP connection that ignores the trailers of chunked bodies.
+
+    uvicorn appends trailers to the headers of the request, so a trailer could replace a header that
+    a proxy has checked or removed.
+    """
+
+    def on_headers_complete(self) -> None:
+        """Start the request with the headers so far. The parser adds trailers to `self.headers`."""
+        super().on_headers_complete()
+        self.scope["headers"] = self.headers.copy()
 
 
 class Server(uvicorn.Server):
@@ -129,7 +143,7 @@ def build(settings: Settings, began: float) -> Server:
         host=settings.host,
         port=settings.port,
         root_path=settings.root_path,
-        http="httptools",
+        http=Connection,
         ws="none",
         limit_concurrency=settings.max_connections,
         timeout_keep_alive=KEEP_ALIVE,

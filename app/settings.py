@@ -5,14 +5,29 @@ from __future__ import annotations
 import os
 import re
 import sys
+from difflib import get_close_matches
 from importlib.util import find_spec
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 from urllib.parse import urlsplit
 
-from pydantic import BeforeValidator, Field, SecretStr, ValidationInfo, field_validator
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from pydantic import (
+    BeforeValidator,
+    Field,
+    SecretStr,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+)
 
 from scene_client.schemas import MAX_RELATIONS
 
@@ -22,6 +37,24 @@ MAX_OBJECTS = 256
 
 _EXPORTER = ("opentelemetry.sdk.trace", "opentelemetry.exporter.otlp.proto.http")
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
+
+
+_PREFIX: Final = "SCENE_"
+# Variables of the clients, which may run in the same environment.
+_OF_CLIENTS: Final = ("URL",)
+_NO_STREAMS: Final = "the service has no streams; send each scene in a request of its own"
+_NO_REMOTE_STORES: Final = "a store is a folder; mount the models and set SCENE_STORE"
+_REMOVED: Final = {
+    "WORKERS": "a replica is one process; start several replicas",
+    **dict.fromkeys(("MAX_STREAMS", "STREAM_IDLE", "STREAM_RESUME"), _NO_STREAMS),
+    **dict.fromkeys(("STORE_CACHE", "STORE_CACHE_BYTES", "STORE_MAX_AGE"), _NO_REMOTE_STORES),
+    **dict.fromkeys(("TRUSTED_KEYS", "UNSIGNED_STORE", "SIGNING_KEY"), _NO_REMOTE_STORES),
+}
+# Kubernetes sets such variables in each pod, for every Service whose name starts with `scene`.
+_SERVICE_LINK: Final = re.compile(
+    r"(\w+_)?SERVICE_(HOST|PORT(_\w+)?)=.*|(\w+_)?PORT_\d+_(TCP|UDP|SCTP)(_\w+)?=.*"
+    r"|\w+_PORT=(tcp|udp|sctp)://.*"
+)
 
 
 def _is_installed(module: str) -> bool:
@@ -76,6 +109,35 @@ def _is_origin(text: str) -> bool:
     return text == f"{parts.scheme}://{host}" + ("" if port in {None, usual} else f":{port}")
 
 
+class _Environment(EnvSettingsSource):
+    """The environment variables of the service. Unknown names are errors."""
+
+    def __call__(self) -> dict[str, Any]:
+        """Return the settings in the environment.
+
+        Raises:
+            pydantic.ValidationError: the environment contains an unknown setting.
+        """
+        known = [name.upper() for name in self.settings_cls.model_fields]
+        errors: list[InitErrorDetails] = []
+        for variable, value in sorted(os.environ.items()):
+            name = variable.upper().removeprefix(_PREFIX)
+            if name == variable.upper() or not value or name in {*known, *_OF_CLIENTS}:
+                continue
+            if _SERVICE_LINK.fullmatch(f"{name}={value}"):
+                continue
+            message = "unknown setting; app/settings.py lists the settings"
+            if name in _REMOVED:
+                message = f"this setting is removed: {_REMOVED[name]}"
+            elif similar := get_close_matches(name, known, 1):
+                message = f"unknown setting; did you mean {_PREFIX}{similar[0]}?"
+            kind = PydanticCustomError("unknown_setting", "{message}", {"message": message})
+            errors.append({"type": kind, "loc": (name.lower(),), "input": None})
+        if errors:
+            raise ValidationError.from_exception_data("Settings", errors)
+        return super().__call__()
+
+
 class Settings(BaseSettings):
     """The settings of the service.
 
@@ -87,7 +149,7 @@ class Settings(BaseSettings):
     """
 
     model_config = SettingsConfigDict(
-        env_prefix="SCENE_",
+        env_prefix=_PREFIX,
         env_ignore_empty=True,
         frozen=True,
         extra="forbid",
@@ -153,6 +215,14 @@ class Settings(BaseSettings):
     max_body_bytes: Annotated[
         int, Field(ge=1024, le=64 * 2**20, description="maximum size of a request body in bytes")
     ] = 2 * 2**20
+    max_scene_bytes: Annotated[
+        int,
+        Field(
+            ge=1024,
+            le=64 * 2**20,
+            description="maximum size in bytes of the body of a question about one scene",
+        ),
+    ] = 256 * 2**10
     held_body_bytes: Annotated[
         int,
         Field(
@@ -258,6 +328,17 @@ class Settings(BaseSettings):
     access_log: Annotated[bool, Field(description="log one line per request, without payload")] = (
         True
     )
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        *_: PydanticBaseSettingsSource,
+        **__: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Return the sources of the settings: first arguments, then environment variables."""
+        return init_settings, _Environment(settings_cls)
 
     @property
     def secrets(self) -> list[str]:

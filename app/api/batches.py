@@ -7,14 +7,13 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Final, TypeVar
 
 from fastapi import APIRouter
-from pydantic import ValidationError
 from pydantic_core import to_json
 from starlette.requests import Request
 
 from app.api import catalogue
-from app.api.body import JSONRoute
+from app.api.body import BatchRoute, validated
 from app.api.openapi import operation_id, queued
-from app.api.problems import from_exception, report_defect, unfit
+from app.api.problems import from_exception, report_defect
 from app.api.questions import begin
 from app.serving.answers import written
 from app.serving.models import DEFAULT
@@ -36,7 +35,7 @@ _PROBLEMS: Final = queued(
 
 router = APIRouter(
     tags=["batches"],
-    route_class=JSONRoute,
+    route_class=BatchRoute,
     responses=_PROBLEMS,
     generate_unique_id_function=operation_id,
 )
@@ -59,9 +58,10 @@ async def _answer_each(
             try:
                 held.check()
                 one = held.with_answer_bytes(left)
-                answer = written(
-                    await question.answer(one, _validated(scene, place, question.request))
-                )
+                # Only this validation may fail because of the client. Any later validation error is
+                # a defect of the service.
+                asked = validated(scene, question.request, at=("scenes", place))
+                answer = written(await question.answer(one, asked))
                 results.append(b'{"status":200,"result":%b}' % answer)
                 count(SUCCESS)
             except Exception as error:  # noqa: BLE001 — any error fails only this scene
@@ -92,15 +92,6 @@ def _reference(scene: Any) -> str:
     """Return the field `model` of a scene that is not validated yet, or the default model."""
     found = scene.get("model", DEFAULT) if isinstance(scene, dict) else DEFAULT
     return found if isinstance(found, str) else DEFAULT
-
-
-def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
-    try:
-        return kind.model_validate(scene)
-    except ValidationError as error:
-        # The client caused this validation error. Any later validation error is a defect of the
-        # service.
-        raise unfit(error, scene, kind, at=("scenes", place)) from None
 
 
 def _answering(question: Question[Any]) -> Callable[..., Awaitable[bytes]]:

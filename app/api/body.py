@@ -6,10 +6,12 @@ import asyncio
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from email.message import Message
+from functools import cache
 from itertools import islice
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from fastapi.routing import APIRoute
 from pydantic import ValidationError
@@ -19,11 +21,14 @@ from starlette.types import Receive, Scope, Send
 
 from app.api import catalogue
 from app.api.gateway import ADMIN_KEY, carries, too_large
-from app.api.problems import ProblemError, from_exception, unfit
-from app.serving.errors import RequestError
+from app.api.problems import ProblemError, from_exception, invalid, unfit
+from app.serving.errors import Location, RequestError
 from app.settings import Settings
 from scene_client.schemas import FieldError
+from scene_client.schemas import Request as Form
 from scene_client.validation import MAX_ERRORS, PLAIN, pointer
+
+FormT = TypeVar("FormT", bound=Form)
 
 MAX_MEMBERS: Final = 32
 """Maximum number of members of a JSON object. Objects of valid requests have fewer members.
@@ -35,7 +40,8 @@ So the limit on the number of members bounds the memory of the reports.
 SMALL: Final = 64 * 1024
 """The service always accepts a body of at most this size in bytes if it arrives in one piece.
 
-This rule lets small requests through when incomplete bodies of other clients fill the budget.
+This rule lets small requests through when incomplete bodies of other clients fill the budget. The
+event loop parses small bodies itself, and leaves larger bodies to a thread.
 """
 
 
@@ -50,13 +56,13 @@ class Bodies:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self.limit = settings.max_body_bytes
         self.budget = settings.held_body_bytes
         self.patience = settings.client_timeout
         self.held = 0
+        self._parser = ThreadPoolExecutor(1, thread_name_prefix="parsing")
 
-    async def read(self, receive: Receive) -> bytes:
-        """Read a whole body and add its length to `held`.
+    async def read(self, receive: Receive, limit: int) -> bytes:
+        """Read a whole body of at most ``limit`` bytes and add its length to `held`.
 
         After the answer, the caller must subtract the length of the body from `held`.
 
@@ -83,8 +89,8 @@ class Bodies:
                     else:
                         body = bytearray(body) if isinstance(body, bytes) else body
                         body += part
-                    if len(body) > self.limit:
-                        raise too_large(self.limit)
+                    if len(body) > limit:
+                        raise too_large(limit)
                     if self.held > self.budget and not (is_whole and len(body) <= SMALL):
                         detail = f"All bodies in progress exceed {self.budget} bytes together."
                         raise ProblemError(catalogue.BODIES_FULL, detail)
@@ -99,6 +105,56 @@ class Bodies:
             self.held -= len(body)
             raise
         return bytes(body)
+
+    async def parse(self, body: bytes, form: type[FormT]) -> tuple[Any, FormT]:
+        """Return the JSON value of a body, and the same value as a ``form``.
+
+        Raises:
+            ProblemError: see `parse` and `validated`.
+        """
+        if len(body) <= SMALL:
+            return _read(body, form)
+        return await asyncio.get_running_loop().run_in_executor(self._parser, _read, body, form)
+
+
+def _read(body: bytes, form: type[FormT]) -> tuple[Any, FormT]:
+    value = parse(body)
+    return value, validated(value, form)
+
+
+def validated(value: Any, form: type[FormT], *, at: Location = ()) -> FormT:
+    """Validate a JSON value. Refuse lists with too many entries before their validation.
+
+    Args:
+        value: the JSON value.
+        form: the schema.
+        at: location of ``value`` in a batch request. It is empty for other requests.
+
+    Raises:
+        ProblemError: `catalogue.INVALID_REQUEST`.
+    """
+    errors = [
+        FieldError(pointer=pointer((*at, name)), message=f"must have at most {most} entries")
+        for name, most in _most_entries(form).items()
+        if isinstance(value, dict) and isinstance(value.get(name), list) and len(value[name]) > most
+    ]
+    if errors:
+        raise invalid(catalogue.INVALID_REQUEST, errors)
+    try:
+        return form.model_validate(value)
+    except ValidationError as error:
+        raise unfit(error, value, form, at=at) from None
+
+
+@cache
+def _most_entries(form: type[Form]) -> dict[str, int]:
+    """Return the maximum length of each list (and text) among the fields of a schema."""
+    return {
+        name: limit.max_length
+        for name, field in form.model_fields.items()
+        for limit in field.metadata
+        if hasattr(limit, "max_length")
+    }
 
 
 def parse(body: bytes) -> Any:
@@ -199,15 +255,26 @@ _DECODER: Final = json.JSONDecoder(object_pairs_hook=_members)
 _LENIENT: Final = json.JSONDecoder(object_pairs_hook=_members, parse_constant=_Constant)
 
 
-def _is_json(content_type: bytes) -> bool:
-    if content_type == b"application/json":
-        return True
-    message = Message()
-    message["content-type"] = content_type.decode("latin-1")
-    subtype = message.get_content_subtype()
-    return message.get_content_maintype() == "application" and (
-        subtype == "json" or subtype.endswith("+json")
-    )
+def _check_media(http: Request) -> None:
+    """Check that the headers declare plain JSON in UTF-8.
+
+    Raises:
+        ProblemError: `catalogue.UNSUPPORTED_MEDIA_TYPE`.
+    """
+    headers = http.headers
+    content_type, detail = headers.get("content-type", ""), ""
+    if content_type != "application/json":
+        message = Message()
+        message["content-type"] = content_type
+        kind, subtype = message.get_content_maintype(), message.get_content_subtype()
+        if kind != "application" or not (subtype == "json" or subtype.endswith("+json")):
+            detail = "The header Content-Type must be application/json."
+        elif message.get_content_charset("utf-8") not in {"utf-8", "utf8"}:
+            detail = "The charset in the header Content-Type must be utf-8."
+    if any(coding.lower() != "identity" for coding in headers.getlist("content-encoding")):
+        detail = "The body must not be compressed: leave the header Content-Encoding out."
+    if detail:
+        raise ProblemError(catalogue.UNSUPPORTED_MEDIA_TYPE, detail)
 
 
 class JSONRoute(APIRoute):
@@ -232,21 +299,14 @@ class JSONRoute(APIRoute):
         if scope["query_string"]:
             detail = "This route has no query parameters. Send all fields in the JSON body."
             raise ProblemError(catalogue.BAD_REQUEST, detail)
-        kind = next((value for name, value in scope["headers"] if name == b"content-type"), b"")
-        if not _is_json(kind):
-            detail = "The header Content-Type must be application/json."
-            raise ProblemError(catalogue.UNSUPPORTED_MEDIA_TYPE, detail)
+        _check_media(http)
         bodies: Bodies = scope["app"].state.bodies
-        body = await bodies.read(receive)
+        body = await bodies.read(receive, self.limit(scope["app"].state.settings))
         try:
             if not body:
                 raise ProblemError(catalogue.NOT_JSON, "The body is empty.")
-            value = parse(body)
             form: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
-            try:
-                asked = form.model_validate(value)
-            except ValidationError as error:
-                raise unfit(error, value, form) from None
+            value, asked = await bodies.parse(body, form)
             try:
                 answer: bytes = await self.endpoint(asked=asked, http=http, **scope["path_params"])
             except RequestError as error:
@@ -262,6 +322,18 @@ class JSONRoute(APIRoute):
 
     def check(self, http: Request) -> None:
         """Check a request before its body is read. Subclasses may raise `ProblemError`."""
+
+    def limit(self, settings: Settings) -> int:
+        """Return the maximum size of a body in bytes."""
+        return min(settings.max_scene_bytes, settings.max_body_bytes)
+
+
+class BatchRoute(JSONRoute):
+    """A `JSONRoute` whose bodies contain many scenes."""
+
+    def limit(self, settings: Settings) -> int:
+        """Return the maximum size of a batch in bytes."""
+        return settings.max_body_bytes
 
 
 class AdminJSONRoute(JSONRoute):

@@ -137,8 +137,8 @@ BODY_TOO_LARGE: Final = ProblemType(
     "body-too-large",
     413,
     "The body is too large",
-    "Send fewer scenes in one request. SCENE_MAX_BODY_BYTES sets the limit. The limit also applies "
-    "to chunked bodies.",
+    "Send fewer scenes in one request. SCENE_MAX_SCENE_BYTES limits the body of a question about "
+    "one scene, and SCENE_MAX_BODY_BYTES all bodies. Both limits also apply to chunked bodies.",
 )
 BODIES_FULL: Final = ProblemType(
     "bodies-full",
@@ -152,7 +152,8 @@ UNSUPPORTED_MEDIA_TYPE: Final = ProblemType(
     "unsupported-media-type",
     415,
     "The body is not declared as JSON",
-    "Send Content-Type: application/json.",
+    "Send Content-Type: application/json, without a charset other than utf-8 and without "
+    "Content-Encoding.",
 )
 INVALID_REQUEST: Final = ProblemType(
     "invalid-request",

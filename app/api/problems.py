@@ -115,7 +115,7 @@ def from_exception(error: Exception, *, at: Location = (), body: Any = None) -> 
                 )
                 for fault in error.faults[:MAX_ERRORS]
             ]
-            return _faulty(kind, errors, len(error.faults))
+            return invalid(kind, errors)
         case UnknownModelError():
             return ProblemError(catalogue.MODEL_NOT_FOUND, str(error))
         case ModelUnavailableError():
@@ -153,8 +153,11 @@ def from_exception(error: Exception, *, at: Location = (), body: Any = None) -> 
             )
 
 
-def _faulty(kind: ProblemType, errors: list[FieldError], count: int) -> ProblemError:
-    detail = f"The request has {count} error{'' if count == 1 else 's'}, listed in `errors`."
+def invalid(kind: ProblemType, errors: list[FieldError]) -> ProblemError:
+    """Return the problem for a request with these errors. Only `MAX_ERRORS` errors are listed."""
+    count = len(errors)
+    most = "at least " * (count >= MAX_ERRORS)
+    detail = f"The request has {most}{count} error{'' if count == 1 else 's'}, listed in `errors`."
     if kind is catalogue.UNKNOWN_LABELS:
         detail += (
             " GET /models/{name}/vocabulary lists the known names. With `unknown_labels` set to "
@@ -174,8 +177,7 @@ def unfit(
         form: the schema.
         at: location of ``body`` in a batch request. It is empty for other requests.
     """
-    errors = field_errors(error, body, form, at=at)
-    return _faulty(catalogue.INVALID_REQUEST, errors, error.error_count())
+    return invalid(catalogue.INVALID_REQUEST, field_errors(error, body, form, at=at))
 
 
 def report_defect(error: Exception, request_id: str) -> None:

@@ -43,7 +43,7 @@ NEIGHBOUR_GAP: Final = 1.0  # maximum distance in metres between the footprints 
 NEIGHBOUR_DISTANCE: Final = 1.5  # maximum distance in metres between centres if a size is unknown
 MIN_OFFSET: Final = 0.10  # minimum |dx| or |dy| in metres for *front* or *left*
 MOST_DISTANT: Final = 100.0  # longest plausible distance from the viewer in metres; detects mm
-SMALLEST: Final = 1e-3  # shortest plausible side of a box in metres
+SMALLEST: Final = 1e-3  # shortest plausible longest side of a box in metres
 LARGEST: Final = 20.0  # longest plausible side of a box in metres
 
 _NONE: Final = -1  # index for "no relation"
@@ -110,13 +110,14 @@ def derive_relations(
     Args:
         positions: (n, 3) centres in viewer axes, in metres. A row with NaN means an unknown
             position. The relations of such a box stay unobserved.
-        sizes: (n, 3) extents before the rotation, in metres. A row with NaN means an unknown size.
+        sizes: (n, 3) extents before the rotation, in metres; 0 for flat boxes. A row with NaN means
+            an unknown size.
         yaws: (n,) rotation of each box about z in radians. None means that all rotations are 0.
         horizontal: whether to derive left and front. False means that the viewer is unknown, so
             that left and front stay unobserved.
 
     Raises:
-        ValueError: a shape is wrong, a value is infinite, or a size is not positive.
+        ValueError: a shape is wrong, a value is infinite, or a size is negative.
     """
     points = _array("positions", positions, (len(positions), 3))
     n = len(points)
@@ -124,8 +125,8 @@ def derive_relations(
     turns = np.zeros(n) if yaws is None else _array("yaws", yaws, (n,))
     if not _are_finite(points, extents, turns):
         raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
-    if not _are_positive(extents):
-        raise ValueError("sizes must be positive or NaN, but a size is zero or negative")
+    if np.any(extents < 0):
+        raise ValueError("sizes must not be negative")
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     observed = np.zeros_like(holds)
     _relate_all(points, extents, turns, horizontal, holds, observed)
@@ -141,16 +142,6 @@ def _are_finite(points, extents, turns):
                 return False
         if not math.isfinite(turns[i]):
             return False
-    return True
-
-
-@compiled
-def _are_positive(extents):
-    """Return whether all extents are positive or NaN."""
-    for i in range(len(extents)):
-        for k in range(3):
-            if extents[i, k] <= 0.0:
-                return False
     return True
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.scene.frames import is_world_fixed
-from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
+from app.scene.geometry import SMALLEST, Viewpoint, derive_relations, to_viewer_frame
 from app.scene.scene import Scene, SceneObject
 
 _UNKNOWN = (math.nan, math.nan, math.nan)
@@ -40,7 +40,7 @@ def observe(
         viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
             the origin and looks along x.
         typical_sizes: (V, 3) typical extents of each class in metres (`Vocabulary.sizes`). They
-            replace missing sizes of objects. NaN means an unknown size.
+            replace missing sizes of objects, and sizes below `SMALLEST`. NaN means an unknown size.
     """
     if scene.relations is not None or all(thing.position is None for thing in scene.objects):
         return scene
@@ -73,7 +73,7 @@ def _seen_from(objects: tuple[SceneObject, ...], viewpoint: Viewpoint) -> tuple[
 
 
 def _extent(thing: SceneObject, typical_sizes: NDArray[np.float64] | None) -> Sequence[float]:
-    if thing.size is not None:
+    if thing.size is not None and max(thing.size) >= SMALLEST:
         return thing.size
     if typical_sizes is not None and thing.class_index is not None:
         size: list[float] = typical_sizes[thing.class_index].tolist()

@@ -51,8 +51,8 @@ class SceneObject:
             raise ValueError(f"confidence of {self.id!r} must be in (0, 1], not {self.confidence}")
         if self.position is not None and not _are_finite(self.position):
             raise ValueError(f"position of {self.id!r} must be three finite numbers (metres)")
-        if self.size is not None and not (_are_finite(self.size) and min(self.size) > 0):
-            raise ValueError(f"size of {self.id!r} must be three positive numbers (metres)")
+        if self.size is not None and not (_are_finite(self.size) and min(self.size) >= 0):
+            raise ValueError(f"size of {self.id!r} must be three numbers of at least 0 (metres)")
         if not math.isfinite(self.yaw):
             raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
 

@@ -33,7 +33,7 @@ from scene_client.schemas import (
     SceneWarning,
     UnknownLabels,
 )
-from scene_client.validation import PLAIN
+from scene_client.validation import MAX_ERRORS, PLAIN
 
 MAX_SUGGESTED: Final = 32
 """Maximum number of searches for classes similar to an unknown label, per scene.
@@ -77,6 +77,11 @@ class Faults:
     ) -> None:
         """Add an error without raising it."""
         self.found.setdefault(reason, []).append(Fault(location, message, tuple(suggestions)))
+
+    @property
+    def are_many(self) -> bool:
+        """Whether an answer cannot list further errors."""
+        return sum(map(len, self.found.values())) >= MAX_ERRORS
 
     def raise_any(self) -> None:
         """Raise an exception if the request has errors.
@@ -516,6 +521,8 @@ def _triples(
     names, some_ignored = reading.names, bool(reading.left_out)
     triples: dict[Triple, bool] = {}
     for place, relation in enumerate(relations):
+        if faults.are_many:
+            break
         location: Location = ("relations", place)
         if some_ignored and (
             names.is_ignored(relation.subject) or names.is_ignored(relation.object)

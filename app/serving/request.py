@@ -24,6 +24,13 @@ T = TypeVar("T")
 
 SUCCESS: Final = "success"
 
+MANY_OBJECTS: Final = 64
+MANY_RELATIONS: Final = 256
+"""Largest scene that the event loop reads without a look at its expected time.
+
+To read such a scene takes about 1 ms: the service derives the relations from the poses.
+"""
+
 
 @dataclass(slots=True)
 class Record:
@@ -94,25 +101,48 @@ class Request(Ticket):
     holding: bool = False
     look_ups: LookUps = field(default_factory=LookUps)
 
-    def read(
+    async def read(
         self, scene: SceneRequest, *, may_be_empty: bool = False
     ) -> tuple[ServedModel, Reading]:
         """Return the model in the field `model` of a scene, and the scene converted for this model.
+
+        The queue of the model reads large scenes.
 
         Raises:
             UnknownModelError: the model does not exist.
             ModelUnavailableError: the service refused to load the model.
             RequestError: the scene is invalid; see `read_scene`.
+            DeadlinePassedError, DisconnectedError: see `WorkQueue`.
         """
         model = self.models.resolve(scene.model)
         self.record.models.add(model.key)
-        return model, read_scene(
-            scene, model.vocabulary, self.limits, self.look_ups, may_be_empty=may_be_empty
+        read = partial(
+            read_scene,
+            scene,
+            model.vocabulary,
+            self.limits,
+            self.look_ups,
+            may_be_empty=may_be_empty,
         )
+        relations = len(scene.relations or ())
+        if len(scene.objects) <= MANY_OBJECTS and relations <= MANY_RELATIONS:
+            return model, read()
+        posed = sum(
+            not isinstance(thing, str) and thing.position is not None for thing in scene.objects
+        )
+        # The time for the relations from poses grows with the number of pairs of objects.
+        done = await model.queue.run(
+            read,
+            self,
+            kind=f"read {posed.bit_length()}",
+            size=len(scene.objects) + relations + posed**2,
+        )
+        return model, done.result
 
     async def ask(
         self,
         model: ServedModel,
+        name: str,
         question: Callable[Concatenate[Artifact, Scene, P], T],
         scene: Scene,
         *args: P.args,
@@ -122,14 +152,14 @@ class Request(Ticket):
 
         Args:
             model: the model that computes the answer.
-            question: function of `app.questions` that computes the answer.
+            name: name of the question, for log and metrics.
+            question: function that computes the answer.
             scene: the scene with the class indices of the model.
             *args, **kwargs: further arguments of ``question``.
 
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
         """
-        name = question.__name__
         call = partial(question, model.artifact, scene, *args, **kwargs)
         rows = 0 if self.holding else 1
         model.queue.take(rows)

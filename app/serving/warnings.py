@@ -47,8 +47,8 @@ def scene_warnings(
         _add(
             found,
             "implausible-size",
-            f"a side of the object is below {SMALLEST * 1e3:g} mm or above {LARGEST:g} m; "
-            "sizes must be in metres",
+            f"all sides of the object are below {SMALLEST * 1e3:g} mm, so its size is unknown, or "
+            f"a side is above {LARGEST:g} m; sizes must be in metres",
             [thing for thing in sized if not _is_plausible(thing.size)],
         )
     if request.frame_id is not None and is_optical(request.frame_id) and _is_flat(given):
@@ -94,7 +94,7 @@ def _distant(given: Scene, request: SceneRequest) -> list[SceneObject]:
 
 
 def _is_plausible(size: Point | None) -> bool:
-    return size is None or (min(size) >= SMALLEST and max(size) <= LARGEST)
+    return size is None or SMALLEST <= max(size) <= LARGEST
 
 
 def _is_flat(given: Scene) -> bool:

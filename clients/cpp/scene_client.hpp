@@ -42,7 +42,7 @@ struct Error : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-// The client cannot send the request: invalid UTF-8, an invalid URL, or a timeout out of range.
+// The client cannot send the request: invalid UTF-8, URL or API key, or a timeout out of range.
 struct InvalidRequestError : Error {
   using Error::Error;
 };
@@ -99,6 +99,9 @@ class Client {
   explicit Client(Options options = {})
       : options_(std::move(options)), address_(split(options_.url)), http_(address_.server) {
     if (!http_.is_valid()) throw InvalidRequestError("the URL is invalid");
+    for (const char letter : options_.api_key)
+      if (letter < '!' || letter > '~')
+        throw InvalidRequestError("the API key must be ASCII, without spaces or line breaks");
     http_.set_keep_alive(true);
     http_.set_tcp_nodelay(true);
     http_.set_decompress(false);  // a decompressed body could have any size

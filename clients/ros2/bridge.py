@@ -29,7 +29,7 @@ def options(description: str) -> argparse.ArgumentParser:
     arguments.add_argument(
         "--questions", nargs="+", choices=QUESTIONS, default=["missing", "outliers"]
     )
-    arguments.add_argument("--label-map", help="coco, if the class ids are COCO numbers")
+    arguments.add_argument("--label-map", help="coco80 or coco91, if the class ids are numbers")
     return arguments
 
 

@@ -186,7 +186,10 @@ NO_SCENES = [
     ('{"detections": [null]}', "neither a scene nor a message"),
     ('{"detections": []}', "no detection with a class"),
     ("3", "A scene must be a JSON object"),
-    ('{"objects": [{"label": "bed", "size": {"x": -1, "y": 1, "z": 1}}]}', "positive numbers"),
+    (
+        '{"objects": [{"label": "bed", "size": {"x": -1, "y": 1, "z": 1}}]}',
+        "numbers x, y, z from 0",
+    ),
     ('{"objects": [{"id": "a", "label": "bed"}, {"id": "a", "label": "bed"}]}', "another object"),
     ('{"objects": [{"label": "bed", "position": {"x": 1e9, "y": 0, "z": 0}}]}', "100 000 km"),
     ('{"objects": [{"label": "bed", "size": {"x": 2e4, "y": 1, "z": 1}}]}', "10 km"),

@@ -253,10 +253,10 @@ def whole_bodies() -> Iterator[Hostile]:
             "noise": random.Random(0).randbytes(10_000),
             "brackets": b"[" * 100_000,
             "closed brackets": b"[" * 100_000 + b"]" * 100_000,
-            "objects": b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
+            "objects": b'{"a":' * 30_000 + b"1" + b"}" * 30_000,
             "XML": b"<?xml version='1.0'?><!DOCTYPE a [<!ENTITY b SYSTEM 'file:///etc/passwd'>]>",
             "form": b"objects=bed&objects=lamp",
-            "long number": b"1" * 1_000_000,
+            "long number": b"1" * 200_000,
             "lone quote": b'"' + _TEXT * 10_000,
             "backslashes": b'"' + b"\\" * 100_001,
         }.items():
@@ -265,10 +265,10 @@ def whole_bodies() -> Iterator[Hostile]:
             "a number": NUMBER.encode(),
             "a text": b'"%s"' % _TEXT,
             "a list": b"[]",
-            "many texts": b"[" + b",".join([b'"a"'] * 400_000) + b"]",
-            "many numbers": b"[" + b"0," * 900_000 + b"0]",
+            "many texts": b"[" + b",".join([b'"a"'] * 50_000) + b"]",
+            "many numbers": b"[" + b"0," * 100_000 + b"0]",
             "long exponent": b"1e" + b"9" * 100_000,
-            "many members": b"{" + b",".join(b'"%d":0' % k for k in range(100_000)) + b"}",
+            "many members": b"{" + b",".join(b'"%d":0' % k for k in range(20_000)) + b"}",
         }.items():
             yield Hostile(f"{path} {name}", path, body, method, expected=frozenset({422}))
         body = b'{"objects": [' + b",".join([b'"bed"'] * 1_000_000) + b"]}"
@@ -471,7 +471,7 @@ def header_fields() -> Iterator[Hostile]:
         for value in values:
             yield Hostile(
                 f"{name}: {value[:20]!r}", "/missing", b'{"objects": ["bed"]}', "POST",
-                {name: value}, frozenset({200, 400, 422, 504}),
+                {name: value}, frozenset({200, 400, 415, 422, 504}),
             )  # fmt: skip
     for name in ("X-Admin-Key", "Authorization"):
         for value in values:

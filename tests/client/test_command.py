@@ -18,6 +18,7 @@ from scene_client import Client, __version__, tables
 from scene_client.command import app
 from scene_client.schemas import (
     Disagreement,
+    GenerateAnswer,
     MisplacedRelation,
     MissingAnswer,
     Outlier,
@@ -208,6 +209,72 @@ def test_other_lines_are_2(scene: Any, tmp_path: Path, line: str, text: str, wor
     done = scene("missing", f"{tmp_path / 'scenes.jsonl'}{line}")
     assert (done.exit_code, done.stdout) == (2, "")
     assert word in done.stderr
+
+
+NUMBERED: dict[str, Any] = {
+    "message": {"detections": [{"results": [{"hypothesis": {"class_id": "59", "score": 0.8}}]}]},
+    "results": [{"image_id": 4, "category_id": 59, "bbox": [1, 2, 3, 4], "score": 0.8}],
+    "list": [{"label": "59", "confidence": 0.8}],
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERED)
+def test_class_ids_need_a_label_map(scene: Any, tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps(NUMBERED[kind]))
+    done = scene("outliers", str(path))
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert "--label-map" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    (tmp_path / "names.txt").write_text("lamp\n" * 59 + "bed\nlamp\n")
+    (tmp_path / "list.json").write_text(json.dumps(["lamp"] * 59 + ["bed"]))
+    (tmp_path / "object.json").write_text(json.dumps({"59": "bed"}))
+    (tmp_path / "coco.json").write_text(json.dumps({"categories": [{"id": 59, "name": "bed"}]}))
+    for names in ("coco80", *map(str, sorted(tmp_path.glob("[!s]*")))):
+        done = scene("outliers", str(path), "--label-map", names, "--json")
+        assert done.exit_code == 0, done.stderr
+        (entry,) = json.loads(done.stdout)["outliers"]
+        assert entry["label"] == "bed"
+    done = scene("outliers", str(path), "--label-map", "coco91", "--unknown-labels", "error")
+    assert '"pizza": the model does not know' in done.stderr
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", '[{"id": 1}]', "7", "\x00\xd8"])
+def test_a_label_map_without_labels_is_refused(scene: Any, tmp_path: Path, text: str) -> None:
+    (tmp_path / "names").write_bytes(text.encode("latin-1"))
+    done = scene("missing", "59", "--label-map", str(tmp_path / "names"))
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert "--label-map" in done.stderr
+    several = [{"category_id": 59, "image_id": image} for image in (1, 2)]
+    assert "several images" in scene("missing", "-", stdin=json.dumps(several)).stderr
+
+
+NOT_FINITE = """{"detections": [{"id": "\\"NaN", "results": [{
+    "hypothesis": {"class_id": "bed", "score": 0.9},
+    "pose": {"pose": {"position": {"x": NaN, "y": null, "z": -Infinity}}, "covariance": [NaN]}}],
+    "bbox": {"center": {"position": {"x": 2, "y": 0, "z": 0}}, "size": {"x": 2, "y": 3, "z": 0}}}]
+}"""
+"""A flat box, and numbers that JSON lacks where the box makes them unnecessary."""
+
+
+def test_numbers_that_json_lacks_stop_no_message(scene: Any) -> None:
+    done = scene("outliers", "-", "--json", stdin=NOT_FINITE)
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert [entry["object"] for entry in found["outliers"]] == ['"NaN']
+    assert found["warnings"] == []
+
+
+def test_long_lists_of_sampled_relations_are_cut() -> None:
+    objects = ["bed", *(f"lamp {number}" for number in range(20))]
+    sides = [{"subject": name, "relation": "left", "object": "bed"} for name in objects[1:]]
+    on = {"subject": "lamp 7", "relation": "on-top", "object": "bed"}
+    drawn = {"objects": objects, "relations": [*sides, on], "log_score": 0.0, "context": {}}
+    found = GenerateAnswer.model_validate(ANSWERED | {"seed": 1, "scenes": [drawn]})
+    table = shown(tables.generate(found))
+    assert table.count("left bed") == tables.MOST_RELATIONS - 1
+    assert "lamp 7 on-top bed" in table
+    assert "… and 9 more" in table
 
 
 def test_commas_separate_labels(scene: Any) -> None:

@@ -144,11 +144,17 @@ def test_a_score_in_per_cent_is_clipped_and_reported() -> None:
     assert reasons(fields) == [(0, "high-score")]
 
 
-@pytest.mark.parametrize("size", [(0, 0, 0), (1, 0, 1), (1, -1, 1), (1, 1, math.nan), (1, 1, 1e5)])
+@pytest.mark.parametrize("size", [(0, 0, 0), (1, -1, 1), (1, 1, math.nan), (1, 1, 1e5)])
 def test_extents_that_are_none_are_left_out(size: Any) -> None:
     thing = only(from_detection3d_array(array(seen(result("bed"), size=size))))
     assert "size" not in thing
     assert thing["position"] == {"x": 1.0, "y": 0.0, "z": 0.5}
+
+
+@pytest.mark.parametrize("size", [(2, 3, 0), (0, 1, 1)])
+def test_a_flat_box_has_a_size(size: Any) -> None:
+    found = only(from_detection3d_array(array(seen(result("rug"), size=size))))
+    assert found["size"] == dict(zip("xyz", map(float, size), strict=True))
 
 
 @pytest.mark.parametrize(

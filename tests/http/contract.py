@@ -47,6 +47,7 @@ def documented(examples: int) -> Any:
                 # reason. 504 is valid too, since a request may have a deadline of 2 ms.
                 "checks": {
                     "positive_data_acceptance": {"expected-statuses": [*positive, "422"]},
+                    "negative_data_rejection": {"expected-statuses": negative},
                     "not_a_server_error": {"expected-statuses": ["2xx", "3xx", "4xx", "504"]},
                 },
                 # A batch with an invalid scene has status 200; only the scene's entry has a

@@ -87,7 +87,7 @@ async def post(client: httpx.AsyncClient, body: bytes | str, path: str = "/relat
         b'{"objects": ["be\nd"]}',
         b'{"objects": ["bed"], "seed": ' + b"9" * 5000 + b"}",
         b"[" * 100_000 + b"]" * 100_000,
-        b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
+        b'{"a":' * 30_000 + b"1" + b"}" * 30_000,
         b'{"objects": ' + b"[" * 300 + b"]" * 300 + b"}",
     ],
     ids=lambda body: repr(body[:24]),
@@ -97,15 +97,24 @@ async def test_what_is_not_strict_json_is_refused(client: httpx.AsyncClient, bod
 
 
 @pytest.mark.parametrize(
-    "content_type",
-    [None, "text/plain", "application/x-www-form-urlencoded", "application/xml", "json", "", "*/*"],
+    ("headers", "named"),
+    [
+        ({}, "application/json"),
+        *(
+            ({"Content-Type": kind}, "application/json")
+            for kind in ("text/plain", "application/x-www-form-urlencoded", "json", "", "*/*")
+        ),
+        ({"Content-Type": "application/json; charset=utf-16"}, "charset"),
+        ({"Content-Type": "application/a+json; charset=latin-1"}, "charset"),
+        ({"Content-Type": "application/json", "Content-Encoding": "gzip"}, "Content-Encoding"),
+        ({"Content-Type": "application/json", "Content-Encoding": "identity, br"}, "compressed"),
+    ],
 )
-async def test_what_is_not_declared_as_json_is_refused(
-    client: httpx.AsyncClient, content_type: str | None
+async def test_what_is_not_declared_as_plain_json_is_refused(
+    client: httpx.AsyncClient, headers: dict[str, str], named: str
 ) -> None:
-    headers = {} if content_type is None else {"Content-Type": content_type}
     response = await client.post("/relations", content=b'{"objects": ["bed"]}', headers=headers)
-    problem(response, 415, "unsupported-media-type")
+    assert named in problem(response, 415, "unsupported-media-type")["detail"]
 
 
 @pytest.mark.parametrize(
@@ -133,7 +142,7 @@ UNFIT: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"objects": [""]}, "objects/0"),
         ({"objects": ["be\0d"]}, "objects/0"),
         ({"objects": ["be\nd"]}, "objects/0"),
-        ({"objects": ["x" * 1_000_000]}, "objects/0"),
+        ({"objects": ["x" * 200_000]}, "objects/0"),
         ({"objects": ["bed"] * 257}, "objects"),
         ({"objects": [{}]}, "objects/0/label"),
         ({"objects": [BED | {"id": ""}]}, "objects/0/id"),
@@ -143,7 +152,7 @@ UNFIT: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"objects": [BED | {"confidence": True}]}, "objects/0/confidence"),
         ({"objects": [BED | {"position": {"x": 1, "y": 2}}]}, "objects/0/position/z"),
         ({"objects": [BED | {"position": POINT | {"x": 10**400}}]}, "objects/0/position/x"),
-        ({"objects": [BED | {"size": POINT | {"x": 0}}]}, "objects/0/size/x"),
+        ({"objects": [BED | {"size": POINT | {"x": -1}}]}, "objects/0/size/x"),
         ({"objects": [BED | {"orientation": POINT | {"w": 2}}]}, "objects/0/orientation"),
         ({"relations": [{}]}, "relations/0/subject"),
         ({"relations": [LEFT | {"relation": "near"}]}, "relations/0/relation"),
@@ -209,7 +218,7 @@ async def test_no_body_has_more_faults_than_it_is_long(
 ) -> None:
     unknown = {f"u{k}": 0 for k in range(29)}
     triple = {"subject": "bed", "relation": "left", "object": "lamp"}
-    body = {"objects": ["bed", "lamp"], "relations": [triple, triple | unknown] * 2048}
+    body = {"objects": ["bed", "lamp"], "relations": [triple, triple | unknown] * 64}
     document = problem(await post(client, json.dumps(body), f"/{question}"), 422, "invalid-request")
     # Those of the first that does not fit, and of no other.
     assert [error["pointer"] for error in document["errors"]] == [
@@ -322,7 +331,7 @@ async def test_numbers_that_are_not_json_are_pointed_at(client: httpx.AsyncClien
     assert "line 1 column" in document["detail"]
     many = '{"objects": [' + ", ".join(["NaN"] * 1000) + "]}"
     document = problem(await post(client, many), 400, "not-json")
-    assert len(document["errors"]) == 100
+    assert len(document["errors"]) == 32
 
 
 async def test_misspelt_fields_are_pointed_at_with_suggestions(client: httpx.AsyncClient) -> None:
@@ -345,11 +354,11 @@ async def test_pointers_do_not_repeat_what_is_no_plain_name(
     assert [error["pointer"] for error in document["errors"]] == ["#"]
 
 
-async def test_at_most_100_faults_are_listed(client: httpx.AsyncClient) -> None:
+async def test_at_most_32_faults_are_listed(client: httpx.AsyncClient) -> None:
     document = problem(
         await client.post("/relations", json={"objects": [1] * 256}), 422, "invalid-request"
     )
-    assert len(document["errors"]) == 100
+    assert len(document["errors"]) == 32
 
 
 # ----------------------------------------------------------------------------- models, routes

@@ -253,7 +253,7 @@ FAR = {"id": "far", "label": "chair", "position": at(2000, 300, 400), "size": at
 MOVED = [thing | {"position": thing["position"] | {"x": 502.0}} for thing in LAMP_ON_DESK]
 SIZES = [
     {"id": "a", "label": "bed", "size": at(500, 2, 1)},
-    {"id": "b", "label": "bed", "size": at(1, 0.0005, 1)},
+    {"id": "b", "label": "bed", "size": at(0, 0, 0.0005)},
 ]
 # The vocabulary has typical sizes of lamps and desks, of beds it has none.
 BARE = [{key: value for key, value in one.items() if key != "size"} for one in LAMP_ON_DESK]
@@ -269,6 +269,7 @@ BED = {"id": "b", "label": "bed", "position": at(2, 1, 0.3)}
         # Millimetres.
         ({"objects": [*LAMP_ON_DESK, FAR]}, "implausible-position", ["far"]),
         ({"objects": SIZES}, "implausible-size", ["a", "b"]),
+        ({"objects": [{"label": "bed", "size": at(2, 3, 0)}]}, None, []),
         # A map may be large, but not around the robot.
         ({"objects": MOVED}, "implausible-position", ["d", "l"]),
         ({"objects": MOVED, "frame_id": "map"}, None, []),

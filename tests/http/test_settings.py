@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from app.__main__ import main
 from app.serving.logs import JSONFormatter, PlainFormatter
 from app.settings import Settings
 
@@ -119,6 +120,46 @@ def test_origins_are_listed_as_browsers_send_them(
     for between in (",", ", ", " "):
         monkeypatch.setenv("SCENE_CORS_ORIGINS", between.join(origins))
         assert Settings().cors_origins == origins
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("SCENE_STOER", "models", "unknown setting; did you mean SCENE_STORE?"),
+        ("scene_max_object", "7", "unknown setting; did you mean SCENE_MAX_OBJECTS?"),
+        ("SCENE_HTTP_PORT", "80", "unknown setting"),
+        ("SCENE_ZZ", "1", "unknown setting; app/settings.py lists the settings"),
+        ("SCENE_WORKERS", "2", "this setting is removed: a replica is one process"),
+        ("SCENE_SIGNING_KEY", "a.pem", "this setting is removed: a store is a folder"),
+        ("SCENE_STREAM_RESUME", "1", "this setting is removed: the service has no streams"),
+        ("SCENE_PORT", "tcp://10.0.0.1:8000", "Input should be a valid integer"),
+        ("SCENE_STOER", "", None),
+        ("SCENE_URL", "http://127.0.0.1", None),
+        ("SCENE_SERVICE_HOST", "10.0.0.1", None),
+        ("SCENE_SERVICE_PORT", "8000", None),
+        ("SCENE_SERVICE_PORT_HTTP", "8000", None),
+        ("SCENE_PORT_8000_TCP", "tcp://10.0.0.1:8000", None),
+        ("SCENE_PORT_8000_TCP_ADDR", "10.0.0.1", None),
+        ("SCENE_HEADLESS_SERVICE_HOST", "10.0.0.1", None),
+        ("SCENE_HEADLESS_PORT", "tcp://10.0.0.1:8000", None),
+    ],
+)
+def test_unknown_names_stop_the_start(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    value: str,
+    message: str | None,
+) -> None:
+    monkeypatch.setenv("SCENE_STORE", str(tmp_path))
+    monkeypatch.setenv(name, value)
+    if message is None:
+        assert Settings().port == 8000
+    else:
+        assert main() == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"{name.upper()}: {message}")
 
 
 def test_a_store_that_is_a_file_is_refused(tmp_path: Path) -> None:

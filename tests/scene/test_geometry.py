@@ -200,7 +200,7 @@ def test_a_scene_of_none_and_of_one() -> None:
         ([[0, 0, math.inf]], [[1, 1, 1]], None, "infinite"),
         ([[0, 0, 0]], [[1, 1, math.inf]], None, "infinite"),
         ([[0, 0, 0]], [[1, 1, 1]], [NAN], "infinite"),
-        ([[0, 0, 0]], [[1, 0, 1]], None, "positive"),
+        ([[0, 0, 0]], [[1, -1, 1]], None, "negative"),
     ],
 )
 def test_bad_poses_are_refused(positions: list, sizes: list, yaws: list, message: str) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ CHAIR = SceneObject("chair", "chair", 2, position=(1.2, 0.0, 0.5))
         ({"confidence": math.nan}, "confidence of 'a'"),
         ({"position": (0.0, math.nan, 0.0)}, "position of 'a'"),
         ({"position": (0.0, 0.0)}, "position of 'a'"),
-        ({"size": (1.0, 0.0, 1.0)}, "size of 'a'"),
+        ({"size": (1.0, -1.0, 1.0)}, "size of 'a'"),
         ({"size": (1.0, math.inf, 1.0)}, "size of 'a'"),
         ({"yaw": math.inf}, "yaw of 'a'"),
     ],
@@ -60,6 +61,14 @@ def test_poses_become_relations() -> None:
     assert seen.poses is not None
     assert seen.poses.observed[LEFT, 0, 2]
     assert not seen.poses.observed[ABOVE, 0, 2]  # the chair has no size
+
+
+def test_flat_boxes_have_relations_and_boxes_below_a_millimetre_have_no_size() -> None:
+    rug = replace(MONITOR, id="rug", position=(2.0, 0.0, 0.0), size=(2.0, 3.0, 0.0))
+    assert observe(Scene((DESK, rug))).relations == ((ON_TOP, 0, 1),)
+    speck = replace(rug, size=(0.0, 0.0, 0.0005))
+    bare = replace(rug, size=None)
+    assert observe(Scene((DESK, speck))).relations == observe(Scene((DESK, bare))).relations
 
 
 def test_typical_sizes_take_the_place_of_unknown_ones() -> None:

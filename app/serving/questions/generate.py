@@ -42,7 +42,7 @@ _UNIT_BYTES = 12  # maximum size in bytes of the number of one hidden unit
 
 async def generate(request: Request, asked: GenerateRequest) -> Answer:
     """Sample scenes that contain the given objects and relations. Equal seeds give equal scenes."""
-    model, reading = request.read(asked, may_be_empty=True)
+    model, reading = await request.read(asked, may_be_empty=True)
     _check_context(asked, model)
     seed = secrets.randbits(DRAWN_SEED_BITS) if asked.seed is None else asked.seed
 

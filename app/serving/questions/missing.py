@@ -47,7 +47,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
     The list `more` contains listed classes that probably have further instances, such as a second
     nightstand. It is empty for questions about a place.
     """
-    model, reading = request.read(asked)
+    model, reading = await request.read(asked)
     faults = Faults()
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:
@@ -60,9 +60,10 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         at = _place(asked.at, model, reading, faults)
     if faults.found:
         faults.raise_any()
-    found = await request.ask(
+    found, further = await request.ask(
         model,
-        questions.missing,
+        "missing",
+        _missing_and_more,
         reading.scene,
         top_k=asked.top_k,
         candidates=candidates,
@@ -71,15 +72,6 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         coverage=asked.coverage,
         details=asked.detail == "full",
     )
-    further: tuple[questions.More, ...] = ()
-    if asked.at is None:
-        further = questions.more(
-            model.artifact,
-            reading.scene,
-            top_k=asked.top_k,
-            candidates=candidates,
-            coverage=asked.coverage,
-        )
     found = tuple([_notable(entry, reading.scene) for entry in found])
     require_size(_size(found, further), reading, request.limits.answer_bytes, "top_k")
     answer = envelope(asked, request.id, model.reference, reading)
@@ -95,6 +87,34 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         for entry in further
     ]
     return answer
+
+
+def _missing_and_more(
+    artifact: Artifact,
+    scene: Scene,
+    *,
+    top_k: int,
+    candidates: Sequence[int] | None,
+    at: tuple[str, int] | None,
+    axes: Axes | None,
+    coverage: float | None,
+    details: bool,
+) -> tuple[tuple[questions.MissingAnswer, ...], tuple[questions.More, ...]]:
+    """Compute both lists of the answer. The list `more` is empty for questions about a place."""
+    found = questions.missing(
+        artifact,
+        scene,
+        top_k=top_k,
+        candidates=candidates,
+        at=at,
+        axes=axes,
+        coverage=coverage,
+        details=details,
+    )
+    if at is not None:
+        return found, ()
+    further = questions.more(artifact, scene, top_k=top_k, candidates=candidates, coverage=coverage)
+    return found, further
 
 
 def _notable(entry: questions.MissingAnswer, scene: Scene) -> questions.MissingAnswer:

@@ -38,9 +38,10 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
     The list `outliers` starts with the most probable outlier. All instances of a class have the
     same probability. The list `misplaced` starts with the relation that is most probably false.
     """
-    model, reading = request.read(asked)
+    model, reading = await request.read(asked)
     found = await request.ask(
         model,
+        "outliers",
         questions.outliers,
         reading.scene,
         sensitivity=asked.sensitivity,

@@ -31,9 +31,10 @@ async def relations(request: Request, asked: RelationsRequest) -> Answer:
     The answer also lists disagreements: pairs of objects whose observed relation differs from the
     relation that the model expects from the rest of the scene.
     """
-    model, reading = request.read(asked)
+    model, reading = await request.read(asked)
     found, disagreements = await request.ask(
         model,
+        "relations",
         questions.relations,
         reading.scene,
         top_k=asked.top_k,

@@ -10,8 +10,9 @@ import { SceneError } from './scene.js';
  * @returns {object[]} the scenes in the format of the API; several only from JSON lines
  * @throws {SceneError | SyntaxError}
  */
-export function scenesIn(text) {
-  if (isLabels(text)) return [{ objects: text.split(/[,\n]/).map((label) => label.trim()).filter(Boolean) }];
+export function scenesIn(source) {
+  if (isLabels(source)) return [{ objects: source.split(/[,\n]/).map((label) => label.trim()).filter(Boolean) }];
+  const text = source.replace(NOT_FINITE, (part) => (part[0] === '"' ? part : 'null'));
   try {
     return [sceneOf(JSON.parse(text))];
   } catch (error) {
@@ -20,6 +21,9 @@ export function scenesIn(text) {
     return lines.map((line) => sceneOf(JSON.parse(line)));
   }
 }
+
+// Texts, and the numbers that JSON lacks. Detectors write such numbers, for example as covariances.
+const NOT_FINITE = /"(?:[^"\\]|\\.)*"|-?\b(?:NaN|Infinity)\b/g;
 
 /** Whether a text consists of labels, with commas or line ends between them, instead of JSON. */
 const isLabels = (text) => !/[{}[\]":]/.test(text) && /\p{L}/u.test(text);
@@ -68,7 +72,7 @@ function detected({ header, detections }) {
   const seen = detections.map((one) => ({ ...one, best: best(one.results ?? []) })).filter(({ best: { label } }) => label);
   if (!seen.length) throw new SceneError('The message has no detection with a class and a positive score.');
   if (seen.every(({ best: { label } }) => /^-?\d+$/.test(label))) {
-    throw new SceneError('The class ids are numbers. The Python client can translate them with a label map.');
+    throw new SceneError('The class ids are numbers. The command `scene` translates them with --label-map.');
   }
   const ids = new Map();
   return {
@@ -98,7 +102,8 @@ const isSet = (pose) => {
 /** Position, size and orientation of a detection, as far as the message has them in its own frame. */
 function box({ bbox, header: own, best: { pose } }, header) {
   if (own?.frame_id && header?.frame_id && own.frame_id !== header.frame_id) return {};
-  const sized = bbox?.size && [bbox.size.x, bbox.size.y, bbox.size.z].every((side) => side > 0);
+  const sides = bbox?.size && [bbox.size.x, bbox.size.y, bbox.size.z];
+  const sized = sides?.every((side) => side >= 0) && sides.some(Boolean);
   const found = sized || isSet(bbox?.center) ? bbox.center : pose;
   if (!found?.position || !(sized || isSet(found))) return {};
   const { position, orientation: q } = found;

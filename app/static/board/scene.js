@@ -66,10 +66,11 @@ function fail(condition, words) {
   if (condition) throw new SceneError(words);
 }
 
+const SMALLEST = 1e-3; // metres
 const isNumber = (value) => typeof value === 'number' && Number.isFinite(value);
 const AXES = ['x', 'y', 'z'];
 const isPlace = (value) => isNumber(value) && Math.abs(value) <= FARTHEST;
-const isExtent = (value) => isNumber(value) && value > 0 && value <= LARGEST;
+const isExtent = (value) => isNumber(value) && value >= 0 && value <= LARGEST;
 
 /**
  * Reads a scene of the API.
@@ -136,13 +137,15 @@ function readThing(entry, id, index, before, sizes) {
   fail(typeof found.label !== 'string' || !found.label.trim(), `${where} needs a label.`);
   fail(typeof id !== 'string' || !id.trim() || id.startsWith('\u0000'), `${where} has an id that is not a text.`);
   fail(before.some((thing) => thing.id === id), `${where} has the id of another object: ${id}.`);
-  const { position, size = null, orientation: q } = found;
+  const { position, size: extents, orientation: q } = found;
   const confidence = found.confidence ?? 1;
   fail(position && !AXES.every((axis) => isPlace(position[axis])), `${where} needs a position with numbers x, y, z within ±100 000 km.`);
-  fail(size && !AXES.every((axis) => isExtent(size[axis])), `${where} needs a size with positive numbers x, y, z of at most 10 km.`);
+  fail(extents && !AXES.every((axis) => isExtent(extents[axis])), `${where} needs a size with numbers x, y, z from 0 to 10 km.`);
   fail(!(isNumber(confidence) && confidence > 0 && confidence <= 1), `${where} has a confidence outside (0, 1].`);
   fail(q && !([q.x, q.y, q.z, q.w].every(isNumber) && Math.abs(Math.hypot(q.x, q.y, q.z, q.w) - 1) <= 0.01), `${where} has an orientation that is not a quaternion of length 1.`);
   const yaw = q ? (Math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)) * 180) / Math.PI : 0;
+  // A box with a short side is flat. A box with short sides alone has an unknown size.
+  const size = extents && AXES.some((axis) => extents[axis] >= SMALLEST) ? extents : null;
   const thing = { id, label: found.label, size, yaw: round(yaw, 2), confidence, x: 0, y: 0, z: 0 };
   const height = sizer(sizes)(thing).size.z;
   const at = position && { x: position.x, y: position.y, z: round(position.z - height / 2) };

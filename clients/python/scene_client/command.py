@@ -43,7 +43,7 @@ from scene_client.errors import (
     problem_text,
 )
 from scene_client.offline import OfflineClient
-from scene_client.ros_fields import MessageError
+from scene_client.ros_fields import WELL_KNOWN, MessageError, read_label_map
 from scene_client.schemas import Detail, FieldError, RelationName, Sensitivity, UnknownLabels
 from scene_client.sync import Client
 from scene_client.vision_msgs import from_message, is_message
@@ -201,6 +201,14 @@ Unknown = Annotated[
     UnknownLabels | None,
     typer.Option(help="Unknown labels: refuse them, ignore them, or use the nearest class."),
 ]
+LabelMap = Annotated[
+    str | None,
+    typer.Option(
+        metavar="coco80|coco91|FILE",
+        help="Labels of numeric class ids: COCO's ids 0 to 79, COCO's ids 1 to 90, or a file with "
+        "one label a line, a JSON list, a JSON object from ids to labels, or COCO's categories.",
+    ),
+]
 HowMuch = Annotated[
     Detail | None, typer.Option(help="Only the scores, or also places and reasons.")
 ]
@@ -220,9 +228,10 @@ def relations(
         bool, typer.Option("--include-opposites", help="Also list right, behind, under and below.")
     ] = False,
     unknown_labels: Unknown = None,
+    label_map: LabelMap = None,
 ) -> None:
     """List the likely spatial relations between the objects."""
-    scene = _scene(things, relations, room_type, unknown_labels)
+    scene = _scene(things, relations, room_type, unknown_labels, label_map)
     request = scene | _named(
         top_k=top_k,
         min_probability=min_probability,
@@ -250,10 +259,11 @@ def missing(
     room_type: RoomType = None,
     top_k: TopK = None,
     unknown_labels: Unknown = None,
+    label_map: LabelMap = None,
     detail: HowMuch = None,
 ) -> None:
     """List objects that the scene probably lacks, and their likely places."""
-    scene = _scene(things, relations, room_type, unknown_labels)
+    scene = _scene(things, relations, room_type, unknown_labels, label_map)
     request = scene | _named(
         top_k=top_k,
         coverage=coverage,
@@ -279,10 +289,11 @@ def outliers(
     relations: Stated = None,
     room_type: RoomType = None,
     unknown_labels: Unknown = None,
+    label_map: LabelMap = None,
     detail: HowMuch = None,
 ) -> None:
     """List objects that do not fit the scene, and relations that are probably false."""
-    scene = _scene(things, relations, room_type, unknown_labels)
+    scene = _scene(things, relations, room_type, unknown_labels, label_map)
     request = scene | _named(
         sensitivity=sensitivity,
         threshold=threshold,
@@ -303,7 +314,7 @@ def generate(
     steps: Annotated[int | None, typer.Option(help="Number of Gibbs sweeps.")] = None,
     temperature: Annotated[
         float | None,
-        typer.Option(help="Sampling temperature. Values above 1 give more varied scenes."),
+        typer.Option(help="Sampling temperature, 0.05 to 1.5. High values give varied scenes."),
     ] = None,
     plot: Annotated[
         Path | None,
@@ -314,12 +325,13 @@ def generate(
     relations: Stated = None,
     room_type: RoomType = None,
     unknown_labels: Unknown = None,
+    label_map: LabelMap = None,
 ) -> None:
     """Sample scenes that contain the given objects."""
     asked: Asked = context.obj
     if plot is not None and find_spec("matplotlib") is None:
         _fail("the option --plot needs matplotlib: run pip install matplotlib", MEANINGLESS)
-    scene = _scene(things or [], relations, room_type, unknown_labels)
+    scene = _scene(things or [], relations, room_type, unknown_labels, label_map)
     request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
     answer = asked.show(lambda client: client.generate(request), tables.generate, request)
     if plot is not None:
@@ -370,6 +382,7 @@ def _scene(
     stated: list[str] | None,
     room_type: str | None,
     unknown_labels: UnknownLabels | None,
+    label_map: str | None,
 ) -> dict[str, Any]:
     """Return the fields of the request from files and options. Options override files."""
     if things is None:
@@ -381,8 +394,9 @@ def _scene(
     files = [thing for thing in things if _is_file(thing)]
     if files and things != files[:1]:
         _fail(f"{files[0]} is a whole scene: remove the labels and other files", MEANINGLESS)
-    scene = _read(files[0]) if files else {"objects": things}
-    return scene | _named(
+    labels = {} if label_map is None else _label_map(label_map)
+    scene = _read(files[0], labels) if files else {"objects": things}
+    return _labelled(scene, labels) | _named(
         relations=[_relation(text) for text in stated] if stated else None,
         room_type=room_type,
         unknown_labels=unknown_labels,
@@ -406,9 +420,42 @@ def _is_file(thing: str) -> bool:
     return thing == "-" or thing.endswith(".json") or bool(_LINES.match(thing)) or os.sep in thing
 
 
-def _read(argument: str) -> dict[str, Any]:
-    lines = _LINES.match(argument)
-    name = lines["file"] if lines else argument
+def _label_map(option: str) -> dict[str, str | None]:
+    """Return the labels of the class ids that the option `--label-map` names."""
+    names: Any = option
+    try:
+        if option not in WELL_KNOWN:
+            text = _bytes(option).decode()
+            try:
+                names = json.loads(text)
+            except ValueError:
+                names = text.splitlines()
+            names = names.get("categories", names) if isinstance(names, dict) else names
+            if isinstance(names, list) and isinstance(names[0], dict):
+                names = {entry["id"]: entry["name"] for entry in names}
+        return read_label_map(names)
+    except (LookupError, TypeError, ValueError):
+        _fail(f"--label-map: {option} does not contain labels", MEANINGLESS)
+
+
+def _labelled(scene: dict[str, Any], labels: dict[str, str | None]) -> dict[str, Any]:
+    """Replace the labels of objects that are class ids."""
+    if not isinstance(scene.get("objects"), list):
+        return scene
+    objects = []
+    for thing in scene["objects"]:
+        label = thing.get("label") if isinstance(thing, dict) else thing
+        if str(label).isdecimal():
+            label = labels.get(str(label))
+            if label is None:
+                wanted = "set --label-map to coco80, coco91 or a file with the labels of the ids"
+                _fail(f"an object has a class id instead of a label: {wanted}", MEANINGLESS)
+            thing = {**thing, "label": label} if isinstance(thing, dict) else label
+        objects.append(thing)
+    return scene | {"objects": objects}
+
+
+def _bytes(name: str) -> bytes:
     try:
         if name == "-":
             text = sys.stdin.buffer.read(MAX_FILE + 1)
@@ -419,6 +466,13 @@ def _read(argument: str) -> dict[str, Any]:
         _fail(f"cannot read {name}: {error.strerror}", MEANINGLESS)
     if len(text) > MAX_FILE:
         _fail(f"{name} is too large: it has more than {MAX_FILE} bytes", MEANINGLESS)
+    return text
+
+
+def _read(argument: str, labels: dict[str, str | None]) -> dict[str, Any]:
+    lines = _LINES.match(argument)
+    name = lines["file"] if lines else argument
+    text = _bytes(name)
     if lines:
         text = _line(name, text, lines["line"])
     try:
@@ -426,17 +480,28 @@ def _read(argument: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         _fail(f"{argument} is not JSON: {error}", MEANINGLESS)
     if is_message(scene):
-        return _detected(name, scene)
+        return _detected(name, scene, labels)
     if is_annotated(scene):
         try:
             return from_annotated(scene)
         except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError):
             _fail(f"{argument} is not a scene of the training format", MEANINGLESS)
     if isinstance(scene, list):
-        return {"objects": scene}
+        return {"objects": _of_coco(name, scene)}
     if not isinstance(scene, dict):
         _fail(f"{name} must contain a request or a list of objects", MEANINGLESS)
     return scene
+
+
+def _of_coco(name: str, entries: list[Any]) -> list[Any]:
+    """Return the objects of a list, which may be a file of COCO's results for one image."""
+    if not all(isinstance(entry, dict) and "category_id" in entry for entry in entries):
+        return entries
+    if len({str(entry.get("image_id")) for entry in entries}) > 1:
+        _fail(f"{name} has several images: keep the results of one image_id", MEANINGLESS)
+    return [
+        {"label": entry["category_id"], "confidence": entry.get("score", 1.0)} for entry in entries
+    ]
 
 
 def _line(name: str, text: bytes, line: str | None) -> bytes:
@@ -450,10 +515,10 @@ def _line(name: str, text: bytes, line: str | None) -> bytes:
     return lines[number - 1]
 
 
-def _detected(name: str, message: Any) -> dict[str, Any]:
+def _detected(name: str, message: Any, labels: dict[str, str | None]) -> dict[str, Any]:
     """Return the request fields for a ROS message with detections, as JSON from rosbridge."""
     try:
-        fields = from_message(message)
+        fields = from_message(message, labels or None)
     except MessageError as error:
         _fail(f"{name}: {error}", MEANINGLESS)
     for note in fields.notes:

@@ -48,7 +48,7 @@ class Options:
     If a proxy strips a path prefix, ``url`` must include this prefix.
 
     Raises:
-        InvalidRequestError: the URL, the timeout or the number of retries is invalid.
+        InvalidRequestError: the URL, the timeout, a key or the number of retries is invalid.
     """
 
     url: str
@@ -64,6 +64,10 @@ class Options:
             raise _refused("the URL must start with http:// or https:// and contain a host")
         if parts.query or parts.fragment:
             raise _refused("the URL must not have a query or a fragment")
+        if not all(
+            "!" <= letter <= "~" for letter in (self.api_key or "") + (self.admin_key or "")
+        ):
+            raise _refused("a key must have only ASCII characters, without spaces or line breaks")
         if self.retries < 0:
             raise _refused("the number of retries must not be negative")
         self.limit(self.timeout)

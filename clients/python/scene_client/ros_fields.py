@@ -140,7 +140,11 @@ COCO: Final = (
 )
 """Labels of the 80 classes of COCO. The index of a label is the usual class id of detectors."""
 
-_WELL_KNOWN: Final = {"coco": COCO}
+_UNUSED: Final = frozenset((12, 26, 29, 30, 45, 66, 68, 69, 71, 83))
+COCO_91: Final = dict(zip((n for n in range(1, 91) if n not in _UNUSED), COCO, strict=True))
+"""Labels of the same classes by the `category_id` (1 to 90) of COCO's files."""
+
+WELL_KNOWN: Final = {"coco": COCO, "coco80": COCO, "coco91": COCO_91}
 
 
 def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
@@ -150,8 +154,9 @@ def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
 
     Args:
         label_map: a mapping from class ids (text or numbers) to labels, a list of labels with the
-            class ids as indices, a vision_msgs/LabelInfo (message or JSON), or "coco". None means
-            an empty label map.
+            class ids as indices, a vision_msgs/LabelInfo (message or JSON), "coco80" or "coco" for
+            the ids 0 to 79 of detectors, or "coco91" for the ids 1 to 90 of COCO's files. None
+            means an empty label map.
 
     Raises:
         MessageError: `label_map` has another type.
@@ -159,10 +164,10 @@ def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
     if label_map is None:
         return {}
     if isinstance(label_map, str):
-        if label_map not in _WELL_KNOWN:
-            known = ", ".join(sorted(_WELL_KNOWN))
+        if label_map not in WELL_KNOWN:
+            known = ", ".join(sorted(WELL_KNOWN))
             raise MessageError(f"no label map has the name {label_map!r}; known names: {known}")
-        label_map = _WELL_KNOWN[label_map]
+        label_map = WELL_KNOWN[label_map]
     elif (classes := take(label_map, "class_map")) is not None:
         label_map = {
             take(entry, "class_id"): take(entry, "class_name")

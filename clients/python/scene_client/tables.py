@@ -19,6 +19,7 @@ from scene_client.schemas import (
     ModelList,
     OutliersAnswer,
     Placement,
+    Relation,
     RelationsAnswer,
     VocabularyAnswer,
     WeightedLabel,
@@ -29,6 +30,9 @@ MOST_MISPLACED: Final = 10
 
 A scene of twelve objects with positions can have a hundred relations.
 """
+
+MOST_RELATIONS: Final = 12
+"""Maximum number of relations of a sampled scene in a table. Vertical relations come first."""
 
 LIKELY_PLACE: Final = 0.25
 """Minimum probability of a place in a table of missing objects.
@@ -157,13 +161,21 @@ def generate(answer: GenerateAnswer) -> RenderableType:
         (
             str(number),
             ", ".join(scene.objects),
-            "\n".join(f"{r.subject} {r.relation} {r.object}" for r in scene.relations),
+            _relations(scene.relations),
             f"{scene.log_score:.1f}",
         )
         for number, scene in enumerate(answer.scenes, 1)
     ]
     title = f"seed {answer.seed}"
     return _table("scene", "objects", "relations", "log score", rows=rows, title=title)
+
+
+def _relations(relations: Sequence[Relation]) -> str:
+    ranked = sorted(relations, key=lambda one: one.relation in {"left", "front"})
+    lines = [f"{one.subject} {one.relation} {one.object}" for one in ranked[:MOST_RELATIONS]]
+    if len(ranked) > MOST_RELATIONS:
+        lines.append(f"… and {len(ranked) - MOST_RELATIONS} more")
+    return "\n".join(lines)
 
 
 def models(answer: ModelList) -> RenderableType:

@@ -17,7 +17,7 @@ from pydantic_core import ErrorDetails
 
 from scene_client.schemas import OBJECT_TAGS, FieldError, OrArray, Request
 
-MAX_ERRORS: Final = 100
+MAX_ERRORS: Final = 32
 """Maximum number of errors that the answer to a request lists."""
 
 # Messages for pydantic's types of errors. The names in braces are members of pydantic's context.
@@ -68,7 +68,10 @@ def field_errors(
     *,
     at: tuple[str | int, ...] = (),
 ) -> list[FieldError]:
-    """Return the first `MAX_ERRORS` errors of a request.
+    """Return the errors of a request, at most `MAX_ERRORS`.
+
+    Validation stops at the first invalid object. So the function replaces this object by a valid
+    one and validates the request again, until it has enough errors.
 
     Args:
         error: the validation error of pydantic.
@@ -77,13 +80,38 @@ def field_errors(
         at: location of ``body`` in the request.
     """
     found = []
-    # The limit also bounds the time, because suggestions for 100,000 unknown members take a minute.
-    for fault in error.errors(include_url=False)[:MAX_ERRORS]:
+    for fault in _first_errors(error, body, form):
         location = fault["loc"]
         message, suggestions = _worded(fault, form)
         where = pointer(at) + pointer(location, body)[1:]
         found.append(FieldError(pointer=where, message=message, suggestions=suggestions))
     return found
+
+
+def _first_errors(error: ValidationError, body: Any, form: type[Request]) -> list[ErrorDetails]:
+    errors = later = error.errors(include_url=False)
+    while len(errors) < MAX_ERRORS:
+        # Only errors of entries have a location of more than one step.
+        place: Any = next(
+            (one["loc"][1] for one in later if one["loc"][1:] and _is_object(one)), None
+        )
+        if place is None:
+            break
+        objects = [*body["objects"]]
+        objects[place] = "valid"
+        body = {**body, "objects": objects}
+        try:
+            form.model_validate(body)
+            break
+        except ValidationError as next_error:
+            later = list(filter(_is_object, next_error.errors(include_url=False)))
+            errors += later
+    # Errors of objects come first, as in the schema.
+    return sorted(errors, key=_is_object, reverse=True)[:MAX_ERRORS]
+
+
+def _is_object(fault: ErrorDetails) -> bool:
+    return fault["loc"][:1] == ("objects",)
 
 
 def pointer(location: tuple[str | int, ...], body: Any = None) -> str:

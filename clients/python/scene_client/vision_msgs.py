@@ -99,8 +99,8 @@ def from_detection3d_array(
     """Convert objects with poses. The service derives their relations in the axes of ``frame_id``.
 
     If the box of a detection is unset, the pose of the best hypothesis replaces the box. Extents
-    that are not positive count as unknown. An all-zero quaternion means no rotation. An object
-    without a finite position has no position in the request.
+    count as unknown if one is negative or not finite, or if all are 0. An all-zero quaternion means
+    no rotation. An object without a finite position has no position in the request.
 
     Args:
         message: a vision_msgs/Detection3DArray.
@@ -221,8 +221,9 @@ class _Reader:
         ]
         if not sightings and label_map is None and self._only_numbers():
             raise MessageError(
-                "the class ids are numbers: set label_map to their labels (a mapping, a list of "
-                "labels in the order of the numbers, a vision_msgs/LabelInfo, or 'coco')"
+                "the class ids are numbers: set label_map (--label-map of the command scene) to "
+                "'coco80', 'coco91' or their labels (a list in the order of the numbers, a "
+                "mapping, or a vision_msgs/LabelInfo)"
             )
         self.sightings = self._surest(sightings)
         self.ids = self._ids()
@@ -337,7 +338,7 @@ class _Reader:
             return {}
         box = take(seen.detection, "bbox") if boxes else None
         pose, size = take(box, "center"), numbers(take(box, "size"), "xyz")
-        sized = size is not None and all(0 < side <= _MAX_EXTENT for side in size)
+        sized = size is not None and any(size) and all(0 <= side <= _MAX_EXTENT for side in size)
         if not sized and _is_unset(pose):
             pose = seen.pose
             if _is_unset(pose):

@@ -112,10 +112,11 @@ class SceneWarning(Reply):
         ],
         Field(
             description="implausible-position: an object is more than 100 m from the viewer. "
-            "implausible-size: a side of an object is below 1 mm or above 20 m. flat-scene: all "
-            "objects have the same depth in an optical frame. unknown-sizes: vertical relations of "
-            "an object are unobserved, because its size is unknown. not-judged: the model has too "
-            "few training scenes to judge objects or relations, and the list is empty"
+            "implausible-size: all sides of an object are below 1 mm, or one is above 20 m. "
+            "flat-scene: all objects have the same depth in an optical frame. unknown-sizes: "
+            "vertical relations of an object are unobserved, because its size is unknown. "
+            "not-judged: the model has too few training scenes to judge objects or relations, and "
+            "the list is empty"
         ),
     ]
     message: str

@@ -48,7 +48,7 @@ def _plain_text(value: str) -> str:
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
-Extent = Annotated[float, Field(gt=0, le=1e4, allow_inf_nan=False)]
+Extent = Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 UnitNumber = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Label = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_plain_text)]
@@ -113,7 +113,10 @@ class Position(Request):
 
 
 class Size(Request):
-    """Extents of a box in metres along its own axes, without the rotation by ``orientation``."""
+    """Extents of a box in metres along its own axes, without the rotation by ``orientation``.
+
+    A box may be flat. If all extents are below 1 mm, the size is unknown.
+    """
 
     x: Extent
     y: Extent
@@ -207,7 +210,7 @@ SceneObject = Annotated[
 ]
 
 
-SomeObjects = Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
+SomeObjects = Annotated[list[SceneObject], Field(min_length=1, max_length=256, fail_fast=True)]
 
 
 class Relation(Request):
@@ -223,7 +226,8 @@ class SceneRequest(Request):
 
     objects: Annotated[
         list[SceneObject],
-        Field(max_length=256, description="labels or detections, at most 256"),
+        # Validation stops at the first invalid object. `validation.field_errors` then repeats it.
+        Field(max_length=256, fail_fast=True, description="labels or detections, at most 256"),
     ]
     relations: Annotated[
         list[Annotated[Relation, OrArray()]] | None,

@@ -1,0 +1,202 @@
+"""Bodies and headers that cost much or pretend to be others: refused before the work begins."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from pydantic import ValidationError
+
+from app.questions import more
+from app.serving.reading import read_scene
+from scene_client.schemas import MissingRequest
+from tests.http.test_problems import problem
+from tests.services import LiveService, Replace, launch, serve
+
+API_KEY = "0123456789abcdef"
+JSON = {"Content-Type": "application/json"}
+
+
+@pytest.fixture(scope="module")
+def locked(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    log = tmp_path_factory.mktemp("locked") / "log"
+    with launch(shared_store, log, SCENE_API_KEY=API_KEY) as service:
+        yield service
+
+
+def objects(size: int) -> bytes:
+    return b'{"objects":[' + b",".join([b"{}"] * (size // 3 - 8)) + b"]}"
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(
+    ("path", "field", "entry", "most"),
+    [
+        ("missing", "objects", {}, 256),
+        ("missing", "candidates", 7, 4096),
+        ("relations", "pairs", [], 4096),
+        ("outliers", "relations", [], 65536),
+        ("outliers/batch", "scenes", {}, 256),
+    ],
+)
+async def test_entries_are_counted_before_they_are_validated(
+    client: httpx.AsyncClient, path: str, field: str, entry: Any, most: int
+) -> None:
+    """All other faults of the body stay unreported, so pydantic has not seen it."""
+    body = {"objects": ["bed"], "unknown": 1, field: [entry] * (most + 1)}
+    document = problem(await client.post(f"/{path}", json=body), 422, "invalid-request")
+    assert [(error["pointer"], error["message"]) for error in document["errors"]] == [
+        (f"#/{field}", f"must have at most {most} entries")
+    ]
+
+
+@pytest.mark.anyio
+async def test_the_body_of_one_scene_has_a_limit_of_its_own(client: httpx.AsyncClient) -> None:
+    scene = b'{"objects":["bed"]}'
+    for size, status in ((2**18, 200), (2**18 + 1, 413)):
+        response = await client.post("/missing", content=scene.ljust(size), headers=JSON)
+        assert response.status_code == status
+    batch = b'{"scenes":[%b]}' % scene
+    response = await client.post("/missing/batch", content=batch.ljust(2**21), headers=JSON)
+    assert response.status_code == 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("path", "body", "status"),
+    [
+        ("/missing", objects(2**21), 413),
+        ("/missing", objects(2**18), 422),
+        ("/missing/batch", b'{"scenes":[%b]}' % objects(2**21 - 20), 200),
+    ],
+)
+def test_health_answers_beside_bodies_of_empty_objects(
+    live: LiveService, path: str, body: bytes, status: int
+) -> None:
+    """One connection made health wait 459 ms."""
+    ends = threading.Event()
+
+    def attack() -> None:
+        with httpx.Client(base_url=live.url, timeout=30) as client:
+            while not ends.is_set():
+                assert client.post(path, content=body, headers=JSON).status_code == status
+
+    attacker = threading.Thread(target=attack)
+    attacker.start()
+    waits = []
+    try:
+        for _ in range(100):
+            asked = time.monotonic()
+            assert live.client.get("/health/live").is_success
+            waits.append(time.monotonic() - asked)
+            time.sleep(0.01)
+    finally:
+        ends.set()
+        attacker.join()
+    assert sorted(waits)[98] < 0.2
+
+
+@pytest.mark.parametrize(
+    ("left_out", "status"),
+    [
+        (b"", 200),
+        (b"X-API-Key: 0123456789abcdef\r\n", 401),
+        (b"Content-Type: application/json\r\n", 415),
+        (b"Host: 127.0.0.1\r\n", 421),
+    ],
+)
+def test_trailers_are_no_headers(locked: LiveService, left_out: bytes, status: int) -> None:
+    """A trailer with the key opened the service."""
+    headers = (
+        b"Host: 127.0.0.1\r\nX-API-Key: 0123456789abcdef\r\nContent-Type: application/json\r\n"
+    ).replace(left_out, b"")
+    body = b'{"objects":["bed"]}'
+    with socket.create_connection(("127.0.0.1", locked.port), timeout=10) as connection:
+        connection.sendall(
+            b"POST /missing HTTP/1.1\r\n%bTransfer-Encoding: chunked\r\n\r\n" % headers
+            + b"%x\r\n%b\r\n0\r\n%b\r\n" % (len(body), body, left_out or b"X-Note: a\r\n")
+        )
+        assert connection.recv(64).startswith(b"HTTP/1.1 %d " % status)
+
+
+UNKNOWN = {f"u{k}": 0 for k in range(30)}
+AT = {"x": 1, "y": 0, "z": 0}
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(
+    ("body", "first", "last"),
+    [
+        ({"objects": ["bed", 7, *[{"label": "bed"} | UNKNOWN] * 200]}, "objects/1", "objects/3/u0"),
+        (
+            {"objects": ["bed"], "relations": [["a", "left", "b"]] * 4096},
+            "relations/0/0",
+            "relations/15/2",
+        ),
+    ],
+)
+async def test_a_request_has_at_most_32_errors(
+    client: httpx.AsyncClient, body: dict[str, Any], first: str, last: str
+) -> None:
+    """6,600 unknown fields made health wait 557 ms, 4,096 unknown names 126 ms."""
+    document = problem(await client.post("/missing", json=body), 422, "invalid-request")
+    pointers = [error["pointer"] for error in document["errors"]]
+    assert (len(pointers), pointers[0], pointers[-1]) == (32, f"#/{first}", f"#/{last}")
+    assert "at least 32 errors" in document["detail"]
+    with pytest.raises(ValidationError) as raised:
+        MissingRequest.model_validate({"objects": [{"label": "bed"} | UNKNOWN] * 200})
+    assert raised.value.error_count() == len(UNKNOWN)
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(
+    ("scene", "is_large"),
+    [
+        ({"objects": ["bed"] * 3}, False),
+        ({"objects": [{"label": "bed", "position": AT}] * 65}, True),
+        ({"objects": ["bed", "lamp"], "relations": [["bed", "left", "lamp"]] * 257}, True),
+    ],
+)
+async def test_large_scenes_are_read_off_the_event_loop(
+    shared_store: Path, monkeypatch: pytest.MonkeyPatch, scene: dict[str, Any], is_large: bool
+) -> None:
+    threads = []
+
+    def read(*args: Any, **options: Any) -> Any:
+        threads.append(threading.current_thread())
+        return read_scene(*args, **options)
+
+    async with serve(shared_store) as client:
+        monkeypatch.setattr("app.serving.request.read_scene", read)
+        assert (await client.post("/outliers", json=scene)).status_code == 200
+    assert (threads[0] is not threading.main_thread()) == is_large
+
+
+@pytest.mark.anyio
+async def test_further_instances_are_counted_off_the_event_loop(
+    shared_store: Path, replace: Replace
+) -> None:
+    """With the rest of the question, in its thread and within its deadline."""
+    threads = []
+
+    def slow(question: Any, *args: Any, **options: Any) -> Any:
+        threads.append(threading.current_thread())
+        time.sleep(0.5)
+        return question(*args, **options)
+
+    async with serve(shared_store) as client:
+        replace(more.__name__, slow)
+        asking = asyncio.ensure_future(
+            client.post(
+                "/missing", json={"objects": ["bed"]}, headers={"X-Request-Timeout-Ms": "300"}
+            )
+        )
+        problem(await asking, 504, "deadline-passed")
+    assert threading.main_thread() not in threads
