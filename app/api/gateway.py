@@ -129,6 +129,7 @@ class Gateway:
         headers = scope["headers"]
         given = next((value for name, value in headers if name == b"x-request-id"), b"")
         request_id = given if _REQUEST_ID.fullmatch(given) else str(uuid4()).encode()
+        upgrades = any(name == b"upgrade" for name, _ in headers)
         record = Record()
         state = scope.setdefault("state", {})
         state["request_id"] = request_id.decode()
@@ -138,8 +139,9 @@ class Gateway:
             if message["type"] == "http.response.start":
                 record.begin(message["status"])
                 message["headers"] = _completed(message.get("headers", ()), request_id)
-                if self._backlog.draining:
-                    # The client's next request must go to another replica.
+                # While draining, the client's next request must go to another replica. After a
+                # request to upgrade, the parser would read its body as the next request.
+                if self._backlog.draining or upgrades:
                     message["headers"].append((b"connection", b"close"))
             await send(message)
 
