@@ -108,7 +108,7 @@ class Scenes:
         if rng.random() < 0.1:
             body["stamp"] = {"sec": rng.randrange(10**9), "nanosec": rng.randrange(10**9)}
         if rng.random() < 0.25:
-            body["unknown_labels"] = rng.choice(["error", "ignore", "nearest"])
+            body["unknown_labels"] = rng.choice(["error", "ignore", "nearest", "nearest-or-ignore"])
             word = rng.choice(self.labels)
             wrong = rng.choice([word + "s", word[1:], word[:-1] + "x", "blue " + word, "zzxqv"])
             body["objects"] = [*body["objects"], wrong]

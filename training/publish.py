@@ -27,7 +27,7 @@ from training.calibrate import calibrate
 from training.config import Config, DataConfig, load_config, shipped_configs
 from training.counts import fit_counts
 from training.datasets.sources import SOURCES
-from training.datasets.vocabulary import with_room_aliases
+from training.datasets.vocabulary import with_aliases, with_room_aliases
 from training.evaluation.alarms import untouched_alarms
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
@@ -138,7 +138,7 @@ def refit(
     """Publish a new version of a published model with refitted statistics, without training.
 
     The new version keeps weights, calibration and metrics. Only the statistics (offsets, counts),
-    their metrics and the example scenes are new. The examples are those of the shipped
+    their metrics, the example scenes and the built-in synonyms of classes are new. The examples are those of the shipped
     configuration with the name of the model, otherwise those of its own configuration. The metrics
     of weights that were trained on test scenes come from statistics that were not fitted to test
     scenes.
@@ -187,6 +187,7 @@ def refit(
         *metrics(rows),
     )
     changes = {"version": version, "created": _now(), "examples": examples}
+    changes["vocabulary"] = VocabularyEntry.of(with_aliases(artifact.vocabulary), artifact.spec.A)
     description = Description(**fields | changes)
     return _stored(store, description, with_statistics(artifact, scenes))
 

@@ -169,9 +169,9 @@ UNKNOWN_LABELS: Final = ProblemType(
     "The model does not know some labels or room types",
     "`errors` points at each unknown name and suggests the nearest known ones. With "
     "`unknown_labels` set to `ignore`, the service ignores unknown labels and lists them in "
-    "`ignored`. With `nearest`, it maps each unknown label to the most similar class and lists it "
-    "in `mapped`. It refuses a label without a similar class. GET /models/{name}/vocabulary lists "
-    "every known label.",
+    "`ignored`. With `nearest`, it maps misspelt labels and phrases to a class and lists them in "
+    "`mapped`. It refuses a label that could be several classes. With `nearest-or-ignore`, it "
+    "ignores such a label. GET /models/{name}/vocabulary lists every known label.",
 )
 CONTRADICTORY_EVIDENCE: Final = ProblemType(
     "contradictory-evidence",

@@ -6,15 +6,20 @@ with the same key name the same class. The vocabulary lists synonyms ("tv", "tel
 aliases.
 
 `head_of` returns the object in a phrase with "of": a "bottle of milk" is a bottle, and a "pair of
-shoes" is shoes.
+shoes" is shoes. `readings` removes the syntax of detectors: a "mouse_(computer_equipment)" is a
+mouse, and "chair_12" is a chair.
 """
 
 from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Callable, Iterator
 from functools import lru_cache
-from typing import Final
+from typing import Final, Literal
+
+Rule = Literal["qualifier", "alternative", "article", "instance", "prompt", "spelling", "head"]
+"""How a label was read. The rules "spelling" and "head" are guesses of `app.scene.nearest`."""
 
 _SEPARATORS: Final = re.compile(r"[\s_\-./'’‐-―]+")
 
@@ -144,3 +149,71 @@ def split_words(label: str) -> tuple[str, ...]:
 def _fold_unicode(label: str) -> str:
     composed = unicodedata.normalize("NFKC", label).casefold()
     return singular(_SEPARATORS.sub("", unicodedata.normalize("NFKC", composed)))
+
+
+# ------------------------------------------------------------------------------------ syntax
+
+_QUALIFIED: Final = re.compile(r"(.*?[^\W_])[\s_]*\(([^()]*)\).*")
+_OR: Final = re.compile(r"[/\\,;]+")
+_MOST_ALTERNATIVES: Final = 8
+_ARTICLE: Final = re.compile(r"(?:an?|the)[\s_]+(.+)", re.IGNORECASE)
+# Suffixes: coordinates ("Bed|-01.0|+00.0"), numbers ("chair_12", "cup.001", "chair12") and
+# hexadecimal ids that contain a digit ("Mug_b045e42b"). Prefixes: numbers ("011_banana").
+_INSTANCE: Final = re.compile(
+    r"(?:\d+_)?(.*?[^\W\d_])(?:\|.*|\d+|(?:[\s_\-#.:]+(?=[a-f]*\d)[\da-f]+%?)*)", re.IGNORECASE
+)
+_PROMPT: Final = re.compile(
+    r"(?:an?|the)[\s_](?:[\w-]+[\s_]){0,2}(?:photo|photograph|picture|image)[\s_]of[\s_]"
+    r"(?:(?:an?|the|some|one)[\s_])?(.+)",
+    re.IGNORECASE,
+)
+
+
+def readings(label: str, depth: int = 2) -> Iterator[tuple[Rule, str]]:
+    """Yield pairs (rule, name) of the names in a detector's label, most certain name first.
+
+    Args:
+        label: the label.
+        depth: maximum number of rules in sequence. For example, "a photo of a sofa/couch" needs
+            two rules. The pair contains the first rule.
+    """
+    found = [(rule, name) for rule, read in _RULES.items() for name in read(label)]
+    yield from found
+    if depth > 1:
+        for rule, name in found:
+            yield from ((rule, inner) for _, inner in readings(name, depth - 1))
+
+
+def _qualifier(label: str) -> list[str]:
+    """Return name and qualifier together in both orders, and the name alone."""
+    if (found := _QUALIFIED.fullmatch(label)) is None:
+        return []
+    name, qualifier = found.groups()
+    return [f"{qualifier} {name}", f"{name} {qualifier}", name]
+
+
+def _alternative(label: str) -> list[str]:
+    """Return the alternatives. In "coffee/side table", the alternatives share the last word."""
+    parts = [part for part in map(str.strip, _OR.split(label, _MOST_ALTERNATIVES)) if part]
+    if len(parts) < 2:
+        return []
+    *_, shared = last = parts[-1].split()
+    together = [f"{parts[0]} {shared}"] if len(last) > 1 and " " not in parts[0] else []
+    return [*together, *parts]
+
+
+def _matched(pattern: re.Pattern[str]) -> Callable[[str], list[str]]:
+    def read(label: str) -> list[str]:
+        found = pattern.fullmatch(label)
+        return [] if found is None or found[1] == label else [found[1]]
+
+    return read
+
+
+_RULES: Final[dict[Rule, Callable[[str], list[str]]]] = {
+    "qualifier": _qualifier,
+    "alternative": _alternative,
+    "article": _matched(_ARTICLE),
+    "instance": _matched(_INSTANCE),
+    "prompt": _matched(_PROMPT),
+}

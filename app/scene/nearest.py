@@ -1,35 +1,28 @@
-"""Search for the known names that are most similar to an unknown name.
+"""Search for the known name that an unknown name probably stands for.
 
-The similarity of two names is the larger of two values:
+`NameIndex.guess` returns an entry only if a wrong entry is improbable, because a wrong class is
+worse than none. It reads a name in two ways:
 
-    spelling   1 - edits / length of the longer name. Two exchanged letters are one edit.
-    words      0 if the last words of the names differ. If the last words are equal ("coffee mug"
-               and "mug"), the value rises with the number of common words.
+    spelling   Misspelt words, such as "nigthstand". The edits lie within words, and their number
+               depends on the length of the word. Another entry with a similar spelling makes the
+               name ambiguous.
+    head       The last words of a phrase, such as "office table", without words after a preposition
+               ("table on wheels"). Modifiers alone decide nothing.
 
-A second search ignores words for size, colour and material: a "big lamp" is a "lamp".
-
-The module does not use word vectors, because they find wrong classes too often. The nearest class
-by cosine similarity is right for only 40 % of held-out aliases. Even if distant classes are
-rejected, less than 85 % of the results are right (GloVe 6B, 100 dimensions, 20,000 words).
+`NameIndex.nearest` returns plausible entries for error messages. The module does not use word
+vectors, because the nearest class by cosine similarity is right for only 40 % of held-out aliases.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from rapidfuzz import process
-from rapidfuzz.distance import OSA
+from rapidfuzz.distance import OSA, Levenshtein
 
-from app.scene.labels import split_words
-
-ACCEPTED: Final = 0.8
-"""Minimum similarity at which the nearest known name replaces an unknown name.
-
-This value is the lowest multiple of 0.05 at which 90 % of the replacements are right. The test
-names are aliases that the search does not know, and misspelt names. In the `indoor` vocabulary,
-2724 of 2895 replacements are right. For the aliases alone, 572 of 727 replacements are right.
-"""
+from app.scene.labels import Rule, head_of, split_words
 
 LONGEST: Final = 64
 """Maximum length of a name whose spelling the search compares, in characters.
@@ -39,15 +32,50 @@ comparison grows with the length. All class names have fewer than 32 characters.
 """
 
 _LEAST: Final = 0.6  # minimum similarity of a suggestion
-_BY_KIND: Final = 0.95  # factor if the search ignored words for size, colour or material
 _BY_REST: Final = 0.9  # factor if the first letters differ, because people rarely mistype them
 _FARTHER: Final = 0.1  # maximum difference of similarity between a suggestion and the best one
 
+# Costs of edits, in tenths. Typing errors and confused vowels are frequent; other letters rarely
+# change.
+_SLIP: Final = 4  # two exchanged letters, or a letter twice instead of once
+_VOWEL: Final = 5  # another vowel
+_EDIT: Final = 8  # a letter too many or too few, or the neighbour on the keyboard
+_OTHER: Final = 15  # any other letter
+_FIRST: Final = 20  # another first letter, because people rarely mistype it
+_BY_PHRASE: Final = 11  # additional cost if the other words of the phrase agree
+_MARGIN: Final = 5  # two entries with costs as close as this make a name ambiguous
+_MOST_EDITS: Final = 2
+_MOST_CORRECTIONS: Final = 6
+_MOST_WORDS: Final = 8
+_MOST_MISSPELT: Final = 2  # number of words of a phrase
+_SHORTEST: Final = 4  # number of letters; a shorter word with a mistake can be anything
+_BY_HEAD: Final = 0.9  # factor if modifiers are unknown
+_VOWELS: Final = frozenset("aeiouy")
+_KEYS: Final = ("qwertyuiop", "asdfghjkl", "zxcvbnm")
+_NEIGHBOURS: Final = frozenset(
+    pair
+    for row, below in itertools.zip_longest(_KEYS, _KEYS[1:], fillvalue="")
+    for pair in (*itertools.pairwise(row), *zip(row, below), *zip(row[1:], below))  # noqa: B905
+)
 
-_LOOKS: Final = frozenset(
-    "big small large little tiny huge tall short long low high old new wide narrow round square "  # noqa: SIM905
-    "red green blue yellow orange purple pink brown black white grey gray beige dark light wooden "
-    "wood metal plastic leather steel golden silver".split()
+_PREPOSITIONS: Final = frozenset(
+    ("of", "with", "on", "in", "for", "behind", "under", "below", "above", "over", "near", "beside")
+)
+# These words join two objects: "stove and oven", and "vase with flowers" if both are known.
+_SEVERAL: Final = frozenset(("and", "or", "&", "+", "without"))
+_TOGETHER: Final = frozenset(("with", "in"))
+# A "toy trailer" is a toy, and a "puppet cat" is a puppet.
+_IMITATIONS: Final = frozenset(("toy", "stuffed", "plush", "puppet"))
+# A modifier changes the meaning of these words: a "jail cell" is no phone, and a "bottle cap" is no
+# hat.
+_AMBIGUOUS: Final = frozenset(
+    "bar board boat burner button can cap card cell chip cleaner conditioner console controller "  # noqa: SIM905
+    "cooker cover cream cube cycle die disc dish disk draw dressing dryer equipment file "
+    "filing foundation frame glass ground handle hanger holder hood horse iron island jam "
+    "jelly keyboard letter mail maker marble mint mold monitor nail nut oil pack pad part paste "
+    "pepper phone plate player plug pole polish present rail receiver register ring roll salt "
+    "scooter screen self shade sheet shower slab spray stand stick stopper string switch "
+    "tablet tank tape throw tie top tower trunk tub tube vest washer washing weight".split()
 )
 
 
@@ -63,6 +91,14 @@ class Match(NamedTuple):
     similarity: float
 
 
+class Guess(NamedTuple):
+    """The entry that an unknown name probably stands for."""
+
+    entry: int
+    similarity: float
+    rule: Rule
+
+
 class NameIndex:
     """Search for entries, such as object classes, with names similar to an unknown name.
 
@@ -74,27 +110,73 @@ class NameIndex:
         self._entries = [index for _, index in names]
         self._words = [split_words(name) for name, _ in names]
         self._keys = ["".join(words) for words in self._words]
+        self._by_key = dict(zip(self._keys, self._entries, strict=True))
         self._by_head: dict[str, list[int]] = {}
         for place, words in enumerate(self._words):
-            self._by_head.setdefault(_head(words), []).append(place)
+            self._by_head.setdefault(words[-1], []).append(place)
+        self._known_words = {word for words in self._words for word in words}
+        self._lexicon: dict[int, list[str]] = {}  # by length
+        for word in sorted({*self._known_words, *self._keys}):
+            self._lexicon.setdefault(len(word), []).append(word)
+
+    def guess(self, name: str) -> Guess | None:
+        """Return the entry that a name probably stands for, or None."""
+        words = split_words(head_of(name) or name)
+        if len("".join(words)) > LONGEST or len(words) > _MOST_WORDS or _SEVERAL & {*words}:
+            return None
+        unknown = {*words} - self._known_words
+        corrections = {word: [(word, 0)] for word in words}
+        if len(unknown) <= _MOST_MISSPELT:
+            corrections |= {word: self._corrections(word) for word in unknown}
+        if (found := self._spelt(words, corrections)) is not None:
+            return found
+        cut = next((k for k, word in enumerate(words) if k and word in _PREPOSITIONS), len(words))
+        if _TOGETHER & {*words[cut : cut + 1]} and self._spelt(words[cut + 1 :], corrections):
+            return None
+        imitations = [word for word in words[: cut - 1] if word in _IMITATIONS]
+        for start in range(cut):
+            head = imitations[:1] or words[start:cut]
+            if start and len(head) == 1 and head[0] in _AMBIGUOUS:
+                return None
+            if (entry := self._by_key.get("".join(head))) is not None:
+                return Guess(entry, _BY_HEAD, "head")
+        return None
+
+    def _spelt(
+        self, words: Sequence[str], corrections: Mapping[str, Sequence[tuple[str, int]]]
+    ) -> Guess | None:
+        """Return the entry whose name is the phrase, perhaps with misspelt words."""
+        found: dict[int, tuple[int, int]] = {}
+        for spelling in itertools.product(*(corrections[word] for word in words)):
+            entry = self._by_key.get("".join(known for known, _ in spelling))
+            if entry is not None:
+                allowed = sum(_allowed(known) for known, cost in spelling if cost)
+                more = _BY_PHRASE if allowed and len(words) > 1 else 0
+                cost = sum(cost for _, cost in spelling)
+                found[entry] = min((cost, allowed + more), found.get(entry, (cost, allowed + more)))
+        if not found:
+            return None
+        (entry, (cost, allowed)), *others = sorted(found.items(), key=lambda match: match[1])
+        if cost > allowed or (others and others[0][1][0] - cost <= _MARGIN):
+            return None
+        return Guess(entry, round(1 - cost / 10 / len("".join(words)), 3), "spelling")
+
+    def _corrections(self, word: str) -> list[tuple[str, int]]:
+        """Return pairs (known word, cost of the edits), or the word itself if none is similar."""
+        if len(word) < _SHORTEST:
+            return [(word, 0)]
+        lengths = range(max(_SHORTEST, len(word) - _MOST_EDITS), len(word) + _MOST_EDITS + 1)
+        lexicon = [known for length in lengths for known in self._lexicon.get(length, ())]
+        edits = process.extract(
+            word, lexicon, scorer=OSA.distance, limit=None, score_cutoff=_MOST_EDITS
+        )
+        costs = [(known, _cost(word, known, count)) for known, count, _ in edits]
+        return sorted(costs, key=lambda found: found[1])[:_MOST_CORRECTIONS] or [(word, 0)]
 
     def nearest(self, name: str, limit: int) -> tuple[Match, ...]:
         """Return at most ``limit`` plausible entries, most similar first."""
         words = split_words(name)
-        best = self._similarities(words)
-        kind = [word for word in words if word not in _LOOKS]
-        if 0 < len(kind) < len(words):
-            for index, similarity in self._similarities(kind).items():
-                _keep(best, index, _BY_KIND * similarity)
-        ranked = sorted(best.items(), key=lambda entry: (-entry[1], entry[0]))[:limit]
-        least = max(_LEAST, ranked[0][1] - _FARTHER) if ranked else 0.0
-        return tuple(Match(*entry) for entry in ranked if entry[1] >= least)
-
-    def _similarities(self, words: Sequence[str]) -> dict[int, float]:
-        """Map each entry with a similar name to its similarity."""
         best: dict[int, float] = {}
-        if not words:
-            return best
         joined = "".join(words)
         if len(joined) <= LONGEST:
             found = process.extract(
@@ -105,14 +187,14 @@ class NameIndex:
                 score_cutoff=_LEAST,
             )
             for key, similarity, place in found:
-                begins_alike = key[:1] == words[0][:1]
+                begins_alike = key[:1] == joined[:1]
                 _keep(best, self._entries[place], similarity * (1 if begins_alike else _BY_REST))
-        kin = self._by_head.get(_head(words), ())
-        is_only = len({self._entries[place] for place in kin}) == 1
-        for place in kin:
-            similarity = _in_common(words, self._words[place], is_only=is_only)
-            _keep(best, self._entries[place], similarity)
-        return best
+        for place in self._by_head.get(words[-1], ()) if words else ():
+            common = len({*words} & {*self._words[place]}) / len({*words, *self._words[place]})
+            _keep(best, self._entries[place], 0.5 + common / 2)
+        ranked = sorted(best.items(), key=lambda entry: (-entry[1], entry[0]))[:limit]
+        least = max(_LEAST, ranked[0][1] - _FARTHER) if ranked else 0.0
+        return tuple(Match(*entry) for entry in ranked if entry[1] >= least)
 
 
 def spelt_alike(name: str, known: Sequence[str], limit: int = 3) -> list[str]:
@@ -131,32 +213,28 @@ def _keep(best: dict[int, float], index: int, similarity: float) -> None:
     best[index] = max(similarity, best.get(index, 0.0))
 
 
-def _head(words: Sequence[str]) -> str:
-    """Return the head word of a name: the word before "of", or the last word without "of"."""
-    return words[words.index("of", 1) - 1] if "of" in words[1:] else words[-1]
+def _allowed(known: str) -> int:
+    """Return the maximum cost of the edits that lead to a known word."""
+    return _SLIP if len(known) < 5 else _EDIT if len(known) < 8 else _EDIT + _SLIP
 
 
-def _in_common(words: Sequence[str], known: Sequence[str], *, is_only: bool) -> float:
-    """Return the similarity of two names with the same head word.
+def _cost(word: str, known: str, distance: int) -> int:
+    """Return the cost of the edits that turn a word into a known word, in tenths."""
+    edits = Levenshtein.editops(word, known)
+    if (swaps := len(edits) - distance) > 0:
+        return _SLIP * swaps + _EDIT * (distance - swaps)
+    return sum(_edit_cost(word, known, *edit) for edit in edits.as_list())
 
-    The similarity depends on the common words. If the unknown name has all words of the known name
-    and more, it probably names a subclass ("coffee mug" of "mug"). An unknown name with fewer words
-    may belong to another class.
 
-    A head word is ambiguous if the names of several entries have it. These figures are for aliases
-    that the search does not know. If only one entry has the head word, 86 % of the aliases belong
-    to this entry. If several entries have the head word, 59 % of the aliases belong to the entry
-    whose name is only the head word.
-
-    Args:
-        words: words of the unknown name.
-        known: words of the known name.
-        is_only: whether only one entry has names with this head word.
-    """
-    one, other = set(words), set(known)
-    shared = len(one & other)
-    if other <= one:
-        if shared == 1 and len(one) > 1:
-            return 0.875 if is_only else 0.75
-        return 0.75 + 0.25 * shared / len(one)
-    return (0.5 if one <= other else 0.3) + 0.25 * shared / len(one | other)
+def _edit_cost(word: str, known: str, kind: str, here: int, there: int) -> int:
+    if kind == "replace":
+        old, new = word[here], known[there]
+        if {old, new} <= _VOWELS:
+            return _VOWEL
+        if not here:
+            return _FIRST
+        return _EDIT if {(old, new), (new, old)} & _NEIGHBOURS else _OTHER
+    text, place = (word, here) if kind == "delete" else (known, there)
+    letter = text[place]
+    is_double = letter in (text[place - 1 : place], text[place + 1 : place + 2])
+    return _SLIP if is_double else _EDIT if place else _OTHER

@@ -6,9 +6,11 @@ correct all errors at once.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -17,7 +19,7 @@ from pydantic_core import to_json
 from app.scene.frames import body_pose, is_optical
 from app.scene.geometry import Viewpoint
 from app.scene.labels import label_key
-from app.scene.nearest import ACCEPTED, Match, spelt_alike
+from app.scene.nearest import Guess, Match, spelt_alike
 from app.scene.observe import observe
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene, SceneObject
@@ -28,7 +30,8 @@ from scene_client.schemas import (
     Detection,
     Mapped,
     ObservedRelation,
-    Relation,
+    Quaternion,
+    RelationName,
     SceneRequest,
     SceneWarning,
     UnknownLabels,
@@ -110,48 +113,65 @@ class LookUps:
     """
 
     suggestions: int = 0
-    _found: dict[tuple[int, str, bool], tuple[Match, ...]] = field(default_factory=dict)
+    _guesses: dict[tuple[int, str, bool], Guess | None] = field(default_factory=dict)
+    _similar: dict[tuple[int, str, bool], tuple[Match, ...]] = field(default_factory=dict)
 
-    def nearest(
-        self, vocabulary: Vocabulary, label: str, *, is_room: bool, limit: int
-    ) -> tuple[Match, ...] | None:
-        """Return the names most similar to an unknown label, or None after ``limit`` searches."""
-        # id() stays unique, because the request keeps its models and their vocabularies in memory.
+    # id() of a vocabulary stays unique, because the request keeps its models in memory.
+
+    def guess(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> Guess | None:
+        """Return what an unknown label probably stands for.
+
+        Raises:
+            OverflowError: the request has had `MAX_MAPPED` guesses.
+        """
         key = id(vocabulary), label, is_room
-        if key not in self._found:
-            if len(self._found) >= limit:
-                return None
+        if key not in self._guesses:
+            if len(self._guesses) >= MAX_MAPPED:
+                raise OverflowError
+            guess = vocabulary.guess_room if is_room else vocabulary.guess
+            self._guesses[key] = guess(label)
+        return self._guesses[key]
+
+    def similar(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> tuple[Match, ...]:
+        """Return the names most similar to a label, or none after `MAX_SUGGESTED` searches."""
+        key = id(vocabulary), label, is_room
+        if key not in self._similar:
+            if len(self._similar) >= MAX_SUGGESTED:
+                return ()
             look_up = vocabulary.nearest_room if is_room else vocabulary.nearest
-            self._found[key] = look_up(label)
-        return self._found[key]
+            self._similar[key] = look_up(label)
+        return self._similar[key]
 
 
 @dataclass(slots=True)
 class Unknown:
-    """The unknown labels of one scene and their treatment.
+    """The labels of one scene that the vocabulary does not list, and their treatment.
 
     Attributes:
         vocabulary: classes and room types of the model.
         treatment: value of the field `unknown_labels` of the request.
         look_ups: searches for similar classes, shared by all scenes of the request.
         ignored: names of the ignored objects.
-        mapped: dictionary from each unknown label to the class that replaces it.
+        mapped: the class that replaces each label. A key consists of the label and whether it is a
+            room type.
     """
 
     vocabulary: Vocabulary
     treatment: UnknownLabels
     look_ups: LookUps
     ignored: list[str] = field(default_factory=list)
-    mapped: dict[str, Mapped] = field(default_factory=dict)
-    _looked_up: dict[tuple[str, bool], tuple[Match, ...]] = field(default_factory=dict)
+    mapped: dict[tuple[str, bool], Mapped] = field(default_factory=dict)
+    _guesses: dict[tuple[str, bool], Guess | None] = field(default_factory=dict)
 
     def resolve(
         self, label: str, name: str, location: Location, faults: Faults, *, is_room: bool = False
     ) -> int | None:
-        """Return the class or room type that replaces an unknown label.
+        """Return the class or room type that replaces an unlisted label.
+
+        Each treatment accepts the syntax of detectors, such as "chair_12".
 
         Args:
-            label: the unknown label.
+            label: the label.
             name: name of the object with this label. The list of ignored names contains it if the
                 label is ignored.
             location: location of the label in the request, for an error message.
@@ -161,17 +181,39 @@ class Unknown:
         Returns:
             Index of the class or room type. None means that the label is ignored or refused.
         """
-        if self.treatment == "ignore":
-            self.ignored.append(name)
-            return None
-        matches = self._nearest(label, is_room=is_room)
-        known = self.vocabulary.room_types if is_room else self.vocabulary.labels
-        if self.treatment == "nearest" and matches and matches[0].similarity >= ACCEPTED:
-            found, similarity = matches[0]
-            self.mapped[label] = Mapped(
-                label=label, class_=known[found], similarity=round(similarity, 3)
+        vocabulary = self.vocabulary
+        found = vocabulary.read_room(label) if is_room else vocabulary.read(label)
+        if found is None and self.treatment.startswith("nearest"):
+            found = self._guess(label, is_room=is_room)
+        if found is not None:
+            known = vocabulary.room_types if is_room else vocabulary.labels
+            self.mapped[label, is_room] = Mapped(
+                label=label,
+                class_=known[found.entry],
+                similarity=found.similarity,
+                rule=found.rule,
             )
-            return found
+            return found.entry
+        if self.treatment.endswith("ignore"):
+            self.ignored.append(name)
+        else:
+            self._refuse(label, location, faults, is_room=is_room)
+        return None
+
+    def copy(self) -> Unknown:
+        """Return a copy. A question with further labels changes only its own copy."""
+        return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
+
+    def _guess(self, label: str, *, is_room: bool) -> Guess | None:
+        key = label, is_room
+        if key in self._guesses or len(self._guesses) < MAX_SUGGESTED:
+            with suppress(OverflowError):
+                guess = self.look_ups.guess(self.vocabulary, label, is_room=is_room)
+                return self._guesses.setdefault(key, guess)
+        return None
+
+    def _refuse(self, label: str, location: Location, faults: Faults, *, is_room: bool) -> None:
+        known = self.vocabulary.room_types if is_room else self.vocabulary.labels
         message = "the model does not know this label"
         if not is_room and self.vocabulary.room_index(label) is not None:
             message += "; it is a room type: send it as `room_type`"
@@ -179,29 +221,17 @@ class Unknown:
             message = "this model does not have room types"
             if known:
                 message = f"the model does not know this room type; it knows {some_of(known)}"
-        if self.treatment == "nearest" and (label, is_room) not in self._looked_up:
+        if self.treatment == "nearest" and (label, is_room) not in self._guesses:
             message += (
                 f"; the service maps at most {MAX_SUGGESTED} unknown labels per scene and "
                 f"{MAX_MAPPED} per batch to the nearest class"
             )
-        suggestions = [known[match.entry] for match in matches]
-        if self.look_ups.suggestions >= MAX_SUGGESTED:
-            suggestions = []
+        suggestions: list[str] = []
+        if self.look_ups.suggestions < MAX_SUGGESTED:
+            matches = self.look_ups.similar(self.vocabulary, label, is_room=is_room)
+            suggestions = [known[match.entry] for match in matches]
         self.look_ups.suggestions += bool(suggestions)
         faults.add(Reason.UNKNOWN_LABELS, location, message, suggestions)
-        return None
-
-    def _nearest(self, label: str, *, is_room: bool) -> tuple[Match, ...]:
-        key = label, is_room
-        if key not in self._looked_up:
-            if len(self._looked_up) >= MAX_SUGGESTED:
-                return ()
-            limit = MAX_SUGGESTED if self.treatment == "error" else MAX_MAPPED
-            found = self.look_ups.nearest(self.vocabulary, label, is_room=is_room, limit=limit)
-            if found is None:
-                return ()
-            self._looked_up[key] = found
-        return self._looked_up[key]
 
 
 @dataclass
@@ -371,6 +401,8 @@ def read_scene(
             if not isinstance(entry, str):
                 location = (*location, "label")
             index = unknown.resolve(label, ids[place], location, faults)
+            if faults.found and faults.are_many:
+                break
         if index is None:
             reading.left_out.append((ids[place], label))
         elif isinstance(entry, str):
@@ -389,8 +421,9 @@ def read_scene(
     if reading.left_out:
         left_out = {name for name, _ in reading.left_out}
         reading.ids = [name for name in ids if name not in left_out]
-    if request.relations is not None:
-        triples, reading.flipped = _triples(request.relations, reading, faults)
+    stated = _stated(request, ids)
+    if stated is not None:
+        triples, reading.flipped = _triples(stated, reading, faults)
         faults.raise_any()
         reading.scene = Scene(reading.scene.objects, triples, request.relations_complete, room)
     if has_detections:
@@ -493,6 +526,9 @@ def _scene_object(
         size = (detection.size.x, detection.size.y, detection.size.z)
     if detection.position is not None:
         turn = detection.orientation
+        if detection.yaw is not None:
+            half = detection.yaw / 2
+            turn = Quaternion(x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
         position, size, yaw = body_pose(
             (detection.position.x, detection.position.y, detection.position.z),
             size,
@@ -511,8 +547,35 @@ def _room(name: str, unknown: Unknown, faults: Faults) -> int | None:
     return unknown.resolve(name, name, ("room_type",), faults, is_room=True)
 
 
+def _stated(
+    request: SceneRequest, ids: Sequence[str]
+) -> list[tuple[Location, str, RelationName, str]] | None:
+    """Return the stated relations and supports with their locations.
+
+    None means that positions decide.
+    """
+    supports: list[tuple[Location, str, RelationName, str]] = []
+    has_positions = True
+    for place, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
+        if isinstance(entry, str) or entry.position is None:
+            has_positions = False
+        if not isinstance(entry, str) and entry.supported_by is not None:
+            location = ("objects", place, "supported_by")
+            supports.append((location, name, "on-top", entry.supported_by))
+    if request.relations is None and (has_positions or not supports):
+        return None
+    relations = enumerate(request.relations or ())
+    return [
+        *(
+            (("relations", place), one.subject, one.relation, one.object)
+            for place, one in relations
+        ),
+        *supports,
+    ]
+
+
 def _triples(
-    relations: Sequence[Relation], reading: Reading, faults: Faults
+    stated: Sequence[tuple[Location, str, RelationName, str]], reading: Reading, faults: Faults
 ) -> tuple[tuple[Triple, ...], frozenset[Triple]]:
     """Return the canonical triples of the stated relations.
 
@@ -520,23 +583,21 @@ def _triples(
     """
     names, some_ignored = reading.names, bool(reading.left_out)
     triples: dict[Triple, bool] = {}
-    for place, relation in enumerate(relations):
-        if faults.are_many:
-            break
-        location: Location = ("relations", place)
-        if some_ignored and (
-            names.is_ignored(relation.subject) or names.is_ignored(relation.object)
-        ):
+    for location, first, relation, second in stated:
+        if some_ignored and (names.is_ignored(first) or names.is_ignored(second)):
             continue
-        subject = names.find(relation.subject, (*location, "subject"), faults)
-        other = names.find(relation.object, (*location, "object"), faults)
+        if faults.found and faults.are_many:
+            break
+        is_relation = location[0] == "relations"
+        subject = names.find(first, (*location, "subject") if is_relation else location, faults)
+        other = names.find(second, (*location, "object") if is_relation else location, faults)
         if subject is None or other is None:
             continue
         if subject == other:
             message = "an object cannot have a relation to itself"
             faults.add(Reason.CONTRADICTION, location, message)
             continue
-        index, i, j = canonicalise(subject, relation.relation, other)
+        index, i, j = canonicalise(subject, relation, other)
         if (index, j, i) in triples:
             message = "this relation contradicts an earlier relation of the same two objects"
             faults.add(Reason.CONTRADICTION, location, message)

@@ -103,7 +103,7 @@ def test_a_detection_becomes_an_object_with_a_pose() -> None:
         ],
         "frame_id": "base_link",
         "stamp": {"sec": 3, "nanosec": 4},
-        "unknown_labels": "ignore",
+        "unknown_labels": "nearest-or-ignore",
     }
     assert fields.notes == ()
 

@@ -166,7 +166,90 @@ async def test_unknown_labels_can_be_taken_for_the_nearest_class(client: httpx.A
     assert [error["pointer"] for error in document["errors"]] == ["#/objects/4"]
 
 
+@pytest.mark.parametrize(
+    ("label", "expected", "rule"),
+    [
+        ("lamp_(light_source)", "lamp", "qualifier"),
+        ("table_(desk)", "table", "qualifier"),  # the model knows "desk table"
+        ("bin (trash can)", None, None),
+        ("divan/couch;lounge", "sofa", "alternative"),
+        ("desk/waste basket", "desk", "alternative"),
+        ("waste/trash basket", "garbage bin", "alternative"),  # both are baskets
+        ("The lamp", "lamp", "article"),
+        ("chair_12", "chair", "instance"),
+        ("Book_b045e42b", "book", "instance"),
+        ("Bed|-01.0|+00.0", "bed", "instance"),
+        ("011_pillow", "pillow", "instance"),
+        ("a photo of a chair", "chair", "prompt"),
+        ("a photo of a sofa/couch", "sofa", "alternative"),
+        ("chair facade", None, None),
+        ("3d lamp", None, None),
+    ],
+)
+@pytest.mark.parametrize("treatment", ["error", "ignore", "nearest-or-ignore"])
+async def test_the_syntax_of_detectors_is_read(
+    client: httpx.AsyncClient, treatment: str, label: str, expected: str | None, rule: str | None
+) -> None:
+    scene = {"objects": [{"id": "x", "label": label}, "lamp"], "unknown_labels": treatment}
+    response = await client.post("/outliers", json=scene)
+    if expected is None and treatment == "error":
+        problem(response, 422, "unknown-labels")
+    elif expected is None and treatment == "ignore":
+        assert (response.json()["mapped"], response.json()["ignored"]) == ([], ["x"])
+    elif expected is not None:
+        entry = {"label": label, "class": expected, "similarity": 1.0, "rule": rule}
+        assert response.json()["mapped"] == [entry]
+
+
+async def test_a_room_type_is_read_like_a_label(client: httpx.AsyncClient) -> None:
+    answer = await ask(client, "outliers", objects=["bed"], room_type="bedroom_1")
+    assert [(one["label"], one["class"]) for one in answer["mapped"]] == [("bedroom_1", "bedroom")]
+
+
+async def test_what_no_class_is_near_can_be_ignored(client: httpx.AsyncClient) -> None:
+    answer = await ask(
+        client,
+        "outliers",
+        objects=["nigthstand", "droid", "big lamp"],
+        room_type="hangar",
+        unknown_labels="nearest-or-ignore",
+    )
+    rules = [(one["label"], one["rule"]) for one in answer["mapped"]]
+    assert rules == [("nigthstand", "spelling"), ("big lamp", "head")]
+    assert answer["ignored"] == ["droid", "hangar"]
+
+
 # ------------------------------------------------------------------------------------- poses
+
+
+async def test_a_scene_of_the_training_is_a_request(client: httpx.AsyncClient) -> None:
+    """Arrays, whole numbers as ids, supports, and fields that only the training uses."""
+    bed = {"id": 0, "label": "bed", "position": [2, 1, 0.2], "size": [2, 1.5, 0.4], "yaw": 0.5}
+    scene = {
+        "scene_id": "bench-3",
+        "source": "own",
+        "group": None,
+        "room_type": "bedroom",
+        "objects": [bed, {"id": 1, "label": "lamp"}, {"id": 2, "label": "book", "supported_by": 1}],
+        "relations": [[1, "on-top", 0]],
+    }
+    answer = await ask(client, "outliers", **scene)
+    stated = {("1", "on-top", "0"), ("2", "on-top", "1")}
+    assert triples(answer["misplaced"]) == stated
+    assert answer["frame_id"] == "map"
+    assert "frame_id" not in await ask(client, "outliers", **scene, viewer_frame=True)
+    # The same boxes as arrays and as objects.
+    boxes = [
+        {**entry, "position": [*entry["position"].values()], "size": [*entry["size"].values()]}
+        for entry in LAMP_ON_DESK
+    ]
+    assert await observed(client, objects=boxes) == await observed(client, objects=LAMP_ON_DESK)
+    yaw, orientation = [
+        await ask(client, "outliers", objects=[boxes[0] | turn, boxes[1]])
+        for turn in ({"yaw": 0.5}, {"orientation": [0, 0, math.sin(0.25), math.cos(0.25)]})
+    ]
+    assert yaw | {"request_id": ""} == orientation | {"request_id": ""}
+
 
 LAMP_ON_DESK = [
     {"id": "d", "label": "desk", "position": at(2, 0, 0.4), "size": at(0.7, 1.4, 0.8)},

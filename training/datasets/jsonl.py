@@ -27,6 +27,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
+from app.scene.geometry import SMALLEST
 from training.datasets.files import bounded_int, read_lines
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.sources import relation_of
@@ -186,11 +187,13 @@ def _object(values: Mapping[str, Any], name: str) -> AnnotatedObject:
     yaw = values.get("yaw", 0.0)
     if not _is_number(yaw):
         raise ValueError(f"yaw must be a number, not {yaw!r}")
+    size = _vector("size", values.get("size"))
     return AnnotatedObject(
         id=name,
         label=_text("label", values["label"]),
         position=_vector("position", values.get("position")),
-        size=_vector("size", values.get("size")),
+        # Sides that are all below 1 mm mean an unknown size, as in a request.
+        size=size if size and max(map(abs, size)) >= SMALLEST else None,
         yaw=float(yaw),
         supported_by=None if supported_by is None else _id(supported_by),
         box2d=_numbers("box2d", values.get("box2d"), 4),

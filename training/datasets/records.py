@@ -69,8 +69,8 @@ class AnnotatedObject:
         _check_numbers("position", self.id, self.position, 3)
         _check_numbers("size", self.id, self.size, 3)
         _check_numbers("box2d", self.id, self.box2d, 4)
-        if self.size is not None and min(self.size) <= 0:
-            raise ValueError(f"size of {self.id!r} must be positive, not {self.size}")
+        if self.size is not None and min(self.size) < 0:
+            raise ValueError(f"size of {self.id!r} must not be negative, but is {self.size}")
         if self.box2d is not None and (
             self.box2d[0] > self.box2d[2] or self.box2d[1] > self.box2d[3]
         ):

@@ -99,6 +99,7 @@ def write_indoor_vocabulary(
         minimum_rooms=MINIMUM_MENTIONS,
         outdoor=True,
     )
+    vocabulary = with_aliases(vocabulary, names)
     path.write_text(vocabulary_json(vocabulary), encoding="utf-8")
     return vocabulary
 
@@ -114,6 +115,28 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
     lines = ",\n".join(json.dumps(entry, ensure_ascii=False) for entry in values["objects"])
     rooms = json.dumps(values["room_types"], ensure_ascii=False)
     return f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n'
+
+
+def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
+    """Return the vocabulary with the curated synonyms of its classes, and of kinds that it lacks.
+
+    The classes, their order and their sizes stay the same. The function also renews the aliases of
+    a published model: publish its artifact again with the result as `vocabulary`.
+
+    Args:
+        vocabulary: the classes.
+        names: the curated names. None means those of `vocabularies/names.toml`.
+    """
+    names = names or curated_names()
+    objects = []
+    for entry in vocabulary.objects:
+        new = [
+            name for name in names.aliases.get(entry.label, ()) if vocabulary.index(name) is None
+        ]
+        objects.append(replace(entry, aliases=(*entry.aliases, *new)))
+    found = Vocabulary(objects, vocabulary.room_types)
+    objects = [_with_kinds(entry, found, names) for entry in found.objects]
+    return with_room_aliases(Vocabulary(objects, vocabulary.room_types), names)
 
 
 def with_room_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
@@ -194,13 +217,13 @@ def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene])
 
     Args:
         vocabulary: the classes. A class with fewer than `MINIMUM_BOXES` boxes stays unchanged.
-        scenes: the scenes. Objects without a size are skipped.
+        scenes: the scenes. Objects without a size and flat objects are skipped.
     """
     boxes: dict[int, list[tuple[float, float]]] = {}
     found: dict[str, int | None] = {}
     for scene in scenes:
         for thing in scene.objects:
-            if thing.size is None:
+            if thing.size is None or not min(thing.size):
                 continue
             if thing.label not in found:
                 found[thing.label] = vocabulary.index(thing.label)

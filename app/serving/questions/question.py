@@ -134,8 +134,23 @@ SCENES: Final[dict[str, Example]] = {
         {"objects": ["bed", "nightstand", "flux capacitor"], "unknown_labels": "ignore"},
     ),
     "nearest": Example(
-        "unknown labels are mapped to the nearest class",
-        {"objects": ["bed", "nigthstand", "big lamp"], "unknown_labels": "nearest"},
+        "unknown labels are mapped to the nearest class, or ignored",
+        {
+            "objects": ["bed", "nigthstand", "a big lamp", "chair_12", "flux capacitor"],
+            "unknown_labels": "nearest-or-ignore",
+        },
+    ),
+    "training": Example(
+        "a scene in the format of the training",
+        {
+            "scene_id": "bench-3",
+            "objects": [
+                {"id": 0, "label": "desk", "position": [2.0, 0.0, 0.4], "size": [0.7, 1.4, 0.8]},
+                {"id": 1, "label": "lamp", "supported_by": 0},
+            ],
+            "relations": [[1, "on-top", 0]],
+            "room_type": "office",
+        },
     ),
 }
 """Valid example requests for every question that needs a list of objects."""

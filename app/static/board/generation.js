@@ -24,7 +24,7 @@ export function createGeneration(form, drawn, store, say) {
       objects: [],
       ...(evidence.checked && { objects, ...scene }),
       ...(room && { room_type: room }),
-      model, seed, unknown_labels: 'nearest',
+      model, seed, unknown_labels: 'nearest-or-ignore',
     };
   }
 

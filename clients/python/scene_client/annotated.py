@@ -9,7 +9,7 @@ from typing import Any
 
 
 def is_annotated(scene: Any) -> bool:
-    """Return whether a value is a scene of the training format. Requests have no `scene_id`."""
+    """Return whether a value is a scene of the training format, which has a `scene_id`."""
     return isinstance(scene, dict) and "scene_id" in scene
 
 
@@ -62,6 +62,6 @@ def _detection(name: str, thing: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _metres(vector: list[float]) -> dict[str, float]:
-    x, y, z = vector
+def _metres(vector: list[float] | dict[str, float]) -> dict[str, float]:
+    x, y, z = vector.values() if isinstance(vector, dict) else vector
     return {"x": x, "y": y, "z": z}

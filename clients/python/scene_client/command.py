@@ -199,7 +199,9 @@ RoomType = Annotated[str | None, typer.Option(help="Type of the room.")]
 TopK = Annotated[int | None, typer.Option(help="Maximum number of results.")]
 Unknown = Annotated[
     UnknownLabels | None,
-    typer.Option(help="Unknown labels: refuse them, ignore them, or use the nearest class."),
+    typer.Option(
+        help="Unknown labels: refuse them, ignore them, or map them to the nearest class."
+    ),
 ]
 LabelMap = Annotated[
     str | None,

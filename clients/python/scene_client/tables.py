@@ -144,8 +144,8 @@ def notes(answer: BaseModel) -> list[str]:
     if not isinstance(answer, Answer):
         return []
     mapped = [
-        f"{entry.label}: unknown label, replaced by {entry.class_} "
-        f"(similarity {entry.similarity:.2f})"
+        f"{entry.label}: read as {entry.class_} "
+        f"(rule {entry.rule}, similarity {entry.similarity:.2f})"
         for entry in answer.mapped
     ]
     warnings = [

@@ -57,8 +57,8 @@ _KINDS: Final = {
 # the pointer ends at the parent. So a request cannot put arbitrary text into an error.
 PLAIN: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _MARKS: Final = frozenset({*OBJECT_TAGS, "[key]"})
-# Indices of the members if an array replaces a relation, a pair or a place; see `OrArray`.
-_INDICES: Final = {"subject": 0, "relation": -2, "object": -1}
+# Indices of the members if an array replaces an object; see `OrArray`.
+_INDICES: Final = {"subject": 0, "relation": -2, "object": -1, "x": 0, "y": 1, "z": 2, "w": 3}
 
 
 def field_errors(

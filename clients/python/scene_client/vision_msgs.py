@@ -94,7 +94,7 @@ def from_detection3d_array(
     min_score: float = 0.0,
     boxes: bool = True,
     viewpoint: Viewpoint | None = None,
-    unknown_labels: UnknownLabels = "ignore",
+    unknown_labels: UnknownLabels = "nearest-or-ignore",
 ) -> SceneFields:
     """Convert objects with poses. The service derives their relations in the axes of ``frame_id``.
 
@@ -112,8 +112,8 @@ def from_detection3d_array(
         viewpoint: position and viewing direction (x, y, yaw) of the robot in the frame of the
             detections. In a map, odom or world frame, the relations left and front need the
             viewpoint. By default, the robot is at the origin of the frame and looks along x.
-        unknown_labels: field of the request. The default is "ignore", because detectors often have
-            classes that the model lacks.
+        unknown_labels: field of the request. With the default, the service leaves out classes
+            that the model lacks.
 
     Raises:
         MessageError: the message does not contain a valid scene, or an argument is invalid.
@@ -131,7 +131,7 @@ def from_detection2d_array(
     label_map: LabelMap | None = None,
     *,
     min_score: float = 0.0,
-    unknown_labels: UnknownLabels = "ignore",
+    unknown_labels: UnknownLabels = "nearest-or-ignore",
 ) -> SceneFields:
     """Convert objects without poses. The relation left comes from neighbouring boxes in the image.
 
@@ -158,7 +158,7 @@ def from_message(
     min_score: float = 0.0,
     boxes: bool = True,
     viewpoint: Viewpoint | None = None,
-    unknown_labels: UnknownLabels = "ignore",
+    unknown_labels: UnknownLabels = "nearest-or-ignore",
 ) -> SceneFields:
     """Convert a Detection3DArray or a Detection2DArray.
 
@@ -395,7 +395,8 @@ class _Reader:
     def finish(self, fields: dict[str, Any], unknown_labels: str) -> SceneFields:
         """Add the frame and the time of the message to the fields. Return them with the notes."""
         if unknown_labels not in get_args(UnknownLabels):
-            raise MessageError("unknown_labels must be 'error', 'ignore' or 'nearest'")
+            choices = ", ".join(map(repr, get_args(UnknownLabels)))
+            raise MessageError(f"unknown_labels must be one of {choices}")
         fields["unknown_labels"] = unknown_labels
         if self.frame is not None:
             fields["frame_id"] = self.frame

@@ -248,7 +248,7 @@ def test_sources_by_name_are_found_in_the_folder_extra(
                 ({"position": [1, 2, "3"]}, "position must be a list of 3 numbers"),
                 ({"position": {"x": 1, "y": 2}}, "position must be a list of 3 numbers"),
                 ({"position": [1, 2, math.inf]}, "position of '0' must be 3 finite"),
-                ({"size": [1, 2, 0]}, "size of '0' must be positive"),
+                ({"size": [1, 2, -1]}, "size of '0' must not be negative"),
                 ({"yaw": "north"}, "yaw must be a number"),
                 ({"yaw": math.nan}, "yaw of '0' must be finite"),
                 ({"box2d": [3, 0, 1, 1]}, "box2d of '0' must be"),
@@ -498,7 +498,7 @@ def expected_corners(box: dict[str, Any]) -> list[tuple[float, float]]:
     ("box", "message"),
     [
         ({"coeffs": np.array([[1.0, 0.5]])}, r"coeffs must be finite, of shape \(3,\)"),
-        ({"coeffs": np.array([[1.0, 0.5, 0.0]])}, "must be positive"),
+        ({"coeffs": np.array([[1.0, 0.5, -0.1]])}, "must not be negative"),
         ({"centroid": np.array([[1.0, math.nan, 0.0]])}, "centroid must be finite"),
         ({"basis": "none"}, "basis is not numeric"),
         ({"classname": ""}, "classname must be a non-empty string"),

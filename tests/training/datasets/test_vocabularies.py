@@ -184,10 +184,10 @@ def test_the_committed_vocabulary_follows_the_curated_names() -> None:
 @pytest.fixture(scope="module")
 def real(repository: Path) -> dict[str, list[AnnotatedScene]]:
     folder = repository.parent / "shared" / "data"
-    paths = [*sorted(folder.glob("*.jsonl.gz")), *sorted(folder.glob("extra/*.jsonl.gz"))]
+    paths = {path.name.removesuffix(".jsonl.gz"): path for path in folder.rglob("*.jsonl.gz")}
     if not paths:
         pytest.skip("the real scenes of ../shared/data are not here")
-    return {path.name.removesuffix(".jsonl.gz"): read_scenes(path) for path in paths}
+    return {source: read_scenes(paths[source]) for source in sorted(COVERAGE)}
 
 
 def test_the_committed_vocabulary_is_what_the_data_give(

@@ -87,18 +87,29 @@ class ObservedRelation:
 
 
 class Mapped(Reply):
-    """A label that the model does not know, and the class that replaces it."""
+    """A label that the vocabulary does not list, and the class that replaces it."""
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, serialize_by_alias=True)
 
     label: Annotated[
-        str, Field(description="unknown label of an object or candidate, or room type")
+        str, Field(description="unlisted label of an object or candidate, or room type")
     ]
     class_: Annotated[str, Field(alias="class", description="canonical label of the class")]
     similarity: Annotated[
         float,
         Field(
-            ge=0, le=1, description="similarity of the label and the class, in spelling or words"
+            ge=0,
+            le=1,
+            description="similarity of the label and the class. 1 means that the rule is certain",
+        ),
+    ]
+    rule: Annotated[
+        Literal["qualifier", "alternative", "article", "instance", "prompt", "spelling", "head"],
+        Field(
+            description="how the service read the label. Certain rules: qualifier "
+            "(`mouse_(computer_equipment)`), alternative (`sofa/couch`), article (`a chair`), "
+            "instance (`chair_12`), prompt (`a photo of a chair`). Guesses: spelling "
+            "(`nigthstand`), head (`office table`)"
         ),
     ]
 
@@ -140,15 +151,16 @@ class Answer(Reply):
     ignored: Annotated[
         list[str],
         Field(
-            description="with `unknown_labels: ignore`: ids of the objects, candidates and room "
-            "type that the model does not know. The answer ignores them"
+            description="with `ignore` or `nearest-or-ignore` as `unknown_labels`: ids of the "
+            "objects, candidates and room type that the model does not know. The answer ignores "
+            "them"
         ),
     ] = []
     mapped: Annotated[
         list[Mapped],
         Field(
-            description="with `unknown_labels: nearest`: each label that the model does not know, "
-            "with the class that replaces it"
+            description="each label that the vocabulary does not list, with the class that "
+            "replaces it. Guesses need `nearest` or `nearest-or-ignore` as `unknown_labels`"
         ),
     ] = []
     warnings: Annotated[

@@ -13,8 +13,8 @@ from scene_client.schemas.requests import (
     Body,
     Detail,
     Finite,
+    Id,
     Label,
-    Name,
     OrArray,
     Probability,
     RelationName,
@@ -29,7 +29,7 @@ class Anchor(Request):
     """A place: the relation to an object of the scene, such as "on-top" and "desk"."""
 
     relation: RelationName
-    object: Name
+    object: Id
 
 
 class MissingRequest(SceneRequest):
@@ -143,6 +143,7 @@ class MoreInstances(Reply):
     listed_count: Annotated[int, Field(ge=1, description="number of listed objects of the class")]
     expected_count: Annotated[
         Finite,
+        Id,
         Field(description="expected number of objects of the class, including the listed objects"),
     ]
     low: Annotated[int, Field(ge=1, description="lower limit of an 80 % interval of the number")]

@@ -11,7 +11,7 @@ from pydantic import Field
 from scene_client.schemas.answers import Answer, ScoredRelation
 from scene_client.schemas.requests import (
     Body,
-    Name,
+    Id,
     OrArray,
     Probability,
     RelationName,
@@ -25,8 +25,8 @@ from scene_client.schemas.requests import (
 class Pair(Request):
     """Two objects, each named by its id or an unambiguous label."""
 
-    subject: Name
-    object: Name
+    subject: Id
+    object: Id
 
 
 class RelationsRequest(SceneRequest):

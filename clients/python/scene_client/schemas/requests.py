@@ -14,6 +14,7 @@ from typing import Annotated, Any, Generic, Literal, Self, TypeAlias, TypedDict,
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -29,13 +30,14 @@ from pydantic_core.core_schema import CoreSchema, no_info_before_validator_funct
 
 MAX_BATCH = 256
 MAX_SEED = 2**63 - 1
+_MAX_ID = 2**53
 MAX_RELATIONS = 65536
 """Upper limit of the setting ``SCENE_MAX_RELATIONS``.
 
 The validation of a million invalid relations would take seconds.
 """
 
-UnknownLabels = Literal["error", "ignore", "nearest"]
+UnknownLabels = Literal["error", "ignore", "nearest", "nearest-or-ignore"]
 Detail = Literal["scores", "full"]
 RelationName = Literal["left", "right", "front", "behind", "on-top", "under", "above", "below"]
 
@@ -46,13 +48,31 @@ def _plain_text(value: str) -> str:
     return value
 
 
+def _as_text(value: Any) -> Any:
+    # In JSON, 7.0 is a whole number too.
+    is_id = type(value) in (int, float) and 0 <= value <= _MAX_ID and value == int(value)
+    return str(int(value)) if is_id else value
+
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
 Extent = Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)]
+Angle = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 UnitNumber = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Label = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_plain_text)]
 Name = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(_plain_text)]
+Id = Annotated[
+    Name,
+    BeforeValidator(
+        _as_text, json_schema_input_type=Name | Annotated[int, Field(ge=0, le=_MAX_ID)]
+    ),
+]
+"""An id or a label. A whole number is the id with its digits, as in training scenes."""
+Unused = Annotated[
+    str | None,
+    Field(max_length=256, description="field of a training scene; unused by the service"),
+]
 ModelSpec = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_plain_text)]
 
 
@@ -151,7 +171,7 @@ class Viewpoint(Request):
 
     x: Metres
     y: Metres
-    yaw: Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
+    yaw: Angle
 
 
 class Stamp(Request):
@@ -165,7 +185,7 @@ class Detection(Request):
     """One detected object."""
 
     id: Annotated[
-        Name | None,
+        Id | None,
         Field(
             description="id of the object in this scene; default: its label, followed by a number "
             "if several objects have this label"
@@ -181,13 +201,33 @@ class Detection(Request):
             description="probability that the object exists",
         ),
     ] = 1.0
-    position: Annotated[Position | None, Field(description="centre of the object's box")] = None
-    size: Annotated[
-        Size | None, Field(description="default: the typical size of the class, if known")
+    position: Annotated[
+        Annotated[Position, OrArray()] | None, Field(description="centre of the object's box")
     ] = None
-    orientation: Annotated[Quaternion | None, Field(description="rotation of the object's box")] = (
-        None
-    )
+    size: Annotated[
+        Annotated[Size, OrArray()] | None,
+        Field(description="default: the typical size of the class, if known"),
+    ] = None
+    orientation: Annotated[
+        Annotated[Quaternion, OrArray()] | None, Field(description="rotation of the object's box")
+    ] = None
+    yaw: Annotated[
+        Angle | None,
+        Field(description="rotation about the z axis in radians, instead of `orientation`"),
+    ] = None
+    supported_by: Annotated[
+        Id | None,
+        Field(
+            description="id of the object under this object: the relation on-top. Unused if the "
+            "service derives relations from the positions of all objects"
+        ),
+    ] = None
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> Self:
+        if self.yaw is not None and self.orientation is not None:
+            raise PydanticCustomError("two_rotations", "must have either orientation or yaw")
+        return self
 
 
 def _kind_of_object(value: object) -> str | None:
@@ -216,9 +256,9 @@ SomeObjects = Annotated[list[SceneObject], Field(min_length=1, max_length=256, f
 class Relation(Request):
     """A relation from `subject` to `object`. Each object is an id or an unambiguous label."""
 
-    subject: Name
+    subject: Id
     relation: RelationName
-    object: Name
+    object: Id
 
 
 class SceneRequest(Request):
@@ -275,10 +315,33 @@ class SceneRequest(Request):
         UnknownLabels,
         Field(
             description="treatment of labels that the model does not know. `error` refuses the "
-            "request. `ignore` leaves these objects out of the scene. `nearest` uses the most "
-            "similar class (see `mapped`) and refuses a label without a similar class"
+            "request. `ignore` leaves these objects out of the scene. `nearest` corrects misspelt "
+            "words and reads phrases by their last words (see `mapped`); it refuses a label that "
+            "could be several classes. `nearest-or-ignore` leaves such a label out"
         ),
     ] = "error"
+
+    scene_id: Annotated[
+        Unused,
+        Field(
+            description="id of a training scene. Without `frame_id` and `viewer_frame`, its "
+            "positions are in the frame `map`"
+        ),
+    ] = None
+    source: Unused = None
+    group: Unused = None
+    viewer_frame: Annotated[
+        bool,
+        Field(description="whether the axes of a training scene are those of the viewer"),
+    ] = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _frame_of_training_scene(cls, value: Any) -> Any:
+        is_annotated = isinstance(value, dict) and value.get("scene_id") is not None
+        if is_annotated and not value.get("viewer_frame") and value.get("frame_id") is None:
+            return value | {"frame_id": "map"}
+        return value
 
 
 class SceneFields(TypedDict, total=False):
