@@ -137,7 +137,7 @@ class Walk:
 
     def own_model(self) -> None:
         """Train on 300 scenes of a workplace, and promote the model."""
-        self._record.step("Train on 300 scenes of one's own, as docs/training.md describes")
+        self._record.step("Train on 300 own scenes, as docs/training.md describes")
         guide = (ROOT / "docs" / "training.md").read_text("utf-8")
         for block in re.findall(r"^```sh\n(.*?)^```", guide, re.MULTILINE | re.DOTALL):
             for command in block.splitlines():
@@ -146,9 +146,9 @@ class Walk:
 
     def own_page(self) -> None:
         """Open the page with the own model."""
-        self._record.step("Open the page with one's own model")
+        self._record.step("Open the page with the own model")
         with self._service(["python", "-m", "app"], "my-store") as url, self._page(url) as page:
-            self._record.picture(page, "own-model", "The page with one's own model")
+            self._record.picture(page, "own-model", "The page with the own model")
             require(page.locator("#board .object").count() > 2, "the page shows no scene")
             errors = page.locator("[role=alert]:visible, .error:visible:not(:empty)")
             require(errors.count() == 0, f"the page shows errors: {errors.all_inner_texts()}")
