@@ -58,7 +58,6 @@ class SceneTensors:
     """A set of scenes as tensors. `batch` returns some of the scenes.
 
     Attributes:
-        scenes: the encoded scenes.
         v: presence of each class, (scenes, classes).
         room: index of the room type, (scenes,). -1 means unknown.
         source: index of the data source in annotated_classes and source_names, (scenes,) int64.
@@ -117,7 +116,6 @@ def scene_tensors(
 
     Args:
         annotated: maps the name of a data source to the classes that it mentions, (classes,) bool.
-        size: number of classes of the vocabulary.
 
     Raises:
         ValueError: `annotated` has no entry for the source of a scene.

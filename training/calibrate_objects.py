@@ -4,9 +4,9 @@
                partly listed scenes. Both are chosen by the rank of hidden classes.
     missing    Probability that an unlisted class is present, fitted to scenes that show 25 %, 50 %,
                75 % or all but one of their classes. Near-duplicate scenes have a lower weight.
-    outlier    Probability that a class is an intruder (an object that does not belong in the
-               scene), with thresholds. Half of the scenes contain an intruder.
-    evidence   Weight of relations and poses in answers about objects.
+    outlier    Probability that a class is an intruder, with thresholds. Half of the scenes contain
+               an intruder.
+    evidence   See `fit_evidence`.
 
 The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
 logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
@@ -24,16 +24,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from app.questions.generate import room_fit
 from app.questions.posterior import posterior
 from app.registry import NEVER, Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
-from app.scene import Scene, SceneObject
+from app.scene import Scene
+from training.array_types import Flags, Floats, Rng
 from training.batches import SceneTensors, subset
 from training.cases import RIDGE, logistic
 from training.evaluation.alarms import ALARMS
+from training.evaluation.asking import of_classes
 from training.evaluation.evidence import removals
 from training.evaluation.intruders import (
     IntruderScores,
@@ -45,8 +46,6 @@ from training.evaluation.intruders import (
 from training.evaluation.missing import SHARES, MachineScore, hide
 from training.evaluation.outliers import alarm_threshold
 from training.machines.arrays import machine_of
-
-Floats = NDArray[np.float64]
 
 COVERAGES = (0.3, 0.4, 0.5, 0.6, 0.7)
 WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
@@ -115,11 +114,7 @@ def calibrate_objects(
     """Return the model's calibration with newly fitted entries about objects.
 
     Args:
-        artifact: the model.
-        validation: scenes that were not used in training.
         train: training scenes. They give the frequency of each class, and limits for room types.
-        structure: True for structure classes such as walls, (classes,) bool.
-        seed: seed of the random choices.
         chosen: a calibration that was fitted on other validation scenes. Its coverage, coverage
             weight, weights of evidence and alpha are copied. None chooses new values.
     """
@@ -200,15 +195,13 @@ class _Shown:
         partial: maps an assumed coverage to the log-odds of the unlisted classes, (unlisted
             classes,). The log-odds allow for an incomplete list.
         hidden: True for unlisted classes that are in the scene, (unlisted classes,) bool.
-        listed: number of listed classes.
         share: share of listed classes as text, such as "75 %".
-        source: index of the data source of the scene.
         weight: number of scenes of the data source that this sampled scene represents.
     """
 
     closed: Floats
     partial: dict[float, Floats]
-    hidden: NDArray[np.bool_]
+    hidden: Flags
     listed: int
     share: str
     source: int
@@ -284,7 +277,7 @@ def _shown(
         for k, v, hidden in zip(cases.scene, cases.v.numpy(), cases.hidden.numpy(), strict=True):
             classes = np.flatnonzero(v)
             absent = np.flatnonzero((v == 0) & ~structure.numpy())
-            given = posterior(whole, _labels(classes))
+            given = posterior(whole, of_classes(classes.tolist()))
             partial = {}
             if whole.completions is not None:
                 partial = {
@@ -295,10 +288,6 @@ def _shown(
             listed = max(1, int((~structure.numpy()[classes]).sum()))
             own = weight[int(k)] / (1 if share else _DRAWS_OF_ONE)
             yield _Shown(closed, partial, hidden[absent], listed, name, source_of[int(k)], own)
-
-
-def _labels(classes: NDArray[np.int64]) -> Scene:
-    return Scene(tuple(SceneObject(str(c), str(c), int(c)) for c in classes))
 
 
 def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
@@ -403,7 +392,7 @@ def fit_outliers(
 
 
 def listing(
-    scenes: SceneTensors, structure: Tensor, listed: int, rng: np.random.Generator
+    scenes: SceneTensors, structure: Tensor, listed: int, rng: Rng
 ) -> tuple[SceneTensors, Tensor]:
     """Return the scenes with more than `listed` classes, and shortened object lists.
 
@@ -422,7 +411,7 @@ Scored = Sequence[tuple[IntruderScores, SceneTensors]]
 """Scores of untouched scenes, and these scenes: one entry for each shortening of the scenes."""
 
 
-def thresholds(untouched: Scored, entry: CountSlope, rng: np.random.Generator) -> Thresholds:
+def thresholds(untouched: Scored, entry: CountSlope, rng: Rng) -> Thresholds:
     """Return the thresholds with the target shares of alarms, and at least the minimum."""
     return Thresholds(
         **{
@@ -432,7 +421,7 @@ def thresholds(untouched: Scored, entry: CountSlope, rng: np.random.Generator) -
     )
 
 
-def _limit(untouched: Scored, entry: CountSlope, rng: np.random.Generator, share: float) -> float:
+def _limit(untouched: Scored, entry: CountSlope, rng: Rng, share: float) -> float:
     """Return the probability that raises alarms in a share of the untouched scenes.
 
     The function averages over the shortenings, because several shortenings of a scene are not
@@ -524,7 +513,7 @@ def least_of_the_best(scores: dict[float, float]) -> float:
     return min(pull for pull, score in scores.items() if score >= enough)
 
 
-def _rank(artifact: Artifact, scene: Scene, target: int, structure: NDArray[np.bool_]) -> int:
+def _rank(artifact: Artifact, scene: Scene, target: int, structure: Flags) -> int:
     given = posterior(artifact, scene)
     absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
     z = given.absent_posterior(absent, artifact.calibration.coverage)

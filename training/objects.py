@@ -88,8 +88,6 @@ def fit_objects(
         train: training scenes. Scenes with incomplete object lists are left out.
         config: epochs, learning rate, number of chains and batch size. With 0 epochs, the machine
             stays unchanged.
-        seed: seed of the random choices.
-        progress: function that is called with the finished share of the updates, from 0 to 1.
 
     Raises:
         FloatingPointError: a weight became infinite or NaN.

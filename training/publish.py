@@ -30,7 +30,7 @@ from training.datasets.sources import SOURCES
 from training.datasets.vocabulary import with_room_aliases
 from training.evaluation.alarms import untouched_alarms
 from training.evaluation.everyday import EVERYDAY
-from training.evaluation.report import Row, evaluate
+from training.evaluation.report import evaluate
 from training.evaluation.tasks import STATISTICS
 from training.example_scenes import known_examples, read_examples
 from training.machines import BoltzmannMachine
@@ -70,17 +70,12 @@ def publish_run(
     The store keeps weights in half precision. Calibration and evaluation use the same precision.
 
     Args:
-        run: the finished run.
-        scenes: scenes of the run.
-        store: store for the new version.
-        version: number of the new version.
         measured: second run of the same configuration, and its scenes, for a `run` that was trained
             on test scenes. The second run did not use test scenes. Its test results and chosen
             calibration values are published.
         judge: function that returns further reasons against the calibrated model.
         accept: function that is called with each reason against the model, which is published all
             the same. None refuses a model with such a reason.
-        progress: function that is called with messages about the progress.
 
     Raises:
         RefusedError: there is a reason against the model.
@@ -119,7 +114,7 @@ def publish_run(
         calibration=calibrated.calibration,
         training=_training(run, measured),
         data=data_sources(scenes),
-        metrics=metrics(rows),
+        metrics=tuple(rows),
         terms=terms(scenes),
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
         examples=scenes.examples,
@@ -144,7 +139,6 @@ def refit(
     scenes.
 
     Args:
-        artifact: the published model.
         root: folder of the training scenes.
 
     Raises:
@@ -184,7 +178,7 @@ def refit(
     fields = {name: getattr(manifest, name) for name in Description.model_fields}
     fields["metrics"] = (
         *(metric for metric in manifest.metrics if metric.task not in STATISTICS),
-        *metrics(rows),
+        *rows,
     )
     changes = {"version": version, "created": _now(), "examples": examples}
     description = Description(**fields | changes)
@@ -268,7 +262,7 @@ def _measure(
     data: TrainingData,
     progress: Callable[[str], None],
     tasks: Collection[str] | None = None,
-) -> list[Row]:
+) -> list[Metric]:
     """Return the metrics on test scenes, or an empty list if there are no test scenes."""
     if not len(data.test):
         return []
@@ -305,22 +299,6 @@ def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
             )
         )
     return tuple(sources)
-
-
-def metrics(rows: list[Row]) -> tuple[Metric, ...]:
-    """Convert the result rows of the evaluation to metrics for the manifest of the model."""
-    return tuple(
-        Metric(
-            task=row.task,
-            source=row.source,
-            metric=row.metric,
-            value=row.figure.value,
-            low=row.figure.low,
-            high=row.figure.high,
-            n=row.figure.n,
-        )
-        for row in rows
-    )
 
 
 def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:

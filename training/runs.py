@@ -74,9 +74,6 @@ class FinishedRun:
     def require(self, scenes: str) -> None:
         """Check that the run was trained on given scenes.
 
-        Args:
-            scenes: digest of the scenes.
-
         Raises:
             RunError: the run was trained on other scenes.
         """
@@ -98,7 +95,6 @@ def save_run(
     """Write the weights and then `result.json`. The file `result.json` marks the run as finished.
 
     Args:
-        data: folder of the scenes.
         scenes: digest of the scenes, their vocabulary and split.
     """
     machine = result.machine
@@ -158,9 +154,6 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
     """Read a checkpoint.
-
-    Args:
-        digest: digest of the configuration and the scenes.
 
     Raises:
         RunError: the file cannot be read, or belongs to another configuration or other scenes.

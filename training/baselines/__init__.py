@@ -4,6 +4,9 @@ A class that a data source never mentions counts as absent in all scenes of this
 training objective. If the fit leaves such classes out, the validation MRR (mean reciprocal rank)
 falls: from .398 to .381 for EASE, from .397 to .335 for the denoising autoencoder, and from .152 to
 .145 for popularity. The reason is that a score must rank all classes without knowing the source.
+
+`v` is the presence of classes in the training scenes, (scenes, classes), and `structure` a mask of
+structure classes such as walls, (classes,) bool.
 """
 
 from __future__ import annotations

@@ -39,8 +39,6 @@ class Trial:
     """The result of one point of a hyperparameter grid.
 
     Attributes:
-        parameters: hyperparameters of the grid point.
-        validation: metric on the validation scenes.
         seconds: wall time of fit and evaluation in seconds. Work that was already done for earlier
             grid points is not included.
     """
@@ -105,7 +103,6 @@ class Baseline(Generic[Score]):
     """One baseline, shown as one row of a result table.
 
     Attributes:
-        name: name of the row.
         propose: generator function that yields (parameters, score) for each grid point. Its
             arguments are the training scenes, a mask of structure classes, (classes,) bool, and a
             seed.
@@ -136,14 +133,6 @@ class Baseline(Generic[Score]):
         progress: Callable[[str], None] = lambda _: None,
     ) -> Fitted[Score]:
         """Fit on training scenes, and select the best grid point on validation scenes.
-
-        Args:
-            train: training scenes.
-            validation: validation scenes.
-            structure: True for structure classes such as walls, (classes,) bool. Structure classes
-                are evidence, and are never ranked.
-            seed: seed of the fit.
-            progress: function that is called with a message after each grid point.
 
         Raises:
             ValueError: the numbers of classes differ, or scenes needed for fit or metric are

@@ -36,10 +36,7 @@ class Course:
     """Settings of the training of a network.
 
     Attributes:
-        epochs: number of epochs.
-        batch_size: number of scenes in a batch.
         learning_rate: maximum learning rate of the cycle.
-        weight_decay: weight decay of AdamW.
         noise: maximum probability with which a class other than the target is hidden.
         offers: epochs at which the network becomes a candidate, as shares of `epochs`.
     """
@@ -58,7 +55,6 @@ class NetworkScore:
 
     Attributes:
         network: network from presence, (scenes, classes), to logits of the same shape.
-        structure: True for structure classes such as walls, (classes,) bool.
     """
 
     network: nn.Module
@@ -74,9 +70,6 @@ class NetworkScore:
         """Return the score of each class, (scenes, classes).
 
         Present classes and structure classes have the score -inf.
-
-        Args:
-            v: presence of each class, (scenes, classes).
         """
         values: Tensor = self.network(v)
         return values.masked_fill((v > 0) | self.structure, -torch.inf).log_softmax(1)
@@ -88,12 +81,8 @@ def train_network(
     """Train a network. At each candidate epoch, yield the epoch and the score of averaged weights.
 
     Args:
-        network: network from presence, (scenes, classes), to logits of the same shape.
         v: presence in the training scenes, (scenes, classes). Scenes that contain only structure
             classes are left out.
-        structure: True for structure classes such as walls, (classes,) bool.
-        course: settings of the training.
-        seed: seed of the random choices.
 
     Raises:
         ValueError: every scene contains only structure classes.
@@ -213,9 +202,6 @@ class SetTransformer(nn.Module):
         popularity: share of scenes with each class, (classes,). The log of this share initialises
             the output bias.
         width: width of the encoder. Its feed-forward part is twice as wide.
-        heads: number of attention heads.
-        layers: number of layers of the encoder.
-        dropout: dropout rate of the encoder.
     """
 
     def __init__(

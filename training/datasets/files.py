@@ -24,7 +24,6 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
     small compressed file could fill the memory.
 
     Args:
-        path: the file.
         limit: maximum length of a line in bytes, including the line end.
 
     Raises:
@@ -100,13 +99,6 @@ def located(path: Path, where: str) -> Iterator[None]:
 
 def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type, ...]) -> Any:
     """Check the type of the field ``name`` of a JSON object, and return its value.
-
-    Args:
-        path: the file.
-        where: position of the JSON object in the file.
-        values: the JSON object.
-        name: name of the field.
-        kind: accepted types.
 
     Raises:
         DatasetError: the field is missing or has another type.

@@ -19,6 +19,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from app.scene import ObjectClass, Vocabulary
+from training.array_types import Flags
 from training.datasets.records import DatasetError
 
 MAX_WORDS: Final = 1_000_000
@@ -76,7 +77,7 @@ class WordVectors:
         return {word: row for row, word in enumerate(self.words) if self.vectors[row].any()}
 
 
-def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, NDArray[np.bool_]]:
+def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, Flags]:
     """Return the word vectors of the classes of a vocabulary.
 
     The vector of a class is the vector of its label. If the label has no vector, the vector of the

@@ -41,7 +41,6 @@ def artifact_contender(
     """Build the contender of a model.
 
     Args:
-        train: training scenes. Annealing in the density task starts at their class frequencies.
         calibrated: True includes the calibrated probabilities and the outlier alarm. False includes
             only the uncalibrated scores of the machine.
     """

@@ -3,8 +3,8 @@
 The class is drawn from one of four distributions over absent classes:
 
     uniform     all classes have the same probability
-    popularity  the probability is proportional to the number of training scenes with the class
-    room        uniform over the classes that training scenes of the same room type contain
+    popularity  see `by_popularity`
+    room        see `by_room`
     signature   a class that is typical of another room type
 
 Structure classes such as walls are never intruders. Scenes with fewer than three other classes are
@@ -31,9 +31,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from training.array_types import Flags, Floats, Ints
 from training.batches import SceneTensors
 from training.cases import scene_rng
-from training.evaluation.metrics import Flags, Floats, Ints, Items, Ratio
+from training.evaluation.metrics import Items, Ratio
 
 SIGNATURE = 10
 """Maximum number of signature classes of a room type."""
@@ -71,7 +72,6 @@ def draw_intruders(
     """Draw an intruder for each scene. Return its class, (scenes,) int64; -1 skips the scene.
 
     Args:
-        structure: (classes,) bool, True for structure classes.
         weights: (scenes, classes) sampling weights. None means equal weights.
     """
     present = scenes.v > 0
@@ -172,7 +172,6 @@ class IntruderScores:
         intruder: (objects,) bool, True if the object is the intruder.
         size: (objects,) number of distinct classes in the scored scene.
         clean: (objects,) bool, True if the scored scene has no intruder.
-        scenes: number of scenes.
         skipped: number of scenes that are too small or have no possible intruder.
     """
 
@@ -193,10 +192,7 @@ class IntruderScores:
         return counts
 
     def with_prior(self, prior: Floats) -> IntruderScores:
-        """Subtract `prior` (classes,) from the log-odds of the objects.
-
-        `prior` is the prior log-odds that an object of the class is an intruder.
-        """
+        """Subtract the prior log-odds that a class is an intruder, `prior` (classes,)."""
         return replace(self, log_odds=self.log_odds - prior[self.thing])
 
     @property
@@ -210,24 +206,15 @@ class IntruderScores:
         return Items(self.scene[rows], score, truth, self.scenes, self.skipped)
 
     def hit_at_1(self) -> Ratio:
-        """Return the share of scenes whose intruder has the lowest log-odds.
-
-        For ties, the result is the expectation under random order.
-        """
+        """Return the share of scenes whose intruder has the lowest log-odds; expected over ties."""
         return self.dirty.hit_at_1()
 
     def false_alarms(self, loud: Flags) -> Ratio:
-        """Return the share of clean scenes with an alarm.
-
-        `loud` (objects,) is True for objects with an alarm.
-        """
+        """Return the share of clean scenes with an alarm, for the alarms `loud` (objects,)."""
         return self._alarms(loud, self.clean)
 
     def caught(self, loud: Flags) -> Ratio:
-        """Return the share of intruders with an alarm.
-
-        `loud` (objects,) is True for objects with an alarm.
-        """
+        """Return the share of intruders with an alarm, for the alarms `loud` (objects,)."""
         return self._alarms(loud, self.intruder)
 
     def _alarms(self, loud: Flags, judged: Flags) -> Ratio:
@@ -250,9 +237,7 @@ def intruder_scores(
     All relations are unobserved.
 
     Args:
-        structure: (classes,) bool, True for structure classes.
         score: function that takes presence (rows, classes) and returns log-odds (rows, classes).
-        weights: sampling weights of the intruders, see `draw_intruders`.
     """
     added = draw_intruders(scenes, structure, weights, seed)
     kept = (added >= 0).nonzero().squeeze(1)
@@ -282,13 +267,7 @@ def _scored(
     structure: Tensor,
     score: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, ...]:
-    """Return the arrays of `IntruderScores` for a block of scenes.
-
-    Args:
-        v: (scenes, classes) presence, with intruders.
-        index: (scenes,) index of each scene.
-        added: (scenes,) class of the intruder; -1 for a clean scene.
-    """
+    """Return the arrays of `IntruderScores` for a block of scenes."""
     row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
     odds = torch.zeros(0)
     if len(row):

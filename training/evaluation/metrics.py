@@ -22,11 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
+from training.array_types import Flags, Floats, Ints
 from training.evaluation.item_statistics import STATISTICS
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 RESAMPLES = 1000
 
@@ -73,11 +70,7 @@ class Metric(ABC):
 
     @abstractmethod
     def at(self, weight: Floats) -> float:
-        """Return the metric with scene k counted weight[k] times; NaN if undefined.
-
-        Raises:
-            NotImplementedError: the metric describes a whole set and keeps only its resamples.
-        """
+        """Return the metric with scene k counted weight[k] times; NaN if undefined."""
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Metric | None:
@@ -266,7 +259,6 @@ class _OfItems(Metric):
 
     Attributes:
         scene: (N,) scene of each item.
-        count: number of scenes.
 
     Raises:
         ValueError: there are no items.
@@ -334,8 +326,6 @@ class Scored(_OfItems):
 
     Attributes:
         statistic: name in `STATISTICS`.
-        score: (N,) score of each item.
-        truth: (N,) bool, the item is true.
 
     Raises:
         ValueError: there are no items, or the statistic is unknown.
@@ -380,7 +370,6 @@ class Items:
         scene: (N,) scene of each item.
         score: (N,) score of each item.
         truth: (N,) bool, the item is true.
-        scenes: number of scenes.
         skipped: number of scenes that could not be scored.
     """
 
@@ -409,9 +398,7 @@ class Resampled(Metric):
     """A metric of whole sets; only its value and its resamples are kept.
 
     Attributes:
-        point: the value.
         drawn: (resamples,) from `resample` with seed 0.
-        count: number of resampled scenes.
         items: number of scenes in the other set of the comparison.
     """
 

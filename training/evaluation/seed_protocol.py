@@ -165,7 +165,6 @@ def switch_on_probability(
     The probability is p(v_i = 1 | h1, relations), with one sample of the hidden layer h1.
 
     Args:
-        batch: the complete scenes.
         target: (scenes,) int64, the removed class of each scene.
         left_on: True keeps the relations of the removed class as annotated. False makes these
             relations unobserved.

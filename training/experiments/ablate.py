@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +11,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rich.console import Console
 
 from training.batches import seen_triples
-from training.config import Config, ConfigError, data_folder, load_config, with_settings
+from training.config import (
+    Config,
+    ConfigError,
+    data_folder,
+    first_error,
+    load_config,
+    own_or_shipped,
+    read_toml,
+    with_settings,
+)
 from training.evaluation.report import SourceReport, pooled, settings_by_source
 from training.evaluation.setting import Setting
 from training.experiments.measure import (
@@ -119,26 +127,11 @@ def _configs(
     limit: int | None,
     epochs: int | None,
 ) -> list[Config]:
-    """Return the configurations of the full model and of the selected ablations.
-
-    Args:
-        limit: maximum number of scenes per data source.
-        epochs: maximum number of training epochs.
-
-    Raises:
-        ConfigError: an ablation is invalid (see `load_rows`), the configuration has no shipped
-            ablations, or a selected ablation is unknown.
-    """
+    """Return the configurations of the full model and of the selected ablations."""
     full = load_config(reference)
     if limit is not None:
         full = with_settings(full, {"data.limit": limit})
-    shipped = shipped_ablations()
-    if path is None and full.name not in shipped:
-        raise ConfigError(
-            f"{full.name} has no shipped ablations (available for: {', '.join(shipped)}). Pass a "
-            "TOML file of ablations with --rows"
-        )
-    found = load_rows(path or shipped[full.name], full)
+    found = load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
     if unknown := sorted(set(names or ()) - {config.name for config in found}):
         raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(c.name for c in found)}")
     chosen = [full, *(config for config in found if not names or config.name in names)]
@@ -219,12 +212,6 @@ class _File(BaseModel):
     row: tuple[_Change, ...] = Field(min_length=1)
 
 
-def shipped_ablations() -> dict[str, Path]:
-    """Return the shipped ablation files by the name of the full model."""
-    folder = Path(__file__).parents[1] / "configs/ablations"
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
-
-
 def load_rows(path: Path, full: Config) -> list[Config]:
     """Read the ablations in a TOML file: one configuration for each `[[row]]` of the file.
 
@@ -236,15 +223,9 @@ def load_rows(path: Path, full: Config) -> list[Config]:
             have the same name, or an ablation has the same settings as the full model.
     """
     try:
-        file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError as error:
-        raise ConfigError(f"ablation file {path} does not exist") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path.name} is not TOML: {error}") from error
+        file = _File.model_validate(read_toml(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{path.name}: {place}: {first['msg']}") from error
+        raise ConfigError(f"{path.name}: {first_error(error)}") from error
     configs: dict[str, Config] = {}
     for row in file.row:
         if row.name in configs or row.name == full.name:

@@ -69,7 +69,6 @@ class Example:
     """An example question: a scene with one removed object, and the answers of both models.
 
     Attributes:
-        scene: scene id.
         room_type: room type of the scene, or "" if unknown.
         shown: labels of the remaining objects.
         removed: label of the removed object.
@@ -93,7 +92,6 @@ class Comparison:
     Attributes:
         results: metrics of both models. The first model is the reference `ours`.
         b: title of the second model.
-        scenes: number of compared scenes.
         groups: number of groups of near-duplicates among the compared scenes.
         certain: False if a model may have learnt from some of the scenes.
         notes: remarks on the results.
@@ -241,14 +239,10 @@ def compare(
 
     Args:
         root: folder with the scene files of the first model's configuration.
-        limit: maximum number of scenes.
-        examples: maximum number of examples.
-        say: function that shows the current step to the user.
 
     Raises:
         ConfigError: the first model lacks its training configuration, its scene files are missing,
             or too few scenes are held out from both models.
-        DatasetError: the scene files cannot be read.
     """
     if a.config is None or a.vocabulary is None:
         raise ConfigError(
@@ -300,11 +294,6 @@ def side_by_side(
     """Measure every metric that both models support, and the paired differences.
 
     The bootstrap resamples groups of near-duplicate scenes.
-
-    Args:
-        titles: titles of the two models.
-        rivals: function of each model that returns its scores for a task.
-        structure: (classes,) bool, True for structure classes such as walls.
 
     Raises:
         ValueError: for every task, the scenes belong to fewer than two groups, so intervals are

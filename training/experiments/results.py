@@ -46,10 +46,6 @@ class Cell:
     """One metric of one row on one data source.
 
     Attributes:
-        row: name of the row.
-        task: name of the task.
-        source: name of the data source, or "pooled".
-        metric: name of the metric.
         figure: mean over training seeds, with the bootstrap interval over scenes.
         seeds: value of the metric for each training seed.
     """
@@ -86,17 +82,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Asked:
-    """Number of scenes of one task, for one row, training seed and data source.
-
-    Attributes:
-        row: name of the row.
-        seed: training seed.
-        task: name of the task.
-        source: name of the data source, or "pooled".
-        scenes: number of scenes.
-        skipped: number of scenes that could not be scored.
-        notes: additional values, such as a kernel bandwidth, or log Z with its standard errors.
-    """
+    """Number of scenes of one task, for one row, training seed and data source."""
 
     row: str
     seed: int
@@ -245,8 +231,6 @@ def summarise(
     """Compute the metrics of every row, and the paired differences from the reference row.
 
     Args:
-        ours: name of the reference row.
-        parameters: number of trained weights by row name.
         groups: function that takes a task name and returns the group of each scene. With this
             function, the bootstrap of differences resamples groups instead of scenes.
 
@@ -279,11 +263,7 @@ def summarise(
 
 
 def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:
-    """Return the report with only the wanted metrics, because resampling all metrics is slow.
-
-    Args:
-        wanted: names of the metrics to keep, by task.
-    """
+    """Return the report with only the wanted metrics, because resampling all metrics is slow."""
     outcomes = {
         task: outcome
         and replace(

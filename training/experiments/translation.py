@@ -41,8 +41,6 @@ class Translation:
 
     Attributes:
         own: (V,) int64, the model's class for each of the V scene classes; -1 for an unknown class.
-        size: number of classes of the model.
-        unknown: score of an unknown class.
     """
 
     own: Tensor
@@ -62,7 +60,6 @@ class Translation:
         """Return scores of the model that take scenes and return values in the scene classes.
 
         Args:
-            model: scores of the model in its own classes.
             task: name of the task. In T3 (outliers) and T3b (false relations), the lowest score
                 ranks first. In other tasks, the highest score ranks first.
         """

@@ -64,12 +64,7 @@ class Objective(ABC):
         return []
 
     def finish(self, machine: BoltzmannMachine, train: SceneTensors) -> BoltzmannMachine:
-        """Return the trained machine in the form that the model file stores.
-
-        Args:
-            machine: the machine with its best weights.
-            train: the training scenes.
-        """
+        """Return the trained machine in the form that the model file stores."""
         del train
         return machine
 
@@ -111,7 +106,6 @@ def relation_nll(
     on a random share of the observed relations of each scene and sums over the other relations.
 
     Args:
-        edges: layout of the relation units.
         logits, r, observed, weight: logit, value, observed flag and weight of each relation unit,
             all (scenes, units).
         h1: means of the hidden units given the objects, (scenes, hidden units).
