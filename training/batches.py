@@ -150,18 +150,12 @@ def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
 
 
 def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
-    """Return the relations of a batch in the layout of the machine.
-
-    The result is (edges, r, observed): layout, values and observed flags of the relation units.
-    """
+    """Return the layout, values and observed flags of the relation units of a batch."""
     return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
 
 
 def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
-    """Return the triples (relation, subject class, object class) of at least `minimum` scenes.
-
-    The result is sorted and has the shape (triples, 3).
-    """
+    """Return the sorted triples (relation, subject, object) of `minimum` scenes, (triples, 3)."""
     keys: list[np.ndarray] = []
     for scene in scenes:
         relation, subject, object_ = scene.evidence.holds.nonzero()

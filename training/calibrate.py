@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,11 +33,11 @@ from scipy.special import expit
 from app.questions.missing import PLACES
 from app.questions.outliers import stated_log_odds
 from app.questions.posterior import posterior
-from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
+from app.registry import Artifact, Calibration, PairSlope, Slope
 from app.scene import Scene
 from training.array_types import Flags, Floats, Rng
 from training.batches import SceneTensors, subset
-from training.calibrate_objects import LEAST, calibrate_objects, recalibrated
+from training.calibrate_objects import calibrate_objects, recalibrated, thresholds
 from training.cases import (
     RIDGE,
     Triple,
@@ -50,7 +51,6 @@ from training.cases import (
 )
 from training.datasets import EncodedScene
 from training.datasets.sources import meaning_of
-from training.evaluation.alarms import ALARMS
 from training.evaluation.outliers import kept_in_each_source
 from training.oracle.units import NO_UNIT
 
@@ -92,7 +92,6 @@ def calibrate(
     """Fit every entry of the calibration.
 
     Args:
-        artifact: the model with the neutral calibration.
         chosen: a calibration from which some values are copied; see `calibrate_objects`.
     """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
@@ -203,10 +202,7 @@ def fit_placements(
 
 
 def _examples(blocks: list[Floats]) -> Floats:
-    """Return the examples for which the machine has a relation unit.
-
-    Without a relation unit, an example has no log-odds.
-    """
+    """Return the examples for which the machine has a relation unit, and so log-odds."""
     every = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
     return every[every[:, _LOGIT] > NO_UNIT]
 
@@ -385,8 +381,7 @@ def fit_misplaced(
 
     The input is the log-odds of the relation given the rest of the scene. Each scene takes part
     twice, untouched and with one false relation. A threshold gives an alarm in a fixed share of
-    untouched scenes (`ALARMS`), measured on the data source with the most alarms, and is at least
-    the minimum of `LEAST`.
+    untouched scenes, measured on the data source with the most alarms, but see `thresholds`.
 
     Returns:
         The entries `misplaced` and `misplaced_thresholds`. Both are None if fewer than
@@ -417,12 +412,9 @@ def fit_misplaced(
     group = np.array([encoded.group for encoded, _ in untouched])
     _, source = np.unique([encoded.source for encoded, _ in untouched], return_inverse=True)
     worst = expit(intercept + slope * np.array([least for _, least in untouched]))
-    limits = {
-        name: max(LEAST[name], kept_in_each_source(worst, group, source, rng, share))
-        for name, share in ALARMS.items()
-    }
+    limits = thresholds(partial(kept_in_each_source, worst, group, source, rng))
     entry = Slope(intercept=intercept, slope=slope)
-    return {"misplaced": entry, "misplaced_thresholds": Thresholds(**limits)}
+    return {"misplaced": entry, "misplaced_thresholds": limits}
 
 
 def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:

@@ -18,8 +18,9 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -144,10 +145,7 @@ def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
 
 
 def popularity(train: SceneTensors) -> Floats:
-    """Return the log-odds that a complete training scene contains each class, (classes,).
-
-    The count of scenes is smoothed by 1/2.
-    """
+    """Return the smoothed log-odds that a complete training scene contains a class, (classes,)."""
     weight = train.weight * (train.complete if bool(train.complete.any()) else 1.0)
     count = (train.v * weight.unsqueeze(1)).sum(0).double().numpy()
     total = float(weight.sum())
@@ -366,7 +364,8 @@ def fit_outliers(
     if slope >= 0:
         return {}
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
-    limits = thresholds([(next(iter(judged.values())), scenes)], entry, rng)
+    whole = [(next(iter(judged.values())), scenes)]
+    limits = thresholds(partial(limit_of, whole, entry, rng))
     fitted: dict[str, Any] = {
         "popularity_weight": alpha,
         "outlier": entry,
@@ -384,9 +383,9 @@ def fit_outliers(
             for some, parts_of in lists
         ]
         share = _ENOUGH * ALARMS["medium"]
-        if _limit(parts_scored, entry, np.random.default_rng(seed), share) <= limits.medium:
+        if limit_of(parts_scored, entry, np.random.default_rng(seed), share) <= limits.medium:
             break
-        own = thresholds(parts_scored, entry, rng)
+        own = thresholds(partial(limit_of, parts_scored, entry, rng))
         short.append(_between(limits, own, short[-1] if short else NEVER))
     return fitted | {"short_list_thresholds": tuple(short)}
 
@@ -411,17 +410,12 @@ Scored = Sequence[tuple[IntruderScores, SceneTensors]]
 """Scores of untouched scenes, and these scenes: one entry for each shortening of the scenes."""
 
 
-def thresholds(untouched: Scored, entry: CountSlope, rng: Rng) -> Thresholds:
-    """Return the thresholds with the target shares of alarms, and at least the minimum."""
-    return Thresholds(
-        **{
-            name: max(LEAST[name], _limit(untouched, entry, rng, share))
-            for name, share in ALARMS.items()
-        }
-    )
+def thresholds(limit: Callable[[float], float]) -> Thresholds:
+    """Return the limits of the target shares of alarms, each at least the minimum."""
+    return Thresholds(**{name: max(LEAST[name], limit(share)) for name, share in ALARMS.items()})
 
 
-def _limit(untouched: Scored, entry: CountSlope, rng: Rng, share: float) -> float:
+def limit_of(untouched: Scored, entry: CountSlope, rng: Rng, share: float) -> float:
     """Return the probability that raises alarms in a share of the untouched scenes.
 
     The function averages over the shortenings, because several shortenings of a scene are not
@@ -462,10 +456,7 @@ def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
 
 
 def _found(scores: IntruderScores) -> Floats:
-    """Return hit@1 and the detected share of intruders.
-
-    The threshold of detection gives an alarm in 10 % of the unaltered scenes.
-    """
+    """Return hit@1 and the share of intruders that an alarm in 10 % of unaltered scenes detects."""
     worst = np.full(scores.scenes, np.inf)
     np.minimum.at(worst, scores.scene[scores.clean], scores.log_odds[scores.clean])
     limit = np.quantile(worst[np.isfinite(worst)], ALARMS["medium"])

@@ -204,10 +204,7 @@ def altered_scene(
     triples: Sequence[Triple],
     rng: Rng,
 ) -> tuple[Scene, Triple] | None:
-    """Return a scene in which a false triple replaces one of `triples`, and the false triple.
-
-    The result is None if 50 draws find no false triple.
-    """
+    """Return a scene with a false triple in place of a true one, and this triple; or None."""
     usable = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds
     place = int(rng.integers(len(triples)))

@@ -328,7 +328,7 @@ def _train(
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
     try:
         with Display(trainer, console, tensorboard if is_first() else None) as display:
-            result = trainer.run(display.updated, display.ended, display.objects)
+            result = trainer.run(display.progress, display.ended, display.objects)
     except KeyboardInterrupt:
         # Count the epochs in the checkpoint, because the last epoch may be finished but not saved.
         kept = len(trainer.epochs) if trainer.resume() else 0

@@ -275,10 +275,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def config_path(reference: str) -> Path:
-    """Return the configuration file for a reference.
-
-    A reference is the name of a shipped configuration, a file, or a folder made by `init`.
-    """
+    """Return the file of a reference: a shipped name, a file, or a folder made by `init`."""
     path = shipped_configs().get(reference, Path(reference))
     return path / f"{path.resolve().name}.toml" if path.is_dir() else path
 

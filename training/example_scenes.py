@@ -62,10 +62,7 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
 def known_examples(
     examples: Sequence[Example], vocabulary: Vocabulary
 ) -> tuple[tuple[Example, ...], list[str]]:
-    """Return the examples whose labels and room type are in a vocabulary.
-
-    Also return the reason for each example that is left out.
-    """
+    """Return the examples that a vocabulary covers, and the reasons against the others."""
     kept, reasons = [], []
     for example in examples:
         try:

@@ -28,11 +28,7 @@ _CURVES = (
 
 
 class Display(Progress):
-    """A progress bar with epoch, validation scores and remaining time.
-
-    Args:
-        logs: folder of the TensorBoard log. None means no log.
-    """
+    """A progress bar with epoch, scores and remaining time. `logs` is a TensorBoard folder."""
 
     def __init__(self, trainer: Trainer, console: Console, logs: Path | None = None) -> None:
         super().__init__(
@@ -53,7 +49,7 @@ class Display(Progress):
         )
         self._log = None if logs is None else tensorboard(logs, trainer.config)
 
-    def updated(self, epoch: int, done: float, loss: float) -> None:
+    def progress(self, epoch: int, done: float, loss: float) -> None:
         """Show the progress after an update of the weights."""
         trainer = self._trainer
         total = trainer.config.training.epochs
@@ -80,10 +76,7 @@ def scores(epoch: Epoch) -> str:
 
 
 def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
-    """Return a function that writes an epoch to a TensorBoard log.
-
-    The arguments of the function are the epoch and the number of updates so far.
-    """
+    """Return a function of an epoch and the number of updates that writes to TensorBoard."""
     # TensorBoard is imported only when needed, because the import takes longer than a small run.
     from torch.utils.tensorboard import SummaryWriter
 
@@ -110,10 +103,7 @@ def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Return the values as a line of at most `width` block characters of different heights.
-
-    If there are more values than `width`, each block shows the mean of several values.
-    """
+    """Return the values, or means of several, as at most `width` blocks of different heights."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return ""

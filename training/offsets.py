@@ -299,10 +299,7 @@ def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
 
 
 def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
-    """Fit mu and the class effects u and v of `fit` by alternation, in place.
-
-    Each value is a weighted mean of residuals. u and v are shrunk towards 0.
-    """
+    """Fit mu and the effects u and v, shrunk towards 0, by alternation, in place."""
     # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)
 

@@ -214,11 +214,7 @@ def calibrated_draft(
     data: TrainingData,
     chosen: Calibration | None = None,
 ) -> Artifact:
-    """Return the calibrated model of a run, with weights rounded to half precision.
-
-    Args:
-        chosen: a calibration from which some values are copied; see `calibrate_objects`.
-    """
+    """Return the calibrated model of a run in half precision. `chosen`: see `calibrate_objects`."""
     machine = as_stored(run.machine)
     calibration = calibrate(
         draft_artifact(machine, vocabulary),
@@ -302,10 +298,7 @@ def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
 
 
 def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
-    """Return the terms of use of a data source, and True if they allow only research.
-
-    The configuration contains the terms of the user's own files.
-    """
+    """Return a source's terms of use, and True if they allow only research."""
     if source in SOURCES and source in data.sources:
         return SOURCES[source].terms, SOURCES[source].research_only
     words = data.terms or "the user's own scenes, without stated terms of use"

@@ -92,11 +92,7 @@ def save_run(
     data: Path | None = None,
     scenes: str = "",
 ) -> None:
-    """Write the weights and then `result.json`. The file `result.json` marks the run as finished.
-
-    Args:
-        scenes: digest of the scenes, their vocabulary and split.
-    """
+    """Write the weights, and then `result.json`, which marks the run as finished."""
     machine = result.machine
     state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
     spec = json.dumps(machine.spec.to_dict())

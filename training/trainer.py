@@ -78,10 +78,7 @@ class TrainingData:
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
-    """Return an untrained machine.
-
-    Its weight matrices are small random numbers, and its biases are log-odds of training counts.
-    """
+    """Return a machine with small random matrices and log-odds of training counts as biases."""
     shape = config.machine
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
@@ -114,10 +111,7 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
-    """Return the smoothed log-odds of `count` events in `total` trials.
-
-    1/2 is added to the number of events and to the number of other trials.
-    """
+    """Return the log-odds of `count` events in `total` trials, smoothed by 1/2 event each."""
     return ((count + 0.5) / (total - count + 0.5)).log()
 
 
@@ -393,19 +387,8 @@ class Trainer:
             p.copy_(current[name])
         seconds = time.perf_counter() - began
         self.seconds += seconds
-        self.epochs.append(
-            Epoch(
-                number,
-                loss,
-                train[0],
-                train[1],
-                validation[0],
-                validation[1],
-                mrr,
-                precision,
-                seconds,
-            )
-        )
+        errors = train[0], train[1], validation[0], validation[1]
+        self.epochs.append(Epoch(number, loss, *errors, mrr, precision, seconds))
 
     def _rank_objects(self, machine: BoltzmannMachine) -> tuple[float]:
         """Return the MRR of removed objects on fixed validation scenes."""

@@ -70,10 +70,7 @@ PLACED: Final = BASELINES["frequency table p(i | a, j)"]
 
 
 def placed_product(name: str, score: Any, table: Any) -> Baseline[PlacedScore]:
-    """Return a baseline for task T2-at (objects at a place).
-
-    Its score is the product of a fitted object score and the fitted table of `PLACED`.
-    """
+    """Return the baseline of T2-at whose score is the product of a fitted score and `PLACED`."""
     propose = relations.times(score, table)
     return Baseline(f"{PLACED.name} × {name}", propose, fitting.placed_mrr, ("placed",))
 

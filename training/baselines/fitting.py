@@ -65,18 +65,12 @@ def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> 
 
 
 def partial_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """Return the mean reciprocal rank (MRR) of hidden objects (task T2 partial).
-
-    Half of the objects of each scene are hidden.
-    """
+    """Return the mean reciprocal rank (MRR) of the hidden half of the objects (T2 partial)."""
     return rank_hidden(hide(scenes, structure, 0.5), structure, score)[0].value
 
 
 def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
-    """Return the mean reciprocal rank (MRR) of removed objects at a known place (task T2-at).
-
-    The place is one relation of the removed object to another object.
-    """
+    """Return the mean reciprocal rank (MRR) of removed objects at a known place (T2-at)."""
     return leave_one_out_at(scenes, structure, score)[0].mrr().value
 
 
@@ -91,10 +85,7 @@ def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: Relat
 
 
 def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDensity) -> float:
-    """Return the mean log-likelihood of the objects of a scene in nats.
-
-    The function uses the upper estimate of log Z, so the result is a lower estimate.
-    """
+    """Return a lower estimate of the mean log-likelihood of objects in nats (upper log Z)."""
     return float(density.log_unnormalised(scenes.v).double().mean()) - density.upper
 
 

@@ -118,11 +118,7 @@ def train_network(
 
 
 def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float) -> Tensor:
-    """Return the cross-entropy of a removed class, averaged over scenes.
-
-    One class of each scene is removed. The global random generator draws the removed class and the
-    hidden classes.
-    """
+    """Return the cross-entropy of one randomly removed class a scene, averaged over scenes."""
     target = torch.multinomial(v * ~structure, 1)
     left = v.scatter(1, target, 0.0)
     hidden = torch.rand(v.shape) < noise * torch.rand(len(v), 1)
@@ -144,10 +140,7 @@ _HEAVY = replace(_AUTOENCODER, noise=1.0)
 
 
 def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
-    """Return an untrained autoencoder with two hidden layers of `width` units.
-
-    The logs of the class frequencies in v, (scenes, classes), initialise the output bias.
-    """
+    """Return an untrained autoencoder; class frequencies in `v` initialise its output bias."""
     V = v.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -175,10 +168,7 @@ def autoencoder(
 def autoencoder_for_parts(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[ObjectScore]:
-    """Yield scores of autoencoders that are trained with high noise.
-
-    In a training scene, up to all classes except the target can be hidden.
-    """
+    """Yield scores of autoencoders whose noise hides up to all classes except the target."""
     return autoencoder(train, structure, seed, _HEAVY)
 
 
@@ -223,10 +213,7 @@ class SetTransformer(nn.Module):
         nn.init.normal_(self.embedding.weight, std=width**-0.5)
 
     def forward(self, v: Tensor) -> Tensor:
-        """Return the logits of the removed class, (scenes, classes), for presence v.
-
-        The output of the query token determines the logits.
-        """
+        """Return the logits of the removed class, (scenes, classes), from the query token."""
         most = int((v > 0).sum(1).max())
         present, token = v.topk(most, dim=1)
         token = torch.where(present > 0, token, self.classes + 1)

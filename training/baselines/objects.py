@@ -58,10 +58,7 @@ class LinearScore:
 
 
 def frequency(v: Tensor) -> Tensor:
-    """Return the share of scenes with each class, (classes,).
-
-    The share is smoothed: half a scene with the class and half a scene without the class are added.
-    """
+    """Return the share of scenes with each class, (classes,), smoothed by 1/2 in both counts."""
     return (v.sum(0) + 0.5) / (len(v) + 1.0)
 
 
@@ -195,11 +192,7 @@ _EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)
 def fit_pairwise(
     v: Tensor, l2: float, *, start: LinearScore | None = None, iterations: int = _ITERATIONS
 ) -> LinearScore:
-    """Fit the pairwise model by penalised pseudo-likelihood.
-
-    Args:
-        start: model from which the optimisation starts. The default has independent classes.
-    """
+    """Fit the pairwise model by penalised pseudo-likelihood, from `start` or no interaction."""
     V = v.shape[1]
     if start is None:
         start = LinearScore(frequency(v).logit(), torch.zeros(V, V))
@@ -226,10 +219,7 @@ def fit_pairwise(
 
 
 def pairwise(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[LinearScore]:
-    """Yield a score for each L2 penalty, largest penalty first.
-
-    Each fit starts at the solution of the previous penalty.
-    """
+    """Yield a score for each L2 penalty, largest first. A fit starts at the last solution."""
     score = None
     for l2 in _PAIRWISE_L2:
         score = fit_pairwise(train.v, l2, start=score)

@@ -35,10 +35,7 @@ class TripleCounts:
     together: Tensor
 
     def overall(self) -> Tensor:
-        """Return the probability of each relation over all pairs of classes, (relations,).
-
-        The counts have add-one (Laplace) smoothing.
-        """
+        """Return the add-one smoothed probability of each relation over all pairs, (relations,)."""
         return (self.held.sum((1, 2)) + 1.0) / (self.together.sum() + 2.0)
 
 
@@ -141,10 +138,7 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
 
 
 def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RelationScore]:
-    """Yield a score for each smoothing of pairs and of classes, and each weight of the counts.
-
-    The weight of the instance counts has no effect if all counts are 1.
-    """
+    """Yield a score for each smoothing of pairs and of classes, and each weight of the counts."""
     counts = count_triples(train, structure)
     for pair in _PAIR:
         for end in _END:

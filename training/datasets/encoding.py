@@ -184,12 +184,7 @@ def _counts(evidence: ClassEvidence, classes: Ints, alike: Sequence[int]) -> Int
 
 
 def _relations(scene: AnnotatedScene, meaning: Meaning) -> tuple[PoseRelations, Floats | None]:
-    """Derive the relations between all instances of a scene; `encode` describes the rules.
-
-    Returns:
-        The relations, and the positions from which they were derived, (instances, 3). The second
-        value is None if the relations do not come from positions.
-    """
+    """Derive all relations, as `encode` describes, and return the positions they come from."""
     positions = None
     if scene.relations is not None:
         return _from_lists(scene, scene.relations, meaning), None

@@ -85,10 +85,7 @@ def bounded_int(digits: str) -> int:
 
 @contextmanager
 def located(path: Path, where: str) -> Iterator[None]:
-    """Convert a TypeError or ValueError in the `with` block to a DatasetError.
-
-    The DatasetError contains the path and the position in the file.
-    """
+    """Convert a TypeError or ValueError in the `with` block to a DatasetError with its place."""
     try:
         yield
     except DatasetError:

@@ -356,10 +356,7 @@ class _Layout:
 
 
 def _offset(box: _Box, u: float, v: float) -> tuple[float, float]:
-    """Return the room coordinates of a point near a box.
-
-    The point is u metres along the front of the box and v metres away from its back.
-    """
+    """Return the point u metres along the front of a box and v metres away from its back."""
     cos, sin = math.cos(box.yaw), math.sin(box.yaw)
     return box.x + cos * u - sin * v, box.y + sin * u + cos * v
 

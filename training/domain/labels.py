@@ -62,11 +62,7 @@ class Lookalike:
 
 
 def outside_vocabulary(scenes: Iterable[EncodedScene], *, named: bool) -> str:
-    """Return one line about the labels outside the vocabulary, "" without such labels.
-
-    Args:
-        named: True names the labels, most frequent first. False only counts them.
-    """
+    """Return one line that counts or names the labels outside the vocabulary, "" without any."""
     with_labels = [scene.unknown for scene in scenes if scene.unknown]
     spellings: dict[str, Counter[str]] = {}
     for label, count in Counter(label for labels in with_labels for label in labels).items():

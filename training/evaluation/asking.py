@@ -80,11 +80,7 @@ def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -
 
 
 def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Scene:
-    """Return a scene that contains only labels, without relations and poses.
-
-    Args:
-        kept: indices of the instances in the returned scene. None means all instances.
-    """
+    """Return a scene of labels, without relations and poses, of the instances in `kept` or all."""
     places = range(len(encoded.instance_classes)) if kept is None else kept
     return replace(scene_of(encoded, places, ()), room_type=None)
 

@@ -104,10 +104,7 @@ def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> Lines:
 
 
 def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
-    """Build a scene of the labels in the vocabulary.
-
-    The id of an object is its label, or label_number if several objects have the label.
-    """
+    """Build a scene of the known labels; several objects of a label have the ids label_number."""
     objects = []
     taken: set[str] = set()
     for label in labels:

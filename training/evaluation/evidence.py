@@ -117,11 +117,7 @@ def intrusions(
     intruders: Ints,
     kind: str,
 ) -> Iterator[Case]:
-    """Generate the T3 questions: each scene with one intruder.
-
-    Args:
-        intruders: (scenes,) class of the intruder in each scene; -1 skips the scene.
-    """
+    """Generate the T3 questions: each scene with its intruder, (scenes,); -1 skips the scene."""
     for place, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
         both = told(encoded, list(range(len(encoded.instance_classes))), kind)
         if intruder < 0 or both is None:
@@ -141,10 +137,7 @@ def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
 
 
 def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
-    """Generate the T1 questions: the evidence is about half of the classes, at least two.
-
-    All pairs of instances without evidence are queried.
-    """
+    """Generate the T1 questions: evidence about half of the classes, all other pairs queried."""
     for place, encoded in enumerate(scenes.scenes):
         own, classes = encoded.instance_classes, encoded.evidence.classes
         usable = classes[~structure[classes]]
@@ -162,10 +155,7 @@ def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> 
 
 
 def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
-    """Return the reciprocal rank of a removed class among all absent classes.
-
-    For ties, the result is the expectation under random order.
-    """
+    """Return the reciprocal rank of a removed class among absent classes, expected over ties."""
     p = missing_probabilities(artifact, scene)
     above, ties = int((p > p[target]).sum()), int((p == p[target]).sum())
     return float((1.0 / np.arange(above + 1, above + ties + 1)).mean())

@@ -54,10 +54,7 @@ def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 
 
 def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return weights (scenes, classes) of 1 or 0.
-
-    A weight is 1 if a training scene of the scene's room type contains the class.
-    """
+    """Return 1 for classes that training scenes of the room type contain, (scenes, classes)."""
     weights = torch.zeros_like(scenes.v)
     for room in scenes.room.unique().tolist():
         if room >= 0:
@@ -121,10 +118,7 @@ def signatures(train: SceneTensors) -> Signatures:
 
 
 def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return the sampling probability of each class in each scene, (scenes, classes).
-
-    All probabilities of a scene are 0 if it can have no signature intruder.
-    """
+    """Return the sampling probability of each signature intruder, (scenes, classes), or 0."""
     found = signatures(train)
     weights = np.zeros(scenes.v.shape)
     absent = scenes.v.numpy() == 0
@@ -143,11 +137,7 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 def kinds_of_intruders(
     scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Ints]:
-    """Draw three intruders for every scene: uniform, by popularity and by signature.
-
-    Returns:
-        The classes of the intruders, by (data source, scene id).
-    """
+    """Draw uniform, popular and signature intruders, by (data source, scene id)."""
     laws: list[Tensor | None] = [None]
     if train is not None:
         laws += [by_popularity(scenes, train), by_signature(scenes, train)]
@@ -197,10 +187,7 @@ class IntruderScores:
 
     @property
     def dirty(self) -> Items:
-        """Return the objects of scenes with an intruder as items for ranking metrics.
-
-        The score of an object is its negated log-odds. Only the intruder counts as true.
-        """
+        """The objects of scenes with an intruder as items: negated log-odds, true for intruders."""
         rows = ~self.clean
         score, truth = -self.log_odds[rows], self.intruder[rows]
         return Items(self.scene[rows], score, truth, self.scenes, self.skipped)

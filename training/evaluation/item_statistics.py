@@ -48,10 +48,7 @@ def _levels(score: Floats, truth: Flags) -> _Levels:
 
 
 def auroc(score: Floats, truth: Flags) -> Prepared:
-    """Return the probability that a true item has a higher score than a false item.
-
-    A pair of items with equal scores counts half.
-    """
+    """Return the probability that a true item scores above a false item; ties count half."""
     levels = _levels(score, truth)
 
     def at(weight: Floats) -> float:

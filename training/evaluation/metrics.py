@@ -74,10 +74,7 @@ class Metric(ABC):
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Metric | None:
-        """Return the metric over the concatenated scenes of all parts.
-
-        The result is None for metrics of whole sets.
-        """
+        """Return the metric over the scenes of all parts; None for metrics of whole sets."""
         return None
 
     @property
@@ -154,12 +151,9 @@ def _widening(groups: int) -> float:
     return float(quantiles * np.sqrt(groups / (groups - 1)))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4)  # many metrics resample the same scenes one after the other
 def scene_weights(scenes: int, resamples: int, seed: int) -> Floats:
-    """Return how often each resample draws each scene, (resamples, scenes); read-only.
-
-    The result is cached, because many metrics resample the same scenes one after the other.
-    """
+    """Return how often each resample draws each scene, (resamples, scenes); read-only."""
     rng = np.random.default_rng(seed)
     weights = np.empty((resamples, scenes))
     for row in weights:
@@ -411,10 +405,7 @@ class Resampled(Metric):
     def of(
         cls, statistic: Callable[[Floats], float], scenes: int, items: int, resamples: int
     ) -> Resampled:
-        """Create the metric from a statistic of the scene weights.
-
-        Resampling inflates distances between sets. So the resamples are centred on the value.
-        """
+        """Create the metric from a statistic of scene weights. The resamples are centred."""
         point = statistic(np.ones(scenes))
         drawn = resample(statistic, scenes, resamples)
         return cls(point, _centred(drawn, point), scenes, items)

@@ -140,11 +140,7 @@ class Ranking:
         return metrics | {"MRR, macro by class": macro}
 
     def with_unknown(self, unknown: Ints) -> Ratio:
-        """Return the MRR, where each label outside the vocabulary is a removed object of score 0.
-
-        Args:
-            unknown: (scenes,) number of labels outside the vocabulary. Skipped scenes are ignored.
-        """
+        """Return the MRR if each unknown label, (scenes,), is a removed object of score 0."""
         known = self.mrr()
         scored = known.denominators > 0
         return Ratio(known.numerators, known.denominators + unknown * scored)
@@ -192,11 +188,7 @@ class Partial:
 
 
 def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int = 0) -> Partial:
-    """Hide classes of every scene with at least two classes.
-
-    Args:
-        share: share of the classes that stay listed. None hides one class.
-    """
+    """Hide classes of every scene with two classes: all but a share of them, or one (None)."""
     plain = ~structure.numpy()
     places: list[int] = []
     hidden = torch.zeros_like(scenes.v, dtype=torch.bool)

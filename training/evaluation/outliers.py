@@ -80,10 +80,7 @@ class Alarm:
 
 
 def calibrated_alarm(calibration: Calibration) -> Alarm | None:
-    """Return the alarm rule of the service, with the default sensitivity.
-
-    The result is None if the model judges no object.
-    """
+    """Return the default alarm rule of the service, or None if the model judges no object."""
     entry, presets = calibration.outlier, calibration.outlier_thresholds
     if entry is None or presets is None:
         return None
@@ -101,11 +98,7 @@ def calibrated_alarm(calibration: Calibration) -> Alarm | None:
 def fitted_alarm(
     score: ObjectScore, validation: SceneTensors, structure: Tensor, seed: int = 0
 ) -> Alarm:
-    """Fit the alarm of a score without calibration, on log-odds only.
-
-    Args:
-        validation: at most 1,500 scenes with complete object lists are used.
-    """
+    """Fit the alarm of a score without calibration, on at most 1,500 complete scenes."""
     complete = subset(validation, validation.complete.nonzero().squeeze(1))
     scenes = some_scenes(complete, _SCENES, seed)
     scores = intruder_scores(scenes, structure, score, seed=seed)
@@ -196,11 +189,7 @@ _SHORT_LISTS = (1, 2, 4, 6)
 
 
 def outliers_task(contender: Contender, setting: Setting, law: Law | None = None) -> Outcome | None:
-    """Measure T3 with the object score of a contender.
-
-    Args:
-        law: distribution of the intruders. None means uniform.
-    """
+    """Measure T3 with an object score, for intruders of a law, or uniform ones without a law."""
     if contender.objects is None or (law is not None and setting.train is None):
         return None
     scenes = setting.some()

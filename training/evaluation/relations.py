@@ -138,11 +138,7 @@ def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candida
 def score_scenes(
     scenes: SceneTensors, structure: Tensor, score: RelationScore, *, counts: bool = True
 ) -> list[Candidates]:
-    """Score the T1a candidates of the scenes with annotated triples.
-
-    Args:
-        counts: True passes the instance counts to the score. False sets all counts to 0 (unknown).
-    """
+    """Score the T1a candidates of annotated scenes. Without `counts`, all counts are 0, unknown."""
 
     def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
         for _, batch in _batches(scenes, 1, block=32):
@@ -209,11 +205,7 @@ class RelationRanking:
 
 
 def rank(scored: Iterable[Candidates], scenes: int, *, first: int | None = None) -> RelationRanking:
-    """Count annotated triples among the best candidates.
-
-    Args:
-        first: number of predictions; by default the number of annotated triples of the scene.
-    """
+    """Count annotated triples among the first candidates, by default as many as are annotated."""
     annotated, hits = np.zeros(scenes, dtype=np.int64), np.zeros(scenes)
     for scene in scored:
         if count := int(scene.truth.sum()):
@@ -230,11 +222,7 @@ def rank_relations(
 
 
 def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Candidates]:
-    """Select the candidates that never held in training (zero-shot).
-
-    Args:
-        seen: (T, 3) triples (a, i, j) of training; see `training.batches.seen_triples`.
-    """
+    """Select the candidates that are not among the training triples `seen`, (T, 3) (zero-shot)."""
     relation, subject, object_ = seen.long().unbind(1)
     keys = triple_keys(relation, subject, object_, classes).numpy()
     return [scene.where(~np.isin(scene.key, keys)) for scene in scored]

@@ -58,10 +58,7 @@ class SourceReport:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-serialisable dictionary.
-
-        The dictionary also contains intervals, which are for human readers only.
-        """
+        """Return a JSON-serialisable dictionary, with intervals for human readers."""
         return {
             "source": self.source,
             "scenes": self.scenes,
@@ -72,8 +69,9 @@ class SourceReport:
         }
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> SourceReport:
-        """Create a report from the output of `to_dict`."""
+    def read(cls, path: Path) -> SourceReport:
+        """Read a report that `measure` wrote."""
+        values = json.loads(path.read_text(encoding="utf-8"))
         tasks = values["tasks"].items()
         return cls(
             values["source"],
@@ -106,20 +104,14 @@ def settings_by_source(
     *,
     limit: int | None = 600,
 ) -> Iterator[tuple[str, Setting]]:
-    """Iterate over the data sources, by name, and their evaluation settings.
-
-    Each setting has only the scenes and the training scenes of its data source.
-    """
+    """Iterate over the data sources and the settings of their scenes and training scenes."""
     training = dict(by_source(train))
     for source, some in by_source(scenes):
         yield source, Setting(some, structure, training.get(source), seen, limit)
 
 
 def digest(setting: Setting) -> str:
-    """Return the sha256 of all values that determine the questions.
-
-    These values are the scene ids, the limit, the seed and the everyday facts.
-    """
+    """Return the sha256 of the questions: scene ids, limit, seed and everyday facts."""
     names = [f"{scene.source} {scene.scene_id}" for scene in setting.scenes.scenes]
     facts = [] if setting.everyday is None else [f"facts {facts_digest(setting.everyday)}"]
     asked = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
@@ -165,13 +157,10 @@ def measure(
     tasks: Iterable[str] = tuple(TASKS),
     progress: Progress = silent,
 ) -> SourceReport:
-    """Measure tasks, and write the report to the file at `path` after every task.
-
-    Tasks that the file already contains are skipped.
-    """
+    """Measure the tasks that the file at `path` lacks, and write it after every task."""
     report = SourceReport(source, digest(setting))
     if path.exists():
-        report = SourceReport.from_dict(json.loads(path.read_text(encoding="utf-8")))
+        report = SourceReport.read(path)
     for _ in run(contender, setting, report, tasks=tasks, progress=progress):
         write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
     return report

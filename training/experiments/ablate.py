@@ -144,10 +144,7 @@ def _configs(
 
 
 def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
-    """Return the evaluation settings, for the validation and test part of each data source.
-
-    `limit` is the maximum number of scenes in slow tasks.
-    """
+    """Return the evaluation settings of the validation and test part of each data source."""
     seen = seen_triples(scenes.train.scenes, scenes.train.v.shape[1])
     parts = {"validation": scenes.validation, "test": scenes.test}
     return {
@@ -160,10 +157,7 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
 
 
 def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
-    """Return the reports with only the metrics of `PRIMARY`.
-
-    The first two reports are new: they pool the data sources of the validation and test part.
-    """
+    """Return the `PRIMARY` metrics, first of the pooled validation and test parts."""
     pools = {
         f"{part} pooled": pooled(
             [report for name, report in reports.items() if name.startswith(part)], f"{part} pooled"
@@ -176,10 +170,7 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
 def _costs(
     folder: Path, configs: Sequence[Config], seeds: int
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Return the number of trained weights and the mean training time in seconds, by model name.
-
-    Weights that stay at zero do not count as trained.
-    """
+    """Return the number of weights not held at zero, and the mean seconds, by model name."""
     weights, seconds = {}, {}
     for config in configs:
         places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]

@@ -322,10 +322,7 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
 
 
 def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> Results:
-    """Measure the machines of a domain by the seed protocol (Bozcan et al., 2018).
-
-    Each machine is trained once, on a random split of the scenes.
-    """
+    """Measure each machine, trained once on a random split, by the seed protocol."""
     scenes = options.scenes(domain, split="random")
     plan = _plan(folder, scenes, options, tuple(SEED_TASKS))
     rows = [

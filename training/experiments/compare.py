@@ -115,10 +115,7 @@ class Comparison:
         return self.results.ours
 
     def worse_by(self, margin: float) -> list[Difference]:
-        """Return the primary metrics in which the first model is worse by more than `margin`.
-
-        In these metrics, the whole interval of the paired difference is below -margin.
-        """
+        """Return the primary metrics whose whole interval of the difference is below -margin."""
         return [
             row for row in self.results.differences if is_primary(row) and row.figure.high < -margin
         ]
@@ -320,10 +317,7 @@ def side_by_side(
 
 
 def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
-    """Return the relation tasks that only the other model's card measures.
-
-    The result is empty if any of `rows` measures a relation task.
-    """
+    """Return the relation tasks that the other card measures, if `rows` measures none."""
     if other.artifact is None or any(row.task in RELATIONAL for row in rows):
         return ()
     measured = {metric.task for metric in other.artifact.manifest.metrics}

@@ -354,7 +354,7 @@ def read_report(path: Path, setting: Setting) -> SourceReport:
     Raises:
         BenchmarkError: the report belongs to other scenes or questions.
     """
-    report = SourceReport.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    report = SourceReport.read(path)
     if report.scenes != digest(setting):
         raise BenchmarkError(
             f"the report {path} belongs to other scenes or questions: use --fresh or another folder"

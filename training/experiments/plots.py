@@ -132,10 +132,7 @@ def recall_curves(results: Results, source: str) -> Figure:
 def recall_points(
     results: Results, task: str, prefix: str, source: str
 ) -> dict[str, list[tuple[int, float]]]:
-    """Return the points (k, recall at k) of one task, by model name.
-
-    The name of each metric is `prefix` followed by k, for example "R@10".
-    """
+    """Return the points (k, recall at k) of the metrics "<prefix>k", by model name."""
     found: dict[str, list[tuple[int, float]]] = {}
     for cell in results.cells:
         k = cell.metric.removeprefix(prefix)

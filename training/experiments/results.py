@@ -70,10 +70,7 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """Return whether the reference row is `better` or `worse` than the other row.
-
-        If the interval contains zero, the verdict is `undecided`.
-        """
+        """`better` or `worse` than the other row; `undecided` if the interval contains zero."""
         low, high = self.figure.low, self.figure.high
         if self.metric.startswith(_LOWER_IS_BETTER):
             low, high = -high, -low
@@ -145,10 +142,7 @@ class Results:
         return "\n\n".join(parts) + "\n"
 
     def tables(self, shown: Mapping[str, tuple[str, ...]] | None = None) -> Iterator[Table]:
-        """Generate one table per task for the terminal, with the pooled sources if there are any.
-
-        A star has the meaning of `markdown`.
-        """
+        """Generate one table per task for the terminal, of the pooled sources if there are any."""
         if shown is None:
             shown = {name: task.shown for name, task in TASKS.items()}
         sources = list(dict.fromkeys(cell.source for cell in self.cells))
@@ -325,10 +319,7 @@ def _range(counts: Iterable[int]) -> str:
 
 
 def _notes(asked: Sequence[Asked]) -> str:
-    """Return a table of notes, with one line per data source if the notes of all rows are equal.
-
-    Otherwise the table has one line per row, or one line per row and data source.
-    """
+    """Return a table of notes, with one line per source or row if the others have equal notes."""
     found: dict[str, Mapping[str, float]] = {}
     for place in ("{0.source}", "{0.row}, seed {0.seed}", "{0.row}, seed {0.seed}, {0.source}"):
         found = {place.format(one): one.notes for one in asked}

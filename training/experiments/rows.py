@@ -213,10 +213,7 @@ def always(contender: Contender) -> Rival:
 def _fit(
     baseline: Baseline[Any], data: TrainingData, seed: int, folder: Path, say: Say
 ) -> Fitted[Any]:
-    """Fit a baseline, and write all tried settings into trials.jsonl.
-
-    Trials of an earlier, interrupted fit are replaced.
-    """
+    """Fit a baseline, and write its trials into trials.jsonl in place of its earlier trials."""
     fitted = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
     before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []

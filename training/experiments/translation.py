@@ -28,10 +28,7 @@ BEYOND = 1e9
 
 
 def same_classes(a: Vocabulary, b: Vocabulary) -> bool:
-    """Return True if each class index names the same class in both vocabularies.
-
-    Typical sizes and aliases of the classes may differ.
-    """
+    """Return whether each index names the same class in both; sizes and aliases may differ."""
     return a.labels == b.labels and bool((a.structure == b.structure).all())
 
 
@@ -88,10 +85,7 @@ class Translation:
         return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, known], "amax")
 
     def scores(self, values: Tensor) -> Tensor:
-        """Map scores (scenes, model classes) to scores (scenes, scene classes).
-
-        The score of an unknown class is `unknown`.
-        """
+        """Map scores (scenes, model classes) to scene classes; unknown classes get `unknown`."""
         found = values[:, self.own.clamp(min=0)]
         return found.masked_fill(self.own < 0, self.unknown)
 

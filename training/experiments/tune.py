@@ -17,7 +17,6 @@ Source: Akiba et al., "Optuna: a next-generation hyperparameter optimization fra
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
@@ -232,10 +231,7 @@ class Search:
         return study
 
     def run(self, study: Study, trials: int, seed: int = 0) -> None:
-        """Run trials until the study has `trials`; the first trial uses the unchanged settings.
-
-        Several processes may run trials of the study.
-        """
+        """Run trials, perhaps beside other processes; the first uses the unchanged settings."""
         import optuna
 
         self._requeue(study)
@@ -327,11 +323,8 @@ class Search:
 
     def metrics(self, place: Path) -> dict[str, Metric]:
         """Return `FIGURES` of a finished trial in its folder, over all validation scenes."""
-        texts = (
-            (place / f"{source}.json").read_text(encoding="utf-8")
-            for source in sorted({scene.source for scene in self.data.validation.scenes})
-        )
-        report = pooled([SourceReport.from_dict(json.loads(text)) for text in texts])
+        sources = sorted({scene.source for scene in self.data.validation.scenes})
+        report = pooled([SourceReport.read(place / f"{source}.json") for source in sources])
         return {
             name: outcome.metrics[metric]
             for name, (task, metric) in FIGURES.items()

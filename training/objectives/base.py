@@ -26,12 +26,7 @@ class Objective(ABC):
     def __init__(
         self, config: ObjectiveConfig, machine: BoltzmannMachine, structure: Tensor | None = None
     ) -> None:
-        """Store the settings.
-
-        Args:
-            structure: True for structure classes such as walls, (classes,) bool. None means that
-                the vocabulary has no structure classes.
-        """
+        """Store the settings. Without `structure`, no class is a structure class."""
         self.config = config
         nothing = torch.zeros(machine.spec.V, dtype=torch.bool)
         self.structure = nothing if structure is None else structure.to(machine.b.device)
@@ -54,10 +49,7 @@ class Objective(ABC):
         """
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:  # noqa: B027
-        """Change the gradients before the update, for example by centring.
-
-        The default leaves the gradients unchanged.
-        """
+        """Change the gradients before the update, for example by centring."""
 
     def parameters(self) -> list[nn.Parameter]:
         """Return the trained parameters of the objective itself, beside the machine's weights."""

@@ -180,10 +180,7 @@ class CompositeLikelihood(Objective):
         masked: Masked,
         generator: torch.Generator,
     ) -> Tensor:
-        """Return the log-odds of each class given the other classes, (scenes, classes).
-
-        All relations are unobserved.
-        """
+        """Return the log-odds of each class given the other classes, (scenes, classes)."""
         v, batch = masked.v, masked.batch
         if self.config.structure_dropout:
             drop = uniform(v.shape, generator) < self.config.structure_dropout
@@ -219,10 +216,7 @@ class CompositeLikelihood(Objective):
 
 
 def unlisted_off(batch: Batch, structure: Tensor) -> Batch:
-    """Return the batch with all relations between the classes of a scene observed.
-
-    Unlisted relations count as false. Relations of structure classes keep their status.
-    """
+    """Return the batch with all unlisted relations of a scene false, except those of structure."""
     n = batch.classes.shape[1]
     thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
     pairs = thing[:, :, None] & thing[:, None, :] & ~torch.eye(n, dtype=torch.bool)

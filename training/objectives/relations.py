@@ -188,10 +188,7 @@ def partly_shown(v: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def add_word_prior(machine: BoltzmannMachine, words: Tensor) -> None:
-    """Add a word prior to the class weights S, O, s and o of a machine.
-
-    A machine without these factors stays unchanged.
-    """
+    """Add a word prior to the class weights S, O, s and o that a machine has."""
     for names, columns in ((_ROWS, False), (_COLUMNS, True)):
         for name in names:
             weight = dict(machine.named_parameters()).get(name)
