@@ -176,18 +176,14 @@ def write_csv(path: Path, epochs: list[Epoch]) -> None:
 
 def write_plot(path: Path, epochs: list[Epoch], title: str) -> None:
     """Plot the reconstruction errors of objects and of relations against the epoch."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.2), constrained_layout=True)
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
     x = [epoch.epoch for epoch in epochs]
-    for axis, unit in zip(axes, ("object", "relation"), strict=True):
+    for axis, unit in zip(figure.subplots(1, 2), ("object", "relation"), strict=True):
         for part in ("train", "validation"):
             axis.plot(x, [getattr(e, f"{unit}_error_{part}") for e in epochs], label=part)
         axis.set(xlabel="epoch", ylabel="mean absolute error", title=f"{unit}s")
         axis.legend()
     figure.suptitle(f"Reconstruction error, {title}")
     figure.savefig(path, dpi=120)
-    pyplot.close(figure)

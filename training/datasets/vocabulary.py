@@ -142,11 +142,13 @@ def source_vocabulary(
     "table".
     """
     names = curated_names()
+    # An empty entry preserves the curated spelling of a class without aliases.
+    spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     mentioned_only = Names(
         structure=names.structure,
         not_objects=names.not_objects,
         surroundings=names.surroundings,
-        aliases=_reachable(names),
+        aliases=spellings | names.aliases,
         rooms=names.rooms,
     )
     found = build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True)
@@ -159,14 +161,6 @@ def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> Obj
     unknown = [kind for kind in names.kinds.get(entry.label, ()) if vocabulary.index(kind) is None]
     more = [name for kind in unknown for name in (kind, *names.aliases.get(kind, ()))]
     return replace(entry, aliases=(*entry.aliases, *more))
-
-
-def _reachable(names: Names) -> dict[str, tuple[str, ...]]:
-    """Return the aliases of each curated class. A class without aliases has an empty entry.
-
-    The empty entry preserves the curated spelling of the class.
-    """
-    return dict.fromkeys((*names.base, *names.household, *names.structure), ()) | names.aliases
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:

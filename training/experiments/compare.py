@@ -21,7 +21,7 @@ from app.scene import Vocabulary
 from training.batches import SceneTensors, scene_tensors
 from training.cases import some_scenes
 from training.config import DATA, ConfigError
-from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
+from training.datasets import DatasetError, annotated_classes, encode
 from training.domain.command import fail
 from training.evaluation.missing import ObjectScore, leave_one_out
 from training.evaluation.report import Progress, SourceReport, digest, run, silent
@@ -117,7 +117,9 @@ class Comparison:
     def worse_by(self, margin: float) -> list[Difference]:
         """Return the primary metrics whose whole interval of the difference is below -margin."""
         return [
-            row for row in self.results.differences if is_primary(row) and row.figure.high < -margin
+            row
+            for row in self.results.differences
+            if row.metric == COMPARED[row.task][0] and row.figure.high < -margin
         ]
 
     def to_dict(self) -> dict[str, Any]:
@@ -125,11 +127,6 @@ class Comparison:
         own = asdict(self)
         own.pop("results")
         return self.results.to_dict() | {"a": self.a} | own
-
-
-def is_primary(row: Difference) -> bool:
-    """Return True if the metric of a row is the primary metric of its task."""
-    return row.metric == COMPARED[row.task][0]
 
 
 def compare_command(
@@ -162,7 +159,8 @@ def compare_command(
             say: Say = status.update
             models = Store(store)
             a = find(new, models, data, say)
-            b = find(old or _served(models), models, data, say)
+            served = "default" if "default" in models.aliases() else BASELINE_SIDE
+            b = find(old or served, models, data, say)
             comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         fail(error)
@@ -170,11 +168,6 @@ def compare_command(
         text = json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False)
         output.write_text(text + "\n", encoding="utf-8")
     show(comparison, console)
-
-
-def _served(store: Store) -> str:
-    """Return the alias `default`. If the store has no such alias, return `BASELINE_SIDE`."""
-    return "default" if "default" in store.aliases() else BASELINE_SIDE
 
 
 def _root(given: Path | None, *sides: Side) -> Path:
@@ -250,7 +243,9 @@ def compare(
     sources = read_sources(a.config.data, root)
     held = held_out(a, b, sources, root)
     data = split_and_encode(a.config.data, sources, a.vocabulary).training_data()
-    scenes = some_scenes(_tensors(held.scenes, a.vocabulary), limit)
+    encoded = encode(held.scenes, a.vocabulary)
+    annotated = annotated_classes(encoded, a.vocabulary)
+    scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), limit)
     rivals = (a.rival(a.vocabulary, data, say), b.rival(a.vocabulary, data, say))
     try:
         titles = a.title, b.title if b.title != a.title else f"{b.title} (second)"
@@ -322,11 +317,6 @@ def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
         return ()
     measured = {metric.task for metric in other.artifact.manifest.metrics}
     return tuple(task for task in RELATIONAL if task in measured)
-
-
-def _tensors(scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary) -> SceneTensors:
-    encoded = encode(scenes, vocabulary)
-    return scene_tensors(encoded, annotated_classes(encoded, vocabulary), len(vocabulary))
 
 
 def _notes(a: Side, b: Side, held: HeldOut, limit: int | None) -> Iterator[str]:

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 from matplotlib.figure import Figure
 
 from training.evaluation.answers import QUESTIONS
@@ -47,7 +46,6 @@ def write_plots(
         machines: trained and calibrated machines, one per training seed. The reliability plots use
             the seed of the first machine.
     """
-    matplotlib.use("Agg")
     runs: dict[str, list[Path]] = {}
     for entry in machines:
         runs.setdefault(entry.name, []).append(plan.place(entry) / "run" / "curve.csv")

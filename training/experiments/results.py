@@ -19,6 +19,10 @@ from training.evaluation.report import SourceReport, write_whole
 from training.evaluation.tasks import TASKS, in_words
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
+Shown = Mapping[str, tuple[str, ...]]
+
+SHOWN: Shown = {name: task.shown for name, task in TASKS.items()}
+"""Names of the metrics in tables, by task."""
 
 # Annotators list only a part of the relations that hold.
 UNLISTED = "An unlisted relation counts as wrong"
@@ -118,22 +122,18 @@ class Results:
             "asked": [asdict(asked) for asked in self.asked],
         }
 
-    def markdown(
-        self, shown: Mapping[str, tuple[str, ...]] | None = None, *, changes: bool = False
-    ) -> str:
+    def markdown(self, shown: Shown = SHOWN, *, changes: bool = False) -> str:
         """Return one Markdown table per metric, and remarks on each task.
 
         A table has one line per row and one column per data source. A star marks a row that is
         worse than the reference row: the whole interval of the paired difference agrees.
 
         Args:
-            shown: names of the metrics by task. None means the metrics in `TASKS`.
+            shown: names of the metrics by task.
             changes: True replaces the intervals of the metrics by intervals of the differences. A
                 difference is the row minus the reference row.
         """
         parts: list[str] = []
-        if shown is None:
-            shown = {name: task.shown for name, task in TASKS.items()}
         for task, metrics in shown.items():
             tables = [table for name in metrics if (table := self._table(task, name, changes))]
             if tables:
@@ -141,51 +141,49 @@ class Results:
                 parts += [*tables, *remarks(asked)]
         return "\n\n".join(parts) + "\n"
 
-    def tables(self, shown: Mapping[str, tuple[str, ...]] | None = None) -> Iterator[Table]:
-        """Generate one table per task for the terminal, of the pooled sources if there are any."""
-        if shown is None:
-            shown = {name: task.shown for name, task in TASKS.items()}
+    def tables(self, shown: Shown = SHOWN) -> Iterator[Table]:
+        """Generate one table per task for the terminal, of the pooled sources if there are any.
+
+        A star has the meaning of `markdown`.
+        """
         sources = list(dict.fromkeys(cell.source for cell in self.cells))
         chosen = [source for source in sources if "pooled" in source] or sources
-        worse = {
-            (gap.row, gap.task, gap.source, gap.metric)
-            for gap in self.differences
-            if gap.verdict == "better"
-        }
         for task, metrics in shown.items():
             table = Table("metric, model", *chosen, title=in_words(task), box=box.SIMPLE_HEAD)
             for metric in metrics:
-                texts: dict[str, dict[str, str]] = {}
-                for cell in self.cells:
-                    if (cell.task, cell.metric) == (task, metric) and cell.source in chosen:
-                        star = " *" if (cell.row, task, cell.source, metric) in worse else ""
-                        texts.setdefault(cell.row, {})[cell.source] = f"{cell.figure}{star}"
-                if texts:
+                texts = self._texts(task, metric)
+                rows = {row: found for row, found in texts.items() if found.keys() & set(chosen)}
+                if rows:
                     table.add_row(f"[bold]{metric}[/bold]")
-                for row, found in texts.items():
+                for row, found in rows.items():
                     table.add_row(f"  {row}", *(found.get(source, "") for source in chosen))
             if table.row_count:
                 yield table
 
-    def _table(self, task: str, metric: str, changes: bool) -> str:
-        cells = [cell for cell in self.cells if (cell.task, cell.metric) == (task, metric)]
-        if not cells:
-            return ""
+    def _texts(self, task: str, metric: str, changes: bool = False) -> dict[str, dict[str, str]]:
+        """Return the cells of a metric as texts, by row and data source."""
         gaps = {
             (gap.row, gap.source): gap
             for gap in self.differences
             if (gap.task, gap.metric) == (task, metric)
         }
-        texts = {
-            (cell.row, cell.source): _text(cell, gaps.get((cell.row, cell.source)), changes)
-            for cell in cells
-        }
-        sources = list(dict.fromkeys(cell.source for cell in cells))
+        texts: dict[str, dict[str, str]] = {}
+        for cell in self.cells:
+            if (cell.task, cell.metric) == (task, metric):
+                gap = gaps.get((cell.row, cell.source))
+                texts.setdefault(cell.row, {})[cell.source] = _text(cell, gap, changes)
+        return texts
+
+    def _table(self, task: str, metric: str, changes: bool) -> str:
+        texts = self._texts(task, metric, changes)
+        if not texts:
+            return ""
+        sources = list(dict.fromkeys(source for found in texts.values() for source in found))
         lines = []
-        for row in dict.fromkeys(cell.row for cell in cells):
+        for row, found in texts.items():
             name = f"**{row}**" if row == self.ours else row
             weights = f"{self.parameters[row]:,}" if row in self.parameters else ""
-            lines.append([name, weights, *(texts.get((row, source), "") for source in sources)])
+            lines.append([name, weights, *(found.get(source, "") for source in sources)])
         parts = [f"### {task}: {metric}"]
         if task.startswith(_RELATION_TASKS):
             parts.append(f"{UNLISTED}.")
