@@ -155,7 +155,7 @@ def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tens
 
 
 def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
-    """Return the sorted triples (relation, subject, object) of `minimum` scenes, (triples, 3)."""
+    """Return the sorted triples (relation, subject, object) of `minimum` or more scenes, (n, 3)."""
     keys: list[np.ndarray] = []
     for scene in scenes:
         relation, subject, object_ = scene.evidence.holds.nonzero()

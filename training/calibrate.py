@@ -140,7 +140,7 @@ def fit_given(
 def _asked_pairs(
     artifact: Artifact, scenes: Sequence[EncodedScene], rng: Rng | None = None
 ) -> list[Floats]:
-    """Return the examples of each scene. With `rng`, half of its pairs are observed instead."""
+    """Return the examples of each scene; with `rng`, of half its pairs, given the other half."""
     blocks: list[Floats] = []
     sources = sorted({encoded.source for encoded in scenes})
     for number, encoded in enumerate(scenes):

@@ -204,7 +204,7 @@ def altered_scene(
     triples: Sequence[Triple],
     rng: Rng,
 ) -> tuple[Scene, Triple] | None:
-    """Return a scene with a false triple in place of a true one, and this triple; or None."""
+    """Replace one of `triples` by a false triple. Return the scene and this triple, or None."""
     usable = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds
     place = int(rng.integers(len(triples)))

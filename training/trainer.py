@@ -111,7 +111,7 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
-    """Return the log-odds of `count` events in `total` trials, smoothed by 1/2 event each."""
+    """Return the log-odds of `count` events in `total` trials, with 1/2 added to both counts."""
     return ((count + 0.5) / (total - count + 0.5)).log()
 
 

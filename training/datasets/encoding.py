@@ -184,7 +184,7 @@ def _counts(evidence: ClassEvidence, classes: Ints, alike: Sequence[int]) -> Int
 
 
 def _relations(scene: AnnotatedScene, meaning: Meaning) -> tuple[PoseRelations, Floats | None]:
-    """Derive all relations, as `encode` describes, and return the positions they come from."""
+    """Derive all relations, as `encode` describes. Return them and their positions, or None."""
     positions = None
     if scene.relations is not None:
         return _from_lists(scene, scene.relations, meaning), None

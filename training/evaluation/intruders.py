@@ -137,7 +137,7 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 def kinds_of_intruders(
     scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Ints]:
-    """Draw uniform, popular and signature intruders, by (data source, scene id)."""
+    """Draw uniform, popular and signature intruders of each scene, by (source, scene id)."""
     laws: list[Tensor | None] = [None]
     if train is not None:
         laws += [by_popularity(scenes, train), by_signature(scenes, train)]

@@ -188,7 +188,7 @@ class Partial:
 
 
 def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int = 0) -> Partial:
-    """Hide classes of every scene with two classes: all but a share of them, or one (None)."""
+    """Hide classes of each scene with at least two: all but a share of them, or one (None)."""
     plain = ~structure.numpy()
     places: list[int] = []
     hidden = torch.zeros_like(scenes.v, dtype=torch.bool)

@@ -195,7 +195,7 @@ def _touches(edges: Edges, target: Tensor) -> Tensor:
 
 
 def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
-    """Draw a class to remove from each scene, (scenes,); -1 for scenes with fewer than two."""
+    """Draw a class to remove from each scene, (scenes,); -1 with fewer than two plain classes."""
     found = torch.full((len(scenes),), -1, dtype=torch.int64)
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):

@@ -312,7 +312,7 @@ def side_by_side(
 
 
 def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
-    """Return the relation tasks that the other card measures, if `rows` measures none."""
+    """Return the relation tasks that only the other card measures; () if `rows` measure any."""
     if other.artifact is None or any(row.task in RELATIONAL for row in rows):
         return ()
     measured = {metric.task for metric in other.artifact.manifest.metrics}

@@ -74,7 +74,7 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """`better` or `worse` than the other row; `undecided` if the interval contains zero."""
+        """`better` or `worse` than the other row, or `undecided` if the interval contains zero."""
         low, high = self.figure.low, self.figure.high
         if self.metric.startswith(_LOWER_IS_BETTER):
             low, high = -high, -low

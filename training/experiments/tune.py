@@ -231,7 +231,7 @@ class Search:
         return study
 
     def run(self, study: Study, trials: int, seed: int = 0) -> None:
-        """Run trials, perhaps beside other processes; the first uses the unchanged settings."""
+        """Run trials until the study has `trials`; the first uses the unchanged settings."""
         import optuna
 
         self._requeue(study)
