@@ -58,7 +58,6 @@ class SceneTensors:
     """A set of scenes as tensors. `batch` returns some of the scenes.
 
     Attributes:
-        scenes: the encoded scenes.
         v: presence of each class, (scenes, classes).
         room: index of the room type, (scenes,). -1 means unknown.
         source: index of the data source in annotated_classes and source_names, (scenes,) int64.
@@ -117,7 +116,6 @@ def scene_tensors(
 
     Args:
         annotated: maps the name of a data source to the classes that it mentions, (classes,) bool.
-        size: number of classes of the vocabulary.
 
     Raises:
         ValueError: `annotated` has no entry for the source of a scene.
@@ -152,18 +150,12 @@ def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
 
 
 def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
-    """Return the relations of a batch in the layout of the machine.
-
-    The result is (edges, r, observed): layout, values and observed flags of the relation units.
-    """
+    """Return the layout, values and observed flags of the relation units of a batch."""
     return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
 
 
 def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
-    """Return the triples (relation, subject class, object class) of at least `minimum` scenes.
-
-    The result is sorted and has the shape (triples, 3).
-    """
+    """Return the sorted triples (relation, subject, object) of `minimum` or more scenes, (n, 3)."""
     keys: list[np.ndarray] = []
     for scene in scenes:
         relation, subject, object_ = scene.evidence.holds.nonzero()

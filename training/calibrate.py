@@ -4,12 +4,10 @@ All fits use validation scenes. Without enough scenes for `outlier` or `misplace
 None and the model gives no judgement. An unfitted entry of another question keeps the model's own
 probability. The calibration has these entries:
 
-    missing, outlier   See `training.calibrate_objects`.
-    relation   Probability that a relation holds between two instances. A first fit uses scenes
-               without observed relations. A second fit uses scenes with half of the pairs observed.
-    placement  Probability that a relation holds between a removed object and another object.
-    misplaced  Probability that a relation is false. Each scene takes part untouched and with one
-               false relation.
+    missing, outlier           See `training.calibrate_objects`.
+    relation, relation_given   See `fit_relations` and `fit_given`.
+    placement, asked_place     See `fit_placements`.
+    misplaced                  See `fit_misplaced`.
 
 All fits are logistic regressions (Platt scaling) on relations that a data source annotates as true
 or false. Other relations are left out. One source of generated rooms has more examples than all
@@ -23,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -34,10 +33,11 @@ from scipy.special import expit
 from app.questions.missing import PLACES
 from app.questions.outliers import stated_log_odds
 from app.questions.posterior import posterior
-from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
+from app.registry import Artifact, Calibration, PairSlope, Slope
 from app.scene import Scene
+from training.array_types import Flags, Floats, Rng
 from training.batches import SceneTensors, subset
-from training.calibrate_objects import LEAST, calibrate_objects, recalibrated
+from training.calibrate_objects import calibrate_objects, recalibrated, thresholds
 from training.cases import (
     RIDGE,
     Triple,
@@ -51,7 +51,6 @@ from training.cases import (
 )
 from training.datasets import EncodedScene
 from training.datasets.sources import meaning_of
-from training.evaluation.alarms import ALARMS
 from training.evaluation.outliers import kept_in_each_source
 from training.oracle.units import NO_UNIT
 
@@ -93,10 +92,6 @@ def calibrate(
     """Fit every entry of the calibration.
 
     Args:
-        artifact: the model with the neutral calibration.
-        scenes: validation scenes.
-        train: training scenes. They give the frequency of each class.
-        seed: seed of the random choices.
         chosen: a calibration from which some values are copied; see `calibrate_objects`.
     """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
@@ -125,8 +120,7 @@ def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[P
     The input is the log-odds of the relation between the two classes. The fit uses scenes without
     observed relations.
     """
-    examples = _examples(_asked_pairs(artifact, scenes))
-    return _fit_listed(examples, artifact.spec.A, _LISTED)
+    return _fit_listed(_examples(_asked_pairs(artifact, scenes)), artifact.spec.A, _LISTED)
 
 
 def fit_given(
@@ -144,15 +138,10 @@ def fit_given(
 
 
 def _asked_pairs(
-    artifact: Artifact, scenes: Sequence[EncodedScene], rng: np.random.Generator | None = None
-) -> list[NDArray[np.float64]]:
-    """Return the examples of each scene, one array for each scene.
-
-    Args:
-        rng: random generator that chooses the observed pairs of a scene. Without a generator, no
-            pair is observed and all pairs give examples.
-    """
-    blocks: list[NDArray[np.float64]] = []
+    artifact: Artifact, scenes: Sequence[EncodedScene], rng: Rng | None = None
+) -> list[Floats]:
+    """Return the examples of each scene; with `rng`, of half its pairs, given the other half."""
+    blocks: list[Floats] = []
     sources = sorted({encoded.source for encoded in scenes})
     for number, encoded in enumerate(scenes):
         asked = np.ones((len(encoded.instance_classes),) * 2, dtype=np.bool_)
@@ -183,7 +172,7 @@ def fit_placements(
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
-    blocks: list[NDArray[np.float64]] = []
+    blocks: list[Floats] = []
     for number, encoded in enumerate([*scenes] * _PLACEMENT_CASES):
         taken = taken_away(encoded, structure, rng)
         if taken is None:
@@ -212,16 +201,13 @@ def fit_placements(
     }
 
 
-def _examples(blocks: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the examples for which the machine has a relation unit.
-
-    Without a relation unit, an example has no log-odds.
-    """
+def _examples(blocks: list[Floats]) -> Floats:
+    """Return the examples for which the machine has a relation unit, and so log-odds."""
     every = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
     return every[every[:, _LOGIT] > NO_UNIT]
 
 
-def _told(examples: NDArray[np.float64], sources: Sequence[str]) -> NDArray[np.float64]:
+def _told(examples: Floats, sources: Sequence[str]) -> Floats:
     """Return the examples from data sources that also annotate false relations.
 
     If no source annotates a relation as false, return all examples of that relation.
@@ -233,9 +219,7 @@ def _told(examples: NDArray[np.float64], sources: Sequence[str]) -> NDArray[np.f
     return examples[told | np.isin(relation, without)]
 
 
-def _fit_listed(
-    examples: NDArray[np.float64], relations: int, listed: int
-) -> tuple[PairSlope, ...]:
+def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[PairSlope, ...]:
     """Fit all relations, mainly to the `listed` examples of each scene with the highest log-odds.
 
     An answer lists only these examples. Selection by high log-odds also selects errors, so listed
@@ -252,7 +236,7 @@ def _fit_listed(
 
 
 def _as_often_as_it_holds(
-    examples: NDArray[np.float64], slopes: tuple[PairSlope, ...], listed: int
+    examples: Floats, slopes: tuple[PairSlope, ...], listed: int
 ) -> tuple[PairSlope, ...]:
     """Fit one rising curve from logits to log-odds, for all relations, to the listed examples.
 
@@ -278,15 +262,11 @@ def _as_often_as_it_holds(
 
 
 def rising_curve(
-    logits: NDArray[np.float64], truth: NDArray[np.bool_]
+    logits: Floats, truth: Flags
 ) -> tuple[float, float, tuple[tuple[float, float], ...]]:
     """Fit the log-odds that an example is true as a rising, piecewise linear function of its logit.
 
     A penalty on changes of slope stabilises the curve where examples are few.
-
-    Args:
-        logits: logit of each example, (examples,).
-        truth: truth value of each example, (examples,).
 
     Returns:
         Intercept and slope of the line at the lowest logits, and the bends of the curve. A bend is
@@ -298,7 +278,7 @@ def rising_curve(
     pieces -= np.concatenate([[0.0], at])
     sign = np.where(truth, -1.0, 1.0)
 
-    def loss(weights: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    def loss(weights: Floats) -> tuple[float, Floats]:
         wrong = sign * (weights[0] + pieces @ weights[1:])
         pull = sign * expit(wrong)
         change = np.diff(weights[1:])
@@ -318,31 +298,25 @@ def rising_curve(
     )
 
 
-def _logits(examples: NDArray[np.float64], slopes: tuple[PairSlope, ...]) -> NDArray[np.float64]:
+def _logits(examples: Floats, slopes: tuple[PairSlope, ...]) -> Floats:
     """Return the logits of the examples before the curve is applied."""
     table = np.array([(s.slope, s.log_count, s.log_classes, s.intercept) for s in slopes])
     weights = table[examples[:, _RELATION].astype(np.int64)]
-    found: NDArray[np.float64] = (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1)
+    found: Floats = (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1)
     return found + weights[:, 3]
 
 
-def _source_weights(examples: NDArray[np.float64], best: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the weight of each example, (examples,).
-
-    The weight is the number of listed examples of the same source and relation, to the power
-    -_POWER.
-    """
+def _source_weights(examples: Floats, best: Flags) -> Floats:
+    """Return the weight of each example, (examples,), see `_POWER`."""
     relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
     key = relation * (source.max(initial=0) + 1) + source
     counts = np.bincount(key[best], minlength=int(key.max(initial=-1)) + 1)
     weights = np.maximum(counts, 1.0) ** -_POWER
-    found: NDArray[np.float64] = weights[key]
+    found: Floats = weights[key]
     return found
 
 
-def _among_best(
-    examples: NDArray[np.float64], slopes: tuple[PairSlope, ...], listed: int
-) -> NDArray[np.bool_]:
+def _among_best(examples: Floats, slopes: tuple[PairSlope, ...], listed: int) -> Flags:
     """Mark the `listed` examples of each scene with the highest log-odds, (examples,) bool."""
     logits = _logits(examples, slopes)
     order = np.lexsort((-logits, examples[:, 0]))
@@ -353,13 +327,17 @@ def _among_best(
     return found
 
 
-def _fit_each(
-    examples: NDArray[np.float64], relations: int, weight: NDArray[np.float64]
-) -> tuple[PairSlope, ...]:
+def _fit_each(examples: Floats, relations: int, weight: Floats) -> tuple[PairSlope, ...]:
     fitted = []
     for a in range(relations):
         own = examples[:, _RELATION] == a
-        fitted.append(_fit_relation(examples[own], weight[own]))
+        truth = examples[own, _TRUTH] > 0
+        entry = PairSlope()
+        if len(np.unique(truth)) == 2:
+            features = examples[own, _LOGIT : _LOGIT + 2]
+            slope, count, intercept = logistic(features, truth, weight[own])
+            entry = PairSlope(intercept=intercept, slope=slope, log_count=count)
+        fitted.append(entry)
     return tuple(fitted)
 
 
@@ -368,9 +346,9 @@ def _instance_pairs(
     source: int,
     scene: EncodedScene,
     values: NDArray[np.floating[Any]],
-    structure: NDArray[np.bool_],
-    asked: NDArray[np.bool_],
-) -> NDArray[np.float64]:
+    structure: Flags,
+    asked: Flags,
+) -> Floats:
     """Return the examples of a scene, (examples, 7).
 
     The columns are: scene, relation, log-odds between the classes, log n_i + log n_j of the
@@ -382,31 +360,18 @@ def _instance_pairs(
     logs = np.log(evidence.counts[place])
     usable = ~structure[scene.instance_classes]
     pair = asked & usable[:, None] & usable[None, :] & ~np.eye(len(place), dtype=np.bool_)
-    both, known = logs[:, None] + logs[None, :], known_relations(scene)
-    columns = []
-    for a in range(len(values)):
-        every = values[a][place[:, None], place[None, :]]
-        of = pair & (known[a] | (every >= _so_many_best(every[pair], _LISTED)))
-        logit = every[of]
-        size = np.full(len(logit), np.log(len(evidence.classes)))
-        truth = np.where(known[a], scene.instance_holds[a], _UNKNOWN)[of]
-        which = (np.full(len(logit), number), np.full(len(logit), a))
-        from_source = np.full(len(logit), source)
-        columns.append(np.stack([*which, logit, both[of], size, truth, from_source], 1))
-    return np.concatenate(columns)
+    known, every = known_relations(scene)[: len(values)], values[:, place[:, None], place]
+    least = np.array([_so_many_best(own[pair], _LISTED) for own in every])
+    of = pair & (known | (every >= least[:, None, None]))
+    relation, i, j = np.nonzero(of)
+    truth = np.where(known, scene.instance_holds[: len(values)], _UNKNOWN)[of]
+    columns = number, relation, every[of], logs[i] + logs[j], np.log(len(evidence.classes)), truth
+    return np.stack(np.broadcast_arrays(*columns, source), 1)
 
 
 def _so_many_best(values: NDArray[np.floating[Any]], count: int) -> float:
     """Return the smallest of the `count` largest values."""
     return float(np.partition(values, -count)[-count]) if len(values) > count else -np.inf
-
-
-def _fit_relation(examples: NDArray[np.float64], weight: NDArray[np.float64]) -> PairSlope:
-    truth = examples[:, _TRUTH] > 0
-    if len(np.unique(truth)) < 2:
-        return PairSlope()
-    slope, count, intercept = logistic(examples[:, _LOGIT : _LOGIT + 2], truth, weight)
-    return PairSlope(intercept=intercept, slope=slope, log_count=count)
 
 
 def fit_misplaced(
@@ -416,8 +381,7 @@ def fit_misplaced(
 
     The input is the log-odds of the relation given the rest of the scene. Each scene takes part
     twice, untouched and with one false relation. A threshold gives an alarm in a fixed share of
-    untouched scenes (`ALARMS`), measured on the data source with the most alarms, and is at least
-    the minimum of `LEAST`.
+    untouched scenes, measured on the data source with the most alarms, but see `thresholds`.
 
     Returns:
         The entries `misplaced` and `misplaced_thresholds`. Both are None if fewer than
@@ -448,12 +412,9 @@ def fit_misplaced(
     group = np.array([encoded.group for encoded, _ in untouched])
     _, source = np.unique([encoded.source for encoded, _ in untouched], return_inverse=True)
     worst = expit(intercept + slope * np.array([least for _, least in untouched]))
-    limits = {
-        name: max(LEAST[name], kept_in_each_source(worst, group, source, rng, share))
-        for name, share in ALARMS.items()
-    }
+    limits = thresholds(partial(kept_in_each_source, worst, group, source, rng))
     entry = Slope(intercept=intercept, slope=slope)
-    return {"misplaced": entry, "misplaced_thresholds": Thresholds(**limits)}
+    return {"misplaced": entry, "misplaced_thresholds": limits}
 
 
 def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:

@@ -4,9 +4,9 @@
                partly listed scenes. Both are chosen by the rank of hidden classes.
     missing    Probability that an unlisted class is present, fitted to scenes that show 25 %, 50 %,
                75 % or all but one of their classes. Near-duplicate scenes have a lower weight.
-    outlier    Probability that a class is an intruder (an object that does not belong in the
-               scene), with thresholds. Half of the scenes contain an intruder.
-    evidence   Weight of relations and poses in answers about objects.
+    outlier    Probability that a class is an intruder, with thresholds. Half of the scenes contain
+               an intruder.
+    evidence   See `fit_evidence`.
 
 The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
 logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
@@ -18,22 +18,24 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from app.questions.generate import room_fit
 from app.questions.posterior import posterior
 from app.registry import NEVER, Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
-from app.scene import Scene, SceneObject
+from app.scene import Scene
+from training.array_types import Flags, Floats, Rng
 from training.batches import SceneTensors, subset
 from training.cases import RIDGE, logistic
 from training.evaluation.alarms import ALARMS
+from training.evaluation.asking import of_classes
 from training.evaluation.evidence import removals
 from training.evaluation.intruders import (
     IntruderScores,
@@ -45,8 +47,6 @@ from training.evaluation.intruders import (
 from training.evaluation.missing import SHARES, MachineScore, hide
 from training.evaluation.outliers import alarm_threshold
 from training.machines.arrays import machine_of
-
-Floats = NDArray[np.float64]
 
 COVERAGES = (0.3, 0.4, 0.5, 0.6, 0.7)
 WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
@@ -115,11 +115,7 @@ def calibrate_objects(
     """Return the model's calibration with newly fitted entries about objects.
 
     Args:
-        artifact: the model.
-        validation: scenes that were not used in training.
         train: training scenes. They give the frequency of each class, and limits for room types.
-        structure: True for structure classes such as walls, (classes,) bool.
-        seed: seed of the random choices.
         chosen: a calibration that was fitted on other validation scenes. Its coverage, coverage
             weight, weights of evidence and alpha are copied. None chooses new values.
     """
@@ -149,10 +145,7 @@ def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
 
 
 def popularity(train: SceneTensors) -> Floats:
-    """Return the log-odds that a complete training scene contains each class, (classes,).
-
-    The count of scenes is smoothed by 1/2.
-    """
+    """Return the smoothed log-odds that a complete training scene contains a class, (classes,)."""
     weight = train.weight * (train.complete if bool(train.complete.any()) else 1.0)
     count = (train.v * weight.unsqueeze(1)).sum(0).double().numpy()
     total = float(weight.sum())
@@ -200,15 +193,13 @@ class _Shown:
         partial: maps an assumed coverage to the log-odds of the unlisted classes, (unlisted
             classes,). The log-odds allow for an incomplete list.
         hidden: True for unlisted classes that are in the scene, (unlisted classes,) bool.
-        listed: number of listed classes.
         share: share of listed classes as text, such as "75 %".
-        source: index of the data source of the scene.
         weight: number of scenes of the data source that this sampled scene represents.
     """
 
     closed: Floats
     partial: dict[float, Floats]
-    hidden: NDArray[np.bool_]
+    hidden: Flags
     listed: int
     share: str
     source: int
@@ -284,7 +275,7 @@ def _shown(
         for k, v, hidden in zip(cases.scene, cases.v.numpy(), cases.hidden.numpy(), strict=True):
             classes = np.flatnonzero(v)
             absent = np.flatnonzero((v == 0) & ~structure.numpy())
-            given = posterior(whole, _labels(classes))
+            given = posterior(whole, of_classes(classes.tolist()))
             partial = {}
             if whole.completions is not None:
                 partial = {
@@ -295,10 +286,6 @@ def _shown(
             listed = max(1, int((~structure.numpy()[classes]).sum()))
             own = weight[int(k)] / (1 if share else _DRAWS_OF_ONE)
             yield _Shown(closed, partial, hidden[absent], listed, name, source_of[int(k)], own)
-
-
-def _labels(classes: NDArray[np.int64]) -> Scene:
-    return Scene(tuple(SceneObject(str(c), str(c), int(c)) for c in classes))
 
 
 def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
@@ -377,7 +364,8 @@ def fit_outliers(
     if slope >= 0:
         return {}
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
-    limits = thresholds([(next(iter(judged.values())), scenes)], entry, rng)
+    whole = [(next(iter(judged.values())), scenes)]
+    limits = thresholds(partial(limit_of, whole, entry, rng))
     fitted: dict[str, Any] = {
         "popularity_weight": alpha,
         "outlier": entry,
@@ -395,15 +383,15 @@ def fit_outliers(
             for some, parts_of in lists
         ]
         share = _ENOUGH * ALARMS["medium"]
-        if _limit(parts_scored, entry, np.random.default_rng(seed), share) <= limits.medium:
+        if limit_of(parts_scored, entry, np.random.default_rng(seed), share) <= limits.medium:
             break
-        own = thresholds(parts_scored, entry, rng)
+        own = thresholds(partial(limit_of, parts_scored, entry, rng))
         short.append(_between(limits, own, short[-1] if short else NEVER))
     return fitted | {"short_list_thresholds": tuple(short)}
 
 
 def listing(
-    scenes: SceneTensors, structure: Tensor, listed: int, rng: np.random.Generator
+    scenes: SceneTensors, structure: Tensor, listed: int, rng: Rng
 ) -> tuple[SceneTensors, Tensor]:
     """Return the scenes with more than `listed` classes, and shortened object lists.
 
@@ -422,17 +410,12 @@ Scored = Sequence[tuple[IntruderScores, SceneTensors]]
 """Scores of untouched scenes, and these scenes: one entry for each shortening of the scenes."""
 
 
-def thresholds(untouched: Scored, entry: CountSlope, rng: np.random.Generator) -> Thresholds:
-    """Return the thresholds with the target shares of alarms, and at least the minimum."""
-    return Thresholds(
-        **{
-            name: max(LEAST[name], _limit(untouched, entry, rng, share))
-            for name, share in ALARMS.items()
-        }
-    )
+def thresholds(limit: Callable[[float], float]) -> Thresholds:
+    """Return the limits of the target shares of alarms, each at least the minimum."""
+    return Thresholds(**{name: max(LEAST[name], limit(share)) for name, share in ALARMS.items()})
 
 
-def _limit(untouched: Scored, entry: CountSlope, rng: np.random.Generator, share: float) -> float:
+def limit_of(untouched: Scored, entry: CountSlope, rng: Rng, share: float) -> float:
     """Return the probability that raises alarms in a share of the untouched scenes.
 
     The function averages over the shortenings, because several shortenings of a scene are not
@@ -473,10 +456,7 @@ def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
 
 
 def _found(scores: IntruderScores) -> Floats:
-    """Return hit@1 and the detected share of intruders.
-
-    The threshold of detection gives an alarm in 10 % of the unaltered scenes.
-    """
+    """Return hit@1 and the share of intruders that an alarm in 10 % of unaltered scenes detects."""
     worst = np.full(scores.scenes, np.inf)
     np.minimum.at(worst, scores.scene[scores.clean], scores.log_odds[scores.clean])
     limit = np.quantile(worst[np.isfinite(worst)], ALARMS["medium"])
@@ -524,7 +504,7 @@ def least_of_the_best(scores: dict[float, float]) -> float:
     return min(pull for pull, score in scores.items() if score >= enough)
 
 
-def _rank(artifact: Artifact, scene: Scene, target: int, structure: NDArray[np.bool_]) -> int:
+def _rank(artifact: Artifact, scene: Scene, target: int, structure: Flags) -> int:
     given = posterior(artifact, scene)
     absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
     z = given.absent_posterior(absent, artifact.calibration.coverage)

@@ -12,10 +12,10 @@ from zlib import crc32
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
 from app.scene import CANONICAL, Scene, SceneObject
+from training.array_types import Flags, Floats, Ints, Rng
 from training.batches import SceneTensors, subset
 from training.datasets import EncodedScene
 from training.datasets.sources import meaning_of
@@ -32,7 +32,7 @@ _LISTED: Final = (0.25, 0.5, 0.75, 1.0)
 _VERTICAL = [CANONICAL.index("on-top"), CANONICAL.index("above")]
 
 
-def scene_rng(scene: EncodedScene, seed: int) -> np.random.Generator:
+def scene_rng(scene: EncodedScene, seed: int) -> Rng:
     """Return the random generator of one scene, from the seed and the id of the scene."""
     return np.random.default_rng([seed, crc32(scene.scene_id.encode())])
 
@@ -58,7 +58,7 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
     return Scene(objects, tuple(triples) or None, room_type=room if room >= 0 else None)
 
 
-def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
+def known_relations(encoded: EncodedScene) -> Flags:
     """Return a mask of the relations whose truth is known without selection bias.
 
     The mask has the shape (relations, instances, instances). Some data sources list `left` and
@@ -79,9 +79,7 @@ def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
     return known
 
 
-def taken_away(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[int, list[int]] | None:
+def taken_away(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[int, list[int]] | None:
     """Draw a class to remove. Return its index and the indices of the remaining instances.
 
     Structure classes such as walls stay in the scene. The result is None if the scene has fewer
@@ -95,9 +93,7 @@ def taken_away(
     return target, [k for k, c in enumerate(encoded.instance_classes) if c != target]
 
 
-def told_pairs(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[NDArray[np.bool_], list[Triple]]:
+def told_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Flags, list[Triple]]:
     """Draw half of the object pairs of a scene as observed pairs.
 
     The draw ignores whether a pair has relations. If relations were drawn instead of pairs, pairs
@@ -125,15 +121,13 @@ class Part(NamedTuple):
         room: index of the room type. -1 means that the room type is unknown.
     """
 
-    classes: NDArray[np.int64]
-    listed: NDArray[np.int64]
-    number: NDArray[np.int64]
+    classes: Ints
+    listed: Ints
+    number: Ints
     room: int
 
 
-def some_instances(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> Part:
+def some_instances(encoded: EncodedScene, structure: Flags, rng: Rng) -> Part:
     """Draw a part of a scene to list.
 
     The part contains 25, 50, 75 or 100 % of the classes. Half of the parts list one instance of
@@ -152,9 +146,9 @@ def some_instances(
 
 def occupied_place(
     encoded: EncodedScene,
-    structure: NDArray[np.bool_],
-    shown: NDArray[np.bool_],
-    rng: np.random.Generator,
+    structure: Flags,
+    shown: Flags,
+    rng: Rng,
 ) -> tuple[int, int] | None:
     """Draw a place that is related to a shown object and contains another object.
 
@@ -178,7 +172,7 @@ def occupied_place(
 
 
 def altered_case(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+    encoded: EncodedScene, structure: Flags, rng: Rng
 ) -> tuple[Scene, Triple | None] | None:
     """Return a scene with observed relations, of which one may be false, and the false relation.
 
@@ -193,9 +187,7 @@ def altered_case(
     return altered_scene(encoded, structure, triples, rng)
 
 
-def stated_relations(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> list[Triple] | None:
+def stated_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> list[Triple] | None:
     """Return at most 40 true relations of a scene, or None if fewer than two are known."""
     usable = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds & usable[:, None] & usable[None, :]
@@ -208,14 +200,11 @@ def stated_relations(
 
 def altered_scene(
     encoded: EncodedScene,
-    structure: NDArray[np.bool_],
+    structure: Flags,
     triples: Sequence[Triple],
-    rng: np.random.Generator,
+    rng: Rng,
 ) -> tuple[Scene, Triple] | None:
-    """Return a scene in which a false triple replaces one of `triples`, and the false triple.
-
-    The result is None if 50 draws find no false triple.
-    """
+    """Replace one of `triples` by a false triple. Return the scene and this triple, or None."""
     usable = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds
     place = int(rng.integers(len(triples)))
@@ -233,16 +222,14 @@ def altered_scene(
 
 
 def logistic(
-    features: NDArray[np.float64],
-    truth: NDArray[np.bool_],
-    weight: NDArray[np.float64] | None = None,
+    features: Floats,
+    truth: Flags,
+    weight: Floats | None = None,
     C: float = 1e6,
 ) -> list[float]:
     """Return the coefficients and then the intercept of a logistic regression.
 
     Args:
-        features: features of each example, (examples, features).
-        truth: truth value of each example, (examples,).
         weight: weight of each example, (examples,). None means equal weights.
         C: inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
             unweighted examples are separable.

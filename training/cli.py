@@ -19,7 +19,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from app.registry import Artifact, RegistryError, Store, load_model_set
+from app.registry import Artifact, Metric, RegistryError, Store, load_model_set
 from app.registry.references import AliasTarget
 from training.batches import subset
 from training.config import (
@@ -38,7 +38,8 @@ from training.distributed import is_first, process_group
 from training.domain.command import example, fail, init
 from training.domain.labels import outside_vocabulary
 from training.evaluation.everyday import EVERYDAY
-from training.evaluation.report import Row, evaluate
+from training.evaluation.metrics import Figure
+from training.evaluation.report import evaluate
 from training.evaluation.tasks import in_words
 from training.example_scenes import known_examples, read_examples
 from training.experiments.ablate import ablate
@@ -237,7 +238,7 @@ def evaluate_command(
     The figures are those of the model card. The command `benchmark` evaluates the baselines.
     """
     try:
-        tables: dict[str, list[Row]] = {}
+        tables: dict[str, list[Metric]] = {}
         for reference in models:
             found = Store(store)
             artifact = found.load(*found.resolve(reference))
@@ -272,7 +273,7 @@ def evaluate_command(
         fail(error)
     _show(tables)
     if output is not None:
-        rows = {name: [_flat(row) for row in table] for name, table in tables.items()}
+        rows = {name: [row.model_dump() for row in table] for name, table in tables.items()}
         output.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
@@ -438,23 +439,16 @@ def _promote(
     console.print(f"promoted: {gate.alias} → {target}{was}", soft_wrap=True)
 
 
-def _show(tables: dict[str, list[Row]]) -> None:
+def _show(tables: dict[str, list[Metric]]) -> None:
     figures: dict[str, dict[tuple[str, str], dict[str, str]]] = {}
     for name, rows in tables.items():
         for row in rows:
             lines = figures.setdefault(row.task, {})
-            lines.setdefault((row.metric, row.source), {})[name] = str(row.figure)
+            figure = Figure(row.value, row.low, row.high, row.n)
+            lines.setdefault((row.metric, row.source), {})[name] = str(figure)
     table = Table("task, metric", "source", *tables, box=box.SIMPLE_HEAD)
     for task, lines in sorted(figures.items()):
         table.add_row(f"[bold]{in_words(task)}[/bold]")
         for (metric, source), values in lines.items():
             table.add_row(f"  {metric}", source, *(values.get(name, "") for name in tables))
     console.print(table)
-
-
-def _flat(row: Row) -> dict[str, str | float]:
-    f = row.figure
-    return {
-        "task": row.task, "source": row.source, "metric": row.metric,
-        "value": f.value, "low": f.low, "high": f.high, "n": f.n,
-    }  # fmt: skip

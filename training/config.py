@@ -239,17 +239,43 @@ class Config(_Section):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 
-def shipped_configs() -> dict[str, Path]:
-    """Return a mapping from the name of each shipped configuration to its file."""
-    folder = Path(__file__).parent / "configs"
+def shipped_configs(kind: str = "") -> dict[str, Path]:
+    """Return the shipped files by name: configurations, or their "ablations" or "spaces"."""
+    folder = Path(__file__).parent / "configs" / kind
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
-def config_path(reference: str) -> Path:
-    """Return the configuration file for a reference.
+def own_or_shipped(path: Path | None, config: Config, kind: str, option: str) -> Path:
+    """Return the file of the user, or the shipped file of a kind for a configuration.
 
-    A reference is the name of a shipped configuration, a file, or a folder made by `init`.
+    Raises:
+        ConfigError: the user names no file, and no file is shipped.
     """
+    shipped = shipped_configs(kind)
+    if path is None and config.name not in shipped:
+        raise ConfigError(
+            f"{config.name} has no shipped {kind} (available for: {', '.join(shipped)}). Pass a "
+            f"TOML file with {option}"
+        )
+    return path or shipped[config.name]
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        ConfigError: the file is missing or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path} does not exist") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path.name} is not TOML: {error}") from error
+
+
+def config_path(reference: str) -> Path:
+    """Return the file of a reference: a shipped name, a file, or a folder made by `init`."""
     path = shipped_configs().get(reference, Path(reference))
     return path / f"{path.resolve().name}.toml" if path.is_dir() else path
 
@@ -277,15 +303,13 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
         raise ConfigError(
             f"there is no configuration {reference!r}: pass a TOML file or one of {known}"
         )
+    values = read_toml(path)
+    if seed is not None:
+        values.setdefault("training", {})["seed"] = seed
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-        if seed is not None:
-            values.setdefault("training", {})["seed"] = seed
         return Config.model_validate(values)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path.name} is not TOML: {error}") from error
     except ValidationError as error:
-        raise ConfigError(f"{path.name}: {_first_error(error)}") from error
+        raise ConfigError(f"{path.name}: {first_error(error)}") from error
 
 
 def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
@@ -309,7 +333,7 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
         return Config.model_validate(values)
     except ValidationError as error:
         raise ConfigError(
-            f"the settings {dict(settings)} are invalid: {_first_error(error)}"
+            f"the settings {dict(settings)} are invalid: {first_error(error)}"
         ) from error
 
 
@@ -341,7 +365,8 @@ def _entry(name: str, value: Any) -> str:
     return f"{name} = {json.dumps(value, ensure_ascii=False)}"
 
 
-def _first_error(error: ValidationError) -> str:
+def first_error(error: ValidationError) -> str:
+    """Return the place and the message of the first invalid entry."""
     first = error.errors()[0]
     place = ".".join(str(part) for part in first["loc"]) or "the file"
     return f"{place}: {first['msg']}"

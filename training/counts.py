@@ -22,13 +22,11 @@ from scipy.optimize import minimize
 from app.questions.counts import distribution, functions
 from app.registry.counts import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
 from app.scene import Vocabulary
+from training.array_types import Flags, Floats, Ints
 from training.cases import MOST, Part, scene_rng, some_instances
 from training.datasets import EncodedScene
 from training.datasets.sources import SOURCES
-from training.offsets import source_weights
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from training.offsets import half_precision, source_weights
 
 # Share of the classes of a scene that must occur several times. Other sources list each label once.
 _COUNTING: Final = 0.05
@@ -81,9 +79,7 @@ def folds(
         yield train, test
 
 
-def counted_classes(
-    scenes: Sequence[EncodedScene], vocabulary: Vocabulary
-) -> dict[str, NDArray[np.bool_]]:
+def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, Flags]:
     """Return the classes whose instances a data source counts, as masks (V,) by source name.
 
     A source counts instances if its object lists are complete and if at least 5 % of the entries
@@ -91,7 +87,7 @@ def counted_classes(
     """
     plain = ~vocabulary.structure
     entries, several = Counter[str](), Counter[str]()
-    repeated: dict[str, NDArray[np.bool_]] = {}
+    repeated: dict[str, Flags] = {}
     for scene in scenes:
         if not scene.complete:
             continue
@@ -107,7 +103,7 @@ def counted_classes(
 
 
 def listed_cases(
-    scene: EncodedScene, counted: NDArray[np.bool_], structure: NDArray[np.bool_], seed: int
+    scene: EncodedScene, counted: Flags, structure: Flags, seed: int
 ) -> tuple[Part, NDArray[np.intp]]:
     """Return a listed part of a scene, and the places of its classes that the source counts."""
     part = some_instances(scene, structure, scene_rng(scene, seed))
@@ -117,7 +113,7 @@ def listed_cases(
 def _fit(
     scenes: Sequence[EncodedScene],
     most: Ints,
-    counting: dict[str, NDArray[np.bool_]],
+    counting: dict[str, Flags],
     vocabulary: Vocabulary,
 ) -> Counts:
     """Fit the statistics to all cases of the scenes. Return those of the classes with a `most`."""
@@ -129,7 +125,9 @@ def _fit(
     itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))
     weights[np.arange(len(vocabulary)), :, itself] = 0.0
     classes = np.flatnonzero(most)
-    return Counts(classes, most[classes], _stored(share[classes]), _stored(weights[classes]))
+    return Counts(
+        classes, most[classes], half_precision(share[classes]), half_precision(weights[classes])
+    )
 
 
 def _few_of_group(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
@@ -143,7 +141,7 @@ def _few_of_group(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
 
 
 def _most(
-    scenes: Sequence[EncodedScene], counting: dict[str, NDArray[np.bool_]], vocabulary: Vocabulary
+    scenes: Sequence[EncodedScene], counting: dict[str, Flags], vocabulary: Vocabulary
 ) -> Ints:
     """Return the maximum listed number of each class that the data can tell about, (V,).
 
@@ -191,7 +189,7 @@ class _Cases:
     def of(
         cls,
         scenes: Sequence[EncodedScene],
-        counting: dict[str, NDArray[np.bool_]],
+        counting: dict[str, Flags],
         vocabulary: Vocabulary,
         draws: int,
     ) -> _Cases:
@@ -215,11 +213,7 @@ class _Cases:
 
 
 def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
-    """Return columns of `Counts.weights` and their values for the k-th class of a part.
-
-    Args:
-        start: first column of the other classes.
-    """
+    """Return columns of `Counts.weights` and their values for the k-th class of a part."""
     others, listed = np.delete(part.classes, k), np.delete(part.listed, k)
     columns = [INTERCEPT, SINGLE, SEVERAL, *(start + others).tolist()]
     values = [1.0, float(part.listed[k] == 1), float((listed > 1).any())]
@@ -282,9 +276,9 @@ def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
 def _better(
     scenes: Sequence[EncodedScene],
     most: Ints,
-    counting: dict[str, NDArray[np.bool_]],
+    counting: dict[str, Flags],
     vocabulary: Vocabulary,
-) -> NDArray[np.bool_]:
+) -> Flags:
     """Return the classes, (V,), whose expected number is closer than the class mean."""
     gain = np.zeros(len(vocabulary))
     for train, test in folds(scenes):
@@ -321,8 +315,3 @@ def class_mean(counts: Counts, row: Ints, listed: Ints) -> Floats:
     p = np.exp(counts.log_share[row].astype(np.float64)) * (numbers >= listed[:, None])
     mean: Floats = p @ numbers / p.sum(axis=1)
     return mean
-
-
-def _stored(table: Floats) -> NDArray[np.float32]:
-    """Round a table to half precision, the precision of the model file."""
-    return table.astype(np.float16).astype(np.float32)

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from app.registry.examples import MAX_WORD, Example, Examples
 from app.scene import Vocabulary, canonicalise
-from training.config import ConfigError
+from training.config import ConfigError, first_error
 from training.datasets import AnnotatedScene, curated_names
 from training.datasets.encoding import room_viewpoint
 from training.datasets.records import AnnotatedObject
@@ -39,7 +39,6 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
     Args:
         reference: entry `examples` of the configuration: the name of a shipped file, or a file in
             `root` that ends in .json. An empty text means no examples.
-        root: data folder of the configuration.
 
     Raises:
         ConfigError: the file is missing or invalid.
@@ -51,9 +50,7 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
     try:
         examples: tuple[Example, ...] = _READER.validate_json(path.read_bytes())
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ConfigError(f"{path}, {place}: {first['msg']}") from error
+        raise ConfigError(f"{path}, {first_error(error)}") from error
     except OSError as error:
         raise ConfigError(
             f"{path} cannot be read: {error}. Remove the entry `examples` of the configuration, or "
@@ -65,10 +62,7 @@ def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
 def known_examples(
     examples: Sequence[Example], vocabulary: Vocabulary
 ) -> tuple[tuple[Example, ...], list[str]]:
-    """Return the examples whose labels and room type are in a vocabulary.
-
-    Also return the reason for each example that is left out.
-    """
+    """Return the examples that a vocabulary covers, and the reasons against the others."""
     kept, reasons = [], []
     for example in examples:
         try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -28,18 +27,11 @@ _CURVES = (
 )
 
 
-class Display:
-    """A progress bar with epoch, validation scores and remaining time.
-
-    Args:
-        trainer: the trainer of the run.
-        console: console of the progress bar.
-        logs: folder of the TensorBoard log. None means no log.
-    """
+class Display(Progress):
+    """A progress bar with epoch, scores and remaining time. `logs` is a TensorBoard folder."""
 
     def __init__(self, trainer: Trainer, console: Console, logs: Path | None = None) -> None:
-        self._trainer = trainer
-        self._bar = Progress(
+        super().__init__(
             "[progress.description]{task.description}",
             BarColumn(bar_width=12),
             TextColumn("{task.fields[note]}"),
@@ -48,7 +40,8 @@ class Display:
             TimeRemainingColumn(),
             console=console,
         )
-        self._task = self._bar.add_task(
+        self._trainer = trainer
+        self._task = self.add_task(
             trainer.config.name,
             total=trainer.config.training.epochs,
             completed=len(trainer.epochs),
@@ -56,29 +49,17 @@ class Display:
         )
         self._log = None if logs is None else tensorboard(logs, trainer.config)
 
-    def __enter__(self) -> Display:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._bar.stop()
-
     def progress(self, epoch: int, done: float, loss: float) -> None:
         """Show the progress after an update of the weights."""
         trainer = self._trainer
         total = trainer.config.training.epochs
         state = scores(trainer.epochs[-1]) if trainer.epochs else f"objective {loss:.3f}"
         note = f"epoch {epoch + 1}/{total}, {state}"
-        self._bar.update(self._task, completed=epoch + done, note=note)
+        self.update(self._task, completed=epoch + done, note=note)
 
     def objects(self, done: float) -> None:
         """Show the progress of the first training phase, which trains only objects."""
-        self._bar.update(self._task, completed=0, note=f"objects, {done:.0%}")
+        self.update(self._task, completed=0, note=f"objects, {done:.0%}")
 
     def ended(self, epoch: Epoch) -> None:
         """Write a finished epoch to the TensorBoard log."""
@@ -95,10 +76,7 @@ def scores(epoch: Epoch) -> str:
 
 
 def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
-    """Return a function that writes an epoch to a TensorBoard log.
-
-    The arguments of the function are the epoch and the number of updates so far.
-    """
+    """Return a function of an epoch and the number of updates that writes to TensorBoard."""
     # TensorBoard is imported only when needed, because the import takes longer than a small run.
     from torch.utils.tensorboard import SummaryWriter
 
@@ -125,10 +103,7 @@ def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Return the values as a line of at most `width` block characters of different heights.
-
-    If there are more values than `width`, each block shows the mean of several values.
-    """
+    """Return the values, or means of several, as at most `width` blocks of different heights."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return ""

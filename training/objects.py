@@ -88,8 +88,6 @@ def fit_objects(
         train: training scenes. Scenes with incomplete object lists are left out.
         config: epochs, learning rate, number of chains and batch size. With 0 epochs, the machine
             stays unchanged.
-        seed: seed of the random choices.
-        progress: function that is called with the finished share of the updates, from 0 to 1.
 
     Raises:
         FloatingPointError: a weight became infinite or NaN.
@@ -205,10 +203,7 @@ class _Scenes:
         return self.v[index], self.room[index]
 
     def _shuffle(self) -> None:
-        """Start a pass over the scenes in random order.
-
-        The expected number of draws of a scene in one pass is its weight.
-        """
+        """Start a random pass; the expected number of draws of a scene is its weight."""
         times = self.weight.floor()
         extra = torch.rand(len(times), generator=self._generator) < self.weight - times
         index = torch.arange(len(times)).repeat_interleave(times.long() + extra)
@@ -239,10 +234,7 @@ def _update(
 
 
 def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generator) -> Tensor:
-    """Run the chains for one Gibbs sweep.
-
-    Return the probabilities from which the sweep sampled h1, (chains, hidden units).
-    """
+    """Run one Gibbs sweep; return the probabilities that h1 was sampled from, (chains, H1)."""
     chains.v = bernoulli(machine.object_logits(chains.h1).sigmoid(), generator)
     if machine.spec.H2:
         h2 = machine.second_layer_logits(chains.h1).sigmoid()

@@ -28,10 +28,8 @@ from scipy.special import gammaln
 
 from app.registry import Offsets
 from app.scene import CANONICAL
+from training.array_types import Flags, Floats, Ints
 from training.datasets import EncodedScene
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # Shrinkage of the class effects u and v. It acts like `LAMBDA` additional pairs with effect 0.
 LAMBDA: Final = 4.0
@@ -54,7 +52,6 @@ class Seen:
             viewer axes, (offsets, 3).
         relation: index of the canonical relation, (offsets,).
         subject, other: class indices of the relation's subject and object, (offsets,).
-        scene: index of the scene, (offsets,).
         source: index of the data source of the scene, (offsets,).
     """
 
@@ -65,7 +62,7 @@ class Seen:
     scene: Ints
     source: Ints
 
-    def some(self, some: NDArray[np.bool_]) -> Seen:
+    def some(self, some: Flags) -> Seen:
         """Return the offsets where the mask `some`, (offsets,), is True."""
         return Seen(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
 
@@ -93,9 +90,6 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     All offsets of a pair of classes in one scene have a total weight of 1, because they depend on
     each other. All data sources have the same total weight, because boxes of one source are
     similar.
-
-    Args:
-        V: number of classes.
     """
     seen = seen_offsets(scenes)
     if not len(seen.offset):
@@ -118,8 +112,8 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
         known.append(np.concatenate([mean, np.sqrt(variance)], axis=1))
         counts.append(pairs.scenes.astype(np.int32))
     return Offsets(
-        *(_stored(relation), scenes_of, _stored(subject), _stored(other)),
-        *(np.concatenate(pair), _stored(np.concatenate(known)), np.concatenate(counts)),
+        *(half_precision(relation), scenes_of, half_precision(subject), half_precision(other)),
+        *(np.concatenate(pair), half_precision(np.concatenate(known)), np.concatenate(counts)),
     )
 
 
@@ -246,8 +240,6 @@ def posterior(
 
     Args:
         expected, kappa, alpha, beta: parameters of the prior. alpha + n / 2 must be above 1.
-        n: number of values.
-        mean: mean of the values.
         scatter: sum of the squared deviations from the mean.
     """
     after = kappa + n
@@ -307,10 +299,7 @@ def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
 
 
 def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
-    """Fit mu and the class effects u and v of `fit` by alternation, in place.
-
-    Each value is a weighted mean of residuals. u and v are shrunk towards 0.
-    """
+    """Fit mu and the effects u and v, shrunk towards 0, by alternation, in place."""
     # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)
 
@@ -325,6 +314,6 @@ def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
     fit.doubt_u, fit.doubt_v = 1 / below_u, 1 / below_v
 
 
-def _stored(table: Floats) -> NDArray[np.float32]:
+def half_precision(table: Floats) -> NDArray[np.float32]:
     """Round a table to half precision, the precision of the model file."""
     return table.astype(np.float16).astype(np.float32)

@@ -41,7 +41,6 @@ class SplitScenes:
     Attributes:
         data: the configuration section that names the sources.
         vocabulary: classes; the scenes use their indices.
-        parts: scenes of all sources, by part.
         counts, digests: number of scenes and sha256 of their contents, by source.
         shuffle: seed of the permutation of objects; None if the objects are not permuted.
         words: (V, D) unit word vectors of the classes; None without word vectors.
@@ -170,11 +169,6 @@ def _require_files(data: DataConfig, root: Path) -> None:
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
     """Return the vocabulary of a configuration, with typical object sizes from the scenes.
 
-    Args:
-        data: section `data` of the configuration. It names the vocabulary.
-        scenes: all scenes.
-        root: folder of the vocabulary file.
-
     Raises:
         ConfigError: the vocabulary name is unknown, or the file contains no vocabulary.
     """
@@ -212,11 +206,8 @@ def split_and_encode(
     The split includes all data sources at once, because sources can contain the same room.
 
     Args:
-        data: section `data` of the configuration.
-        scenes: maps source names to scenes.
         vocabulary: vocabulary of a published model. The default is the vocabulary of the
             configuration.
-        root: folder of the vocabulary file.
 
     Raises:
         ConfigError: the vocabulary is invalid; see `build_vocabulary`.

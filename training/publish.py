@@ -30,7 +30,7 @@ from training.datasets.sources import SOURCES
 from training.datasets.vocabulary import with_aliases, with_room_aliases
 from training.evaluation.alarms import untouched_alarms
 from training.evaluation.everyday import EVERYDAY
-from training.evaluation.report import Row, evaluate
+from training.evaluation.report import evaluate
 from training.evaluation.tasks import STATISTICS
 from training.example_scenes import known_examples, read_examples
 from training.machines import BoltzmannMachine
@@ -70,17 +70,12 @@ def publish_run(
     The store keeps weights in half precision. Calibration and evaluation use the same precision.
 
     Args:
-        run: the finished run.
-        scenes: scenes of the run.
-        store: store for the new version.
-        version: number of the new version.
         measured: second run of the same configuration, and its scenes, for a `run` that was trained
             on test scenes. The second run did not use test scenes. Its test results and chosen
             calibration values are published.
         judge: function that returns further reasons against the calibrated model.
         accept: function that is called with each reason against the model, which is published all
             the same. None refuses a model with such a reason.
-        progress: function that is called with messages about the progress.
 
     Raises:
         RefusedError: there is a reason against the model.
@@ -119,7 +114,7 @@ def publish_run(
         calibration=calibrated.calibration,
         training=_training(run, measured),
         data=data_sources(scenes),
-        metrics=metrics(rows),
+        metrics=tuple(rows),
         terms=terms(scenes),
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
         examples=scenes.examples,
@@ -138,13 +133,12 @@ def refit(
     """Publish a new version of a published model with refitted statistics, without training.
 
     The new version keeps weights, calibration and metrics. Only the statistics (offsets, counts),
-    their metrics, the example scenes and the built-in synonyms of classes are new. The examples are those of the shipped
-    configuration with the name of the model, otherwise those of its own configuration. The metrics
-    of weights that were trained on test scenes come from statistics that were not fitted to test
-    scenes.
+    their metrics, the example scenes and the built-in synonyms of classes are new. The examples are
+    those of the shipped configuration with the name of the model, otherwise those of its own
+    configuration. The metrics of weights that were trained on test scenes come from statistics that
+    were not fitted to test scenes.
 
     Args:
-        artifact: the published model.
         root: folder of the training scenes.
 
     Raises:
@@ -184,7 +178,7 @@ def refit(
     fields = {name: getattr(manifest, name) for name in Description.model_fields}
     fields["metrics"] = (
         *(metric for metric in manifest.metrics if metric.task not in STATISTICS),
-        *metrics(rows),
+        *rows,
     )
     changes = {"version": version, "created": _now(), "examples": examples}
     changes["vocabulary"] = VocabularyEntry.of(with_aliases(artifact.vocabulary), artifact.spec.A)
@@ -221,11 +215,7 @@ def calibrated_draft(
     data: TrainingData,
     chosen: Calibration | None = None,
 ) -> Artifact:
-    """Return the calibrated model of a run, with weights rounded to half precision.
-
-    Args:
-        chosen: a calibration from which some values are copied; see `calibrate_objects`.
-    """
+    """Return the calibrated model of a run in half precision. `chosen`: see `calibrate_objects`."""
     machine = as_stored(run.machine)
     calibration = calibrate(
         draft_artifact(machine, vocabulary),
@@ -269,7 +259,7 @@ def _measure(
     data: TrainingData,
     progress: Callable[[str], None],
     tasks: Collection[str] | None = None,
-) -> list[Row]:
+) -> list[Metric]:
     """Return the metrics on test scenes, or an empty list if there are no test scenes."""
     if not len(data.test):
         return []
@@ -308,27 +298,8 @@ def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
     return tuple(sources)
 
 
-def metrics(rows: list[Row]) -> tuple[Metric, ...]:
-    """Convert the result rows of the evaluation to metrics for the manifest of the model."""
-    return tuple(
-        Metric(
-            task=row.task,
-            source=row.source,
-            metric=row.metric,
-            value=row.figure.value,
-            low=row.figure.low,
-            high=row.figure.high,
-            n=row.figure.n,
-        )
-        for row in rows
-    )
-
-
 def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
-    """Return the terms of use of a data source, and True if they allow only research.
-
-    The configuration contains the terms of the user's own files.
-    """
+    """Return a source's terms of use, and True if they allow only research."""
     if source in SOURCES and source in data.sources:
         return SOURCES[source].terms, SOURCES[source].research_only
     words = data.terms or "the user's own scenes, without stated terms of use"

@@ -74,9 +74,6 @@ class FinishedRun:
     def require(self, scenes: str) -> None:
         """Check that the run was trained on given scenes.
 
-        Args:
-            scenes: digest of the scenes.
-
         Raises:
             RunError: the run was trained on other scenes.
         """
@@ -95,12 +92,7 @@ def save_run(
     data: Path | None = None,
     scenes: str = "",
 ) -> None:
-    """Write the weights and then `result.json`. The file `result.json` marks the run as finished.
-
-    Args:
-        data: folder of the scenes.
-        scenes: digest of the scenes, their vocabulary and split.
-    """
+    """Write the weights, and then `result.json`, which marks the run as finished."""
     machine = result.machine
     state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
     spec = json.dumps(machine.spec.to_dict())
@@ -159,9 +151,6 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
     """Read a checkpoint.
 
-    Args:
-        digest: digest of the configuration and the scenes.
-
     Raises:
         RunError: the file cannot be read, or belongs to another configuration or other scenes.
     """
@@ -187,18 +176,14 @@ def write_csv(path: Path, epochs: list[Epoch]) -> None:
 
 def write_plot(path: Path, epochs: list[Epoch], title: str) -> None:
     """Plot the reconstruction errors of objects and of relations against the epoch."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.2), constrained_layout=True)
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
     x = [epoch.epoch for epoch in epochs]
-    for axis, unit in zip(axes, ("object", "relation"), strict=True):
+    for axis, unit in zip(figure.subplots(1, 2), ("object", "relation"), strict=True):
         for part in ("train", "validation"):
             axis.plot(x, [getattr(e, f"{unit}_error_{part}") for e in epochs], label=part)
         axis.set(xlabel="epoch", ylabel="mean absolute error", title=f"{unit}s")
         axis.legend()
     figure.suptitle(f"Reconstruction error, {title}")
     figure.savefig(path, dpi=120)
-    pyplot.close(figure)

@@ -42,6 +42,8 @@ from training.runs import (
 
 _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
+# Attributes of the trainer that a checkpoint stores as they are.
+_COUNTERS = ("objects_trained", "best_epoch", "best_score", "updates", "seconds")
 # Function that is called in the first training phase (objects only) with the finished share of it.
 ObjectProgress = Callable[[float], None]
 # Names of the weights with the full learning rate. The setting `relation_rate` can lower the rate
@@ -76,10 +78,7 @@ class TrainingData:
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
-    """Return an untrained machine.
-
-    Its weight matrices are small random numbers, and its biases are log-odds of training counts.
-    """
+    """Return a machine with small random matrices and log-odds of training counts as biases."""
     shape = config.machine
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
@@ -112,10 +111,7 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
-    """Return the smoothed log-odds of `count` events in `total` trials.
-
-    1/2 is added to the number of events and to the number of other trials.
-    """
+    """Return the log-odds of `count` events in `total` trials, with 1/2 added to both counts."""
     return ((count + 0.5) / (total - count + 0.5)).log()
 
 
@@ -162,8 +158,6 @@ class Trainer:
     """Train one configuration on one set of scenes.
 
     Args:
-        config: the configuration.
-        data: tensors of the split scenes.
         folder: folder of `checkpoint.pt`, `curve.csv` and `curve.png`; None writes no files. Only
             the first process writes.
     """
@@ -264,14 +258,13 @@ class Trainer:
         for name in ("objective", "average", "best"):
             state[name] = {key: value.to(self.device) for key, value in state[name].items()}
         self.machine.load_state_dict(state["machine"])
-        self.objects_trained = state["objects_trained"]
         self.optimiser.load_state_dict(state["optimiser"])
         self.scheduler.load_state_dict(state["scheduler"])
         self.objective.load_state(state["objective"])
         self.generator.set_state(state["generator"])
         self.average, self.best = state["average"], state["best"]
-        self.best_epoch, self.best_score = state["best_epoch"], state["best_score"]
-        self.updates, self.seconds = state["updates"], state["seconds"]
+        for name in _COUNTERS:
+            setattr(self, name, state[name])
         self.epochs = [Epoch(**row) for row in state["epochs"]]
         return True
 
@@ -394,19 +387,8 @@ class Trainer:
             p.copy_(current[name])
         seconds = time.perf_counter() - began
         self.seconds += seconds
-        self.epochs.append(
-            Epoch(
-                epoch=number,
-                loss=loss,
-                object_error_train=train[0],
-                relation_error_train=train[1],
-                object_error_validation=validation[0],
-                relation_error_validation=validation[1],
-                mrr_validation=mrr,
-                r_precision_validation=precision,
-                seconds=seconds,
-            )
-        )
+        errors = train[0], train[1], validation[0], validation[1]
+        self.epochs.append(Epoch(number, loss, *errors, mrr, precision, seconds))
 
     def _rank_objects(self, machine: BoltzmannMachine) -> tuple[float]:
         """Return the MRR of removed objects on fixed validation scenes."""
@@ -438,17 +420,13 @@ class Trainer:
             {
                 "digest": self._digest,
                 "machine": self.machine.state_dict(),
-                "objects_trained": self.objects_trained,
                 "optimiser": self.optimiser.state_dict(),
                 "scheduler": self.scheduler.state_dict(),
                 "objective": objective,
                 "generator": self.generator.get_state(),
                 "average": self.average,
                 "best": self.best,
-                "best_epoch": self.best_epoch,
-                "best_score": self.best_score,
-                "updates": self.updates,
-                "seconds": self.seconds,
+                **{name: getattr(self, name) for name in _COUNTERS},
                 "epochs": [asdict(epoch) for epoch in self.epochs],
             },
         )

@@ -41,6 +41,7 @@ from tests.enumeration.small_machines import (
     small_machine,
 )
 from tests.enumeration.test_completions import exactly, machine_of
+from tests.questions.log_score import log_score
 from tests.questions.test_counts import CHAIR, COUNTS, DESK, LAMP, V, by_hand
 from tests.training.test_objectives import toy_batch, toy_machine
 from training.config import ObjectiveConfig
@@ -53,7 +54,6 @@ from training.machines.partition import ais, base_log_partition, independent_bas
 from training.objectives import OBJECTIVES
 from training.objectives.composite import mask_one_class
 from training.objectives.contrastive import relation_nll
-from training.oracle.log_score import log_score
 
 LOCAL = [name for name in SMALL if name not in SEED_FORM]
 TRIWAYS = [name for name, spec in SMALL.items() if spec.variant == "triway"]

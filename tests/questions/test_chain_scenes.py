@@ -17,9 +17,9 @@ from app.questions import generate
 from app.scene import CANONICAL
 from tests.enumeration.small_machines import enumerate_joint
 from tests.questions.artifacts import LABELS, artifact_of, exact_artifact, larger_artifact, scene_of
+from tests.questions.log_score import log_score
 from training.machines.arrays import machine_of
 from training.machines.edges import present_classes
-from training.oracle.log_score import log_score
 
 SCENES = {
     "nothing": (scene_of([]), {}),

@@ -25,10 +25,10 @@ from tests.questions.artifacts import (
     random_machine,
     scene_of,
 )
+from tests.questions.log_score import log_score
 from tests.questions.test_properties import scenes
 from training.machines import MachineSpec
 from training.machines.arrays import machine_of
-from training.oracle.log_score import log_score
 
 NAMES = tuple(name for name, spec in LARGER.items() if spec.form == "local")
 ARTIFACTS = {name: larger_artifact(name) for name in NAMES}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from training.calibrate_objects import (
     fit_coverage,
     fit_evidence,
     least_of_the_best,
+    limit_of,
     listing,
     popularity,
     recalibrated,
@@ -268,7 +270,9 @@ def test_an_alarm_needs_a_probability_worth_an_alarm():
     """The target share of clean scenes would need alarms from .001."""
     scenes = complete_scenes(rooms(40, 1))
     certain = clean_scores(scenes.v, STRUCTURE, lambda v: torch.full(v.shape, 7.0))
-    limits = thresholds([(certain, scenes)], CountSlope(slope=-1.0), np.random.default_rng(0))
+    limits = thresholds(
+        partial(limit_of, [(certain, scenes)], CountSlope(slope=-1.0), np.random.default_rng(0))
+    )
     assert (limits.low, limits.medium, limits.high) == (0.5, 0.3, 0.2)
 
 

@@ -4,6 +4,9 @@ A class that a data source never mentions counts as absent in all scenes of this
 training objective. If the fit leaves such classes out, the validation MRR (mean reciprocal rank)
 falls: from .398 to .381 for EASE, from .397 to .335 for the denoising autoencoder, and from .152 to
 .145 for popularity. The reason is that a score must rank all classes without knowing the source.
+
+`v` is the presence of classes in the training scenes, (scenes, classes), and `structure` a mask of
+structure classes such as walls, (classes,) bool.
 """
 
 from __future__ import annotations
@@ -67,10 +70,7 @@ PLACED: Final = BASELINES["frequency table p(i | a, j)"]
 
 
 def placed_product(name: str, score: Any, table: Any) -> Baseline[PlacedScore]:
-    """Return a baseline for task T2-at (objects at a place).
-
-    Its score is the product of a fitted object score and the fitted table of `PLACED`.
-    """
+    """Return the baseline of T2-at whose score is the product of a fitted score and `PLACED`."""
     propose = relations.times(score, table)
     return Baseline(f"{PLACED.name} × {name}", propose, fitting.placed_mrr, ("placed",))
 

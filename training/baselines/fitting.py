@@ -39,8 +39,6 @@ class Trial:
     """The result of one point of a hyperparameter grid.
 
     Attributes:
-        parameters: hyperparameters of the grid point.
-        validation: metric on the validation scenes.
         seconds: wall time of fit and evaluation in seconds. Work that was already done for earlier
             grid points is not included.
     """
@@ -67,18 +65,12 @@ def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> 
 
 
 def partial_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """Return the mean reciprocal rank (MRR) of hidden objects (task T2 partial).
-
-    Half of the objects of each scene are hidden.
-    """
+    """Return the mean reciprocal rank (MRR) of the hidden half of the objects (T2 partial)."""
     return rank_hidden(hide(scenes, structure, 0.5), structure, score)[0].value
 
 
 def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
-    """Return the mean reciprocal rank (MRR) of removed objects at a known place (task T2-at).
-
-    The place is one relation of the removed object to another object.
-    """
+    """Return the mean reciprocal rank (MRR) of removed objects at a known place (T2-at)."""
     return leave_one_out_at(scenes, structure, score)[0].mrr().value
 
 
@@ -93,10 +85,7 @@ def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: Relat
 
 
 def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDensity) -> float:
-    """Return the mean log-likelihood of the objects of a scene in nats.
-
-    The function uses the upper estimate of log Z, so the result is a lower estimate.
-    """
+    """Return a lower estimate of the mean log-likelihood of objects in nats (upper log Z)."""
     return float(density.log_unnormalised(scenes.v).double().mean()) - density.upper
 
 
@@ -105,7 +94,6 @@ class Baseline(Generic[Score]):
     """One baseline, shown as one row of a result table.
 
     Attributes:
-        name: name of the row.
         propose: generator function that yields (parameters, score) for each grid point. Its
             arguments are the training scenes, a mask of structure classes, (classes,) bool, and a
             seed.
@@ -136,14 +124,6 @@ class Baseline(Generic[Score]):
         progress: Callable[[str], None] = lambda _: None,
     ) -> Fitted[Score]:
         """Fit on training scenes, and select the best grid point on validation scenes.
-
-        Args:
-            train: training scenes.
-            validation: validation scenes.
-            structure: True for structure classes such as walls, (classes,) bool. Structure classes
-                are evidence, and are never ranked.
-            seed: seed of the fit.
-            progress: function that is called with a message after each grid point.
 
         Raises:
             ValueError: the numbers of classes differ, or scenes needed for fit or metric are

@@ -36,10 +36,7 @@ class Course:
     """Settings of the training of a network.
 
     Attributes:
-        epochs: number of epochs.
-        batch_size: number of scenes in a batch.
         learning_rate: maximum learning rate of the cycle.
-        weight_decay: weight decay of AdamW.
         noise: maximum probability with which a class other than the target is hidden.
         offers: epochs at which the network becomes a candidate, as shares of `epochs`.
     """
@@ -58,7 +55,6 @@ class NetworkScore:
 
     Attributes:
         network: network from presence, (scenes, classes), to logits of the same shape.
-        structure: True for structure classes such as walls, (classes,) bool.
     """
 
     network: nn.Module
@@ -74,9 +70,6 @@ class NetworkScore:
         """Return the score of each class, (scenes, classes).
 
         Present classes and structure classes have the score -inf.
-
-        Args:
-            v: presence of each class, (scenes, classes).
         """
         values: Tensor = self.network(v)
         return values.masked_fill((v > 0) | self.structure, -torch.inf).log_softmax(1)
@@ -88,12 +81,8 @@ def train_network(
     """Train a network. At each candidate epoch, yield the epoch and the score of averaged weights.
 
     Args:
-        network: network from presence, (scenes, classes), to logits of the same shape.
         v: presence in the training scenes, (scenes, classes). Scenes that contain only structure
             classes are left out.
-        structure: True for structure classes such as walls, (classes,) bool.
-        course: settings of the training.
-        seed: seed of the random choices.
 
     Raises:
         ValueError: every scene contains only structure classes.
@@ -129,11 +118,7 @@ def train_network(
 
 
 def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float) -> Tensor:
-    """Return the cross-entropy of a removed class, averaged over scenes.
-
-    One class of each scene is removed. The global random generator draws the removed class and the
-    hidden classes.
-    """
+    """Return the cross-entropy of one randomly removed class a scene, averaged over scenes."""
     target = torch.multinomial(v * ~structure, 1)
     left = v.scatter(1, target, 0.0)
     hidden = torch.rand(v.shape) < noise * torch.rand(len(v), 1)
@@ -155,10 +140,7 @@ _HEAVY = replace(_AUTOENCODER, noise=1.0)
 
 
 def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
-    """Return an untrained autoencoder with two hidden layers of `width` units.
-
-    The logs of the class frequencies in v, (scenes, classes), initialise the output bias.
-    """
+    """Return an untrained autoencoder; class frequencies in `v` initialise its output bias."""
     V = v.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -186,10 +168,7 @@ def autoencoder(
 def autoencoder_for_parts(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[ObjectScore]:
-    """Yield scores of autoencoders that are trained with high noise.
-
-    In a training scene, up to all classes except the target can be hidden.
-    """
+    """Yield scores of autoencoders whose noise hides up to all classes except the target."""
     return autoencoder(train, structure, seed, _HEAVY)
 
 
@@ -213,9 +192,6 @@ class SetTransformer(nn.Module):
         popularity: share of scenes with each class, (classes,). The log of this share initialises
             the output bias.
         width: width of the encoder. Its feed-forward part is twice as wide.
-        heads: number of attention heads.
-        layers: number of layers of the encoder.
-        dropout: dropout rate of the encoder.
     """
 
     def __init__(
@@ -237,10 +213,7 @@ class SetTransformer(nn.Module):
         nn.init.normal_(self.embedding.weight, std=width**-0.5)
 
     def forward(self, v: Tensor) -> Tensor:
-        """Return the logits of the removed class, (scenes, classes), for presence v.
-
-        The output of the query token determines the logits.
-        """
+        """Return the logits of the removed class, (scenes, classes), from the query token."""
         most = int((v > 0).sum(1).max())
         present, token = v.topk(most, dim=1)
         token = torch.where(present > 0, token, self.classes + 1)

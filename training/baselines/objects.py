@@ -58,10 +58,7 @@ class LinearScore:
 
 
 def frequency(v: Tensor) -> Tensor:
-    """Return the share of scenes with each class, (classes,).
-
-    The share is smoothed: half a scene with the class and half a scene without the class are added.
-    """
+    """Return the share of scenes with each class, (classes,), smoothed by 1/2 in both counts."""
     return (v.sum(0) + 0.5) / (len(v) + 1.0)
 
 
@@ -89,7 +86,6 @@ def evidence(v: Tensor, smoothing: float) -> Tensor:
     The result has j as row and i as column, (classes, classes). The diagonal is zero.
 
     Args:
-        v: presence in the training scenes, (scenes, classes).
         smoothing: number of average scenes that are added to the scenes with i, and to the scenes
             without i.
     """
@@ -124,13 +120,7 @@ _SHARPNESS = (2.0, 4.0, 8.0, 12.0)
 
 
 def nearest_score(v: Tensor, *, neighbours: int, sharpness: float) -> ObjectScore:
-    """Return a score function from presence to log-odds, both (scenes, classes).
-
-    Args:
-        v: presence in the training scenes, (training scenes, classes).
-        neighbours: number k of neighbours.
-        sharpness: exponent of the ratio of cosine similarities in a vote.
-    """
+    """Return a score function from presence to log-odds, both (scenes, classes)."""
     popularity = frequency(v)
     index = normalize(v, dim=1).T.contiguous()
 
@@ -165,12 +155,7 @@ _EASE_L2 = (10.0, 30.0, 100.0, 300.0)
 
 
 def fit_ease(v: Tensor, l2: float) -> LinearScore:
-    """Fit a ridge regression of every class on all other classes.
-
-    Args:
-        v: presence in the training scenes, (scenes, classes).
-        l2: ridge penalty λ, above 0.
-    """
+    """Fit a ridge regression of every class on all other classes."""
     mean = v.double().mean(0)
     centred = v.double() - mean
     gram = centred.T @ centred
@@ -207,14 +192,7 @@ _EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)
 def fit_pairwise(
     v: Tensor, l2: float, *, start: LinearScore | None = None, iterations: int = _ITERATIONS
 ) -> LinearScore:
-    """Fit the pairwise model by penalised pseudo-likelihood.
-
-    Args:
-        v: presence in the training scenes, (scenes, classes).
-        l2: strength of the penalty on the weights, at least 0.
-        start: model from which the optimisation starts. The default has independent classes.
-        iterations: maximum number of L-BFGS iterations.
-    """
+    """Fit the pairwise model by penalised pseudo-likelihood, from `start` or no interaction."""
     V = v.shape[1]
     if start is None:
         start = LinearScore(frequency(v).logit(), torch.zeros(V, V))
@@ -241,10 +219,7 @@ def fit_pairwise(
 
 
 def pairwise(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[LinearScore]:
-    """Yield a score for each L2 penalty, largest penalty first.
-
-    Each fit starts at the solution of the previous penalty.
-    """
+    """Yield a score for each L2 penalty, largest first. A fit starts at the last solution."""
     score = None
     for l2 in _PAIRWISE_L2:
         score = fit_pairwise(train.v, l2, start=score)
@@ -287,13 +262,6 @@ def fit_annealed(
     validation scenes, the MRR (mean reciprocal rank) is .411 after 40 epochs with the falling rate.
     With a constant rate, the MRR is .377 after 10 epochs and .378 after 20 epochs. Each epoch
     shuffles the scenes and skips an incomplete last batch.
-
-    Args:
-        v: binary presence in the training scenes, (scenes, classes).
-        hidden: number of hidden units.
-        learning_rate: initial learning rate.
-        epochs: number of passes over the scenes.
-        seed: seed of the random choices.
     """
     size = min(_BATCH, len(v))
     rbm = BernoulliRBM(n_components=hidden, batch_size=size, random_state=seed)

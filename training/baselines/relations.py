@@ -35,10 +35,7 @@ class TripleCounts:
     together: Tensor
 
     def overall(self) -> Tensor:
-        """Return the probability of each relation over all pairs of classes, (relations,).
-
-        The counts have add-one (Laplace) smoothing.
-        """
+        """Return the add-one smoothed probability of each relation over all pairs, (relations,)."""
         return (self.held.sum((1, 2)) + 1.0) / (self.together.sum() + 2.0)
 
 
@@ -130,7 +127,6 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
     """Return logit p(r | i, j) by the formula above, (relations, classes, classes).
 
     Args:
-        counts: counts of the training scenes.
         pair: smoothing s of a pair of classes, above 0: number of added cases.
         end: smoothing m of a single class, above 0: number of added cases.
     """
@@ -142,10 +138,7 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
 
 
 def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RelationScore]:
-    """Yield a score for each smoothing of pairs and of classes, and each weight of the counts.
-
-    The weight of the instance counts has no effect if all counts are 1.
-    """
+    """Yield a score for each smoothing of pairs and of classes, and each weight of the counts."""
     counts = count_triples(train, structure)
     for pair in _PAIR:
         for end in _END:
@@ -175,10 +168,8 @@ def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -
     """Fit ComplEx, and return the logits of all triples, (relations, classes, classes).
 
     Args:
-        counts: counts of the training scenes.
         rank: number of complex dimensions of an embedding.
         penalty: weight of the penalty, the mean cubed modulus of the factors of each pair.
-        seed: seed of the initial embeddings.
     """
     generator = torch.Generator().manual_seed(seed)
     A, V, _ = counts.held.shape
@@ -207,13 +198,7 @@ def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -
 
 
 def complex_logits(bias: Tensor, relations: Tensor, classes: Tensor) -> Tensor:
-    """Return the logits d_a + Re <S_i, R_a, conj S_j>, (relations, classes, classes).
-
-    Args:
-        bias: bias d_a of each relation, (relations,).
-        relations: complex embedding R_a of each relation, (relations, rank).
-        classes: complex embedding S_i of each class, (classes, rank).
-    """
+    """Return the logits d_a + Re <S_i, R_a, conj S_j>, (relations, classes, classes)."""
     turned = classes * relations[:, None]
     # Re(x conj(y)) = Re x Re y + Im x Im y. Two real products are faster than a complex product.
     real = turned.real @ classes.real.T + turned.imag @ classes.imag.T
@@ -351,7 +336,6 @@ def smoothed_log_p(
     """Return log p(i | a, j) in the layout of `PlacedTable.log_p`.
 
     Args:
-        counts: counts of the training scenes.
         popularity: frequency of each class, (classes,). The function normalises the sum to 1.
         place: smoothing s of a place (a, j), above 0: number of added cases.
         relation: smoothing m of a relation a, above 0: number of added cases.

@@ -8,6 +8,7 @@ from training.datasets.rooms import generate_rooms, rooms_vocabulary
 from training.datasets.shuffling import shuffle_objects
 from training.datasets.splits import FRACTIONS, split, stable_part
 from training.datasets.vocabulary import (
+    build_indoor_vocabulary,
     build_vocabulary,
     coverage,
     indoor_vocabulary,
@@ -15,7 +16,6 @@ from training.datasets.vocabulary import (
     source_vocabulary,
     vocabulary_json,
     with_typical_sizes,
-    write_indoor_vocabulary,
 )
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "EncodedScene",
     "Names",
     "annotated_classes",
+    "build_indoor_vocabulary",
     "build_vocabulary",
     "coverage",
     "curated_names",
@@ -42,5 +43,4 @@ __all__ = [
     "stable_part",
     "vocabulary_json",
     "with_typical_sizes",
-    "write_indoor_vocabulary",
 ]

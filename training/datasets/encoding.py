@@ -7,10 +7,11 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from app.scene import (
     CANONICAL,
@@ -25,6 +26,7 @@ from app.scene import (
     to_viewer_frame,
 )
 from scene_client.image_plane import are_neighbours, relation_between
+from training.array_types import Flags, Floats, Ints
 from training.datasets.names import Names, curated_names
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 from training.datasets.sources import SOURCES, Meaning, meaning_of
@@ -63,11 +65,11 @@ class EncodedScene:
     group: str
     room_type: int
     evidence: ClassEvidence
-    instance_classes: NDArray[np.int64]
-    instance_holds: NDArray[np.bool_]
-    instance_observed: NDArray[np.bool_]
+    instance_classes: Ints
+    instance_holds: Flags
+    instance_observed: Flags
     unknown: tuple[str, ...]
-    instance_positions: NDArray[np.float64] | None = None
+    instance_positions: Floats | None = None
     weight: float = 1.0
     complete: bool = True
 
@@ -96,9 +98,7 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
     return [encoder(scene, groups[scene.source, scene.group]) for scene in every]
 
 
-def annotated_classes(
-    scenes: Sequence[EncodedScene], vocabulary: Vocabulary
-) -> dict[str, NDArray[np.bool_]]:
+def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, Flags]:
     """Return the classes that each data source annotates, as masks (classes,) by source name.
 
     If a scene does not list an annotated class, the class is absent. A data source annotates the
@@ -106,7 +106,7 @@ def annotated_classes(
     Labels in `Source.left_out` are excluded. The initial bias of a class is its frequency in the
     sources that annotate the class. The evaluation of generated scenes uses only annotated classes.
     """
-    annotated: dict[str, NDArray[np.bool_]] = {}
+    annotated: dict[str, Flags] = {}
     for scene in scenes:
         if scene.source not in annotated:
             known = SOURCES.get(scene.source)
@@ -128,12 +128,12 @@ class _Encoder:
     def __init__(self, vocabulary: Vocabulary, names: Names) -> None:
         self.vocabulary = vocabulary
         self.names = names
-        self.indices: dict[str, int | None] = {}
+        self.index = cache(vocabulary.index)
 
     def __call__(self, scene: AnnotatedScene, group_size: int) -> EncodedScene:
         meaning = meaning_of(scene.source, listed=scene.relations is not None)
         left_out = _left_out(scene.source, self.vocabulary)
-        classes = [self._index(thing.label) for thing in scene.objects]
+        classes = [self.index(thing.label) for thing in scene.objects]
         kept = [i for i, c in enumerate(classes) if c is not None and c not in left_out]
         relations, positions = _relations(scene, meaning)
         holds = relations.holds[:, kept][:, :, kept]
@@ -175,30 +175,16 @@ class _Encoder:
         ]
         return tuple(sorted({label_key(label): label for label in outside}.values()))
 
-    def _index(self, label: str) -> int | None:
-        if label not in self.indices:
-            self.indices[label] = self.vocabulary.index(label)
-        return self.indices[label]
 
-
-def _counts(
-    evidence: ClassEvidence, classes: NDArray[np.int64], alike: Sequence[int]
-) -> NDArray[np.int64]:
+def _counts(evidence: ClassEvidence, classes: Ints, alike: Sequence[int]) -> Ints:
     """Return the number of instances of each class. One object entry can mean several instances."""
     counts = np.zeros_like(evidence.counts)
     np.add.at(counts, np.searchsorted(evidence.classes, classes), alike)
     return counts
 
 
-def _relations(
-    scene: AnnotatedScene, meaning: Meaning
-) -> tuple[PoseRelations, NDArray[np.float64] | None]:
-    """Derive the relations between all instances of a scene; `encode` describes the rules.
-
-    Returns:
-        The relations, and the positions from which they were derived, (instances, 3). The second
-        value is None if the relations do not come from positions.
-    """
+def _relations(scene: AnnotatedScene, meaning: Meaning) -> tuple[PoseRelations, Floats | None]:
+    """Derive all relations, as `encode` describes. Return them and their positions, or None."""
     positions = None
     if scene.relations is not None:
         return _from_lists(scene, scene.relations, meaning), None
@@ -257,7 +243,7 @@ def _close_poses(
             found.observed[relation] &= found.holds[relation]
 
 
-def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, NDArray[np.float64]]:
+def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, Floats]:
     unknown = (math.nan,) * 3
     positions = np.array([thing.position or unknown for thing in scene.objects])
     sizes = np.array([thing.size or unknown for thing in scene.objects])
@@ -280,14 +266,13 @@ def _add_supports(found: PoseRelations, objects: Sequence[AnnotatedObject]) -> N
         found.holds[_ON_TOP, index, support] = True
 
 
-def room_viewpoint(scene_id: str, positions: NDArray[np.float64]) -> Viewpoint:
+def room_viewpoint(scene_id: str, positions: Floats) -> Viewpoint:
     """Return a viewpoint at the middle of one side of the room, facing inwards.
 
     The room is the bounding box of the object centres. A hash of the scene id selects the side, so
     the viewpoint of a scene never changes. Over many scenes, all four sides occur.
 
     Args:
-        scene_id: id of the scene.
         positions: centres of the objects in metres, (objects, 3). Rows with NaN are ignored.
 
     Raises:

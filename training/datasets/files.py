@@ -24,7 +24,6 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
     small compressed file could fill the memory.
 
     Args:
-        path: the file.
         limit: maximum length of a line in bytes, including the line end.
 
     Raises:
@@ -86,10 +85,7 @@ def bounded_int(digits: str) -> int:
 
 @contextmanager
 def located(path: Path, where: str) -> Iterator[None]:
-    """Convert a TypeError or ValueError in the `with` block to a DatasetError.
-
-    The DatasetError contains the path and the position in the file.
-    """
+    """Convert a TypeError or ValueError in the `with` block to a DatasetError with its place."""
     try:
         yield
     except DatasetError:
@@ -100,13 +96,6 @@ def located(path: Path, where: str) -> Iterator[None]:
 
 def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type, ...]) -> Any:
     """Check the type of the field ``name`` of a JSON object, and return its value.
-
-    Args:
-        path: the file.
-        where: position of the JSON object in the file.
-        values: the JSON object.
-        name: name of the field.
-        kind: accepted types.
 
     Raises:
         DatasetError: the field is missing or has another type.

@@ -62,10 +62,7 @@ class Names:
                     raise ValueError(f"kinds: {kind!r} is an alias of {other!r}")
 
     def canonical(self, label: str) -> str:
-        """Return the curated name of a label.
-
-        A label without a curated name is returned in lower case with single spaces.
-        """
+        """Return the curated name of a label, or the label in lower case with single spaces."""
         found = self._by_key.get(label_key(label))
         if found is not None:
             return found

@@ -39,9 +39,6 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
     Rows of other sources are skipped. All scenes have the source name `SOURCE`. Rows about the same
     pair of objects are in one group.
 
-    Args:
-        path: file of the table.
-
     Raises:
         DatasetError: the file is missing, invalid or too large.
     """

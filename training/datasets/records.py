@@ -22,9 +22,7 @@ class DatasetError(ValueError):
     """A data file cannot be read or has invalid content.
 
     Args:
-        path: the file.
         where: position in the file, such as ``line 3`` or ``scans[0].objects[2]``.
-        problem: description of the error.
     """
 
     def __init__(self, path: Path, where: str, problem: str) -> None:
@@ -42,7 +40,6 @@ class AnnotatedObject:
 
     Attributes:
         id: id of the object, distinct within the scene.
-        label: label of the object in the data set.
         position: centre (x, y, z) of the object in metres.
         size: extents (x, y, z) of the object in metres, before rotation by the yaw.
         yaw: rotation of the object about the z axis in radians.
@@ -89,10 +86,8 @@ class AnnotatedScene:
 
     Attributes:
         scene_id: id of the scene, distinct within its data source.
-        source: name of the data source.
         group: name of a group of near-duplicate scenes, such as frames of one place.
         room_type: room type in the data set. None means unknown.
-        objects: objects of the scene.
         relations: triples (subject index, relation, object index). The indices refer to
             ``objects``. None means that relations were not annotated.
         viewer_frame: True if positions are in viewer axes. Otherwise left and front are undefined

@@ -19,6 +19,7 @@ import numpy as np
 
 from app.scene import Viewpoint, Vocabulary, to_viewer_frame
 from app.scene.footprints import overlap_and_gap
+from training.array_types import Rng
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 from training.datasets.vocabulary import source_vocabulary
 
@@ -41,7 +42,6 @@ class Small:
     """A small object on a piece of furniture.
 
     Attributes:
-        label: class of the object.
         size: mean extents of the object.
         chance: probability that an object is added in each of ``most`` attempts.
         most: maximum number of objects of this kind on the piece.
@@ -72,7 +72,6 @@ class Piece:
     """A piece of furniture.
 
     Attributes:
-        label: class of the piece.
         size: mean extents of the piece.
         chance: probability that a piece is added to the room in each of ``most`` attempts.
         where: place of the piece: at a wall, in the centre, hung on a wall, or under the ceiling.
@@ -159,8 +158,6 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
     the relations.
 
     Args:
-        count: number of scenes.
-        seed: seed of the random choices.
         rooms: maps each room type to the pieces of furniture that it can contain. `DOMAINS`
             contains the rooms of other domains.
 
@@ -200,7 +197,7 @@ def _labels(pieces: tuple[Piece, ...]) -> list[str]:
 class _Layout:
     """One furnished room. The origin is a corner of the room, and the walls run along x and y."""
 
-    def __init__(self, rng: np.random.Generator, room_type: str, pieces: tuple[Piece, ...]) -> None:
+    def __init__(self, rng: Rng, room_type: str, pieces: tuple[Piece, ...]) -> None:
         self.rng = rng
         self.room_type = room_type
         self.width, self.depth = rng.uniform(3.2, 5.5), rng.uniform(3.0, 5.0)
@@ -359,10 +356,7 @@ class _Layout:
 
 
 def _offset(box: _Box, u: float, v: float) -> tuple[float, float]:
-    """Return the room coordinates of a point near a box.
-
-    The point is u metres along the front of the box and v metres away from its back.
-    """
+    """Return the point u metres along the front of a box and v metres away from its back."""
     cos, sin = math.cos(box.yaw), math.sin(box.yaw)
     return box.x + cos * u - sin * v, box.y + sin * u + cos * v
 

@@ -17,9 +17,9 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from app.scene import ClassEvidence
+from training.array_types import Flags, Ints, Rng
 from training.datasets.encoding import EncodedScene
 
 # Number of attempted exchanges, divided by the number of slots. An exchange draws two slots, so
@@ -28,7 +28,7 @@ _STEPS_PER_MENTION: Final = 10
 
 
 def shuffle_objects(
-    scenes: Sequence[EncodedScene], structure: NDArray[np.bool_], seed: int
+    scenes: Sequence[EncodedScene], structure: Flags, seed: int
 ) -> list[EncodedScene]:
     """Permute classes between scenes of all data sources, and room types between scenes.
 
@@ -36,11 +36,6 @@ def shuffle_objects(
     unobserved. Counts, confidences and relations stay with their slots. Room types are permuted
     among the scenes with a room type. Scene ids, sources, groups and unknown labels
     stay unchanged.
-
-    Args:
-        scenes: the scenes.
-        structure: True for structure classes such as walls, (classes,) bool.
-        seed: seed of the random exchanges.
 
     Raises:
         ValueError: a class index of a scene exceeds the length of `structure`.
@@ -67,15 +62,8 @@ def shuffle_objects(
     ]
 
 
-def _exchange(
-    owner: NDArray[np.int64], classes: NDArray[np.int64], rng: np.random.Generator
-) -> NDArray[np.int64]:
-    """Return the class of each slot, (slots,), after random exchanges.
-
-    Args:
-        owner: index of the scene of each slot, (slots,).
-        classes: class of each slot before the exchanges, (slots,).
-    """
+def _exchange(owner: Ints, classes: Ints, rng: Rng) -> Ints:
+    """Return the class of each slot, (slots,), after random exchanges."""
     if not len(classes):
         return classes
     label, scene = classes.tolist(), owner.tolist()
@@ -98,12 +86,8 @@ def _exchange(
     return np.array(label, dtype=np.int64)
 
 
-def _relabelled(scene: EncodedScene, labels: NDArray[np.int64], room: int) -> EncodedScene:
-    """Return the scene with a new class in each slot, sorted by class.
-
-    Args:
-        labels: new class of each slot, (slots,).
-    """
+def _relabelled(scene: EncodedScene, labels: Ints, room: int) -> EncodedScene:
+    """Return the scene with a new class in each slot, sorted by class."""
     before = scene.evidence
     order = np.argsort(labels)
     evidence = ClassEvidence(

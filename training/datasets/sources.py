@@ -224,7 +224,6 @@ def meaning_of(source: str, *, listed: bool = True) -> Meaning:
     """Return the meaning of relations and objects that a data source does not list.
 
     Args:
-        source: name of the data source.
         listed: True if the scene lists relations. Only unknown sources, and sources without a fixed
             meaning, depend on this argument.
     """

@@ -44,11 +44,6 @@ def split(
 ) -> dict[Part, list[AnnotatedScene]]:
     """Return the scenes of each part, in their original order.
 
-    Args:
-        scenes: scenes of all data sources.
-        seed: seed of the split.
-        protocol: ``group``, ``stable``, ``random`` or ``final``.
-
     Raises:
         ValueError: the protocol is unknown, or two scenes of a data source have the same id.
     """
@@ -58,7 +53,11 @@ def split(
         raise ValueError(
             "two scenes of one source have the same scene_id; give each scene a distinct id"
         )
-    units = [_unit(scene, protocol) for scene in scenes]
+    # All scenes of a unit have the same part.
+    units = [
+        f"{scene.source}/{scene.scene_id}" if protocol == "random" else scene.group
+        for scene in scenes
+    ]
     part_of: dict[str, Part] = {}
     if protocol == "stable":
         part_of = {unit: stable_part(unit, seed) for unit in units}
@@ -69,14 +68,6 @@ def split(
     for scene, unit in zip(scenes, units, strict=True):
         parts[part_of[unit]].append(scene)
     return parts
-
-
-def _unit(scene: AnnotatedScene, protocol: Protocol) -> str:
-    """Return the name of the unit of a scene: a group, or a single scene with ``random``.
-
-    All scenes of a unit have the same part.
-    """
-    return f"{scene.source}/{scene.scene_id}" if protocol == "random" else scene.group
 
 
 def stable_part(group: str, seed: int) -> Part:

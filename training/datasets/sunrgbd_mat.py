@@ -151,10 +151,7 @@ def _entries(body: memoryview, order: str) -> int:
 
 
 def _structs(value: Any) -> list[Any]:
-    """Convert a MATLAB struct array to a list.
-
-    The value is a single struct, several structs, or an empty matrix for an empty array.
-    """
+    """Convert a struct array to a list: a struct, several, or an empty matrix for none."""
     if isinstance(value, dict):
         return [value]
     return list(value) if isinstance(value, list) else list(np.atleast_1d(value))

@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -38,9 +39,6 @@ def build_vocabulary(
     included. Labels in ``names.not_objects`` are always excluded.
 
     Args:
-        scenes: the annotated scenes.
-        names: the curated names.
-        minimum: minimum number of objects of a class.
         minimum_rooms: minimum number of scenes of a room type. The default is ``minimum``.
         outdoor: True includes the labels in ``names.outdoor`` and ``names.surroundings``.
 
@@ -83,25 +81,16 @@ def build_vocabulary(
     )
 
 
-def write_indoor_vocabulary(
-    scenes: Iterable[AnnotatedScene], path: Path = INDOOR_FILE
-) -> Vocabulary:
-    """Build the indoor vocabulary from the scenes of all data sources, and write it to a file.
+def build_indoor_vocabulary(scenes: Iterable[AnnotatedScene]) -> Vocabulary:
+    """Build the vocabulary of `INDOOR_FILE` from the scenes of all data sources.
 
     Photographs contain relations between indoor objects and outdoor surroundings. Surroundings are
     therefore ordinary classes.
     """
-    names = replace(curated_names(), surroundings=())
-    vocabulary = build_vocabulary(
-        scenes,
-        names,
-        minimum=INDOOR_MINIMUM_MENTIONS,
-        minimum_rooms=MINIMUM_MENTIONS,
-        outdoor=True,
-    )
-    vocabulary = with_aliases(vocabulary, names)
-    path.write_text(vocabulary_json(vocabulary), encoding="utf-8")
-    return vocabulary
+    names, minimum = replace(curated_names(), surroundings=()), INDOOR_MINIMUM_MENTIONS
+    rooms = MINIMUM_MENTIONS
+    vocabulary = build_vocabulary(scenes, names, minimum=minimum, minimum_rooms=rooms, outdoor=True)
+    return with_aliases(vocabulary, names)
 
 
 def vocabulary_json(vocabulary: Vocabulary) -> str:
@@ -140,12 +129,7 @@ def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabula
 
 
 def with_room_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
-    """Return the vocabulary with the curated synonyms of its room types.
-
-    Args:
-        vocabulary: the vocabulary of a training run.
-        names: the curated names. None means those of `vocabularies/names.toml`.
-    """
+    """Return the vocabulary with the curated synonyms of its room types."""
     names = names or curated_names()
     own = {label_key(room) for room in vocabulary.room_types}
     aliases = {
@@ -166,9 +150,9 @@ def read_vocabulary(path: Path) -> Vocabulary:
     return Vocabulary.from_dict(json.loads(path.read_text(encoding="utf-8")))
 
 
-def indoor_vocabulary(path: Path = INDOOR_FILE) -> Vocabulary:
+def indoor_vocabulary() -> Vocabulary:
     """Read the indoor vocabulary from the repository."""
-    return read_vocabulary(path)
+    return read_vocabulary(INDOOR_FILE)
 
 
 def source_vocabulary(
@@ -181,11 +165,13 @@ def source_vocabulary(
     "table".
     """
     names = curated_names()
+    # An empty entry preserves the curated spelling of a class without aliases.
+    spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
     mentioned_only = Names(
         structure=names.structure,
         not_objects=names.not_objects,
         surroundings=names.surroundings,
-        aliases=_reachable(names),
+        aliases=spellings | names.aliases,
         rooms=names.rooms,
     )
     found = build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True)
@@ -200,14 +186,6 @@ def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> Obj
     return replace(entry, aliases=(*entry.aliases, *more))
 
 
-def _reachable(names: Names) -> dict[str, tuple[str, ...]]:
-    """Return the aliases of each curated class. A class without aliases has an empty entry.
-
-    The empty entry preserves the curated spelling of the class.
-    """
-    return dict.fromkeys((*names.base, *names.household, *names.structure), ()) | names.aliases
-
-
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
     """Add the typical size of each class, the median size of its boxes.
 
@@ -220,16 +198,11 @@ def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene])
         scenes: the scenes. Objects without a size and flat objects are skipped.
     """
     boxes: dict[int, list[tuple[float, float]]] = {}
-    found: dict[str, int | None] = {}
-    for scene in scenes:
-        for thing in scene.objects:
-            if thing.size is None or not min(thing.size):
-                continue
-            if thing.label not in found:
-                found[thing.label] = vocabulary.index(thing.label)
-            if (index := found[thing.label]) is not None:
-                x, y, z = thing.size
-                boxes.setdefault(index, []).append(((x * y) ** 0.5, z))
+    index_of = cache(vocabulary.index)
+    for thing in (thing for scene in scenes for thing in scene.objects):
+        if thing.size and min(thing.size) and (index := index_of(thing.label)) is not None:
+            x, y, z = thing.size
+            boxes.setdefault(index, []).append(((x * y) ** 0.5, z))
     return Vocabulary(
         [_sized(entry, boxes.get(index, ())) for index, entry in enumerate(vocabulary.objects)],
         vocabulary.room_types,
@@ -249,8 +222,6 @@ def coverage(
     """Return the share of the objects in scenes whose label is in a vocabulary.
 
     Args:
-        vocabulary: the vocabulary.
-        scenes: the scenes.
         structure: True also counts objects of structure classes such as walls.
 
     Raises:

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from app.scene import ObjectClass, Vocabulary
+from app.scene import Vocabulary
+from training.array_types import Flags
 from training.datasets.records import DatasetError
 
 MAX_WORDS: Final = 1_000_000
@@ -76,7 +77,7 @@ class WordVectors:
         return {word: row for row, word in enumerate(self.words) if self.vectors[row].any()}
 
 
-def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, NDArray[np.bool_]]:
+def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, Flags]:
     """Return the word vectors of the classes of a vocabulary.
 
     The vector of a class is the vector of its label. If the label has no vector, the vector of the
@@ -89,7 +90,8 @@ def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, 
     vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
     found = np.zeros(len(vocabulary), dtype=np.bool_)
     for index, entry in enumerate(vocabulary.objects):
-        if (vector := _class_vector(words, entry)) is not None:
+        named = map(words.of, (entry.label, *entry.aliases))
+        if (vector := next((one for one in named if one is not None), None)) is not None:
             vectors[index], found[index] = vector, True
     return vectors, found
 
@@ -144,13 +146,6 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
             )
     with archive.open(f"{name}.npy") as file:
         return npy.read_array(file, allow_pickle=False)
-
-
-def _class_vector(words: WordVectors, entry: ObjectClass) -> Vectors | None:
-    for name in (entry.label, *entry.aliases):
-        if (vector := words.of(name)) is not None:
-            return vector
-    return None
 
 
 def _unit(vector: NDArray[Any]) -> Vectors:

@@ -25,6 +25,7 @@ from training.datasets.readers import guess_format
 from training.datasets.rooms import DOMAINS
 from training.domain.proposal import Proposal, propose
 from training.domain.report import as_dict, show
+from training.evaluation.report import write_whole
 from training.example_scenes import examples_json
 
 # Maximum number of invalid lines that are printed. Further invalid lines are only counted.
@@ -95,11 +96,11 @@ def init(
     folder.mkdir(parents=True, exist_ok=True)
     for path, some in copies.items():
         write_jsonl(some, path)
-    _write(targets[0], proposal.toml())
-    _write(targets[1], vocabulary_json(proposal.vocabulary))
-    _write(targets[2], examples_json(proposal.examples))
+    write_whole(targets[0], proposal.toml())
+    write_whole(targets[1], vocabulary_json(proposal.vocabulary))
+    write_whole(targets[2], examples_json(proposal.examples))
     if report is not None:
-        _write(report, json.dumps(as_dict(proposal), indent=1, ensure_ascii=False) + "\n")
+        write_whole(report, json.dumps(as_dict(proposal), indent=1, ensure_ascii=False) + "\n")
     show(proposal, console)
     _next(proposal, folder, targets, copies)
 
@@ -115,12 +116,7 @@ def _check_name(name: str) -> None:
 
 
 def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
-    """Read the scenes of a file.
-
-    Raises:
-        BadLinesError: some lines of the file are not valid scenes.
-        DatasetError: the file cannot be read.
-    """
+    """Read the scenes of a file."""
     if format_ is not None and format_ not in READERS:
         raise ConfigError(f"unknown format {format_!r}: use one of {', '.join(READERS)}")
     if (format_ or guess_format(path)) != "jsonl":
@@ -156,14 +152,6 @@ def _sources(
             sources.append(copy)
             copies[folder / copy] = scenes
     return sources, copies
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a text file atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)
 
 
 def _next(

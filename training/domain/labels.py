@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 from rapidfuzz import process
 from rapidfuzz.distance import OSA
@@ -32,7 +33,6 @@ class Label:
     Attributes:
         name: curated name, or the most frequent spelling.
         mentions: number of objects with this name.
-        scenes: number of scenes with this name.
         spellings: spellings in the scenes, most frequent first.
     """
 
@@ -52,7 +52,6 @@ class Lookalike:
         mentions: number of objects with each of the two names.
         merged: True if the rarer name becomes an alias of the other name. If False, the user has to
             decide.
-        why: short reason for the value of `merged`.
     """
 
     name: str
@@ -63,11 +62,7 @@ class Lookalike:
 
 
 def outside_vocabulary(scenes: Iterable[EncodedScene], *, named: bool) -> str:
-    """Return one line about the labels outside the vocabulary, "" without such labels.
-
-    Args:
-        named: True names the labels, most frequent first. False only counts them.
-    """
+    """Return one line that counts or names the labels outside the vocabulary, "" without any."""
     with_labels = [scene.unknown for scene in scenes if scene.unknown]
     spellings: dict[str, Counter[str]] = {}
     for label, count in Counter(label for labels in with_labels for label in labels).items():
@@ -94,14 +89,12 @@ def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
     spellings: dict[str, Counter[str]] = {}
     shown: dict[str, Counter[str]] = {}
     seen: Counter[str] = Counter()
-    canonical: dict[str, tuple[str, str]] = {}
+    canonical = cache(names.canonical)
     for scene in scenes:
         here = set()
         for thing in scene.objects:
-            if thing.label not in canonical:
-                name = names.canonical(thing.label)
-                canonical[thing.label] = (label_key(name), name)
-            key, name = canonical[thing.label]
+            name = canonical(thing.label)
+            key = label_key(name)
             spellings.setdefault(key, Counter())[thing.label] += 1
             shown.setdefault(key, Counter())[name] += 1
             here.add(key)
@@ -172,15 +165,10 @@ def _together(
 ) -> set[frozenset[str]]:
     """Return the pairs of names in `wanted` that occur in the same scene."""
     by_key = {label_key(name): name for name in wanted}
-    known: dict[str, str | None] = {}
+    known = cache(lambda label: by_key.get(label_key(names.canonical(label))))
     found: set[frozenset[str]] = set()
     for scene in scenes:
-        here = set()
-        for thing in scene.objects:
-            if thing.label not in known:
-                known[thing.label] = by_key.get(label_key(names.canonical(thing.label)))
-            if (name := known[thing.label]) is not None:
-                here.add(name)
+        here = {name for thing in scene.objects if (name := known(thing.label)) is not None}
         found |= {frozenset((a, b)) for a in here for b in here if a < b}
     return found
 

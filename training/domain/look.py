@@ -27,7 +27,6 @@ class Finding:
 
     Attributes:
         what: description of the property, in one sentence.
-        count: number of cases.
         examples: the first `SHOWN` cases.
         advice: recommended action of the user.
     """

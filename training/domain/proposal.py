@@ -51,16 +51,13 @@ class Proposal:
     """The files and the report that `init` writes.
 
     Attributes:
-        name: name of the configuration and of the model.
         facts, labels, lookalikes: results of the analysis: statistics, labels and similar labels.
-        minimum: minimum number of objects of a class.
         covered: maps each possible minimum to the number of classes and the share of all objects
             that these classes cover.
         vocabulary: the proposed vocabulary. Merged similar labels are aliases.
         dropped: tuple (name, number of objects, reason) of each name that is not a class.
         values: maps each section of the configuration to its entries.
         reasons: maps "section.entry" to the reason for the value.
-        parts: number of scenes in each part of the proposed split.
         test_groups: number of groups of near-duplicates in the test part.
         examples: example scenes for the visual page.
     """
@@ -114,12 +111,6 @@ def propose(
     terms: str = "",
 ) -> Proposal:
     """Analyse the scenes, and propose a vocabulary and a configuration.
-
-    Args:
-        name: name of the configuration.
-        scenes: the scenes of all files.
-        sources: file names for the entry `data.sources` of the configuration.
-        terms: terms of use of the scenes.
 
     Raises:
         ConfigError: there are fewer than `FEWEST_SCENES` scenes, or they cannot be split.

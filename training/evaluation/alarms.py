@@ -40,7 +40,6 @@ class Alarms:
 
     Attributes:
         source: data source of the scenes, or "the smaller sources".
-        sensitivity: sensitivity of the questions.
         scenes: number of scenes, at most one of each group.
         alarms: number of these scenes with an alarm.
     """

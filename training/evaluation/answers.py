@@ -29,6 +29,7 @@ import numpy as np
 from app.questions import misplaced, missing, outliers, relations
 from app.registry import NEVER, Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, canonicalise
+from training.array_types import Flags, Ints, Rng
 from training.batches import SceneTensors
 from training.cases import (
     altered_case,
@@ -42,7 +43,7 @@ from training.cases import (
 from training.datasets import EncodedScene
 from training.evaluation.asking import labels_alone, with_intruder
 from training.evaluation.intruders import kinds_of_intruders
-from training.evaluation.metrics import Flags, Ints, Items, Metric
+from training.evaluation.metrics import Items, Metric
 from training.evaluation.missing import SHARES, shown_classes
 from training.evaluation.setting import Contender, Outcome, Setting
 
@@ -52,7 +53,7 @@ from training.evaluation.setting import Contender, Outcome, Setting
 _REMOVALS = 4
 # (probability, truth) of each answer about one scene.
 Answered = list[tuple[float, bool]]
-Ask = Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]
+Ask = Callable[[Artifact, EncodedScene, Rng], Answered | None]
 
 
 def uncalibrated(artifact: Artifact) -> Artifact:
@@ -87,7 +88,7 @@ def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -
 def ask_relations(
     artifact: Artifact,
     encoded: EncodedScene,
-    rng: np.random.Generator,  # noqa: ARG001
+    rng: Rng,  # noqa: ARG001
 ) -> Answered | None:
     """Ask for all relations of a scene. The request contains only the labels of the objects."""
     known = known_relations(encoded)
@@ -96,9 +97,7 @@ def ask_relations(
     return _judged(artifact, encoded, labels_alone(encoded), known) or None
 
 
-def ask_given(
-    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
-) -> Answered | None:
+def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for the relations of half of the pairs. The relations of the other half are evidence."""
     asked, given = told_pairs(encoded, artifact.vocabulary.structure, rng)
     if not given:
@@ -120,9 +119,7 @@ def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Fla
     return found
 
 
-def ask_placements(
-    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
-) -> Answered | None:
+def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask where a removed object belongs. Up to `_REMOVALS` objects are removed one at a time."""
     found: Answered = []
     if known_relations(encoded).any():
@@ -131,7 +128,7 @@ def ask_placements(
     return found or None
 
 
-def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator) -> Answered:
+def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered:
     taken = taken_away(encoded, artifact.vocabulary.structure, rng)
     if taken is None:
         return []
@@ -147,9 +144,7 @@ def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: np.random.Gen
     return found
 
 
-def ask_missing(
-    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
-) -> Answered | None:
+def ask_missing(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for missing classes. A random share of the classes, or one class, is hidden."""
     hidden = _hidden(artifact, encoded, rng)
     if hidden is None:
@@ -160,9 +155,7 @@ def ask_missing(
     return [(answer.probability, answer.label in labels) for answer in found]
 
 
-def ask_placed(
-    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
-) -> Answered | None:
+def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for the hidden classes at one place, which is a relation to an object.
 
     A class is left out if it is unknown whether the class has this relation to the object.
@@ -184,7 +177,7 @@ def ask_placed(
     return [(a.probability, a.label in there) for a in found if a.label not in unknown]
 
 
-def _hidden(artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator) -> Ints | None:
+def _hidden(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Ints | None:
     """Draw the classes of a scene to hide. The share of hidden classes is drawn for each scene."""
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
@@ -199,7 +192,7 @@ def _hidden(artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator)
 def ask_outliers(
     artifact: Artifact,
     encoded: EncodedScene,
-    rng: np.random.Generator,
+    rng: Rng,
     intruders: Mapping[tuple[str, str], Ints] | None = None,
 ) -> Answered | None:
     """Ask for outliers. An intruder (an object of an absent class) is added to half of the scenes.
@@ -226,9 +219,7 @@ def ask_outliers(
     return [(a.probability, a.object == intruder) for a in found if usable[a.object]] or None
 
 
-def ask_misplaced(
-    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
-) -> Answered | None:
+def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for misplaced relations. One relation is altered in half of the scenes."""
     case = altered_case(encoded, artifact.vocabulary.structure, rng)
     if case is None:

@@ -8,23 +8,21 @@ memorised scenes. Splits by group keep near-duplicates of test scenes out of tra
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar, get_args
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from app import questions
 from app.questions import Sensitivity
 from app.registry import Artifact
 from app.scene import CANONICAL, Scene, SceneObject
+from training.array_types import Flags, Floats
 from training.cases import scene_of
 from training.datasets import EncodedScene
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Case = TypeVar("Case")
 
 SENSITIVITIES: tuple[Sensitivity, ...] = get_args(Sensitivity)
@@ -82,11 +80,7 @@ def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -
 
 
 def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Scene:
-    """Return a scene that contains only labels, without relations and poses.
-
-    Args:
-        kept: indices of the instances in the returned scene. None means all instances.
-    """
+    """Return a scene of labels, without relations and poses, of the instances in `kept` or all."""
     places = range(len(encoded.instance_classes)) if kept is None else kept
     return replace(scene_of(encoded, places, ()), room_type=None)
 
@@ -133,31 +127,17 @@ def missing_probabilities(
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Answers of `/outliers` about the n objects of a scene, in the order of the objects.
+def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Floats:
+    """Return the answers of `/outliers` about the n objects of a scene, (n, 3).
 
-    Attributes:
-        probability: (n,) probability that the object is an outlier.
-        log_odds: (n,) log-odds of the object given the rest of the scene.
-        is_outlier: (n,) bool, True if the service reports the object as an outlier.
+    The columns are the probability that the object is an outlier, the log-odds of the object given
+    the rest of the scene, and 1 if the service reports the object as an outlier.
     """
-
-    probability: Floats
-    log_odds: Floats
-    is_outlier: Flags
-
-
-def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Verdict:
-    """Return the answers of `/outliers` for a scene at one of the `SENSITIVITIES`."""
-    n = len(scene.objects)
-    probability, log_odds, flagged = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.bool_)
+    columns = np.zeros((len(scene.objects), 3))
     found = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False).outliers
     for answer in found:
-        probability[answer.object] = answer.probability
-        log_odds[answer.object] = answer.log_odds
-        flagged[answer.object] = answer.is_outlier
-    return Verdict(probability, log_odds, flagged)
+        columns[answer.object] = answer.probability, answer.log_odds, answer.is_outlier
+    return columns
 
 
 def relation_probabilities(

@@ -41,7 +41,6 @@ def artifact_contender(
     """Build the contender of a model.
 
     Args:
-        train: training scenes. Annealing in the density task starts at their class frequencies.
         calibrated: True includes the calibrated probabilities and the outlier alarm. False includes
             only the uncalibrated scores of the machine.
     """
@@ -127,10 +126,7 @@ def _instances(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
 
 
 def floor_contender(setting: Setting) -> Contender:
-    """Return a contender whose samples are held-out scenes.
-
-    Its result estimates the best possible value of task T4 (generation).
-    """
+    """Return a contender whose samples are held-out scenes: the best possible value of T4."""
     _, second = held_out_halves(setting.complete)
     return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
 

@@ -20,19 +20,17 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from app import questions
 from app.questions.counts import LIKELY
 from app.registry import Artifact
+from training.array_types import Flags, Floats
 from training.cases import MOST
 from training.counts import class_mean, counted_classes, listed_cases
 from training.datasets import EncodedScene
 from training.evaluation.asking import of_classes
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.setting import Contender, Outcome, Setting
-
-Floats = NDArray[np.float64]
 
 METRICS: Final = (
     "error of the expected count",
@@ -84,7 +82,7 @@ def counts_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 
 def _asked(
-    artifact: Artifact, scene: EncodedScene, counted: NDArray[np.bool_], seed: int
+    artifact: Artifact, scene: EncodedScene, counted: Flags, seed: int
 ) -> list[tuple[float, ...]]:
     """Return the answers about a partly listed scene.
 

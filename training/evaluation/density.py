@@ -29,10 +29,10 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import logsigmoid, softplus
 
+from training.array_types import Floats, Rng
 from training.batches import SceneTensors
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.setting import Contender, Outcome, Setting
@@ -42,8 +42,6 @@ from training.machines.gibbs import initial_state, run
 from training.machines.mean_field import Evidence, mean_field
 from training.machines.partition import LogPartition, ais, independent_base, reverse_ais
 from training.trainer import log_odds_of
-
-Floats = NDArray[np.float64]
 
 _BLOCK = 16
 
@@ -76,7 +74,6 @@ class ObjectDensity:
     Attributes:
         log_unnormalised: function that takes presence vectors (B, V) and returns their
             log-likelihood + log Z, (B,).
-        lower: lower estimate of log Z.
         upper: upper estimate of log Z. It equals `lower` if log Z is exact.
         notes: estimates of log Z and their standard errors, by name.
     """
@@ -104,11 +101,7 @@ def ising_density(
     settings: DensitySettings = DensitySettings(),
     seed: int = 0,
 ) -> ObjectDensity:
-    """Return the density of a pairwise model with biases b (V,) and pairwise weights W (V, V).
-
-    Raises:
-        ValueError: b or W is invalid, see `Ising`.
-    """
+    """Return the density of a pairwise model with biases b (V,) and pairwise weights W (V, V)."""
     model = Ising(b.double().numpy(), W.double().numpy())
     generator = torch.Generator().manual_seed(seed)
     start = torch.randint(len(train), (settings.chains,), generator=generator)
@@ -264,7 +257,6 @@ class Ising:
             start: (chains, V) initial presence of the reverse chains.
             betas: inverse temperatures, increasing from 0 to 1.
             burn_in: number of sweeps of the reverse chains at beta = 1 before annealing.
-            seed: seed of the random numbers.
         """
         rng = np.random.default_rng(seed)
         log_base = float(np.logaddexp(0, a).sum())
@@ -304,7 +296,7 @@ class State:
         linear = (self.model.b - a) @ self.v
         return np.asarray(linear + (self.field * self.v).sum(0) / 2)
 
-    def sweep(self, a: Floats, beta: float, rng: np.random.Generator) -> None:
+    def sweep(self, a: Floats, beta: float, rng: Rng) -> None:
         """Sample each class once given the other classes, at the inverse temperature `beta`."""
         uniform = rng.random(self.v.shape)
         logits = np.log(uniform) - np.log1p(-uniform)

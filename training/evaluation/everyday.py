@@ -69,18 +69,6 @@ def facts_digest(folder: Path) -> str:
     return "" if path is None else sha256(path.read_bytes()).hexdigest()
 
 
-def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> dict[str, tuple[int, int]]:
-    """Return the total (number of hits, number of questions) for each name in `LINES`.
-
-    Raises:
-        FileNotFoundError: the folder contains no facts.
-    """
-    return {
-        line: (sum(hits for hits, _ in found), sum(asked for _, asked in found))
-        for line, found in _lines(artifact, folder).items()
-    }
-
-
 def everyday_task(contender: Contender, setting: Setting) -> Outcome | None:
     """Measure the everyday facts. Each fact counts as one scene. `setting.scenes` is not used."""
     artifact, folder = contender.artifact, setting.everyday
@@ -88,7 +76,7 @@ def everyday_task(contender: Contender, setting: Setting) -> Outcome | None:
         return None
     metrics: dict[str, Metric] = {}
     count = 0
-    for line, found in _lines(artifact, folder).items():
+    for line, found in ask_everyday(artifact, folder).items():
         hits, asked = np.array(found, dtype=np.float64).reshape(-1, 2).T
         count += len(found)
         if asked.sum():
@@ -96,7 +84,12 @@ def everyday_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, count, 0)
 
 
-def _lines(artifact: Artifact, folder: Path) -> Lines:
+def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> Lines:
+    """Ask about every fact in the folder.
+
+    Raises:
+        FileNotFoundError: the folder contains no facts.
+    """
     path = facts_file(folder)
     if path is None:
         raise FileNotFoundError(f"{folder} contains no facts.json")
@@ -111,10 +104,7 @@ def _lines(artifact: Artifact, folder: Path) -> Lines:
 
 
 def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
-    """Build a scene of the labels in the vocabulary.
-
-    The id of an object is its label, or label_number if several objects have the label.
-    """
+    """Build a scene of the known labels; several objects of a label have the ids label_number."""
     objects = []
     taken: set[str] = set()
     for label in labels:

@@ -23,15 +23,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from app.registry import Artifact
 from app.scene import PoseRelations, Scene
+from training.array_types import Flags, Ints
 from training.batches import SceneTensors
 from training.cases import scene_of, scene_rng
 from training.datasets import EncodedScene
 from training.evaluation.asking import (
-    Flags,
     ask_every,
     judge,
     missing_probabilities,
@@ -57,7 +56,6 @@ class Case:
     """One question about a scene, asked with labels only and with additional evidence.
 
     Attributes:
-        place: index of the scene.
         scenes: the scene with labels only, and the scene with evidence.
         target: index of the removed class in T2, or index of the intruding object in T3. Unused in
             T1.
@@ -82,8 +80,6 @@ def told(
     The result is None if the scene lacks this kind of evidence.
 
     Args:
-        kept: indices of the remaining object instances.
-        kind: kind of evidence, one of `KINDS`.
         between: (instances, instances) bool, the pairs of instances with evidence. None means all
             pairs.
     """
@@ -102,9 +98,7 @@ def told(
     return bare, replace(bare, relations=triples, poses=poses)
 
 
-def removals(
-    scenes: SceneTensors, structure: NDArray[np.bool_], kind: str, seed: int = 0
-) -> Iterator[Case]:
+def removals(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
     """Generate the T2 questions: up to two questions per scene, each with one removed class."""
     for place, encoded in enumerate(scenes.scenes):
         classes = encoded.evidence.classes
@@ -120,15 +114,10 @@ def removals(
 def intrusions(
     artifact: Artifact,
     scenes: SceneTensors,
-    intruders: NDArray[np.int64],
+    intruders: Ints,
     kind: str,
 ) -> Iterator[Case]:
-    """Generate the T3 questions: each scene with one intruder.
-
-    Args:
-        intruders: (scenes,) class of the intruder in each scene; -1 skips the scene.
-        kind: kind of evidence, one of `KINDS`.
-    """
+    """Generate the T3 questions: each scene with its intruder, (scenes,); -1 skips the scene."""
     for place, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
         both = told(encoded, list(range(len(encoded.instance_classes))), kind)
         if intruder < 0 or both is None:
@@ -147,13 +136,8 @@ def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
     return with_intruder(artifact, scene, intruder)
 
 
-def halves(
-    scenes: SceneTensors, structure: NDArray[np.bool_], kind: str, seed: int = 0
-) -> Iterator[Case]:
-    """Generate the T1 questions: the evidence is about half of the classes, at least two.
-
-    All pairs of instances without evidence are queried.
-    """
+def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
+    """Generate the T1 questions: evidence about half of the classes, all other pairs queried."""
     for place, encoded in enumerate(scenes.scenes):
         own, classes = encoded.instance_classes, encoded.evidence.classes
         usable = classes[~structure[classes]]
@@ -171,10 +155,7 @@ def halves(
 
 
 def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
-    """Return the reciprocal rank of a removed class among all absent classes.
-
-    For ties, the result is the expectation under random order.
-    """
+    """Return the reciprocal rank of a removed class among absent classes, expected over ties."""
     p = missing_probabilities(artifact, scene)
     above, ties = int((p > p[target]).sum()), int((p == p[target]).sum())
     return float((1.0 / np.arange(above + 1, above + ties + 1)).mean())
@@ -204,7 +185,7 @@ def outliers_evidence_task(contender: Contender, setting: Setting) -> Outcome | 
         return intrusions(artifact, scenes, intruders, kind)
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
-        p = np.where(things(scene, structure), judge(artifact, scene).probability, -np.inf)
+        p = np.where(things(scene, structure), judge(artifact, scene)[:, 0], -np.inf)
         return share_of_first(p, case.target)
 
     return _changes("hit@1", contender, setting, cases, value)
@@ -238,11 +219,9 @@ def _changes(
     """Return the metric without and with each kind of evidence, and the change of the metric.
 
     Args:
-        metric: name of the metric.
         cases_of: function that takes a model, scenes and a kind of evidence, and yields questions.
         value: function that takes a model, one of the two scenes of a question, and the question.
             It returns the metric of the answer, summed over the items of the question.
-        kinds: kinds of evidence.
     """
     artifact = contender.artifact
     if artifact is None:

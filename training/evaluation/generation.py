@@ -32,9 +32,10 @@ from torch import Tensor
 
 from app.questions.generate import STEPS
 from app.scene import CANONICAL
+from training.array_types import Floats
 from training.batches import SceneTensors, subset
 from training.cases import some_scenes
-from training.evaluation.metrics import Floats, Metric, Ratio, Resampled
+from training.evaluation.metrics import Metric, Ratio, Resampled
 from training.evaluation.relations import transitive_closure
 from training.evaluation.setting import Contender, Outcome, Setting
 from training.machines import BoltzmannMachine
@@ -116,7 +117,6 @@ class Drawn:
     """Generated scenes.
 
     Attributes:
-        v: (scenes, classes) presence.
         contradictions: contradictions of the generated relations. None if the sampler generates no
             relations.
     """
@@ -131,7 +131,6 @@ class Sampler(Protocol):
     Args:
         given: (scenes, classes) bool, the classes that each scene must contain.
         room: (scenes,) int64 room type of each scene; -1 if the room type is free.
-        seed: seed of the random numbers.
     """
 
     def __call__(self, given: Tensor, room: Tensor, seed: int) -> Drawn: ...
@@ -262,10 +261,6 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
     """Return a function that takes weights of the held-out scenes and returns MMD².
 
     The statistic excludes pairs of a scene with itself, or with a copy of itself in a resample.
-
-    Args:
-        held_out: (held-out scenes, classes) presence.
-        drawn: (generated scenes, classes) presence.
     """
 
     def kernel(x: Tensor, y: Tensor) -> Floats:
@@ -333,10 +328,7 @@ def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], floa
 
 
 def copies(drawn: Tensor, train: Tensor) -> Floats:
-    """Return 1 for each generated scene with the same set of classes as a training scene, else 0.
-
-    The result has the shape (generated scenes,).
-    """
+    """Return 1 for each generated scene whose classes are those of a training scene, else 0."""
     known = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
     rows = np.packbits(drawn.numpy() > 0, axis=1)
     return np.array([row.tobytes() in known for row in rows], dtype=np.float64)
@@ -354,8 +346,6 @@ def generation_metrics(
 
     Args:
         drawn: at least two generated scenes.
-        held_out: (held-out scenes, classes) presence.
-        train: (training scenes, classes) presence.
         asked: (classes,) bool, the classes that the metrics use.
         bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
         emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.

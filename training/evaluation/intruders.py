@@ -3,8 +3,8 @@
 The class is drawn from one of four distributions over absent classes:
 
     uniform     all classes have the same probability
-    popularity  the probability is proportional to the number of training scenes with the class
-    room        uniform over the classes that training scenes of the same room type contain
+    popularity  see `by_popularity`
+    room        see `by_room`
     signature   a class that is typical of another room type
 
 Structure classes such as walls are never intruders. Scenes with fewer than three other classes are
@@ -31,9 +31,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from training.array_types import Flags, Floats, Ints
 from training.batches import SceneTensors
 from training.cases import scene_rng
-from training.evaluation.metrics import Flags, Floats, Ints, Items, Ratio
+from training.evaluation.metrics import Items, Ratio
 
 SIGNATURE = 10
 """Maximum number of signature classes of a room type."""
@@ -53,10 +54,7 @@ def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 
 
 def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return weights (scenes, classes) of 1 or 0.
-
-    A weight is 1 if a training scene of the scene's room type contains the class.
-    """
+    """Return 1 for classes that training scenes of the room type contain, (scenes, classes)."""
     weights = torch.zeros_like(scenes.v)
     for room in scenes.room.unique().tolist():
         if room >= 0:
@@ -71,7 +69,6 @@ def draw_intruders(
     """Draw an intruder for each scene. Return its class, (scenes,) int64; -1 skips the scene.
 
     Args:
-        structure: (classes,) bool, True for structure classes.
         weights: (scenes, classes) sampling weights. None means equal weights.
     """
     present = scenes.v > 0
@@ -121,10 +118,7 @@ def signatures(train: SceneTensors) -> Signatures:
 
 
 def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return the sampling probability of each class in each scene, (scenes, classes).
-
-    All probabilities of a scene are 0 if it can have no signature intruder.
-    """
+    """Return the sampling probability of each signature intruder, (scenes, classes), or 0."""
     found = signatures(train)
     weights = np.zeros(scenes.v.shape)
     absent = scenes.v.numpy() == 0
@@ -143,11 +137,7 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 def kinds_of_intruders(
     scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Ints]:
-    """Draw three intruders for every scene: uniform, by popularity and by signature.
-
-    Returns:
-        The classes of the intruders, by (data source, scene id).
-    """
+    """Draw uniform, popular and signature intruders of each scene, by (source, scene id)."""
     laws: list[Tensor | None] = [None]
     if train is not None:
         laws += [by_popularity(scenes, train), by_signature(scenes, train)]
@@ -172,7 +162,6 @@ class IntruderScores:
         intruder: (objects,) bool, True if the object is the intruder.
         size: (objects,) number of distinct classes in the scored scene.
         clean: (objects,) bool, True if the scored scene has no intruder.
-        scenes: number of scenes.
         skipped: number of scenes that are too small or have no possible intruder.
     """
 
@@ -193,41 +182,26 @@ class IntruderScores:
         return counts
 
     def with_prior(self, prior: Floats) -> IntruderScores:
-        """Subtract `prior` (classes,) from the log-odds of the objects.
-
-        `prior` is the prior log-odds that an object of the class is an intruder.
-        """
+        """Subtract the prior log-odds that a class is an intruder, `prior` (classes,)."""
         return replace(self, log_odds=self.log_odds - prior[self.thing])
 
     @property
     def dirty(self) -> Items:
-        """Return the objects of scenes with an intruder as items for ranking metrics.
-
-        The score of an object is its negated log-odds. Only the intruder counts as true.
-        """
+        """The objects of scenes with an intruder as items: negated log-odds, true for intruders."""
         rows = ~self.clean
         score, truth = -self.log_odds[rows], self.intruder[rows]
         return Items(self.scene[rows], score, truth, self.scenes, self.skipped)
 
     def hit_at_1(self) -> Ratio:
-        """Return the share of scenes whose intruder has the lowest log-odds.
-
-        For ties, the result is the expectation under random order.
-        """
+        """Return the share of scenes whose intruder has the lowest log-odds; expected over ties."""
         return self.dirty.hit_at_1()
 
     def false_alarms(self, loud: Flags) -> Ratio:
-        """Return the share of clean scenes with an alarm.
-
-        `loud` (objects,) is True for objects with an alarm.
-        """
+        """Return the share of clean scenes with an alarm, for the alarms `loud` (objects,)."""
         return self._alarms(loud, self.clean)
 
     def caught(self, loud: Flags) -> Ratio:
-        """Return the share of intruders with an alarm.
-
-        `loud` (objects,) is True for objects with an alarm.
-        """
+        """Return the share of intruders with an alarm, for the alarms `loud` (objects,)."""
         return self._alarms(loud, self.intruder)
 
     def _alarms(self, loud: Flags, judged: Flags) -> Ratio:
@@ -250,9 +224,7 @@ def intruder_scores(
     All relations are unobserved.
 
     Args:
-        structure: (classes,) bool, True for structure classes.
         score: function that takes presence (rows, classes) and returns log-odds (rows, classes).
-        weights: sampling weights of the intruders, see `draw_intruders`.
     """
     added = draw_intruders(scenes, structure, weights, seed)
     kept = (added >= 0).nonzero().squeeze(1)
@@ -282,13 +254,7 @@ def _scored(
     structure: Tensor,
     score: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, ...]:
-    """Return the arrays of `IntruderScores` for a block of scenes.
-
-    Args:
-        v: (scenes, classes) presence, with intruders.
-        index: (scenes,) index of each scene.
-        added: (scenes,) class of the intruder; -1 for a clean scene.
-    """
+    """Return the arrays of `IntruderScores` for a block of scenes."""
     row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
     odds = torch.zeros(0)
     if len(row):

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from training.array_types import Flags, Floats, Ints
+
 Prepared = Callable[[Floats], float]
 
 BINS = 10
@@ -28,12 +28,11 @@ class _Levels:
     Attributes:
         level: (items,) index of the level of each item. Levels are sorted by score, lowest first.
         scores: (levels,) score of each level.
-        truth: (items,) bool, True for true items.
     """
 
-    level: NDArray[np.int64]
+    level: Ints
     scores: Floats
-    truth: NDArray[np.bool_]
+    truth: Flags
 
     def count(self, weight: Floats) -> tuple[Floats, Floats]:
         """Return the total weight of all items and of the true items, each (levels,)."""
@@ -43,16 +42,13 @@ class _Levels:
         return every, true.astype(np.float64)
 
 
-def _levels(score: Floats, truth: NDArray[np.bool_]) -> _Levels:
+def _levels(score: Floats, truth: Flags) -> _Levels:
     scores, level = np.unique(score, return_inverse=True)
     return _Levels(level.astype(np.int64), scores, truth)
 
 
-def auroc(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """Return the probability that a true item has a higher score than a false item.
-
-    A pair of items with equal scores counts half.
-    """
+def auroc(score: Floats, truth: Flags) -> Prepared:
+    """Return the probability that a true item scores above a false item; ties count half."""
     levels = _levels(score, truth)
 
     def at(weight: Floats) -> float:
@@ -65,7 +61,7 @@ def auroc(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
     return at
 
 
-def average_precision(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
+def average_precision(score: Floats, truth: Flags) -> Prepared:
     """Return the mean precision at the ranks of the true items.
 
     Suppose that n items have the same score and that p of them are true. Suppose also that N items
@@ -89,7 +85,7 @@ def average_precision(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
     return at
 
 
-def calibration_error(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
+def calibration_error(score: Floats, truth: Flags) -> Prepared:
     """Return the expected calibration error (ECE) of probabilities.
 
     The items are sorted by probability and divided into `BINS` bins of equal weight. The ECE is the
@@ -107,7 +103,7 @@ def calibration_error(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
     return at
 
 
-def brier_skill(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
+def brier_skill(score: Floats, truth: Flags) -> Prepared:
     """Return the Brier skill: 1 - Brier score / Brier score of the base rate.
 
     The base rate is the share of true items. The skill is 0 if all probabilities are the base rate.
@@ -141,7 +137,7 @@ class Reliability:
     mass: Floats
 
 
-def reliability(score: Floats, truth: NDArray[np.bool_]) -> Reliability:
+def reliability(score: Floats, truth: Flags) -> Reliability:
     """Return the bins that `calibration_error` uses."""
     levels = _levels(score, truth)
     mass, p, y = _bins(levels.scores, *levels.count(np.ones(len(score))))
@@ -168,7 +164,7 @@ def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats, 
     return np.full(BINS, 1 / BINS), means(every * scores), means(true)
 
 
-STATISTICS: dict[str, Callable[[Floats, NDArray[np.bool_]], Prepared]] = {
+STATISTICS: dict[str, Callable[[Floats, Flags], Prepared]] = {
     "AUROC": auroc,
     "average precision": average_precision,
     "ECE": calibration_error,

@@ -22,11 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
+from training.array_types import Flags, Floats, Ints
 from training.evaluation.item_statistics import STATISTICS
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 RESAMPLES = 1000
 
@@ -73,18 +70,11 @@ class Metric(ABC):
 
     @abstractmethod
     def at(self, weight: Floats) -> float:
-        """Return the metric with scene k counted weight[k] times; NaN if undefined.
-
-        Raises:
-            NotImplementedError: the metric describes a whole set and keeps only its resamples.
-        """
+        """Return the metric with scene k counted weight[k] times; NaN if undefined."""
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Metric | None:
-        """Return the metric over the concatenated scenes of all parts.
-
-        The result is None for metrics of whole sets.
-        """
+        """Return the metric over the scenes of all parts; None for metrics of whole sets."""
         return None
 
     @property
@@ -161,12 +151,9 @@ def _widening(groups: int) -> float:
     return float(quantiles * np.sqrt(groups / (groups - 1)))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4)  # many metrics resample the same scenes one after the other
 def scene_weights(scenes: int, resamples: int, seed: int) -> Floats:
-    """Return how often each resample draws each scene, (resamples, scenes); read-only.
-
-    The result is cached, because many metrics resample the same scenes one after the other.
-    """
+    """Return how often each resample draws each scene, (resamples, scenes); read-only."""
     rng = np.random.default_rng(seed)
     weights = np.empty((resamples, scenes))
     for row in weights:
@@ -266,7 +253,6 @@ class _OfItems(Metric):
 
     Attributes:
         scene: (N,) scene of each item.
-        count: number of scenes.
 
     Raises:
         ValueError: there are no items.
@@ -334,8 +320,6 @@ class Scored(_OfItems):
 
     Attributes:
         statistic: name in `STATISTICS`.
-        score: (N,) score of each item.
-        truth: (N,) bool, the item is true.
 
     Raises:
         ValueError: there are no items, or the statistic is unknown.
@@ -380,7 +364,6 @@ class Items:
         scene: (N,) scene of each item.
         score: (N,) score of each item.
         truth: (N,) bool, the item is true.
-        scenes: number of scenes.
         skipped: number of scenes that could not be scored.
     """
 
@@ -409,9 +392,7 @@ class Resampled(Metric):
     """A metric of whole sets; only its value and its resamples are kept.
 
     Attributes:
-        point: the value.
         drawn: (resamples,) from `resample` with seed 0.
-        count: number of resampled scenes.
         items: number of scenes in the other set of the comparison.
     """
 
@@ -424,10 +405,7 @@ class Resampled(Metric):
     def of(
         cls, statistic: Callable[[Floats], float], scenes: int, items: int, resamples: int
     ) -> Resampled:
-        """Create the metric from a statistic of the scene weights.
-
-        Resampling inflates distances between sets. So the resamples are centred on the value.
-        """
+        """Create the metric from a statistic of scene weights. The resamples are centred."""
         point = statistic(np.ones(scenes))
         drawn = resample(statistic, scenes, resamples)
         return cls(point, _centred(drawn, point), scenes, items)

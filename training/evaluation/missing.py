@@ -30,10 +30,11 @@ from torch import Tensor
 
 from app.registry import Artifact
 from app.scene import CANONICAL
+from training.array_types import Flags, Floats, Ints
 from training.batches import SceneTensors
 from training.cases import scene_rng
 from training.evaluation.asking import ask_rows, missing_probabilities, of_classes
-from training.evaluation.metrics import Flags, Floats, Ints, Macro, Metric, Ratio
+from training.evaluation.metrics import Macro, Metric, Ratio
 from training.evaluation.relations import expected_hits
 from training.evaluation.setting import Contender, Outcome, Setting
 from training.machines import BoltzmannMachine
@@ -88,7 +89,6 @@ class Ranking:
         target: (N,) the hidden class.
         above: (N,) number of candidates with a higher score.
         ties: (N,) number of other candidates with the same score.
-        scenes: number of scenes in the set.
         skipped: number of scenes with too few classes.
     """
 
@@ -140,11 +140,7 @@ class Ranking:
         return metrics | {"MRR, macro by class": macro}
 
     def with_unknown(self, unknown: Ints) -> Ratio:
-        """Return the MRR, where each label outside the vocabulary is a removed object of score 0.
-
-        Args:
-            unknown: (scenes,) number of labels outside the vocabulary. Skipped scenes are ignored.
-        """
+        """Return the MRR if each unknown label, (scenes,), is a removed object of score 0."""
         known = self.mrr()
         scored = known.denominators > 0
         return Ratio(known.numerators, known.denominators + unknown * scored)
@@ -160,12 +156,8 @@ def leave_one_out(
     """Remove each class of each scene in turn, and rank the removed class.
 
     Args:
-        structure: (V,) bool, True for structure classes, such as walls.
         score: a higher score of a class means that the class is more likely missing.
         told_room: True passes the room type of each scene to the score.
-
-    Raises:
-        LeakError: the score depends on more than the shown evidence.
     """
     removable = (scenes.v > 0) & ~structure
     enough = removable.sum(1) >= 2
@@ -187,7 +179,6 @@ class Partial:
         scene: (N,) index of the scene in the set.
         v: (N, V) presence of the shown classes.
         hidden: (N, V) bool, the hidden classes.
-        scenes: number of scenes in the set.
     """
 
     scene: Tensor
@@ -197,12 +188,7 @@ class Partial:
 
 
 def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int = 0) -> Partial:
-    """Hide classes of every scene with at least two classes.
-
-    Args:
-        structure: (V,) bool, True for structure classes, such as walls.
-        share: share of the classes that stay listed. None hides one class.
-    """
+    """Hide classes of each scene with at least two: all but a share of them, or one (None)."""
     plain = ~structure.numpy()
     places: list[int] = []
     hidden = torch.zeros_like(scenes.v, dtype=torch.bool)
@@ -229,8 +215,6 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
     """Return (MRR over hidden classes, precision@5 over scenes).
 
     Raises:
-        LeakError: the score depends on more than the shown evidence.
-        FloatingPointError: a score is NaN.
         ValueError: all scenes have fewer than two classes.
     """
     if not len(partial.v):
@@ -332,11 +316,7 @@ def removed_places(
 def leave_one_out_at(
     scenes: SceneTensors, structure: Tensor, score: PlacedScore, *, seed: int = 0
 ) -> tuple[Ranking, Ints]:
-    """Return the rank of every removed class among the absent classes, and its relation (N,).
-
-    Raises:
-        LeakError: the score depends on more than the shown evidence.
-    """
+    """Return the rank of every removed class among the absent classes, and its relation (N,)."""
     row, target, places = removed_places(scenes, structure, seed)
     values = places.v
     if len(row):

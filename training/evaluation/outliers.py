@@ -24,6 +24,7 @@ from torch import Tensor
 from app.questions import Sensitivity
 from app.registry import Artifact, Calibration
 from app.scene import Scene
+from training.array_types import Flags, Floats, Ints, Rng
 from training.batches import SceneTensors, subset
 from training.cases import scene_rng, some_scenes
 from training.datasets import EncodedScene
@@ -44,7 +45,7 @@ from training.evaluation.intruders import (
     draw_intruders,
     intruder_scores,
 )
-from training.evaluation.metrics import Flags, Floats, Ints, Metric, Ratio
+from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.missing import ObjectScore
 from training.evaluation.setting import Contender, Outcome, Setting
 
@@ -79,10 +80,7 @@ class Alarm:
 
 
 def calibrated_alarm(calibration: Calibration) -> Alarm | None:
-    """Return the alarm rule of the service, with the default sensitivity.
-
-    The result is None if the model judges no object.
-    """
+    """Return the default alarm rule of the service, or None if the model judges no object."""
     entry, presets = calibration.outlier, calibration.outlier_thresholds
     if entry is None or presets is None:
         return None
@@ -100,12 +98,7 @@ def calibrated_alarm(calibration: Calibration) -> Alarm | None:
 def fitted_alarm(
     score: ObjectScore, validation: SceneTensors, structure: Tensor, seed: int = 0
 ) -> Alarm:
-    """Fit the alarm of a score without calibration, on log-odds only.
-
-    Args:
-        validation: at most 1,500 scenes with complete object lists are used.
-        structure: (V,) bool, True for structure classes, such as walls.
-    """
+    """Fit the alarm of a score without calibration, on at most 1,500 complete scenes."""
     complete = subset(validation, validation.complete.nonzero().squeeze(1))
     scenes = some_scenes(complete, _SCENES, seed)
     scores = intruder_scores(scenes, structure, score, seed=seed)
@@ -117,7 +110,7 @@ def alarm_threshold(
     suspicion: Floats,
     scores: IntruderScores,
     scenes: SceneTensors,
-    rng: np.random.Generator,
+    rng: Rng,
     share: float = ALARMS["medium"],
 ) -> float:
     """Compute the suspicion from which an object raises the alarm.
@@ -149,7 +142,7 @@ def kept_in_each_source(
     worst: Floats,
     group: NDArray[np.str_],
     source: Ints,
-    rng: np.random.Generator,
+    rng: Rng,
     share: float,
 ) -> float:
     """Return the threshold that keeps the share of alarms within every source.
@@ -174,7 +167,7 @@ def kept_in_each_source(
     return float(np.nextafter(max(bounds), np.inf))
 
 
-def _bound(worst: Floats, group: NDArray[np.str_], rng: np.random.Generator, share: float) -> float:
+def _bound(worst: Floats, group: NDArray[np.str_], rng: Rng, share: float) -> float:
     """Return a threshold that a share of scenes exceeds, with a safety margin.
 
     Scenes of one place raise alarms together, so the share in new places is uncertain. The margin
@@ -196,11 +189,7 @@ _SHORT_LISTS = (1, 2, 4, 6)
 
 
 def outliers_task(contender: Contender, setting: Setting, law: Law | None = None) -> Outcome | None:
-    """Measure T3 with the object score of a contender.
-
-    Args:
-        law: distribution of the intruders. None means uniform.
-    """
+    """Measure T3 with an object score, for intruders of a law, or uniform ones without a law."""
     if contender.objects is None or (law is not None and setting.train is None):
         return None
     scenes = setting.some()
@@ -288,9 +277,6 @@ def judge_intruders(
     Args:
         intruders: (N,) class of the intruder of each scene, or -1 for a scene without intruder.
         law: suffix of the metric names, for the distribution of the intruders.
-
-    Raises:
-        LeakError: see `ask_every`.
     """
     asked = (intruders >= 0).numpy()
     places = np.flatnonzero(asked).tolist()
@@ -301,7 +287,7 @@ def judge_intruders(
     caught: dict[str, Metric] = {}
     for name in SENSITIVITIES:
         flagged = np.zeros(len(asked))
-        found = ask_every(partial(verdict, artifact, name), cases)
+        found = ask_every(partial(judge, artifact, sensitivity=name), cases)
         for k, case, columns in zip(places, cases, found, strict=True):
             flagged[k] = columns[-1, 2]
             if name == "medium":
@@ -313,12 +299,6 @@ def judge_intruders(
         f"hit@1{law}": Ratio.of_scenes(hits, asked),
         f"hit@1{law}, log-odds alone": Ratio.of_scenes(hits_by_odds, asked),
     } | caught
-
-
-def verdict(artifact: Artifact, sensitivity: Sensitivity, scene: Scene) -> Floats:
-    """Return (n, 3) per object: probability, log-odds, and 1 if it is flagged as an outlier."""
-    found = judge(artifact, scene, sensitivity)
-    return np.column_stack([found.probability, found.log_odds, found.is_outlier])
 
 
 def share_of_first(values: Floats, target: int) -> float:
@@ -335,7 +315,7 @@ def alarms(
     judged: Flags,
 ) -> Ratio:
     """Return the share of judged clean scenes with an object flagged as an outlier."""
-    found = ask_every(partial(verdict, artifact, sensitivity), cases)
+    found = ask_every(partial(judge, artifact, sensitivity=sensitivity), cases)
     loud = [
         bool(((columns[:, 2] > 0) & things(case, structure.numpy())).any())
         for case, columns in zip(cases, found, strict=True)
@@ -343,9 +323,7 @@ def alarms(
     return Ratio.of_scenes(np.array(loud) & judged, judged)
 
 
-def first_classes(
-    encoded: EncodedScene, structure: Tensor, listed: int, rng: np.random.Generator
-) -> Scene:
+def first_classes(encoded: EncodedScene, structure: Tensor, listed: int, rng: Rng) -> Scene:
     """Return a scene of structure and all instances of ``listed`` random classes."""
     every = np.unique(encoded.instance_classes)
     hidden = rng.permutation(every[~structure.numpy()[every]])[listed:]

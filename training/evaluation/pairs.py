@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from app.registry import Artifact
 from app.scene import CANONICAL
+from training.array_types import Flags, Floats, Ints
 from training.batches import SceneTensors, seen_triples
 from training.datasets import EncodedScene
 from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
@@ -38,8 +38,6 @@ VERTICAL = (CANONICAL.index("on-top"), CANONICAL.index("above"))
 # Lower bound of the listed relations' share, so that the log-loss of a pair is at most 21 nats.
 _LEAST = 1e-9
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class ScenePairs:
@@ -47,7 +45,6 @@ class ScenePairs:
 
     Attributes:
         place: index of the scene in its set.
-        scene: the scene.
         ends: (P, 2) indices into the scene's classes, the smaller index first.
         listed: (P, 8) bool, relations of the first class to the second, then of the second to the
             first.
@@ -55,13 +52,13 @@ class ScenePairs:
 
     place: int
     scene: EncodedScene
-    ends: NDArray[np.int64]
-    listed: NDArray[np.bool_]
+    ends: Ints
+    listed: Flags
 
     @property
-    def classes(self) -> NDArray[np.int64]:
+    def classes(self) -> Ints:
         """Class indices of the two classes of each pair, (P, 2)."""
-        ends: NDArray[np.int64] = self.scene.evidence.classes[self.ends]
+        ends: Ints = self.scene.evidence.classes[self.ends]
         return ends
 
 
@@ -123,16 +120,15 @@ class PairAnswers:
         classes: (N, 2) indices of the two classes of each pair.
         p: (N, 8) probability of each of the eight relations.
         listed: (N, 8) bool, True for relations that the scene lists.
-        scenes: number of scenes in the set.
     """
 
-    scene: NDArray[np.int64]
-    classes: NDArray[np.int64]
+    scene: Ints
+    classes: Ints
     p: Floats
-    listed: NDArray[np.bool_]
+    listed: Flags
     scenes: int
 
-    def where(self, mask: NDArray[np.bool_]) -> PairAnswers:
+    def where(self, mask: Flags) -> PairAnswers:
         """Select the pairs with a True value in `mask` (N,)."""
         return PairAnswers(
             self.scene[mask], self.classes[mask], self.p[mask], self.listed[mask], self.scenes
@@ -159,11 +155,7 @@ class PairAnswers:
 
 
 def answer_pairs(asked: list[ScenePairs], score: PairScore, scenes: int) -> PairAnswers:
-    """Compute the probabilities of the eight relations for all pairs of all scenes.
-
-    Raises:
-        LeakError: see `ask_every`.
-    """
+    """Compute the probabilities of the eight relations for all pairs of all scenes."""
     found = ask_every(score, asked)
     return PairAnswers(
         scene=np.repeat([one.place for one in asked], [len(one.ends) for one in asked]),
@@ -202,7 +194,7 @@ def pairs_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(scenes), 0)
 
 
-def _little_known(classes: NDArray[np.int64], setting: Setting) -> dict[str, NDArray[np.bool_]]:
+def _little_known(classes: Ints, setting: Setting) -> dict[str, Flags]:
     """Return masks (N,) of unseen pairs and of rare classes; empty without training scenes.
 
     "unseen pairs": training lists no relation of the two classes. "rare classes": training relates
@@ -217,13 +209,13 @@ def _little_known(classes: NDArray[np.int64], setting: Setting) -> dict[str, NDA
         triples = seen_triples(setting.train.scenes, V)
     known = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
     partners = np.bincount(known.ravel(), minlength=V)
-    rare: NDArray[np.bool_] = np.any(partners[classes] <= RARE, axis=1)
+    rare: Flags = np.any(partners[classes] <= RARE, axis=1)
     return {
         "unseen pairs": ~np.isin(_keys(classes, V), _keys(known, V)),
         "rare classes": rare,
     }
 
 
-def _keys(pairs: NDArray[np.int64], classes: int) -> NDArray[np.int64]:
-    keys: NDArray[np.int64] = pairs[:, 0] * classes + pairs[:, 1]
+def _keys(pairs: Ints, classes: int) -> Ints:
+    keys: Ints = pairs[:, 0] * classes + pairs[:, 1]
     return keys

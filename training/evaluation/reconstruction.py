@@ -20,10 +20,7 @@ _SCENES, _BLOCK = 512, 64
 
 @torch.no_grad()
 def reconstruction_error(machine: BoltzmannMachine, scenes: SceneTensors) -> tuple[float, float]:
-    """Return (object error, relation error) over at most `_SCENES` random scenes.
-
-    The relation error is NaN if the scenes have no observed relations.
-    """
+    """Return (object error, relation error) of random scenes; NaN without observed relations."""
     object_sum = relation_sum = 0.0
     objects = relations = 0
     chosen = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:_SCENES]

@@ -29,9 +29,10 @@ import torch
 from torch import Tensor
 
 from app.scene import CANONICAL
+from training.array_types import Flags, Floats, Ints, Rng
 from training.batches import Batch, SceneTensors
 from training.cases import Triple, scene_rng
-from training.evaluation.metrics import Flags, Floats, Ints, Items, Metric, Ratio
+from training.evaluation.metrics import Items, Metric, Ratio
 from training.evaluation.setting import Contender, Outcome, Setting
 from training.machines import BoltzmannMachine
 from training.machines.edges import triple_keys
@@ -119,14 +120,7 @@ def _batches(
 
 
 def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candidates]:
-    """Return the candidates of every scene, numbered in order.
-
-    Args:
-        batches: batches with scores (B, A, n, n) and masks (B, A, n, n) of the candidates.
-
-    Raises:
-        FloatingPointError: the score of a candidate is NaN.
-    """
+    """Return the candidates of every scene, numbered in order."""
     found: list[Candidates] = []
     for batch, values, mask in batches:
         for row, own in enumerate(batch.classes):
@@ -144,12 +138,7 @@ def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candida
 def score_scenes(
     scenes: SceneTensors, structure: Tensor, score: RelationScore, *, counts: bool = True
 ) -> list[Candidates]:
-    """Score the T1a candidates of the scenes with annotated triples.
-
-    Args:
-        structure: (V,) bool, True for structure classes, such as walls.
-        counts: True passes the instance counts to the score. False sets all counts to 0 (unknown).
-    """
+    """Score the T1a candidates of annotated scenes. Without `counts`, all counts are 0, unknown."""
 
     def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
         for _, batch in _batches(scenes, 1, block=32):
@@ -179,12 +168,7 @@ def complete_scenes(
 
 
 def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed: int) -> Tensor:
-    """Return half of each scene's triples (rounded down), (B, A, n, n) bool.
-
-    Args:
-        truth: (B, A, n, n) bool, all triples.
-        index: indices of the B scenes.
-    """
+    """Return half of each scene's triples (rounded down), (B, A, n, n) bool."""
     given = torch.zeros_like(truth)
     for row, k in enumerate(index):
         triples = truth[row].nonzero()
@@ -221,13 +205,7 @@ class RelationRanking:
 
 
 def rank(scored: Iterable[Candidates], scenes: int, *, first: int | None = None) -> RelationRanking:
-    """Count annotated triples among the best candidates.
-
-    Args:
-        scored: candidates of the scenes.
-        scenes: total number of scenes.
-        first: number of predictions; by default the number of annotated triples of the scene.
-    """
+    """Count annotated triples among the first candidates, by default as many as are annotated."""
     annotated, hits = np.zeros(scenes, dtype=np.int64), np.zeros(scenes)
     for scene in scored:
         if count := int(scene.truth.sum()):
@@ -244,12 +222,7 @@ def rank_relations(
 
 
 def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Candidates]:
-    """Select the candidates that never held in training (zero-shot).
-
-    Args:
-        seen: (T, 3) triples (a, i, j) of training; see `training.batches.seen_triples`.
-        classes: number of classes in the vocabulary, V.
-    """
+    """Select the candidates that are not among the training triples `seen`, (T, 3) (zero-shot)."""
     relation, subject, object_ = seen.long().unbind(1)
     keys = triple_keys(relation, subject, object_, classes).numpy()
     return [scene.where(~np.isin(scene.key, keys)) for scene in scored]
@@ -268,13 +241,8 @@ def expected_hits(score: Floats, truth: Flags, count: int) -> float:
 # -------------------------------------------------------------------------------------------- T3b
 
 
-def alter(holds: Flags, usable: Flags, rng: np.random.Generator) -> tuple[Triple, Triple] | None:
-    """Draw a triple of a scene and a false replacement; return (true, false) or None.
-
-    Args:
-        holds: (A, n, n) bool, the true triples.
-        usable: (A, n, n) bool, the triples that may be used.
-    """
+def alter(holds: Flags, usable: Flags, rng: Rng) -> tuple[Triple, Triple] | None:
+    """Draw a triple of a scene and a false replacement; return (true, false) or None."""
     triples = np.argwhere(holds & usable)
     if len(triples) < 2:
         return None

@@ -21,10 +21,11 @@ import torch
 from torch import Tensor
 
 from app.registry import Artifact
+from app.registry import Metric as CardMetric
 from training.batches import SceneTensors, subset
 from training.evaluation.contenders import artifact_contender
 from training.evaluation.everyday import SOURCE, facts_digest
-from training.evaluation.metrics import Figure, Macro, Metric, Ratio, Resampled, Scored
+from training.evaluation.metrics import Macro, Metric, Ratio, Resampled, Scored
 from training.evaluation.setting import Contender, Outcome, Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
@@ -38,16 +39,6 @@ Progress = Callable[[str], None]
 
 def silent(_: str) -> None:
     """Ignore progress messages."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One metric of a task on a data source, with its interval."""
-
-    task: str
-    source: str
-    metric: str
-    figure: Figure
 
 
 @dataclass
@@ -67,10 +58,7 @@ class SourceReport:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-serialisable dictionary.
-
-        The dictionary also contains intervals, which are for human readers only.
-        """
+        """Return a JSON-serialisable dictionary, with intervals for human readers."""
         return {
             "source": self.source,
             "scenes": self.scenes,
@@ -81,8 +69,9 @@ class SourceReport:
         }
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> SourceReport:
-        """Create a report from the output of `to_dict`."""
+    def read(cls, path: Path) -> SourceReport:
+        """Read a report that `measure` wrote."""
+        values = json.loads(path.read_text(encoding="utf-8"))
         tasks = values["tasks"].items()
         return cls(
             values["source"],
@@ -115,25 +104,14 @@ def settings_by_source(
     *,
     limit: int | None = 600,
 ) -> Iterator[tuple[str, Setting]]:
-    """Iterate over the data sources, by name, and their evaluation settings.
-
-    Each setting has only the scenes and the training scenes of its data source.
-
-    Args:
-        structure: (classes,) bool, True for structure classes such as walls.
-        seen: triples that the model may have learnt from, see `Setting`.
-        limit: maximum number of scenes per data source in slow tasks.
-    """
+    """Iterate over the data sources and the settings of their scenes and training scenes."""
     training = dict(by_source(train))
     for source, some in by_source(scenes):
         yield source, Setting(some, structure, training.get(source), seen, limit)
 
 
 def digest(setting: Setting) -> str:
-    """Return the sha256 of all values that determine the questions.
-
-    These values are the scene ids, the limit, the seed and the everyday facts.
-    """
+    """Return the sha256 of the questions: scene ids, limit, seed and everyday facts."""
     names = [f"{scene.source} {scene.scene_id}" for scene in setting.scenes.scenes]
     facts = [] if setting.everyday is None else [f"facts {facts_digest(setting.everyday)}"]
     asked = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
@@ -179,16 +157,10 @@ def measure(
     tasks: Iterable[str] = tuple(TASKS),
     progress: Progress = silent,
 ) -> SourceReport:
-    """Measure tasks, and write the report to the file at `path` after every task.
-
-    Tasks that the file already contains are skipped.
-
-    Raises:
-        ValueError: a task is unknown, or the file belongs to other scenes or questions.
-    """
+    """Measure the tasks that the file at `path` lacks, and write it after every task."""
     report = SourceReport(source, digest(setting))
     if path.exists():
-        report = SourceReport.from_dict(json.loads(path.read_text(encoding="utf-8")))
+        report = SourceReport.read(path)
     for _ in run(contender, setting, report, tasks=tasks, progress=progress):
         write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
     return report
@@ -228,20 +200,16 @@ def evaluate(
     everyday: Path | None = None,
     tasks: Collection[str] | None = None,
     progress: Progress = silent,
-) -> list[Row]:
+) -> list[CardMetric]:
     """Measure the metrics of a model card on every data source.
 
     Generated scenes are compared with the scenes of all data sources together.
 
     Args:
-        artifact: the model as published, with its calibration.
-        scenes: held-out scenes.
-        structure: (classes,) bool, True for structure classes such as walls.
         train: training scenes. They show which generated scenes are copies, and which classes are
             typical of a room type.
         limit: maximum number of scenes per data source in slow tasks, see `Setting`. None means 200
             scenes, or 20 scenes for a machine that computes its answers by sampling.
-        everyday: folder of the everyday facts, see `Setting`.
         tasks: names of the tasks to measure. None means all tasks of a model card.
     """
     if limit is None:
@@ -253,7 +221,7 @@ def evaluate(
     single = [task for task in wanted if task not in WHOLE_SET]
     sources = list(by_source(scenes))
     training = dict(by_source(train))
-    rows: list[Row] = []
+    rows: list[CardMetric] = []
     for source, some in sources:
         setting = Setting(some, structure, training.get(source), limit=limit)
         rows += _published(contender, setting, source, single, progress)
@@ -272,12 +240,12 @@ def _published(
     source: str,
     tasks: Iterable[str],
     progress: Progress,
-) -> list[Row]:
+) -> list[CardMetric]:
     report = SourceReport(source, digest(setting))
     for _ in run(contender, setting, report, tasks=tasks, progress=progress):
         pass
     return [
-        Row(task, source, name, outcome.metrics[name].figure())
+        CardMetric(task=task, source=source, metric=name, **asdict(outcome.metrics[name].figure()))
         for task, outcome in report.outcomes.items()
         if outcome is not None
         for name in EVERY_TASK[task].card
@@ -317,9 +285,6 @@ def _from_dict(values: dict[str, Any] | None) -> Outcome | None:
 
 def pool(parts: Sequence[Metric]) -> Metric | None:
     """Pool a metric over the scenes of all parts. Return None for a metric of a whole set.
-
-    Args:
-        parts: the metric on each data source.
 
     Raises:
         ValueError: `parts` is empty or contains metrics of different types.

@@ -102,10 +102,7 @@ def removed_switched_on(contender: Contender, setting: Setting) -> Outcome | Non
 
 
 def reconstruction_after_addition(contender: Contender, setting: Setting) -> Outcome | None:
-    """Measure T3: add an absent class to each scene, and sample all objects once.
-
-    All relations are unobserved.
-    """
+    """Measure T3: add an absent class to each scene, and sample all objects once."""
     if contender.machine is None:
         return None
     machine, scenes = contender.machine, setting.some()
@@ -165,7 +162,6 @@ def switch_on_probability(
     The probability is p(v_i = 1 | h1, relations), with one sample of the hidden layer h1.
 
     Args:
-        batch: the complete scenes.
         target: (scenes,) int64, the removed class of each scene.
         left_on: True keeps the relations of the removed class as annotated. False makes these
             relations unobserved.
@@ -199,10 +195,7 @@ def _touches(edges: Edges, target: Tensor) -> Tensor:
 
 
 def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
-    """Draw a class to remove from each scene, (scenes,).
-
-    The result is -1 for scenes with fewer than two classes that are not structure.
-    """
+    """Draw a class to remove from each scene, (scenes,); -1 with fewer than two plain classes."""
     found = torch.full((len(scenes),), -1, dtype=torch.int64)
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):

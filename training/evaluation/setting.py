@@ -115,7 +115,6 @@ class Outcome:
 
     Attributes:
         metrics: metrics by name; the primary metric comes first.
-        scenes: number of scenes.
         skipped: number of scenes that could not be scored.
         notes: additional values, such as a bandwidth.
     """

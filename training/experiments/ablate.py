@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +11,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rich.console import Console
 
 from training.batches import seen_triples
-from training.config import Config, ConfigError, data_folder, load_config, with_settings
+from training.config import (
+    Config,
+    ConfigError,
+    data_folder,
+    first_error,
+    load_config,
+    own_or_shipped,
+    read_toml,
+    with_settings,
+)
 from training.evaluation.report import SourceReport, pooled, settings_by_source
 from training.evaluation.setting import Setting
 from training.experiments.measure import (
@@ -119,26 +127,11 @@ def _configs(
     limit: int | None,
     epochs: int | None,
 ) -> list[Config]:
-    """Return the configurations of the full model and of the selected ablations.
-
-    Args:
-        limit: maximum number of scenes per data source.
-        epochs: maximum number of training epochs.
-
-    Raises:
-        ConfigError: an ablation is invalid (see `load_rows`), the configuration has no shipped
-            ablations, or a selected ablation is unknown.
-    """
+    """Return the configurations of the full model and of the selected ablations."""
     full = load_config(reference)
     if limit is not None:
         full = with_settings(full, {"data.limit": limit})
-    shipped = shipped_ablations()
-    if path is None and full.name not in shipped:
-        raise ConfigError(
-            f"{full.name} has no shipped ablations (available for: {', '.join(shipped)}). Pass a "
-            "TOML file of ablations with --rows"
-        )
-    found = load_rows(path or shipped[full.name], full)
+    found = load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
     if unknown := sorted(set(names or ()) - {config.name for config in found}):
         raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(c.name for c in found)}")
     chosen = [full, *(config for config in found if not names or config.name in names)]
@@ -151,10 +144,7 @@ def _configs(
 
 
 def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
-    """Return the evaluation settings, for the validation and test part of each data source.
-
-    `limit` is the maximum number of scenes in slow tasks.
-    """
+    """Return the evaluation settings of the validation and test part of each data source."""
     seen = seen_triples(scenes.train.scenes, scenes.train.v.shape[1])
     parts = {"validation": scenes.validation, "test": scenes.test}
     return {
@@ -167,10 +157,7 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
 
 
 def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
-    """Return the reports with only the metrics of `PRIMARY`.
-
-    The first two reports are new: they pool the data sources of the validation and test part.
-    """
+    """Return the `PRIMARY` metrics, first of the pooled validation and test parts."""
     pools = {
         f"{part} pooled": pooled(
             [report for name, report in reports.items() if name.startswith(part)], f"{part} pooled"
@@ -183,10 +170,7 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
 def _costs(
     folder: Path, configs: Sequence[Config], seeds: int
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Return the number of trained weights and the mean training time in seconds, by model name.
-
-    Weights that stay at zero do not count as trained.
-    """
+    """Return the number of weights not held at zero, and the mean seconds, by model name."""
     weights, seconds = {}, {}
     for config in configs:
         places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]
@@ -219,12 +203,6 @@ class _File(BaseModel):
     row: tuple[_Change, ...] = Field(min_length=1)
 
 
-def shipped_ablations() -> dict[str, Path]:
-    """Return the shipped ablation files by the name of the full model."""
-    folder = Path(__file__).parents[1] / "configs/ablations"
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
-
-
 def load_rows(path: Path, full: Config) -> list[Config]:
     """Read the ablations in a TOML file: one configuration for each `[[row]]` of the file.
 
@@ -236,15 +214,9 @@ def load_rows(path: Path, full: Config) -> list[Config]:
             have the same name, or an ablation has the same settings as the full model.
     """
     try:
-        file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError as error:
-        raise ConfigError(f"ablation file {path} does not exist") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path.name} is not TOML: {error}") from error
+        file = _File.model_validate(read_toml(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{path.name}: {place}: {first['msg']}") from error
+        raise ConfigError(f"{path.name}: {first_error(error)}") from error
     configs: dict[str, Config] = {}
     for row in file.row:
         if row.name in configs or row.name == full.name:

@@ -129,18 +129,7 @@ class Domain:
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the command.
-
-    Attributes:
-        root: folder with the scene files.
-        tasks: names of the tasks to measure, see `TASKS`.
-        seeds: number of training seeds. Deterministic baselines are trained only once.
-        baselines: names of the baselines to measure. None means all baselines.
-        limit: maximum number of scenes per data source in slow tasks.
-        workers: number of processes.
-        quick: use few scenes, epochs and baselines.
-        fresh: delete earlier reports.
-    """
+    """Options of the command."""
 
     root: Path
     tasks: tuple[str, ...]
@@ -313,8 +302,6 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
 
     Raises:
         ConfigError: the split is random, or the scene files are missing.
-        DatasetError: the scene files cannot be read.
-        BenchmarkError: the folder holds reports of another experiment, see `Plan.known`.
         ValueError: a baseline in `options` is unknown.
     """
     domain.require_groups()
@@ -335,10 +322,7 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
 
 
 def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> Results:
-    """Measure the machines of a domain by the seed protocol (Bozcan et al., 2018).
-
-    Each machine is trained once, on a random split of the scenes.
-    """
+    """Measure each machine, trained once on a random split, by the seed protocol."""
     scenes = options.scenes(domain, split="random")
     plan = _plan(folder, scenes, options, tuple(SEED_TASKS))
     rows = [
@@ -362,7 +346,6 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
     are always measured.
 
     Raises:
-        ConfigError: the split is random, see `Domain.require_groups`.
         ValueError: no task is supported (see `shuffled_tasks`), or all supported tasks need
             relations and the scenes contain none.
     """

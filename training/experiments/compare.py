@@ -21,7 +21,7 @@ from app.scene import Vocabulary
 from training.batches import SceneTensors, scene_tensors
 from training.cases import some_scenes
 from training.config import DATA, ConfigError
-from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
+from training.datasets import DatasetError, annotated_classes, encode
 from training.domain.command import fail
 from training.evaluation.missing import ObjectScore, leave_one_out
 from training.evaluation.report import Progress, SourceReport, digest, run, silent
@@ -69,7 +69,6 @@ class Example:
     """An example question: a scene with one removed object, and the answers of both models.
 
     Attributes:
-        scene: scene id.
         room_type: room type of the scene, or "" if unknown.
         shown: labels of the remaining objects.
         removed: label of the removed object.
@@ -93,7 +92,6 @@ class Comparison:
     Attributes:
         results: metrics of both models. The first model is the reference `ours`.
         b: title of the second model.
-        scenes: number of compared scenes.
         groups: number of groups of near-duplicates among the compared scenes.
         certain: False if a model may have learnt from some of the scenes.
         notes: remarks on the results.
@@ -117,12 +115,11 @@ class Comparison:
         return self.results.ours
 
     def worse_by(self, margin: float) -> list[Difference]:
-        """Return the primary metrics in which the first model is worse by more than `margin`.
-
-        In these metrics, the whole interval of the paired difference is below -margin.
-        """
+        """Return the primary metrics whose whole interval of the difference is below -margin."""
         return [
-            row for row in self.results.differences if is_primary(row) and row.figure.high < -margin
+            row
+            for row in self.results.differences
+            if row.metric == COMPARED[row.task][0] and row.figure.high < -margin
         ]
 
     def to_dict(self) -> dict[str, Any]:
@@ -130,11 +127,6 @@ class Comparison:
         own = asdict(self)
         own.pop("results")
         return self.results.to_dict() | {"a": self.a} | own
-
-
-def is_primary(row: Difference) -> bool:
-    """Return True if the metric of a row is the primary metric of its task."""
-    return row.metric == COMPARED[row.task][0]
 
 
 def compare_command(
@@ -167,7 +159,8 @@ def compare_command(
             say: Say = status.update
             models = Store(store)
             a = find(new, models, data, say)
-            b = find(old or _served(models), models, data, say)
+            served = "default" if "default" in models.aliases() else BASELINE_SIDE
+            b = find(old or served, models, data, say)
             comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         fail(error)
@@ -175,11 +168,6 @@ def compare_command(
         text = json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False)
         output.write_text(text + "\n", encoding="utf-8")
     show(comparison, console)
-
-
-def _served(store: Store) -> str:
-    """Return the alias `default`. If the store has no such alias, return `BASELINE_SIDE`."""
-    return "default" if "default" in store.aliases() else BASELINE_SIDE
 
 
 def _root(given: Path | None, *sides: Side) -> Path:
@@ -241,14 +229,10 @@ def compare(
 
     Args:
         root: folder with the scene files of the first model's configuration.
-        limit: maximum number of scenes.
-        examples: maximum number of examples.
-        say: function that shows the current step to the user.
 
     Raises:
         ConfigError: the first model lacks its training configuration, its scene files are missing,
             or too few scenes are held out from both models.
-        DatasetError: the scene files cannot be read.
     """
     if a.config is None or a.vocabulary is None:
         raise ConfigError(
@@ -259,7 +243,9 @@ def compare(
     sources = read_sources(a.config.data, root)
     held = held_out(a, b, sources, root)
     data = split_and_encode(a.config.data, sources, a.vocabulary).training_data()
-    scenes = some_scenes(_tensors(held.scenes, a.vocabulary), limit)
+    encoded = encode(held.scenes, a.vocabulary)
+    annotated = annotated_classes(encoded, a.vocabulary)
+    scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), limit)
     rivals = (a.rival(a.vocabulary, data, say), b.rival(a.vocabulary, data, say))
     try:
         titles = a.title, b.title if b.title != a.title else f"{b.title} (second)"
@@ -301,11 +287,6 @@ def side_by_side(
 
     The bootstrap resamples groups of near-duplicate scenes.
 
-    Args:
-        titles: titles of the two models.
-        rivals: function of each model that returns its scores for a task.
-        structure: (classes,) bool, True for structure classes such as walls.
-
     Raises:
         ValueError: for every task, the scenes belong to fewer than two groups, so intervals are
             undefined.
@@ -331,19 +312,11 @@ def side_by_side(
 
 
 def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
-    """Return the relation tasks that only the other model's card measures.
-
-    The result is empty if any of `rows` measures a relation task.
-    """
+    """Return the relation tasks that only the other card measures; () if `rows` measure any."""
     if other.artifact is None or any(row.task in RELATIONAL for row in rows):
         return ()
     measured = {metric.task for metric in other.artifact.manifest.metrics}
     return tuple(task for task in RELATIONAL if task in measured)
-
-
-def _tensors(scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary) -> SceneTensors:
-    encoded = encode(scenes, vocabulary)
-    return scene_tensors(encoded, annotated_classes(encoded, vocabulary), len(vocabulary))
 
 
 def _notes(a: Side, b: Side, held: HeldOut, limit: int | None) -> Iterator[str]:

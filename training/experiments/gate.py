@@ -108,9 +108,6 @@ def measure_usefulness(
 
     The baselines learn from the training scenes of the run. Scenes with incomplete object lists are
     left out, unless all test scenes are such scenes.
-
-    Args:
-        limit: maximum number of test scenes.
     """
     complete = data.test.complete.nonzero().squeeze(1)
     scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, limit)
@@ -143,7 +140,6 @@ class Seat:
     """An alias of the model store, and the model that it serves now.
 
     Attributes:
-        alias: name of the alias.
         target: model version that the alias names now. None if the alias is new.
         holder: the served model. None if the alias is new or the model cannot be read.
         note: reason why a comparison with the served model is impossible, or "".
@@ -181,27 +177,13 @@ def compare_with_served(
     limit: int | None,
     say: Say,
 ) -> Comparison:
-    """Compare a new version with the served version before publication.
-
-    Args:
-        artifact: the new version.
-        holder: the served version.
-        root: folder with the scene files of the run.
-        limit: maximum number of scenes.
-
-    Raises:
-        ConfigError: the comparison is impossible, see `compare`.
-    """
+    """Compare a new version with the served version before publication."""
     new = Side(NEW, run.config, scenes.digests, artifact, root)
     return compare(new, holder, root, limit=limit, examples=3, say=say)
 
 
 def losses(comparison: Comparison, margin: float) -> list[str]:
-    """Return the reasons against the first model of a comparison.
-
-    Args:
-        margin: accepted loss of a primary metric.
-    """
+    """Return the reasons against the first model of a comparison."""
     a, b, reasons = comparison.a, comparison.b, []
     if rows := comparison.worse_by(margin):
         names = ", ".join(f"{in_words(row.task)}, {row.metric} {row.figure}" for row in rows)

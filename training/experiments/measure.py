@@ -137,9 +137,6 @@ class Plan:
 
         The model is trained only if a report is missing. On KeyboardInterrupt, the results of
         finished tasks are already on disk.
-
-        Raises:
-            BenchmarkError: the folder holds reports of another experiment, see `known`.
         """
         known = self.known(row)
         rival: Rival | None = None
@@ -193,7 +190,6 @@ def measure_rows(
         The reports by (row name, seed), and the error messages of failed rows by row name.
 
     Raises:
-        BenchmarkError: a folder holds reports of another experiment, see `Plan.known`.
         BrokenProcessPool: a worker process died.
     """
     if fresh:
@@ -330,10 +326,6 @@ def parameters(folder: Path, rows: Sequence[Row]) -> dict[str, int]:
 def claim(place: Path, row: Row, material: str) -> None:
     """Reserve a folder for a row, or check that the folder already belongs to the row.
 
-    Args:
-        place: folder of the row.
-        material: digest of the scenes and their split.
-
     Raises:
         BenchmarkError: the folder belongs to a row with other settings or other scenes.
     """
@@ -362,7 +354,7 @@ def read_report(path: Path, setting: Setting) -> SourceReport:
     Raises:
         BenchmarkError: the report belongs to other scenes or questions.
     """
-    report = SourceReport.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    report = SourceReport.read(path)
     if report.scenes != digest(setting):
         raise BenchmarkError(
             f"the report {path} belongs to other scenes or questions: use --fresh or another folder"

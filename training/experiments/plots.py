@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 from matplotlib.figure import Figure
 
 from training.evaluation.answers import QUESTIONS
@@ -46,16 +45,11 @@ def write_plots(
     Args:
         machines: trained and calibrated machines, one per training seed. The reliability plots use
             the seed of the first machine.
-        reports: reports of all machines and baselines, by (name, seed) and data source.
     """
-    matplotlib.use("Agg")
     runs: dict[str, list[Path]] = {}
     for entry in machines:
         runs.setdefault(entry.name, []).append(plan.place(entry) / "run" / "curve.csv")
-    drawn: dict[str, Figure] = {
-        "learning-curves": learning_curves(runs),
-        "recall": recall_curves(results, POOLED),
-    }
+    drawn = {"learning-curves": learning_curves(runs), "recall": recall_curves(results, POOLED)}
     for entry in machines:
         outcome = reports[entry.name, entry.seed][POOLED].outcomes.get("Calibration")
         if outcome is not None and entry.seed == machines[0].seed:
@@ -70,11 +64,7 @@ def write_plots(
 
 
 def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
-    """Plot validation metrics by epoch, with one colour per machine and one line per seed.
-
-    Args:
-        runs: curve files of each machine, one file per training seed.
-    """
+    """Plot validation metrics by epoch, with one colour per machine and one line per seed."""
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     axes = figure.subplots(2, 2).flat
     for axis, (column, title) in zip(axes, _CURVES.items(), strict=True):
@@ -104,7 +94,7 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
     asked = [name for name in QUESTIONS if f"ECE, {name}" in outcome.metrics]
     figure = Figure(figsize=(3.2 * max(len(asked), 1), 3.6), layout="constrained")
     figure.suptitle(title)
-    for axis, name in zip(_axes(figure, 1, len(asked)), asked, strict=True):
+    for axis, name in zip(_axes(figure, len(asked)), asked, strict=True):
         axis.plot([1e-5, 1], [1e-5, 1], color="0.7", linewidth=1)
         for suffix, marker in ((", uncalibrated", "x"), ("", "o")):
             metric = outcome.metrics[f"ECE, {name}{suffix}"]
@@ -123,9 +113,8 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
 def recall_curves(results: Results, source: str) -> Figure:
     """Plot recall by number of predictions, one line per model, for one data source."""
     figure = Figure(figsize=(12, 5), layout="constrained")
-    for axis, (task, (prefix, title)) in zip(
-        _axes(figure, 1, len(_RECALL)), _RECALL.items(), strict=True
-    ):
+    axes = _axes(figure, len(_RECALL))
+    for axis, (task, (prefix, title)) in zip(axes, _RECALL.items(), strict=True):
         for row, points in recall_points(results, task, prefix, source).items():
             k, values = zip(*points, strict=True)
             ours = row == results.ours
@@ -141,10 +130,7 @@ def recall_curves(results: Results, source: str) -> Figure:
 def recall_points(
     results: Results, task: str, prefix: str, source: str
 ) -> dict[str, list[tuple[int, float]]]:
-    """Return the points (k, recall at k) of one task, by model name.
-
-    The name of each metric is `prefix` followed by k, for example "R@10".
-    """
+    """Return the points (k, recall at k) of the metrics "<prefix>k", by model name."""
     found: dict[str, list[tuple[int, float]]] = {}
     for cell in results.cells:
         k = cell.metric.removeprefix(prefix)
@@ -153,5 +139,5 @@ def recall_points(
     return {row: sorted(points) for row, points in found.items()}
 
 
-def _axes(figure: Figure, rows: int, columns: int) -> Iterator[Any]:
-    return iter(figure.subplots(rows, columns, squeeze=False).flat) if columns else iter(())
+def _axes(figure: Figure, columns: int) -> Iterator[Any]:
+    return iter(figure.subplots(1, columns, squeeze=False).flat) if columns else iter(())

@@ -19,6 +19,10 @@ from training.evaluation.report import SourceReport, write_whole
 from training.evaluation.tasks import TASKS, in_words
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
+Shown = Mapping[str, tuple[str, ...]]
+
+SHOWN: Shown = {name: task.shown for name, task in TASKS.items()}
+"""Names of the metrics in tables, by task."""
 
 # Annotators list only a part of the relations that hold.
 UNLISTED = "An unlisted relation counts as wrong"
@@ -46,10 +50,6 @@ class Cell:
     """One metric of one row on one data source.
 
     Attributes:
-        row: name of the row.
-        task: name of the task.
-        source: name of the data source, or "pooled".
-        metric: name of the metric.
         figure: mean over training seeds, with the bootstrap interval over scenes.
         seeds: value of the metric for each training seed.
     """
@@ -74,10 +74,7 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """Return whether the reference row is `better` or `worse` than the other row.
-
-        If the interval contains zero, the verdict is `undecided`.
-        """
+        """`better` or `worse` than the other row, or `undecided` if the interval contains zero."""
         low, high = self.figure.low, self.figure.high
         if self.metric.startswith(_LOWER_IS_BETTER):
             low, high = -high, -low
@@ -86,17 +83,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Asked:
-    """Number of scenes of one task, for one row, training seed and data source.
-
-    Attributes:
-        row: name of the row.
-        seed: training seed.
-        task: name of the task.
-        source: name of the data source, or "pooled".
-        scenes: number of scenes.
-        skipped: number of scenes that could not be scored.
-        notes: additional values, such as a kernel bandwidth, or log Z with its standard errors.
-    """
+    """Number of scenes of one task, for one row, training seed and data source."""
 
     row: str
     seed: int
@@ -135,22 +122,18 @@ class Results:
             "asked": [asdict(asked) for asked in self.asked],
         }
 
-    def markdown(
-        self, shown: Mapping[str, tuple[str, ...]] | None = None, *, changes: bool = False
-    ) -> str:
+    def markdown(self, shown: Shown = SHOWN, *, changes: bool = False) -> str:
         """Return one Markdown table per metric, and remarks on each task.
 
         A table has one line per row and one column per data source. A star marks a row that is
         worse than the reference row: the whole interval of the paired difference agrees.
 
         Args:
-            shown: names of the metrics by task. None means the metrics in `TASKS`.
+            shown: names of the metrics by task.
             changes: True replaces the intervals of the metrics by intervals of the differences. A
                 difference is the row minus the reference row.
         """
         parts: list[str] = []
-        if shown is None:
-            shown = {name: task.shown for name, task in TASKS.items()}
         for task, metrics in shown.items():
             tables = [table for name in metrics if (table := self._table(task, name, changes))]
             if tables:
@@ -158,54 +141,49 @@ class Results:
                 parts += [*tables, *remarks(asked)]
         return "\n\n".join(parts) + "\n"
 
-    def tables(self, shown: Mapping[str, tuple[str, ...]] | None = None) -> Iterator[Table]:
-        """Generate one table per task for the terminal, with the pooled sources if there are any.
+    def tables(self, shown: Shown = SHOWN) -> Iterator[Table]:
+        """Generate one table per task for the terminal, of the pooled sources if there are any.
 
         A star has the meaning of `markdown`.
         """
-        if shown is None:
-            shown = {name: task.shown for name, task in TASKS.items()}
         sources = list(dict.fromkeys(cell.source for cell in self.cells))
         chosen = [source for source in sources if "pooled" in source] or sources
-        worse = {
-            (gap.row, gap.task, gap.source, gap.metric)
-            for gap in self.differences
-            if gap.verdict == "better"
-        }
         for task, metrics in shown.items():
             table = Table("metric, model", *chosen, title=in_words(task), box=box.SIMPLE_HEAD)
             for metric in metrics:
-                texts: dict[str, dict[str, str]] = {}
-                for cell in self.cells:
-                    if (cell.task, cell.metric) == (task, metric) and cell.source in chosen:
-                        star = " *" if (cell.row, task, cell.source, metric) in worse else ""
-                        texts.setdefault(cell.row, {})[cell.source] = f"{cell.figure}{star}"
-                if texts:
+                texts = self._texts(task, metric)
+                rows = {row: found for row, found in texts.items() if found.keys() & set(chosen)}
+                if rows:
                     table.add_row(f"[bold]{metric}[/bold]")
-                for row, found in texts.items():
+                for row, found in rows.items():
                     table.add_row(f"  {row}", *(found.get(source, "") for source in chosen))
             if table.row_count:
                 yield table
 
-    def _table(self, task: str, metric: str, changes: bool) -> str:
-        cells = [cell for cell in self.cells if (cell.task, cell.metric) == (task, metric)]
-        if not cells:
-            return ""
+    def _texts(self, task: str, metric: str, changes: bool = False) -> dict[str, dict[str, str]]:
+        """Return the cells of a metric as texts, by row and data source."""
         gaps = {
             (gap.row, gap.source): gap
             for gap in self.differences
             if (gap.task, gap.metric) == (task, metric)
         }
-        texts = {
-            (cell.row, cell.source): _text(cell, gaps.get((cell.row, cell.source)), changes)
-            for cell in cells
-        }
-        sources = list(dict.fromkeys(cell.source for cell in cells))
+        texts: dict[str, dict[str, str]] = {}
+        for cell in self.cells:
+            if (cell.task, cell.metric) == (task, metric):
+                gap = gaps.get((cell.row, cell.source))
+                texts.setdefault(cell.row, {})[cell.source] = _text(cell, gap, changes)
+        return texts
+
+    def _table(self, task: str, metric: str, changes: bool) -> str:
+        texts = self._texts(task, metric, changes)
+        if not texts:
+            return ""
+        sources = list(dict.fromkeys(source for found in texts.values() for source in found))
         lines = []
-        for row in dict.fromkeys(cell.row for cell in cells):
+        for row, found in texts.items():
             name = f"**{row}**" if row == self.ours else row
             weights = f"{self.parameters[row]:,}" if row in self.parameters else ""
-            lines.append([name, weights, *(texts.get((row, source), "") for source in sources)])
+            lines.append([name, weights, *(found.get(source, "") for source in sources)])
         parts = [f"### {task}: {metric}"]
         if task.startswith(_RELATION_TASKS):
             parts.append(f"{UNLISTED}.")
@@ -245,8 +223,6 @@ def summarise(
     """Compute the metrics of every row, and the paired differences from the reference row.
 
     Args:
-        ours: name of the reference row.
-        parameters: number of trained weights by row name.
         groups: function that takes a task name and returns the group of each scene. With this
             function, the bootstrap of differences resamples groups instead of scenes.
 
@@ -279,11 +255,7 @@ def summarise(
 
 
 def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:
-    """Return the report with only the wanted metrics, because resampling all metrics is slow.
-
-    Args:
-        wanted: names of the metrics to keep, by task.
-    """
+    """Return the report with only the wanted metrics, because resampling all metrics is slow."""
     outcomes = {
         task: outcome
         and replace(
@@ -345,10 +317,7 @@ def _range(counts: Iterable[int]) -> str:
 
 
 def _notes(asked: Sequence[Asked]) -> str:
-    """Return a table of notes, with one line per data source if the notes of all rows are equal.
-
-    Otherwise the table has one line per row, or one line per row and data source.
-    """
+    """Return a table of notes, with one line per source or row if the others have equal notes."""
     found: dict[str, Mapping[str, float]] = {}
     for place in ("{0.source}", "{0.row}, seed {0.seed}", "{0.row}, seed {0.seed}, {0.source}"):
         found = {place.format(one): one.notes for one in asked}

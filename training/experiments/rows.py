@@ -82,7 +82,6 @@ class Row:
 
     Attributes:
         name: name of the model. It does not depend on the training seed.
-        seed: training seed.
         identity: text with all settings that affect the results. Reports on disk with another
             identity are rejected.
         make: function that trains the model, or reads the trained model from its folder.
@@ -140,7 +139,6 @@ def machine_row(config: Config, *, calibrated: bool = True) -> Row:
     """Return the row of a machine. An interrupted training resumes from the row's folder.
 
     Args:
-        config: training configuration of the machine.
         calibrated: True calibrates the machine as for publication.
     """
     if calibrated:
@@ -215,10 +213,7 @@ def always(contender: Contender) -> Rival:
 def _fit(
     baseline: Baseline[Any], data: TrainingData, seed: int, folder: Path, say: Say
 ) -> Fitted[Any]:
-    """Fit a baseline, and write all tried settings into trials.jsonl.
-
-    Trials of an earlier, interrupted fit are replaced.
-    """
+    """Fit a baseline, and write its trials into trials.jsonl in place of its earlier trials."""
     fitted = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
     before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []

@@ -45,7 +45,6 @@ class Side:
 
     Attributes:
         title: name of the model in tables.
-        config: training configuration. None if unknown.
         learnt: digest of each data source of the training, by source name.
         artifact: the model. None for the baselines.
         data: folder with the scene files of a run. None if the side is not a run.
@@ -68,7 +67,6 @@ class Side:
         Args:
             scenes: vocabulary of the test scenes. If the model has other classes, the questions are
                 translated into the classes of the model.
-            data: scenes on which the baselines are fitted.
         """
         if self.artifact is None:
             fitted = _baselines(data, say)
@@ -84,7 +82,6 @@ def run_side(folder: Path, data: Path | None, say: Say) -> Side:
     """Load a finished run as a side, and calibrate its model as for publication.
 
     Args:
-        folder: folder of the run.
         data: folder with the scene files. None means the folder that the run records.
 
     Raises:
@@ -103,9 +100,6 @@ def run_side(folder: Path, data: Path | None, say: Say) -> Side:
 
 def stored_side(reference: str, store: Store) -> Side:
     """Load a published model as a side.
-
-    Args:
-        reference: alias, name or name@version of the model.
 
     Raises:
         StoreError, ArtifactError: the model does not exist or cannot be used.
@@ -191,7 +185,6 @@ def held_out(
 
     Args:
         sources: current scenes of the first model's configuration, by data source.
-        root: folder with the scene files of both models.
 
     Raises:
         ConfigError: the first model does not record its split, its test part is empty, or the
@@ -237,10 +230,7 @@ def held_out(
 def _kept(
     side: Side, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
 ) -> tuple[Kept, str, bool]:
-    """Return a filter that keeps the scenes held out from a side.
-
-    Also return a note, or "", and False if the side may have learnt from kept scenes.
-    """
+    """Return a filter of the held-out scenes, a note or "", and whether the filter is certain."""
     if side.artifact is None:
         return _all, "", True  # the baselines are fitted on the training scenes of the first model
     digests = {name: digest_of(some) for name, some in sources.items()}
@@ -287,14 +277,7 @@ def _scenes_of(
     digests: Mapping[str, str],
     root: Path,
 ) -> list[AnnotatedScene] | None:
-    """Return all scenes of a side before its split, or None if a data source has changed.
-
-    Args:
-        learnt: digest of each data source of the side's training.
-        sources: scenes that are already read, by data source.
-        digests: digests of `sources`.
-        root: folder with the scene files.
-    """
+    """Return all scenes of a side before its split, or None if a data source has changed."""
     found: list[AnnotatedScene] = []
     for source in data.sources:
         name = source_name(source)

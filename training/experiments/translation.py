@@ -28,10 +28,7 @@ BEYOND = 1e9
 
 
 def same_classes(a: Vocabulary, b: Vocabulary) -> bool:
-    """Return True if each class index names the same class in both vocabularies.
-
-    Typical sizes and aliases of the classes may differ.
-    """
+    """Return whether each index names the same class in both; sizes and aliases may differ."""
     return a.labels == b.labels and bool((a.structure == b.structure).all())
 
 
@@ -41,8 +38,6 @@ class Translation:
 
     Attributes:
         own: (V,) int64, the model's class for each of the V scene classes; -1 for an unknown class.
-        size: number of classes of the model.
-        unknown: score of an unknown class.
     """
 
     own: Tensor
@@ -62,7 +57,6 @@ class Translation:
         """Return scores of the model that take scenes and return values in the scene classes.
 
         Args:
-            model: scores of the model in its own classes.
             task: name of the task. In T3 (outliers) and T3b (false relations), the lowest score
                 ranks first. In other tasks, the highest score ranks first.
         """
@@ -91,10 +85,7 @@ class Translation:
         return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, known], "amax")
 
     def scores(self, values: Tensor) -> Tensor:
-        """Map scores (scenes, model classes) to scores (scenes, scene classes).
-
-        The score of an unknown class is `unknown`.
-        """
+        """Map scores (scenes, model classes) to scene classes; unknown classes get `unknown`."""
         found = values[:, self.own.clamp(min=0)]
         return found.masked_fill(self.own < 0, self.unknown)
 

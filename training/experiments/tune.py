@@ -17,12 +17,10 @@ Source: Akiba et al., "Optuna: a next-generation hyperparameter optimization fra
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
 import socket
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
@@ -37,7 +35,10 @@ from training.config import (
     ConfigError,
     config_toml,
     data_folder,
+    first_error,
     load_config,
+    own_or_shipped,
+    read_toml,
     with_settings,
 )
 from training.evaluation.metrics import Metric, paired_difference
@@ -116,7 +117,7 @@ def tune(
     """
     with resumable(console):
         original = load_config(configuration)
-        distributions = load_space(_space(original, space), original)
+        distributions = load_space(own_or_shipped(space, original, "spaces", "--space"), original)
         place = folder / original.name
         journal = study or place / "study.log"
         if fresh:
@@ -135,22 +136,6 @@ def tune(
     _conclude(search, found, original)
 
 
-def shipped_spaces() -> dict[str, Path]:
-    """Return the files of the shipped search spaces, by configuration name."""
-    folder = Path(__file__).parents[1] / "configs/spaces"
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
-
-
-def _space(config: Config, path: Path | None) -> Path:
-    shipped = shipped_spaces()
-    if path is None and config.name not in shipped:
-        raise ConfigError(
-            f"{config.name} has no shipped search space (available for: {', '.join(shipped)}). "
-            "Pass a TOML file with --space"
-        )
-    return path or shipped[config.name]
-
-
 def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
     """Read a search space, and check its values in the configuration.
 
@@ -161,12 +146,7 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
         ConfigError: the file is missing or not TOML, an entry is neither a list of choices nor an
             interval, a value is invalid for its setting, or a setting cannot be searched.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"search space {path} does not exist") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path.name} is not TOML: {error}") from error
+    values = read_toml(path)
     if not values:
         raise ConfigError(f"the search space {path.name} contains no settings")
     found = {}
@@ -175,9 +155,10 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
             raise ConfigError(f"{name!r} must be equal in all trials: remove it from the space")
         try:
             found[name] = _distribution(entry)
-        except (ValueError, ValidationError) as error:
+        except ValueError as error:
+            reason = first_error(error) if isinstance(error, ValidationError) else error
             raise ConfigError(
-                f"{path.name}: {name}: {_first_line(error)}; write a list of choices, or "
+                f"{path.name}: {name}: {reason}; write a list of choices, or "
                 "{ low = ..., high = ... }"
             ) from error
         for value in entry if isinstance(entry, list) else (entry["low"], entry["high"]):
@@ -202,24 +183,8 @@ def _distribution(entry: Any) -> BaseDistribution:
     return FloatDistribution(bounds.low, bounds.high, log=bounds.log)
 
 
-def _first_line(error: Exception) -> str:
-    if isinstance(error, ValidationError):
-        first = error.errors()[0]
-        return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
-    return str(error)
-
-
 class Search:
-    """A search for settings. Each trial trains a machine and measures it on validation scenes.
-
-    Args:
-        folder: folder of the trials.
-        config: configuration whose settings the trials change.
-        data: scenes for training and validation.
-        space: distribution of each searched setting, by setting name.
-        by: metric to maximise.
-        journal: file of the study; default: in the folder.
-    """
+    """A search for settings. Each trial trains a machine and measures it on validation scenes."""
 
     def __init__(
         self,
@@ -235,11 +200,6 @@ class Search:
 
     def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
         """Open the optuna study in the folder, or create it.
-
-        Args:
-            scenes: digest of the scenes.
-            seed: seed of the sampler.
-            prune: True stops trials that are below the median of earlier trials.
 
         Raises:
             ConfigError: the folder holds a search with another configuration, scenes or metric.
@@ -271,10 +231,7 @@ class Search:
         return study
 
     def run(self, study: Study, trials: int, seed: int = 0) -> None:
-        """Run trials until the study has `trials`; the first trial uses the unchanged settings.
-
-        Several processes may run trials of the study.
-        """
+        """Run trials until the study has `trials`; the first uses the unchanged settings."""
         import optuna
 
         self._requeue(study)
@@ -324,7 +281,6 @@ class Search:
         """Train the machine of one trial, and return its metric on validation scenes.
 
         Raises:
-            FloatingPointError: the training diverged.
             optuna.TrialPruned: the best epoch is below the median of earlier trials.
         """
         import optuna
@@ -367,11 +323,8 @@ class Search:
 
     def metrics(self, place: Path) -> dict[str, Metric]:
         """Return `FIGURES` of a finished trial in its folder, over all validation scenes."""
-        texts = (
-            (place / f"{source}.json").read_text(encoding="utf-8")
-            for source in sorted({scene.source for scene in self.data.validation.scenes})
-        )
-        report = pooled([SourceReport.from_dict(json.loads(text)) for text in texts])
+        sources = sorted({scene.source for scene in self.data.validation.scenes})
+        report = pooled([SourceReport.read(place / f"{source}.json") for source in sources])
         return {
             name: outcome.metrics[metric]
             for name, (task, metric) in FIGURES.items()

@@ -26,12 +26,7 @@ class Objective(ABC):
     def __init__(
         self, config: ObjectiveConfig, machine: BoltzmannMachine, structure: Tensor | None = None
     ) -> None:
-        """Store the settings.
-
-        Args:
-            structure: True for structure classes such as walls, (classes,) bool. None means that
-                the vocabulary has no structure classes.
-        """
+        """Store the settings. Without `structure`, no class is a structure class."""
         self.config = config
         nothing = torch.zeros(machine.spec.V, dtype=torch.bool)
         self.structure = nothing if structure is None else structure.to(machine.b.device)
@@ -54,22 +49,14 @@ class Objective(ABC):
         """
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:  # noqa: B027
-        """Change the gradients before the update, for example by centring.
-
-        The default leaves the gradients unchanged.
-        """
+        """Change the gradients before the update, for example by centring."""
 
     def parameters(self) -> list[nn.Parameter]:
         """Return the trained parameters of the objective itself, beside the machine's weights."""
         return []
 
     def finish(self, machine: BoltzmannMachine, train: SceneTensors) -> BoltzmannMachine:
-        """Return the trained machine in the form that the model file stores.
-
-        Args:
-            machine: the machine with its best weights.
-            train: the training scenes.
-        """
+        """Return the trained machine in the form that the model file stores."""
         del train
         return machine
 
@@ -111,7 +98,6 @@ def relation_nll(
     on a random share of the observed relations of each scene and sums over the other relations.
 
     Args:
-        edges: layout of the relation units.
         logits, r, observed, weight: logit, value, observed flag and weight of each relation unit,
             all (scenes, units).
         h1: means of the hidden units given the objects, (scenes, hidden units).

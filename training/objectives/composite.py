@@ -16,9 +16,7 @@ Scenes with annotated relations have a third term:
 
 By Jensen's inequality, log p(r | v) ≥ E[log p(r | v, h1)] for h1 from p(h1 | v). The relation term
 approximates this bound by using the mean of h1. Unannotated relations are summed out. A machine
-with implication weights has a second relation term. That term is the sum of
-- log p(r_e | r_given, v, E[h1 | v]). r_given is a random share of the relations of a scene, and e
-runs over the other relations.
+with implication weights has a second relation term, see `relation_nll`.
 
 A class that a data source never mentions counts as absent in all scenes of that source. A request
 to the service has no source, so the service must rank all classes.
@@ -88,8 +86,8 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
 class ObjectChains:
     """Persistent Gibbs chains over objects and hidden units, for machines of the local form.
 
-    In the local form (`training.machines.machine`), the sum over relations is 1, so the chains
-    contain only v, h1 and h2. The loss is a difference of free energies, in which h1 is summed out:
+    In the local form, the sum over relations is 1, so the chains contain only v, h1 and h2. The
+    loss is a difference of free energies, in which h1 is summed out:
 
         mean F(data, h2) - mean F(chains, h2),   F = -b·v - c2·h2 - sum softplus(c1 + v'W + J h2)
 
@@ -99,7 +97,6 @@ class ObjectChains:
     Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
 
     Args:
-        count: number of chains.
         steps: number of Gibbs steps before each update of the weights.
     """
 
@@ -110,12 +107,7 @@ class ObjectChains:
     def loss(
         self, machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """Run the chains, then return mean F(data) - mean F(chains). F is the free energy.
-
-        Args:
-            v: presence of objects in the training scenes, (scenes, classes).
-            room: index of the room type of each training scene, (scenes,).
-        """
+        """Run the chains, then return mean F(data) - mean F(chains). F is the free energy."""
         with torch.no_grad():
             h2 = bernoulli(mean_field(machine, Evidence(v, room=room)).h2, generator)
             self._advance(machine, v, room, generator)
@@ -188,10 +180,7 @@ class CompositeLikelihood(Objective):
         masked: Masked,
         generator: torch.Generator,
     ) -> Tensor:
-        """Return the log-odds of each class given the other classes, (scenes, classes).
-
-        All relations are unobserved.
-        """
+        """Return the log-odds of each class given the other classes, (scenes, classes)."""
         v, batch = masked.v, masked.batch
         if self.config.structure_dropout:
             drop = uniform(v.shape, generator) < self.config.structure_dropout
@@ -208,11 +197,7 @@ class CompositeLikelihood(Objective):
     def relation_part(
         self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
     ) -> Tensor:
-        """Return the relation term of the loss, averaged over the scenes of the batch.
-
-        The term is -log p(observed r | v, E[h1 | v]). For a machine with implication weights, it
-        includes the second term of `relation_nll`.
-        """
+        """Return the relation term of the loss, averaged over the scenes of the batch."""
         annotated = batch.observed.flatten(1).any(1)
         if not anywhere(annotated):
             return machine.b.sum() * 0.0
@@ -231,10 +216,7 @@ class CompositeLikelihood(Objective):
 
 
 def unlisted_off(batch: Batch, structure: Tensor) -> Batch:
-    """Return the batch with all relations between the classes of a scene observed.
-
-    Unlisted relations count as false. Relations of structure classes keep their status.
-    """
+    """Return the batch with all unlisted relations of a scene false, except those of structure."""
     n = batch.classes.shape[1]
     thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
     pairs = thing[:, :, None] & thing[:, None, :] & ~torch.eye(n, dtype=torch.bool)

@@ -20,9 +20,8 @@ A robot seldom sees a whole scene. In training, the hidden units h1 therefore de
 subset of the objects. The size of the subset is drawn uniformly for each scene. Otherwise, the
 relations of complete scenes of one source would fit well, but relations in other scenes would not.
 
-For a machine with implication weights, the loss has a second term. That term is the sum of
-- log p(r_e | r_given, v, E[h1 | v]). r_given is a random share of the relations of a scene, and e
-runs over the other relations. The object weights of the machine stay fixed.
+For a machine with implication weights, the loss has a second term, see `relation_nll`. The object
+weights of the machine stay fixed.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Salakhutdinov,
 "Probabilistic matrix factorization" (2007), for normal priors on factors.
@@ -35,7 +34,6 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import (
     cached,
@@ -44,6 +42,7 @@ from torch.nn.utils.parametrize import (
     remove_parametrizations,
 )
 
+from training.array_types import Floats, Ints
 from training.batches import Batch, SceneTensors, relation_units
 from training.config import ObjectiveConfig
 from training.distributed import size, total
@@ -76,7 +75,6 @@ class WordPrior(nn.Module):
 
     Args:
         words: scaled word vectors, (classes, dimensions).
-        width: number of weights of each class.
         columns: True if the weights have the shape (width, classes), False for (classes, width).
     """
 
@@ -97,7 +95,6 @@ class RelationLikelihood(Objective):
     """The negative conditional log-likelihood of annotated relations, plus priors.
 
     Args:
-        config: weights of the terms, and precisions of the priors.
         machine: the machine to train. The constructor adds the word prior to its weights.
         train: the training scenes. They give the names of the sources and the number of scenes.
         words: word vectors of the classes with length 1, (classes, dimensions). None means no word
@@ -191,10 +188,7 @@ def partly_shown(v: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def add_word_prior(machine: BoltzmannMachine, words: Tensor) -> None:
-    """Add a word prior to the class weights S, O, s and o of a machine.
-
-    A machine without these factors stays unchanged.
-    """
+    """Add a word prior to the class weights S, O, s and o that a machine has."""
     for names, columns in ((_ROWS, False), (_COLUMNS, True)):
         for name in names:
             weight = dict(machine.named_parameters()).get(name)
@@ -226,7 +220,6 @@ def with_counted_residuals(
     objects. With few scenes, δ_e stays close to 0.
 
     Args:
-        train: training scenes with annotated relations.
         offsets: corrections of the logits for each data source, (sources, relations).
         source_weights: weight of a relation from each data source, (sources,).
     """
@@ -249,7 +242,7 @@ def with_counted_residuals(
 @torch.no_grad()
 def _known_units(
     machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Ints, Floats, Floats, Floats]:
     """Return keys, logits, values and weights of all annotated relations, each (relations,)."""
     columns: list[list[Tensor]] = [[], [], [], []]
     V = machine.spec.V

@@ -30,7 +30,6 @@ class _Between(NamedTuple):
     """The relation units between the classes of a scene.
 
     Attributes:
-        units: layout of the relation units.
         logits: logit of each relation unit, (draws, units).
         said: change of the log-weights of the draws that removes the observation of a unit, (draws,
             units). It is 0 without observed relations.

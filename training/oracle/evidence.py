@@ -62,7 +62,6 @@ class Observation:
     """One scene in the tensor layout of a machine.
 
     Attributes:
-        machine: the machine.
         scene: classes of the scene as arrays.
         classes: indices of the n distinct classes in ascending order, (n,) int64.
         counts: number of instances of each class, (n,) int64.

@@ -11,6 +11,7 @@ from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
     Names,
+    build_indoor_vocabulary,
     build_vocabulary,
     coverage,
     curated_names,
@@ -18,10 +19,11 @@ from training.datasets import (
     indoor_vocabulary,
     read_scenes,
     source_vocabulary,
+    vocabulary_json,
     with_typical_sizes,
-    write_indoor_vocabulary,
 )
 from training.datasets.vocabulary import (
+    INDOOR_FILE,
     INDOOR_MINIMUM_MENTIONS,
     MINIMUM_MENTIONS,
     with_room_aliases,
@@ -191,12 +193,12 @@ def real(repository: Path) -> dict[str, list[AnnotatedScene]]:
 
 
 def test_the_committed_vocabulary_is_what_the_data_give(
-    real: dict[str, list[AnnotatedScene]], tmp_path: Path
+    real: dict[str, list[AnnotatedScene]],
 ) -> None:
     everything = [scene for source in real.values() for scene in source]
-    path = tmp_path / "indoor.json"
-    written = write_indoor_vocabulary(everything, path)
-    assert written == indoor_vocabulary(path) == indoor_vocabulary()
+    written = build_indoor_vocabulary(everything)
+    assert written == indoor_vocabulary()
+    assert vocabulary_json(written) == INDOOR_FILE.read_text(encoding="utf-8")
     mentions = Counter(
         index
         for scene in everything

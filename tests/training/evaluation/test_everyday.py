@@ -21,10 +21,10 @@ from app.registry import Store, load_model_set
 from app.scene import Scene, SceneObject, opposite
 from app.settings import Settings
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
+from training.evaluation import everyday
 from training.evaluation.everyday import (
     EVERYDAY,
     LINES,
-    ask_everyday,
     everyday_task,
     facts_digest,
     facts_file,
@@ -98,6 +98,11 @@ def score(monkeypatch, capsys, *arguments: str) -> dict[str, tuple[int, int]]:
     runpy.run_path(str(FOLDER / "score.py"), run_name="__main__")
     lines: dict[str, str] = json.loads(capsys.readouterr().out)
     return {name: tuple(map(int, value.split("/"))) for name, value in lines.items()}
+
+
+def ask_everyday(artifact, folder: Path) -> dict[str, tuple[int, int]]:
+    found = everyday.ask_everyday(artifact, folder)
+    return {line: tuple(map(sum, zip(*each, strict=True))) for line, each in found.items()}
 
 
 needs_facts = pytest.mark.skipif(facts_file(FOLDER) is None, reason="the facts are not here")

@@ -108,8 +108,8 @@ def test_what_is_published_holds_the_offsets_of_each_source():
     artifact = contender(train).artifact
     test = draws(MEAN, STD, 6, 1, source="a") + draws(MEAN, STD, 6, 2, source="b")
     rows = evaluate(artifact, tensors(test, V), NO_STRUCTURE, tensors(train, V), limit=4)
-    offsets = [(row.source, row.metric, row.figure.n) for row in rows if row.task == "Offsets"]
+    offsets = [(row.source, row.metric, row.n) for row in rows if row.task == "Offsets"]
     assert ("a", "in the ellipse, left", 6) in offsets
     assert ("b", "distance (m)", 6) in offsets
     assert len(offsets) == 8
-    assert np.isfinite([row.figure.value for row in rows]).all()
+    assert np.isfinite([row.value for row in rows]).all()

@@ -23,7 +23,6 @@ from training.evaluation.alarms import ALARMS
 from training.evaluation.asking import (
     SENSITIVITIES,
     LeakError,
-    Verdict,
     ask_every,
     judge,
     labels_alone,
@@ -213,7 +212,7 @@ def test_intruders_are_judged_by_probability_and_by_log_odds(monkeypatch):
     def known(artifact, asked, sensitivity):
         last = np.arange(len(asked.objects)) == len(asked.objects) - 1
         flat = np.array([thing.class_index == 2 for thing in asked.objects])
-        return Verdict(last + 2.0 * flat, 1.0 * last, last & (sensitivity == "high"))
+        return np.stack([last + 2.0 * flat, 1.0 * last, last & (sensitivity == "high")], 1)
 
     monkeypatch.setattr(outliers, "judge", known)
     structure = torch.arange(len(VOCABULARY)) == 2
@@ -232,7 +231,7 @@ def test_a_published_model_is_judged_as_the_service_ranks():
     drawn = draw_intruders(DATA, STRUCTURE, by_signature(DATA, TRAIN))
     k = int((drawn >= 0).nonzero()[0])
     case = with_intruder(room_model(), labels_alone(DATA.scenes[k]), int(drawn[k]))
-    p = judge(room_model(), case).probability
+    p = judge(room_model(), case)[:, 0]
     usable = ~STRUCTURE.numpy()[[thing.class_index for thing in case.objects]]
     hit = float(p[-1] == p[usable].max())
     assert outcome.metrics["hit@1"].numerators[k] == pytest.approx(hit)
@@ -286,12 +285,12 @@ def test_a_planted_cheater_is_caught(monkeypatch):
     drawn = draw_intruders(DATA, STRUCTURE, by_signature(DATA, TRAIN))
     turns = iter(drawn[drawn >= 0].tolist() * 3)
 
-    def cheat(artifact, sensitivity, asked):
+    def cheat(artifact, asked, sensitivity):
         knows = next(turns)
         hit = np.array([thing.class_index == knows for thing in asked.objects], dtype=float)
         return np.column_stack([hit, -hit, hit])
 
-    monkeypatch.setattr(outliers, "verdict", cheat)
+    monkeypatch.setattr(outliers, "judge", cheat)
     with pytest.raises(LeakError, match="leaks information"):
         signature_task(Contender(artifact=room_model()), Setting(DATA, STRUCTURE, TRAIN))
     with pytest.raises(FloatingPointError, match="NaN"):

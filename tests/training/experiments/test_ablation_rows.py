@@ -6,16 +6,16 @@ from itertools import pairwise
 
 import pytest
 
-from training.config import ConfigError, load_config
-from training.experiments.ablate import load_rows, shipped_ablations
+from training.config import ConfigError, load_config, shipped_configs
+from training.experiments.ablate import load_rows
 
 FULL = load_config("indoor-triway")
 
 
-@pytest.mark.parametrize("name", shipped_ablations())
+@pytest.mark.parametrize("name", shipped_configs("ablations"))
 def test_shipped_rows_learn_from_the_scenes_of_the_full_model(name):
     full = load_config(name)
-    rows = load_rows(shipped_ablations()[name], full)
+    rows = load_rows(shipped_configs("ablations")[name], full)
     assert {row.data for row in rows} == {full.data.model_copy()}
     assert all(row.description for row in rows)
     # Each is another model, not another name.
@@ -36,7 +36,7 @@ def changed(before, after):
 
 def test_the_way_to_the_full_model_is_one_step_at_a_time():
     """Steps that bundle are those that the file's head names."""
-    full = {row.name: row for row in load_rows(shipped_ablations()["indoor-triway"], FULL)}
+    full = {row.name: row for row in load_rows(shipped_configs("ablations")["indoor-triway"], FULL)}
     way = ["seed-form-cd1", "seed-form", "local-form", "no-implications-two-layers", "two-layers"]
     configs = [*(full[name] for name in way), FULL]
     assert [changed(a, b) for a, b in pairwise(configs)] == [
@@ -49,7 +49,7 @@ def test_the_way_to_the_full_model_is_one_step_at_a_time():
 
 
 def test_without_one_part_the_rest_is_as_shipped():
-    rows = load_rows(shipped_ablations()["indoor-triway"], FULL)
+    rows = load_rows(shipped_configs("ablations")["indoor-triway"], FULL)
     own = {"local-rbm", "local-gbm"}
     several = {
         row.name: found

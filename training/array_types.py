@@ -1,0 +1,11 @@
+"""Names for the types of arrays and of their random generator."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+Rng = np.random.Generator
