@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import logsigmoid
 
 from tests.enumeration.small_machines import SEED_FORM, SMALL, enumerate_joint, small_machine
 from training.batches import Batch, relation_units
@@ -19,6 +20,8 @@ from training.evaluation.missing import MachineScore
 from training.evaluation.relations import machine_score as relation_score
 from training.machines import build
 from training.machines.gibbs import State
+from training.machines.log_odds import object_log_odds
+from training.machines.mean_field import Evidence
 from training.objectives import OBJECTIVES
 from training.objectives.composite import mask_one_class, unlisted_off
 from training.objectives.contrastive import centre_gradients, energy_difference
@@ -234,7 +237,33 @@ def test_masking_takes_one_class_out_and_never_structure():
     assert bool(masked.absent.gather(1, masked.target.unsqueeze(1)).all())
 
 
-def test_relations_that_nobody_listed_can_count_as_off():
+def test_composite_likelihood_ranks_the_removed_class_and_separates_present_from_absent():
+    """The loss without relations and chains, scene by scene."""
+    config = ObjectiveConfig(
+        name="composite",
+        presence_weight=0.7,
+        relation_weight=0.0,
+        generative_weight=0.0,
+        object_dropout=0.0,
+        structure_dropout=0.0,
+        room_dropout=0.0,
+    )
+    machine, batch = toy_machine("triway-local"), toy_batch()
+    generators = [torch.Generator().manual_seed(4) for _ in range(2)]
+    found = OBJECTIVES["composite"](config, machine).loss(machine, batch, generators[0])
+    masked = mask_one_class(batch, torch.zeros(5, dtype=torch.bool), generators[1])
+    total = 0.0
+    for v, i, absent, n in zip(
+        masked.v, masked.target, masked.absent, masked.removable, strict=True
+    ):
+        odds = object_log_odds(machine, Evidence(v[None]))[0].detach()
+        others = absent & (torch.arange(5) != i)
+        presence = -n * logsigmoid(odds[i]) - logsigmoid(-odds[others]).sum()
+        total += odds[absent].logsumexp(0) - odds[i] + 0.7 * presence
+    assert float(found.detach()) == pytest.approx(float(total) / len(masked.v), rel=1e-4)
+
+
+def test_unlisted_relations_can_count_as_off():
     """Between things, not structure; scenes that nobody annotated teach nothing either way."""
     batch = toy_batch()
     batch = replace(batch, observed=batch.holds > 0)
