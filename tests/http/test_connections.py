@@ -14,7 +14,7 @@ import pytest
 from tests.chaos.wire import BODY, Answer, Wire, exchange
 from tests.http.stores import make_store
 from tests.http.test_problems import problem
-from tests.services import LiveService, launch
+from tests.services import LiveService, launch, wait_until
 
 pytestmark = pytest.mark.system
 
@@ -140,11 +140,7 @@ def test_who_does_not_read_is_cut_off(service: LiveService) -> None:
 
 
 def wait_for_descriptors(service: LiveService, files: int) -> None:
-    for _ in range(300):
-        if service.descriptors <= files + 2:
-            return
-        time.sleep(0.1)
-    pytest.fail(f"{service.descriptors} descriptors, where there were {files}")
+    wait_until(lambda: service.descriptors <= files + 2)
 
 
 @pytest.mark.slow

@@ -7,10 +7,9 @@ import json
 from dataclasses import replace
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.training.commands import invoke
 from tests.training.domain.scenes import scene
-from training.cli import app
 from training.config import ConfigError, data_folder, load_config
 from training.datasets import generate_rooms
 from training.datasets.jsonl import write_jsonl
@@ -26,12 +25,6 @@ def file(tmp_path):
     path = tmp_path / "scenes.jsonl"
     write_jsonl(SCENES, path)
     return path
-
-
-def invoke(*arguments: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == code, result.output
-    return " ".join(result.output.split())
 
 
 def test_what_is_proposed_can_be_trained_on(file, tmp_path) -> None:
