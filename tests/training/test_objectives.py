@@ -13,7 +13,13 @@ import pytest
 import torch
 from torch.nn.functional import logsigmoid
 
-from tests.enumeration.small_machines import SEED_FORM, SMALL, enumerate_joint, small_machine
+from tests.enumeration.small_machines import (
+    SEED_FORM,
+    SMALL,
+    draw_states,
+    enumerate_joint,
+    small_machine,
+)
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
 from training.evaluation.missing import MachineScore
@@ -40,15 +46,6 @@ def exact_log_partition(machine):
     return (-energy).logsumexp(0)
 
 
-def samples(joint, generator, given=None):
-    p = joint.p if given is None else torch.where(given, joint.p, 0.0)
-    pick = torch.multinomial(p, SAMPLES, replacement=True, generator=generator)
-    edges = joint.edges
-    if joint.machine.spec.variant == "triway":
-        edges = joint.machine.edges(torch.arange(joint.machine.spec.V).expand(SAMPLES, -1))
-    return State(joint.v[pick], joint.h1[pick], joint.h2[pick], joint.r[pick], edges)
-
-
 @pytest.mark.parametrize("name", SMALL)
 def test_energy_difference_estimates_the_exact_gradient(name):
     """Data and model terms from exact samples: each entry within 6 standard errors (< 1e-6 by
@@ -66,7 +63,8 @@ def test_energy_difference_estimates_the_exact_gradient(name):
     machine.zero_grad()
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
-        data, model = samples(joint, generator, given), samples(joint, generator)
+        data = draw_states(joint, SAMPLES, generator, given)
+        model = draw_states(joint, SAMPLES, generator)
     room = torch.full((SAMPLES,), -1)
     unobserved = torch.zeros(SAMPLES, joint.r.shape[1], dtype=torch.bool)
     energy_difference(machine, data, unobserved, model, room, room).backward()
