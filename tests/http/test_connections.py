@@ -100,7 +100,7 @@ def test_a_byte_now_and_then_keeps_no_connection(service: LiveService) -> None:
     assert service.descriptors <= files + 2
 
 
-def test_who_leaves_in_the_middle_is_forgotten(service: LiveService) -> None:
+def test_a_closed_connection_leaves_nothing_behind(service: LiveService) -> None:
     before = service.control()
     files = service.descriptors
     request = HEAD % len(BODY) + BODY
@@ -118,7 +118,7 @@ def test_who_leaves_in_the_middle_is_forgotten(service: LiveService) -> None:
     wait_for_descriptors(service, files)
 
 
-def test_who_does_not_read_is_cut_off(service: LiveService) -> None:
+def test_a_client_that_does_not_read_is_disconnected(service: LiveService) -> None:
     """The system ends the connection, some retransmissions after SCENE_CLIENT_TIMEOUT."""
     before = service.control()
     files = service.descriptors

@@ -92,7 +92,7 @@ def test_drawing_stops_when_told_to(name):
     assert generate(artifact, scene, count=32, seed=5, stop=lambda: True) == ()
 
 
-def test_what_was_seen_not_to_hold_stays_off():
+def test_relations_observed_as_off_stay_off():
     """Two boxes a metre apart, side by side: nothing but left holds of them."""
     plain = scene_of([0, 1])
     poses = derive_relations([[1, 0, 0], [1, 1, 0]], [[0.5, 0.5, 0.5]] * 2)

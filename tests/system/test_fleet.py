@@ -21,8 +21,10 @@ from tests.system.conftest import StartProxy
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
-PROMOTIONS = 50
-POLL = 0.5
+PROMOTIONS = 30
+POLL = 0.2
+NOTICED = 2.5
+"""Seconds within which the proxy has noticed that a replica is ready: it asks every two."""
 
 
 class Fleet:
@@ -67,15 +69,15 @@ class Fleet:
         return path
 
 
-@pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[Fleet]:
-    fleet = Fleet(tmp_path)
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    fleet = Fleet(tmp_path_factory.mktemp("fleet"))
     yield fleet
     for replica in fleet.replicas:
         replica.stop()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def port(fleet: Fleet, haproxy: StartProxy, configuration: Path) -> Iterator[int]:
     own = fleet.configuration(configuration.read_text())
     with haproxy(own, fleet.folder / "proxy", PROXY_REQUESTS="1000000") as proxy:
@@ -113,13 +115,13 @@ def test_a_killed_replica_costs_at_most_its_requests(fleet: Fleet, load: Constan
     killed = fleet.replicas[0]
     killed.client.close()
     with load:
-        time.sleep(1)
+        wait_until(lambda: load.tally.statuses[200] > 100)
         killed.process.kill()
         killed.process.wait()
-        time.sleep(5)
+        time.sleep(5)  # until the proxy has noticed it
         fleet.replicas[0] = fleet.start(0, killed.port)
         wait_until(lambda: is_ready(killed.port))
-        time.sleep(3)
+        time.sleep(NOTICED)
     # The replica writes the head of an answer before the body. If it dies in between, the proxy
     # has already sent the head, and it can only close the connection: status 0.
     assert load.tally.statuses.keys() <= {200, 502, 0}
@@ -132,7 +134,7 @@ def test_a_rolling_update_of_the_settings_loses_and_mixes_nothing(
 ) -> None:
     with load:
         for number, old in enumerate(fleet.replicas):
-            time.sleep(3)  # until the proxy has noticed that the other replica is ready
+            time.sleep(NOTICED)
             old.process.terminate()
             assert old.process.wait(timeout=30) == -signal.SIGTERM
             old.client.close()

@@ -53,8 +53,8 @@ def same_offsets_as_training_alone_teaches(artifact, config) -> None:
 
 def same_weights_with_refitted_statistics(artifact, store) -> None:
     """`publish NAME@VERSION` changes only what is fitted to the scenes without training."""
-    invoke("publish", "rooms-triway@1.0.1", "1.0.2", "--store", store)
-    again = Store(store).load("rooms-triway", "1.0.2")
+    invoke("publish", "rooms-triway@1.0.0", "1.0.1", "--store", store)
+    again = Store(store).load("rooms-triway", "1.0.1")
     for name, array in artifact.weights.arrays.items():
         assert np.array_equal(again.weights[name], array), name
     for name, tensor in artifact.counts.tensors().items():
@@ -65,7 +65,7 @@ def same_weights_with_refitted_statistics(artifact, store) -> None:
     other = tuple(source.model_copy(update={"digest": "0" * 64}) for source in before.data)
     changed = replace(artifact, manifest=before.model_copy(update={"data": other}))
     with pytest.raises(RunError, match="the scenes of rooms have changed"):
-        refit(changed, Path(), Store(store), "1.0.3")
+        refit(changed, Path(), Store(store), "1.0.2")
 
 
 def pinned(name: str) -> set[str]:
@@ -96,12 +96,11 @@ def test_from_rooms_to_answers(tmp_path):
     invoke("train", config, *folders, "--publish", "1.0.0")
     first = AliasTarget(name="rooms-triway", version="1.0.0")
     Store(tmp_path / "store").set_alias("default", first)
-    invoke("publish", tmp_path / "runs/rooms-triway/seed-0", "1.0.1", *folders[2:])
-    assert "1.0.1" in invoke("list", *folders[2:])
+    assert "1.0.0" in invoke("list", *folders[2:])
     figures = tmp_path / "figures.json"
     invoke("evaluate", "default", *folders[2:], "--json", figures)
     tables = json.loads(figures.read_text())
-    artifact = Store(tmp_path / "store").load("rooms-triway", "1.0.1")
+    artifact = Store(tmp_path / "store").load("rooms-triway", "1.0.0")
     # The card of the stored model has the figures that are measured on it again.
     card = {(m.task, m.source, m.metric): m.value for m in artifact.manifest.metrics}
     again = {(r["task"], r["source"], r["metric"]): r["value"] for r in tables["default"]}

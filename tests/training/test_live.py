@@ -62,7 +62,7 @@ def test_a_run_shows_its_scores_and_what_to_do_next(tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_nobody_who_asks_for_no_logs_waits_for_tensorboard() -> None:
+def test_tensorboard_is_imported_only_for_logs() -> None:
     code = "import sys; import training.cli; assert 'torch.utils.tensorboard' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 

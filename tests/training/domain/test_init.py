@@ -27,7 +27,7 @@ def file(tmp_path):
     return path
 
 
-def test_what_is_proposed_can_be_trained_on(file, tmp_path) -> None:
+def test_a_proposed_configuration_can_be_trained(file, tmp_path) -> None:
     folder, report = tmp_path / "lab", tmp_path / "report.json"
     output = invoke("init", "lab", file, "--output", folder, "--terms", "ours", "--json", report)
     assert "train" in output
@@ -119,7 +119,7 @@ def test_every_bad_line_is_named_up_to_a_bound(tmp_path) -> None:
         (("lab", "--format", "csv"), "unknown format"),
     ],
 )
-def test_what_cannot_be_is_refused(file, tmp_path, arguments, message) -> None:
+def test_invalid_arguments_are_refused(file, tmp_path, arguments, message) -> None:
     name, *options = arguments
     assert message in invoke("init", name, file, "--output", tmp_path / "o", *options, code=1)
     assert not (tmp_path / "o").exists()

@@ -23,10 +23,6 @@ name = "no-counts"
 what = "instances are not counted"
 changes = { "machine.without" = ["n"] }
 [[row]]
-name = "rbm"
-what = "an RBM"
-changes = { "machine.variant" = "rbm" }
-[[row]]
 name = "diverging"
 what = "far too fast"
 changes = { "training.learning_rate" = 1e30 }
@@ -63,7 +59,7 @@ def test_every_row_is_compared_with_the_full_model_on_both_parts(finished):
         for cell in found["cells"]
     }
     sources = {f"{part} {name}" for part in ("validation", "test") for name in ("rooms", "pooled")}
-    rows = {"rooms-triway", "seed-form", "no-counts", "rbm"}
+    rows = {"rooms-triway", "seed-form", "no-counts"}
     # Some parts hold no pair that training tells little of.
     little = ("accuracy, unseen pairs", "accuracy, rare classes")
     metrics = {(task, name) for task, names in PRIMARY.items() for name in names} - {
@@ -102,7 +98,7 @@ def test_the_table_has_the_row_minus_the_full_model(finished):
         "weights", "validation pooled", "test pooled", "validation rooms", "test rooms",
     ]  # fmt: skip
     assert [line.split(" |")[0].strip("| ") for line in lines] == [
-        "**rooms-triway**", "seed-form", "no-counts", "rbm",
+        "**rooms-triway**", "seed-form", "no-counts",
     ]  # fmt: skip
     gap = next(
         d["figure"]
@@ -130,7 +126,7 @@ def test_costs_count_trained_weights_alone(finished):
 
 def test_the_same_command_trains_nothing_again(finished, monkeypatch):
     before = results(finished)
-    rows = ("--row", "seed-form", "--row", "no-counts", "--row", "rbm")
+    rows = ("--row", "seed-form", "--row", "no-counts")
     monkeypatch.setattr(Trainer, "run", None)
     invoke(*arguments(finished), *rows)
     after = results(finished)

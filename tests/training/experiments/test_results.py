@@ -72,7 +72,7 @@ def test_a_verdict_needs_the_whole_interval_on_the_better_side(metric, low, high
     assert Difference("a", "T", "x", metric, figure).verdict == verdict
 
 
-def test_what_was_asked_is_in_the_results():
+def test_results_list_the_questions():
     metrics = {"MMD²": Ratio(np.array([0.5]), np.ones(1))}
     outcome = Outcome(metrics, 7, 2, {"bandwidth": 4.0})
     report = SourceReport("x", "", {"T4 generate": outcome, "Density": None})
