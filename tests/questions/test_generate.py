@@ -205,11 +205,9 @@ def test_a_hot_chain_wanders_and_a_cold_one_settles(name):
     """At a high temperature every set of three classes is as likely as any other; near zero the
     chains end in few of them."""
     artifact, _ = drawable(name)
-    hot = label_sets(
-        generate(artifact, scene_of([]), count=2048, seed=1, steps=10, temperature=1e6)
-    )
+    hot = label_sets(generate(artifact, scene_of([]), count=512, seed=1, steps=10, temperature=1e6))
     cold = label_sets(
-        generate(artifact, scene_of([]), count=2048, seed=1, steps=60, temperature=0.05)
+        generate(artifact, scene_of([]), count=512, seed=1, steps=60, temperature=0.05)
     )
     assert len(set(cold)) < len(set(hot)) == 8
 
