@@ -27,7 +27,7 @@ EVERYTHING := $(VENV)/.installed-everything
 RAY := $(RAY_VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: checks help run ray test test-fast test-slow docs chaos soak image audit setup format bench lock clean
+.PHONY: checks help run ray test test-fast test-slow test-all docs chaos soak image audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -45,6 +45,9 @@ test: checks  ## check lint, format, types and imports, then run all tests excep
 test-slow: $(EVERYTHING)  ## run the slow tests: training runs, the site, further parameters (minutes)
 	$(BIN)/python -m app.compile
 	$(PYTEST) -m slow $(ARGS)
+
+test-all: checks  ## run the checks and all tests, as continuous integration does (minutes)
+	$(PYTEST) $(ARGS)
 
 test-fast: checks  ## run the checks and the tests without processes, browser and training (a minute)
 	$(PYTEST) -m "not slow and not system" $(addprefix tests/,machines enumeration http registry scene serving) \
