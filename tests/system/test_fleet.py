@@ -22,7 +22,7 @@ from tests.system.conftest import StartProxy
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 PROMOTIONS = 30
-POLL = 0.2
+POLL = 0.5
 NOTICED = 2.5
 """Seconds within which the proxy has noticed that a replica is ready: it asks every two."""
 
