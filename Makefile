@@ -39,8 +39,8 @@ run: $(SERVICE)  ## serve the shipped models on 127.0.0.1 (port: PORT=8000)
 ray: $(RAY)  ## serve by two replicas with Ray Serve on 127.0.0.1 (port: PORT=8000)
 	exec $(RAY_VENV)/bin/python deploy/ray/run.py --port $(PORT) --replicas 2
 
-test: checks  ## check lint, format, types and imports, then run all tests except the slow ones
-	$(PYTEST) -m "not slow" $(ARGS)
+test: checks  ## check lint, format, types and imports, then run all tests except the slow ones (SLOW=1: all tests)
+	$(PYTEST) $(if $(SLOW),,-m "not slow") $(ARGS)
 
 test-slow: $(EVERYTHING)  ## run the slow tests: training runs, the site, further parameters (minutes)
 	$(BIN)/python -m app.compile
@@ -67,7 +67,7 @@ audit: $(EVERYTHING)  ## report known vulnerabilities and risky code, write bill
 
 chaos: $(EVERYTHING)  ## attack a running service: hostile requests, overload, model changes (minutes)
 	$(BIN)/python -m app.compile
-	$(BIN)/python -m pytest tests/chaos $(ARGS)
+	CHAOS=1 $(BIN)/python -m pytest tests/chaos tests/http/test_contract.py tests/http/test_hostile.py $(ARGS)
 
 soak: $(EVERYTHING)  ## check that memory does not grow in ten minutes of mixed use (MINUTES=10)
 	@# Compile in another process, so that the compiler's memory does not count.

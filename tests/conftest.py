@@ -63,3 +63,9 @@ def require_system_tool() -> Callable[[str], Path]:
         pytest.skip(f"{name} is not installed")
 
     return find
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put modules with slow tests first, so that no worker has a long module left at the end."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -22,6 +22,8 @@ from typing import Any
 import httpx
 import pytest
 
+CHAOS = os.environ.get("CHAOS") == "1"
+"""Whether `make chaos` runs the tests: all attacks, for minutes."""
 ADMIN_KEY = "correct-horse-battery-staple"
 CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed": 11}
 NAMED = {"allowed_hosts": ["service"]}
@@ -200,10 +202,7 @@ def launch(
 
     By default it listens on a free port.
     """
-    if port is None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
+    port = port or free_port()
     process = begin(store, log, program=program, **{"SCENE_PORT": str(port), **variables})
     client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30)
     deadline = time.monotonic() + 60
@@ -220,13 +219,28 @@ def launch(
     raise AssertionError(f"the service did not start:\n{log.read_text()}")
 
 
-def wait_until(condition: Callable[[], bool], log: Path | None = None) -> None:
-    """Wait until the condition holds. Fail with the log after 30 seconds."""
-    deadline = time.monotonic() + 30
+def free_port() -> int:
+    """Return a port of 127.0.0.1 that no program uses now."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def is_ready(port: int) -> bool:
+    """Whether a service, or one behind a proxy, is ready."""
+    with suppress(httpx.TransportError):
+        return httpx.get(f"http://127.0.0.1:{port}/health/ready").status_code == 200
+    return False
+
+
+def wait_until(
+    condition: Callable[[], object], log: Path | None = None, *, seconds: float = 30
+) -> None:
+    """Wait until the condition holds. Fail with the log after some seconds."""
+    deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:
             pytest.fail("it takes too long" + (f":\n{log.read_text()}" if log else ""))
-        time.sleep(0.02)
+        time.sleep(0.01)
 
 
 @pytest.fixture(scope="session")

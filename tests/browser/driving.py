@@ -11,9 +11,6 @@ from typing import Any
 
 from playwright.sync_api import Locator, Page, expect
 
-STILL = 250
-"""Milliseconds after which the page has asked, whatever changed."""
-
 
 class Board:
     """The page. Everything goes through what people see: roles, names, texts."""
@@ -24,7 +21,7 @@ class Board:
     def settle(self) -> None:
         """Wait until everything that changed has been asked and answered."""
         expect(self.page.locator("main[aria-busy=true]")).to_have_count(0, timeout=20_000)
-        self.page.wait_for_timeout(STILL)
+        self.page.evaluate("window.quiet()")
         busy = self.page.locator("article:not([hidden])[aria-busy=true], #drawn[aria-busy=true]")
         expect(busy).to_have_count(0, timeout=20_000)
         self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => done()))")

@@ -112,7 +112,7 @@ def test_a_ghost_becomes_an_object_where_it_was_drawn(bedroom: Board) -> None:
     assert all(label != row.split(" ")[0] for row in bedroom.rows("missing"))
 
 
-def test_what_is_missing_at_a_place_is_asked_from_an_objects_menu(
+def test_the_menu_of_an_object_asks_what_is_missing_there(
     bedroom: Board, api: httpx.Client
 ) -> None:
     bedroom.page.get_by_role("button", name="Actions for nightstand").click()

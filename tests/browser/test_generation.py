@@ -88,7 +88,7 @@ def test_stated_relations_do_not_hold_for_generated_objects(open_board: OpenBoar
 
 
 @pytest.mark.slow
-def test_what_is_on_the_board_stays_in_the_drawn_scene(
+def test_objects_of_the_board_stay_in_the_drawn_scene(
     open_board: OpenBoard, api: httpx.Client
 ) -> None:
     board = open_board()

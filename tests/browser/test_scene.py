@@ -67,7 +67,7 @@ def test_an_object_can_be_dropped_where_it_stands(open_board: OpenBoard, api: ht
     ]
 
 
-def test_what_stands_on_something_moves_with_it(open_board: OpenBoard) -> None:
+def test_objects_on_a_support_move_with_it(open_board: OpenBoard) -> None:
     board = open_board()
     lamp = {"id": "lamp", "label": "lamp", "position": {"x": 2, "y": 0.5, "z": 0.94}}
     board.put(json.dumps({"objects": [*board.exported()["objects"], lamp]}))
@@ -124,7 +124,7 @@ def test_numbers_that_make_no_sense_are_refused_beside_the_field(open_board: Ope
     assert board.body("missing")["objects"][0]["size"]["z"] == 0.74
 
 
-def test_sizes_that_nobody_gave_are_the_models(open_board: OpenBoard, api: httpx.Client) -> None:
+def test_missing_sizes_are_the_models(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board()
     board.add("laptop")
     words = api.get("/models/default/vocabulary").json()["objects"]
@@ -209,7 +209,7 @@ NO_SCENES = [
 
 
 @pytest.mark.slow
-def test_what_is_no_scene_is_refused_in_words(open_board: OpenBoard) -> None:
+def test_invalid_scenes_are_refused_with_a_reason(open_board: OpenBoard) -> None:
     board = open_board()
     page = board.page
     for text, words in NO_SCENES:

@@ -146,7 +146,7 @@ def test_a_service_with_a_key_is_asked_with_it(
         assert key not in board.page.content()
 
 
-def test_what_is_answered_behind_another_tab_is_no_longer_awaited(open_board: OpenBoard) -> None:
+def test_answers_of_hidden_tabs_end_the_wait(open_board: OpenBoard) -> None:
     page = open_board().page
     held: list[Route] = []
     page.route("**/relations", lambda route: held.append(route))

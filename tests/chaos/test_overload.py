@@ -68,7 +68,7 @@ def test_overload_is_refused_and_leaves_nothing_behind(service: LiveService) -> 
     assert "Traceback" not in service.log.read_text()
 
 
-def test_what_is_accepted_keeps_its_deadline(service: LiveService) -> None:
+def test_accepted_requests_keep_their_deadline(service: LiveService) -> None:
     def judge(_: int, status: int, __: object) -> str | None:
         return None if status in {200, 429, 504} else f"status {status}"
 

@@ -134,7 +134,7 @@ def test_success_that_cannot_be_read_is_said_to_be_so(body: bytes) -> None:
 
 
 @pytest.mark.parametrize("status", [429, 503])
-def test_who_is_busy_is_asked_again_when_it_says(status: int) -> None:
+def test_retries_wait_for_retry_after(status: int) -> None:
     world = World(refusal(status, "2"), refusal(status, "3"), FINE)
     assert world.run().models == []
     # Never before the time named, and not everybody at that very moment.
@@ -156,7 +156,7 @@ def test_a_retry_after_that_makes_no_sense_is_none(value: str) -> None:
     assert problem_of(*refusal(503, value)).retry_after is None
 
 
-def test_who_asks_for_more_time_than_is_left_is_not_waited_for() -> None:
+def test_a_retry_after_beyond_the_deadline_is_an_error() -> None:
     world = World(refusal(503, "2"), FINE)
     with pytest.raises(ProblemError) as raised:
         world.run(timeout=1.0)
@@ -165,7 +165,7 @@ def test_who_asks_for_more_time_than_is_left_is_not_waited_for() -> None:
 
 
 @pytest.mark.parametrize("status", [301, 400, 401, 404, 409, 413, 415, 422, 500, 502])
-def test_what_another_attempt_cannot_mend_is_not_attempted(status: int) -> None:
+def test_permanent_errors_are_not_retried(status: int) -> None:
     world = World(refusal(status, "1"))
     with pytest.raises(ProblemError) as raised:
         world.run()
@@ -226,7 +226,7 @@ def test_a_broken_connection_is_tried_again_with_growing_pauses() -> None:
     assert world.pauses == [0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 2.0, 2.0]
 
 
-def test_what_must_not_be_done_twice_is_asked_again_only_if_it_was_not_sent() -> None:
+def test_a_promotion_is_retried_only_if_it_was_not_sent() -> None:
     world = World(BROKEN, FINE)
     with pytest.raises(UnreachableError):
         world.run(promote)

@@ -119,7 +119,7 @@ def test_the_text_of_a_problem_has_the_first_errors(caller: Caller) -> None:
 
 
 @every_client
-def test_who_cannot_wait_is_told_so_and_may_ask_again(caller: Caller) -> None:
+def test_a_passed_deadline_is_an_error_and_the_client_stays_usable(caller: Caller) -> None:
     long = {"objects": [], "count": 64, "steps": 2000, "temperature": 1.5}
     for timeout in (0.001, 0.02):
         with pytest.raises(DeadlineError, match=f"within {timeout:g} s"):
@@ -153,7 +153,7 @@ except DeadlineError:
 """
 
 
-def test_an_offline_client_that_nobody_closes_keeps_no_program_from_ending(
+def test_an_unclosed_offline_client_does_not_block_the_exit(
     shared_store: Path,
 ) -> None:
     done = subprocess.run(
@@ -184,7 +184,7 @@ def test_a_store_without_a_usable_default_is_not_ready(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_served_is_changed_alike_with_a_service_and_without(tmp_path: Path) -> None:
+def test_promotion_works_alike_online_and_offline(tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
     with launch(store, tmp_path / "log") as service:
         with Client(f"http://127.0.0.1:{service.port}", admin_key=ADMIN_KEY) as scene:

@@ -63,7 +63,7 @@ def test_a_row_from_left_to_right_is_drawn_as_one(order: list[str]) -> None:
         assert found[a].x + found[a].width < found[b].x
 
 
-def test_near_is_below_and_left_is_left_whichever_way_it_is_said() -> None:
+def test_opposite_relations_are_drawn_alike() -> None:
     said = boxes(["bed", "desk", "lamp"], ("bed", "left", "desk"), ("lamp", "front", "desk"))
     meant = boxes(["bed", "desk", "lamp"], ("desk", "right", "bed"), ("desk", "behind", "lamp"))
     assert said == meant
@@ -71,7 +71,7 @@ def test_near_is_below_and_left_is_left_whichever_way_it_is_said() -> None:
     assert said["lamp"].y + said["lamp"].height < said["desk"].y
 
 
-def test_what_lies_on_something_is_drawn_on_it() -> None:
+def test_an_object_on_a_support_is_drawn_on_it() -> None:
     found = boxes(
         ["desk", "lamp", "book", "x"], ("lamp", "on-top", "desk"), ("desk", "under", "book")
     )
@@ -83,7 +83,7 @@ def test_what_lies_on_something_is_drawn_on_it() -> None:
     assert boxes(["desk", "lamp"], ("lamp", "above", "desk"))["lamp"].y > desk.y + plot.HEIGHT
 
 
-def test_of_what_contradicts_itself_the_first_said_is_drawn() -> None:
+def test_of_contradictory_relations_the_first_is_drawn() -> None:
     found = boxes(["bed", "desk"], ("bed", "left", "desk"), ("desk", "left", "bed"))
     assert found["bed"].x < found["desk"].x
     found = boxes(["bed", "desk"], ("bed", "on-top", "desk"), ("desk", "on-top", "bed"))

@@ -155,7 +155,7 @@ def test_the_client_s_model_is_asked_where_a_request_names_none(recorder: Record
         (lambda scene: scene.promote("default", ""), "#/model", "empty"),
     ],
 )
-def test_what_the_service_would_refuse_is_not_sent(
+def test_invalid_requests_are_not_sent(
     scene: Client, recorder: Recorder, ask: Callable[[Client], Any], pointer: str, word: str
 ) -> None:
     with pytest.raises(InvalidRequestError, match=word) as raised:

@@ -85,7 +85,7 @@ def test_many_calls_share_one_connection(peer: Any, open_caller: Any) -> None:
 
 @every_client
 @pytest.mark.parametrize("behave", [drip, drip_head, say_nothing, flood])
-def test_no_service_can_keep_anybody_beyond_the_deadline(
+def test_no_service_holds_a_call_beyond_the_deadline(
     peer: Any,
     open_caller: Any,
     behave: Callable[[socket.socket], None],
@@ -140,7 +140,7 @@ def test_a_connection_that_breaks_is_unreachable_in_the_end(peer: Any, open_call
 
 
 @every_client
-def test_nobody_listening_is_unreachable_and_not_ready(open_caller: Any) -> None:
+def test_a_refused_connection_is_unreachable_and_not_ready(open_caller: Any) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with open_caller(f"http://127.0.0.1:{port}", retries=1) as call:
@@ -171,7 +171,7 @@ def test_the_key_and_the_time_left_are_told(peer: Any, open_caller: Any) -> None
 
 @pytest.mark.system
 @every_client
-def test_over_tls_only_who_is_trusted_is_asked_and_deadlines_hold(
+def test_over_tls_certificates_are_verified_and_deadlines_hold(
     peer: Any,
     open_caller: Any,
     tmp_path: Path,

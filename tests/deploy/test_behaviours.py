@@ -115,7 +115,7 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
         assert condition.feedback_message.startswith("toilet_1: an outlier with probability 0.")
 
 
-def test_what_was_not_seen_does_not_belong(
+def test_an_unseen_object_does_not_belong(
     behaviours: Any, client: Client, scene: SceneFields, plant: Plant
 ) -> None:
     condition = behaviours.ObjectBelongs("belongs", client, lambda: scene, "sofa", timeout=30.0)

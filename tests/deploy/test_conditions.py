@@ -124,7 +124,7 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
         ({"scene": '{"objects": []}'}, "nothing was seen"),
     ],
 )
-def test_what_is_no_scene_fails_at_once(program: Path, ports: Any, because: str) -> None:
+def test_an_invalid_scene_fails_at_once(program: Path, ports: Any, because: str) -> None:
     (found,) = tick(program, "http://127.0.0.1:9", "SceneComplete", ports)
     assert (found["status"], found["because"]) == ("FAILURE", because)
     assert not found["waited"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import time
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -16,7 +15,7 @@ import pytest
 
 from tests.client.ros_messages import blank, to_json
 from tests.deploy.ros import STORE, from_json
-from tests.services import LiveService
+from tests.services import LiveService, wait_until
 
 pytest.importorskip("cyclonedds", reason="there is no wheel for this processor")
 
@@ -136,10 +135,7 @@ def hear(robot: Robot) -> Any:
 
 
 def wait_for(error: str, errors: Path) -> None:
-    until = time.monotonic() + 30
-    while error not in errors.read_text():
-        assert time.monotonic() < until, errors.read_text()
-        time.sleep(0.01)
+    wait_until(lambda: error in errors.read_text(), errors)
 
 
 @pytest.mark.system

@@ -77,7 +77,7 @@ def test_a_published_message_is_answered(
     assert errors == []
 
 
-def test_what_cannot_be_asked_is_reported_and_does_not_end_the_program(repository: Path) -> None:
+def test_an_invalid_message_is_reported_and_the_program_continues(repository: Path) -> None:
     message = {"op": "publish", "topic": "/x", "msg": {"objects": []}}
     with bridge(message) as (url, _):
         answers, errors = run(repository, url, "/x")

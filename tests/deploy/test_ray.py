@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import subprocess
 import threading
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
@@ -22,7 +20,7 @@ import yaml
 
 from app.settings import Settings
 from deploy.ray.run import descendants, environment
-from tests.services import LiveService
+from tests.services import LiveService, free_port, wait_until
 
 SCENE = {"objects": ["bed", "lamp"]}
 
@@ -127,9 +125,7 @@ def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[Liv
     python = repository / ".venv-ray" / "bin" / "python"
     if not python.with_name("ray").exists():
         pytest.skip("Ray is not installed; make ray installs it")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     inherited = {k: v for k, v in os.environ.items() if not k.startswith(("SCENE_", "RAY_"))}
     with log.open("w") as stream:
         process = subprocess.Popen(
@@ -141,7 +137,7 @@ def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[Liv
         )
     started: dict[int, str] = {}
     try:
-        wait(lambda: "ready:" in log.read_text() or process.poll() is not None, 240)
+        wait_until(lambda: "ready:" in log.read_text() or process.poll() is not None, seconds=240)
         assert process.poll() is None, log.read_text()
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
             yield LiveService(process, client, port, log)
@@ -152,13 +148,6 @@ def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[Liv
     assert process.returncode == 0, log.read_text()
     assert "ending process" not in log.read_text()
     assert not [command for pid, command in started.items() if Path(f"/proc/{pid}").exists()]
-
-
-def wait(condition: Callable[[], bool], seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "the condition is still false"
-        time.sleep(0.2)
 
 
 def replicas(service: LiveService) -> set[int]:
@@ -224,8 +213,8 @@ def test_load_adds_a_replica_and_rest_removes_it(
     with running(repository, tmp_path / "log", "--config", file) as service:
         assert len(replicas(service)) == 1
         with load(service, 24) as statuses:
-            wait(lambda: len(replicas(service)) == 2, 90)
-        wait(lambda: len(replicas(service)) == 1, 90)
+            wait_until(lambda: len(replicas(service)) == 2, seconds=90)
+        wait_until(lambda: len(replicas(service)) == 1, seconds=90)
         assert statuses.keys() == {200}
 
 
@@ -233,7 +222,7 @@ def test_load_adds_a_replica_and_rest_removes_it(
 def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     log = tmp_path_factory.mktemp("ray") / "log"
     with running(repository, log, "--replicas=2") as service:
-        wait(lambda: len(replicas(service)) == 2, 60)
+        wait_until(lambda: len(replicas(service)) == 2, seconds=60)
         yield service
 
 
@@ -296,13 +285,13 @@ def test_a_new_configuration_replaces_all_replicas_and_loses_nothing(
     settings = {"env_vars": {"SCENE_MAX_OBJECTS": "9"}}
     deployment["ray_actor_options"]["runtime_env"] = settings
     with load(service, 4) as statuses:
-        wait(lambda: statuses[200] > 100, 30)
+        wait_until(lambda: statuses[200] > 100, seconds=30)
         deploy(service, new)
-        wait(lambda: not replicas(service) & before, 180)
+        wait_until(lambda: not replicas(service) & before, seconds=180)
         count = statuses[200]
-        wait(lambda: statuses[200] > count + 100, 30)
+        wait_until(lambda: statuses[200] > count + 100, seconds=30)
     assert statuses.keys() == {200}
-    wait(lambda: len(replicas(service)) == 2, 60)
+    wait_until(lambda: len(replicas(service)) == 2, seconds=60)
     for _ in range(10):
         answer = service.client.post("/missing", json={"objects": ["bed"] * 10})
         assert answer.status_code == 422, answer.text
@@ -313,9 +302,9 @@ def test_a_killed_replica_is_replaced(service: LiveService) -> None:
     before = replicas(service)
     connections = 4
     with load(service, connections) as statuses:
-        wait(lambda: statuses[200] > 100, 30)
+        wait_until(lambda: statuses[200] > 100, seconds=30)
         os.kill(min(before), signal.SIGKILL)
-        wait(lambda: len(replicas(service) - before) == 1, 60)
+        wait_until(lambda: len(replicas(service) - before) == 1, seconds=60)
         count = statuses[200]
-        wait(lambda: statuses[200] > count + 100, 30)
+        wait_until(lambda: statuses[200] > count + 100, seconds=30)
     assert sum(statuses.values()) - statuses[200] <= connections, statuses

@@ -7,7 +7,6 @@ import importlib
 import json
 import math
 import threading
-import time
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
@@ -21,7 +20,7 @@ from scene_client import Client, UnreachableError
 from scene_client.vision_msgs import SceneFields
 from tests.client.ros_messages import blank
 from tests.deploy.ros import PACKAGE, STORE, Ros, from_json, load_package
-from tests.services import LiveService, launch
+from tests.services import LiveService, launch, wait_until
 
 
 @pytest.fixture
@@ -48,11 +47,11 @@ class Running:
         callback()
 
     def tick_until(self, done: Callable[[], Any]) -> None:
-        until = time.monotonic() + 30
-        while not done():
-            assert time.monotonic() < until, "nothing came"
+        def ticked() -> Any:
             self.tick()
-            time.sleep(0.005)
+            return done()
+
+        wait_until(ticked)
 
     def said(self, topic: str) -> list[Any]:
         return self.ros.publishers[topic].sent

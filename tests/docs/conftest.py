@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import httpx
 import pytest
+
+from tests.services import free_port, is_ready, wait_until
 
 _LEFT_OUT = shutil.ignore_patterns(
     ".git", ".venv", "build", "dist", "runs", ".hypothesis", ".*_cache"
@@ -52,9 +51,7 @@ def workplace(
     folder = tmp_path_factory.mktemp("checkout") / "scene"
     shutil.copytree(repository, folder, ignore=_LEFT_OUT, symlinks=True)
     install(folder)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     place = Workplace(folder, f"127.0.0.1:{port}")
     log = folder.parent / "log"
     with log.open("w") as stream:
@@ -67,7 +64,9 @@ def workplace(
             start_new_session=True,
         )
     try:
-        _wait_until_ready(process, place, log)
+        # Loops that are compiled anew take a minute or two.
+        wait_until(lambda: is_ready(port) or process.poll() is not None, log, seconds=400)
+        assert process.poll() is None, log.read_text()
         yield place
     finally:
         os.killpg(process.pid, signal.SIGTERM)
@@ -102,17 +101,3 @@ def install(folder: Path) -> None:
 
 def _without_settings() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith("SCENE_")}
-
-
-def _wait_until_ready(process: subprocess.Popen[bytes], place: Workplace, log: Path) -> None:
-    # Loops that are compiled anew take a minute or two.
-    deadline = time.monotonic() + 400
-    while time.monotonic() < deadline:
-        try:
-            if httpx.get(f"http://{place.address}/health/ready").status_code == 200:
-                return
-        except httpx.TransportError:
-            if process.poll() is not None:
-                break
-        time.sleep(0.05)
-    raise AssertionError(f"`make run` did not start the service:\n{log.read_text()}")

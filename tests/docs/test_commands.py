@@ -51,7 +51,7 @@ def test_settings_exist(page: Path) -> None:
     assert set(re.findall(r"\bSCENE_[A-Z_]+\b", page.read_text(encoding="utf-8"))) <= known
 
 
-def test_what_is_mentioned_is_found() -> None:
+def test_pages_mention_commands() -> None:
     """The tests above read something."""
     lines = [line for page in PAGES for line in mentioned(page)]
     assert sum("make " in line for line in lines) > 10

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from training.machines import BoltzmannMachine, MachineSpec, build
+from training.machines.gibbs import State
 
 TRIPLES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 1, 0)]
 
@@ -103,3 +104,15 @@ def enumerate_joint(machine: BoltzmannMachine, room: int | None = None) -> Joint
 def same(block: Tensor, value: Tensor) -> Tensor:
     """(N,) bool: rows of a block that equal a value."""
     return (block == value).all(1)
+
+
+def draw_states(
+    joint: Joint, count: int, generator: torch.Generator, given: Tensor | None = None
+) -> State:
+    """Exact samples of the joint, where `given` (N,) bool holds."""
+    p = joint.p if given is None else torch.where(given, joint.p, 0.0)
+    pick = torch.multinomial(p, count, replacement=True, generator=generator)
+    edges = joint.edges
+    if joint.machine.spec.variant == "triway":
+        edges = joint.machine.edges(torch.arange(joint.machine.spec.V).expand(count, -1))
+    return State(joint.v[pick], joint.h1[pick], joint.h2[pick], joint.r[pick], edges)

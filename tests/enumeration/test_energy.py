@@ -20,8 +20,8 @@ from tests.enumeration.small_machines import (
 )
 
 
-def relation_logit(machine, e, v, h1):
-    """ℓ_e written out with loops, as on the page."""
+def relation_logit(machine, e, v, h1, counts):
+    """ℓ_e written out with loops, as on the page, of `counts` instances of each class."""
     spec, (a, i, j) = machine.spec, e
     h = [float(x) for x in h1]
     table = [tuple(t) for t in machine.triples.tolist()]
@@ -36,6 +36,7 @@ def relation_logit(machine, e, v, h1):
     w += sum(p["S"][i, k] * p["R"][a, k] * p["O"][j, k] for k in range(spec.K))
     if e in table:
         w += p["residual"][table.index(e)]
+    w = w + p["n"][a, 0] * counts[i].log() + p["n"][a, 1] * counts[j].log()
     for x in range(spec.H1):
         w = w + shared(p, spec, e, x) * h[x]
     return float(p["d"][a] + w)
@@ -47,7 +48,7 @@ def shared(p, spec, e, x):
     return p["P"][a, x] + sum(p["S"][i, k] * p["O"][j, k] * p["M"][a, k, x] for k in range(spec.K))
 
 
-def energy_by_hand(machine, edges, v, r, h1, h2, room=None):
+def energy_by_hand(machine, edges, v, r, h1, h2, counts, room):
     spec = machine.spec
     p = {name: value.detach() for name, value in machine.named_parameters()}
     c1 = p["c1"] if room is None else p["c1"] + p["Q"][room]
@@ -61,7 +62,7 @@ def energy_by_hand(machine, edges, v, r, h1, h2, room=None):
             return math.inf
         if not active:
             continue
-        logit = relation_logit(machine, (a, i, j), v, h1)
+        logit = relation_logit(machine, (a, i, j), v, h1, counts)
         total -= float(r[unit]) * logit
         if spec.form == "local":
             total += math.log1p(math.exp(logit))
@@ -73,7 +74,8 @@ def energy_by_hand(machine, edges, v, r, h1, h2, room=None):
 @pytest.mark.parametrize("name", SMALL)
 def test_energy_is_the_formula(name):
     machine = small_machine(name)
-    edges = full_frame(machine)
+    counts = torch.arange(1.0, machine.spec.V + 1).double()
+    edges = machine.edges(torch.arange(machine.spec.V)[None], counts[None])
     generator = torch.Generator().manual_seed(1)
     room = 1 if machine.spec.C else None
     for _ in range(60):
@@ -84,7 +86,7 @@ def test_energy_is_the_formula(name):
         rooms = None if room is None else torch.tensor([room])
         ours = machine.energy(v[None], r[None], h1[None], h2[None], edges, rooms)
         assert float(ours) == pytest.approx(
-            energy_by_hand(machine, edges, v, r, h1, h2, room), rel=1e-12
+            energy_by_hand(machine, edges, v, r, h1, h2, counts, room), rel=1e-12
         )
 
 

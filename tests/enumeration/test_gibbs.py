@@ -14,7 +14,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+from tests.enumeration.small_machines import SMALL, draw_states, enumerate_joint, small_machine
 from training.machines.edges import present_classes
 from training.machines.gibbs import (
     FREE,
@@ -54,21 +54,13 @@ def histogram(codes, keys):
     return counts / counts.sum()
 
 
-def start(joint, generator, given=None):
-    p = joint.p if given is None else torch.where(given, joint.p, 0.0)
-    pick = torch.multinomial(p, CHAINS, replacement=True, generator=generator)
-    v, r, h1, h2 = joint.v[pick], joint.r[pick], joint.h1[pick], joint.h2[pick]
-    rows = joint.edges
-    if joint.machine.spec.variant == "triway":
-        rows = joint.machine.edges(torch.arange(joint.machine.spec.V).expand(CHAINS, -1))
-    return State(v, h1, h2, r, rows), p / p.sum()
-
-
 def check_stationary(joint, clamp, given, seed, **options):
     """TV within twice the floor's mean; by McDiarmid fails by chance with probability < 1e-9."""
     generator = torch.Generator().manual_seed(seed)
     machine = joint.machine
-    state, p = start(joint, generator, given)
+    state = draw_states(joint, CHAINS, generator, given)
+    p = joint.p if given is None else torch.where(given, joint.p, 0.0)
+    p = p / p.sum()
     all_states = State(joint.v, joint.h1, joint.h2, joint.r, joint.edges)
     if machine.spec.variant == "triway":
         frame = machine.edges(torch.arange(machine.spec.V).expand(len(joint.v), -1))

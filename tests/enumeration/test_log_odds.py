@@ -25,7 +25,7 @@ from training.machines.log_odds import (
     presence_log_odds,
     relation_log_odds,
 )
-from training.machines.mean_field import Evidence
+from training.machines.mean_field import Evidence, mean_field
 
 LOCAL_ONE_LAYER = [n for n in ONE_LAYER if n not in SEED_FORM]
 TWO_LAYERS = [n for n in SMALL if n not in ONE_LAYER]
@@ -145,6 +145,22 @@ def test_log_evidence_of_the_draws(name, keep):
         ours = draws.log_evidence + v @ machine.b + machine.pair_offset(joint.edges, v[None])
         tolerance = 4 / float((2 * draws.log_weight).logsumexp(0).mul(-0.5).exp())
         assert float(ours) == pytest.approx(joint.log_sum(given), abs=tolerance)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_mean_field_solves_its_equations(name):
+    """All relations observed: the slope of ρ_e is r_e, less σ(ℓ_e) in the local form."""
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    v, r, edges = joint.v[::97], joint.r[::97], joint.edges
+    evidence = Evidence(v, edges, r, torch.ones_like(r, dtype=torch.bool))
+    field = mean_field(machine, evidence, iterations=150)
+    m1 = field.y.sigmoid()
+    slope = r - machine.relation_logits(edges, v, m1).sigmoid() * (machine.spec.form == "local")
+    related = machine.hidden_input(edges, slope * machine.gate(edges, v))
+    expected = machine.c1 + v @ machine.W + field.h2 @ machine.J.T + related
+    torch.testing.assert_close(m1, expected.sigmoid(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(field.h2, (machine.c2 + m1 @ machine.J).sigmoid(), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("name", TWO_LAYERS)

@@ -5,20 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
-from training.machines.gibbs import State
+from tests.enumeration.small_machines import SMALL, draw_states, enumerate_joint, small_machine
 from training.machines.partition import ais, base_log_partition, independent_base, reverse_ais
 
 BETAS = torch.linspace(0, 1, 41).tolist()
 CHAINS = 2000
-
-
-def exact_samples(joint, count, generator):
-    pick = torch.multinomial(joint.p, count, replacement=True, generator=generator)
-    edges = joint.edges
-    if joint.machine.spec.variant == "triway":
-        edges = joint.machine.edges(torch.arange(joint.machine.spec.V).expand(count, -1))
-    return State(joint.v[pick], joint.h1[pick], joint.h2[pick], joint.r[pick], edges)
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -37,7 +28,7 @@ def test_forward_and_reverse_bracket_log_z(name):
     joint = enumerate_joint(machine)
     generator = torch.Generator().manual_seed(9)
     forward = ais(machine, BETAS, CHAINS, generator)
-    reverse = reverse_ais(machine, BETAS, exact_samples(joint, CHAINS, generator), generator)
+    reverse = reverse_ais(machine, BETAS, draw_states(joint, CHAINS, generator), generator)
     slack = 5 * max(forward.standard_error, reverse.standard_error)
     assert forward.bound <= joint.log_z + slack
     assert reverse.bound >= joint.log_z - slack

@@ -14,7 +14,7 @@ import pytest
 from tests.chaos.wire import BODY, Answer, Wire, exchange
 from tests.http.stores import make_store
 from tests.http.test_problems import problem
-from tests.services import LiveService, launch
+from tests.services import LiveService, launch, wait_until
 
 pytestmark = pytest.mark.system
 
@@ -102,7 +102,7 @@ def test_a_byte_now_and_then_keeps_no_connection(service: LiveService) -> None:
     assert service.descriptors <= files + 2
 
 
-def test_who_leaves_in_the_middle_is_forgotten(service: LiveService) -> None:
+def test_a_closed_connection_leaves_nothing_behind(service: LiveService) -> None:
     before = service.control()
     files = service.descriptors
     request = HEAD % len(BODY) + BODY
@@ -120,7 +120,7 @@ def test_who_leaves_in_the_middle_is_forgotten(service: LiveService) -> None:
     wait_for_descriptors(service, files)
 
 
-def test_who_does_not_read_is_cut_off(service: LiveService) -> None:
+def test_a_client_that_does_not_read_is_disconnected(service: LiveService) -> None:
     """The system ends the connection, some retransmissions after SCENE_CLIENT_TIMEOUT."""
     before = service.control()
     files = service.descriptors
@@ -142,11 +142,7 @@ def test_who_does_not_read_is_cut_off(service: LiveService) -> None:
 
 
 def wait_for_descriptors(service: LiveService, files: int) -> None:
-    for _ in range(300):
-        if service.descriptors <= files + 2:
-            return
-        time.sleep(0.1)
-    pytest.fail(f"{service.descriptors} descriptors, where there were {files}")
+    wait_until(lambda: service.descriptors <= files + 2)
 
 
 @pytest.mark.slow

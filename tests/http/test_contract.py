@@ -10,13 +10,15 @@ import schemathesis
 
 from tests.http.contract import call, documented
 from tests.http.stores import make_store
-from tests.services import LiveService, launch
+from tests.services import CHAOS, LiveService, launch
 
 pytestmark = pytest.mark.system
 
-# Batches differ in their scenes alone, whose forms are those of single requests; `make chaos` asks
-# all of them.
+# Batches differ in their scenes alone, whose forms are those of single requests. `make chaos` asks
+# all of them, and sends many more requests.
 api = documented(examples=5).exclude(path=["/relations/batch", "/outliers/batch"])
+if CHAOS:
+    api = documented(examples=60)
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +27,8 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     folder = tmp_path_factory.mktemp("contract")
     with launch(make_store(folder / "store"), folder / "log") as service:
         yield service
+        service.control()
+        assert "Traceback" not in service.log.read_text()
 
 
 @pytest.fixture(scope="module")

@@ -88,7 +88,7 @@ async def test_a_broken_new_version_keeps_nothing_else_back(store: Path) -> None
         assert answer.json()["model"]["version"] == "1.0.0"
 
 
-async def test_what_works_goes_on_working(store: Path) -> None:
+async def test_an_unreadable_alias_file_changes_nothing(store: Path) -> None:
     async with serve(store, store_poll=POLL) as client:
         before = await listed(client)
         (store / "aliases.json").write_text("{")

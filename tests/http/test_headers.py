@@ -41,7 +41,7 @@ def check(response: httpx.Response) -> None:
 
 
 @pytest.mark.parametrize(("method", "path", "body"), COMPUTED)
-async def test_what_is_computed_is_kept_nowhere_and_is_no_page(
+async def test_computed_answers_are_not_cached_and_load_nothing(
     client: httpx.AsyncClient, method: str, path: str, body: Any
 ) -> None:
     response = await client.request(method, path, json=body)

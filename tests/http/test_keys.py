@@ -79,7 +79,7 @@ async def test_pages_need_no_key(guarded: httpx.AsyncClient, path: str) -> None:
         "/openapi.json/x",
     ],
 )
-async def test_what_is_not_listed_needs_a_key(guarded: httpx.AsyncClient, path: str) -> None:
+async def test_unlisted_paths_need_a_key(guarded: httpx.AsyncClient, path: str) -> None:
     problem(await guarded.get(path), 401, "unauthorized")
 
 
@@ -155,7 +155,7 @@ async def test_without_an_admin_key_no_key_administers(
             problem(response, 401, "unauthorized")
 
 
-async def test_of_a_strangers_body_nothing_is_read(guarded: httpx.AsyncClient) -> None:
+async def test_a_body_without_a_key_is_not_read(guarded: httpx.AsyncClient) -> None:
     async def body() -> AsyncIterator[bytes]:
         nonlocal read
         read = True

@@ -79,7 +79,7 @@ async def test_a_listed_origin_may_ask(shared: httpx.AsyncClient) -> None:
         (LISTED, "POST", "x-anything"),
     ],
 )
-async def test_what_is_not_allowed_is_refused_beforehand(
+async def test_preflight_requests_of_other_origins_are_refused(
     shared: httpx.AsyncClient, origin: str, method: str, headers: str
 ) -> None:
     response = await preflight(shared, origin, method, headers)

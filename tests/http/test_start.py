@@ -14,7 +14,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.services import LiveService, begin
+from tests.services import LiveService, begin, free_port, wait_until
 
 pytestmark = pytest.mark.system
 
@@ -26,11 +26,8 @@ def messages(log: Path) -> list[str]:
 
 
 def wait_for(text: str, log: Path, process: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + 60
-    while text not in log.read_text():
-        assert process.poll() is None, log.read_text()
-        assert time.monotonic() < deadline, log.read_text()
-        time.sleep(0.01)
+    wait_until(lambda: text in log.read_text() or process.poll() is not None, log, seconds=60)
+    assert process.poll() is None, log.read_text()
 
 
 @contextmanager
@@ -89,9 +86,7 @@ def test_an_address_that_the_machine_does_not_have(
 def test_connections_are_refused_until_the_service_is_ready(
     shared_store: Path, tmp_path: Path
 ) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     log = tmp_path / "log"
     with starting(shared_store, log, SCENE_PORT=str(port)) as process:
         wait_for("Waiting for application startup", log, process)

@@ -47,7 +47,7 @@ def kept(likelihood, fixed=frozenset(), structure=NONE):
 
 
 @given(DRAWN)
-def test_what_stays_can_hold_and_what_goes_could_not(likelihood):
+def test_kept_relations_are_consistent_and_removed_ones_are_not(likelihood):
     """Each one that goes contradicts those that are at least as likely and stay."""
     stay = kept(likelihood)
     assert possible(stay)
@@ -57,7 +57,7 @@ def test_what_stays_can_hold_and_what_goes_could_not(likelihood):
 
 
 @given(DRAWN, st.sets(TRIPLES, max_size=4))
-def test_what_is_given_stays_and_decides(likelihood, fixed):
+def test_given_relations_stay_and_exclude_others(likelihood, fixed):
     stay = kept(likelihood, fixed)
     assert fixed & set(likelihood) <= stay
     for triple in stay - fixed:

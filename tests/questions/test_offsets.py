@@ -48,7 +48,7 @@ def one(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFFSETS):
 
 
 @given(st.integers(0, A - 1), st.integers(0, V - 1), st.integers(0, V - 1))
-def test_what_stands_to_the_right_has_the_negative_offset_of_what_stands_to_the_left(a, i, j):
+def test_opposite_relations_have_negative_offsets(a, i, j):
     """left(i, j) and right(j, i) are one fact, asked from either end."""
     to, back = one(a, i, j), one(a, j, i, outgoing=False)
     assert back.mean == tuple(-x for x in to.mean)

@@ -181,7 +181,7 @@ def test_disagreements_of_chosen_pairs_either_way_round():
         assert_same(found, expected)
 
 
-def test_what_one_instance_shows_is_expected_of_the_others():
+def test_a_relation_of_one_instance_explains_the_others():
     """Two chairs stand otherwise than expected; but one may, where the other stands so."""
     artifact, seen = ARTIFACTS["triway-wide"], 0
     for name in RELATIONS:
@@ -315,7 +315,7 @@ def test_the_order_of_the_objects_does_not_matter(name, scene, random):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nothing_but_an_empty_scene(name):
+def test_an_empty_scene(name):
     empty = scene_of([])
     assert relations(ARTIFACTS[name], empty) == ((), ())
     assert outliers(ARTIFACTS[name], empty) == (1.0, (), ())

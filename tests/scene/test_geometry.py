@@ -179,7 +179,7 @@ ALL, HORIZONTAL, NOTHING = set(CANONICAL), {"left", "front"}, set[str]()
         (box(0.0, 0.0, 0.8, *SHEET), box(0.0, 0.05, 0.8, *SHEET), NOTHING, ALL),
     ],
 )
-def test_what_holds_of_a_pair(
+def test_relations_of_a_pair(
     subject: Thing, anchor: Thing, holds: set[str], observed: set[str]
 ) -> None:
     positions, sizes = zip(subject, anchor, strict=True)

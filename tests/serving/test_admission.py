@@ -150,7 +150,7 @@ async def test_an_answer_that_comes_too_late_is_none(queue: WorkQueue) -> None:
 
 
 @pytest.mark.parametrize("ask", IN_THREADS)
-async def test_nobody_waits_past_the_deadline_for_costly_work(queue: WorkQueue, ask: Any) -> None:
+async def test_costly_work_ends_the_wait_at_the_deadline(queue: WorkQueue, ask: Any) -> None:
     """The one under way is given up; the one behind it is dropped without being begun."""
     release, begun = threading.Event(), threading.Event()
     behind: list[int] = []

@@ -130,7 +130,7 @@ def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["proxy", "scene", "train"])
-def test_what_services_write_is_bounded(compose: dict[str, Any], name: str) -> None:
+def test_logs_and_temporary_files_are_bounded(compose: dict[str, Any], name: str) -> None:
     service = compose["services"][name]
     assert service["logging"]["driver"] == "json-file"
     assert {"max-size", "max-file"} <= service["logging"]["options"].keys()

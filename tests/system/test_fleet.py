@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import socket
-import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from app.registry import AliasTarget, Store
@@ -21,12 +16,15 @@ from scene_client import Client
 from tests.chaos.load import ConstantLoad
 from tests.chaos.test_swaps import SCENES, offline
 from tests.http.stores import make_store
-from tests.services import LiveService, launch
+from tests.services import LiveService, is_ready, launch, wait_until
+from tests.system.conftest import StartProxy
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
-PROMOTIONS = 50
+PROMOTIONS = 30
 POLL = 0.5
+NOTICED = 2.5
+"""Seconds within which the proxy has noticed that a replica is ready: it asks every two."""
 
 
 class Fleet:
@@ -59,61 +57,31 @@ class Fleet:
         answer = replica.client.post("/missing", json={"objects": ["bed"]}).json()
         return str(answer["model"]["version"])
 
-    @contextmanager
-    def proxy(self, program: Path, shipped: str) -> Iterator[int]:
-        """Start HAProxy with the shipped configuration in front of the replicas."""
+    def configuration(self, shipped: str) -> Path:
+        """The shipped configuration with these replicas as servers."""
         template = next(line for line in shipped.splitlines() if "server-template" in line)
         servers = "".join(
             f"    server replica{number} 127.0.0.1:{replica.port}\n"
             for number, replica in enumerate(self.replicas)
         )
-        configuration = self.folder / "haproxy.cfg"
-        configuration.write_text(shipped.replace(template, servers))
-        with socket.create_server(("127.0.0.1", 0)) as probe:
-            port = probe.getsockname()[1]
-        variables = {"PROXY_LISTEN": f"127.0.0.1:{port}", "PROXY_REQUESTS": "1000000"}
-        with (self.folder / "proxy").open("w") as output:
-            process = subprocess.Popen(
-                [program, "-db", "-f", configuration],
-                env=os.environ | variables,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-            )
-        try:
-            wait_until_ready(port)
-            yield port
-        finally:
-            process.terminate()
-            process.wait(timeout=30)
+        path = self.folder / "haproxy.cfg"
+        path.write_text(shipped.replace(template, servers))
+        return path
 
 
-def wait_until_ready(port: int) -> None:
-    for _ in range(300):
-        try:
-            if httpx.get(f"http://127.0.0.1:{port}/health/ready").status_code == 200:
-                return
-        except httpx.TransportError:
-            pass
-        time.sleep(0.1)
-    pytest.fail("the service is not ready")
-
-
-@pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[Fleet]:
-    fleet = Fleet(tmp_path)
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    fleet = Fleet(tmp_path_factory.mktemp("fleet"))
     yield fleet
     for replica in fleet.replicas:
         replica.stop()
 
 
-@pytest.fixture
-def port(
-    fleet: Fleet, require_system_tool: Callable[[str], Path], repository: Path
-) -> Iterator[int]:
-    os.environ["PATH"] += os.pathsep + "/usr/sbin"
-    shipped = (repository / "deploy" / "haproxy" / "haproxy.cfg").read_text()
-    with fleet.proxy(require_system_tool("haproxy"), shipped) as port:
-        yield port
+@pytest.fixture(scope="module")
+def port(fleet: Fleet, haproxy: StartProxy, configuration: Path) -> Iterator[int]:
+    own = fleet.configuration(configuration.read_text())
+    with haproxy(own, fleet.folder / "proxy", PROXY_REQUESTS="1000000") as proxy:
+        yield proxy.port
 
 
 @pytest.fixture
@@ -147,13 +115,13 @@ def test_a_killed_replica_costs_at_most_its_requests(fleet: Fleet, load: Constan
     killed = fleet.replicas[0]
     killed.client.close()
     with load:
-        time.sleep(1)
+        wait_until(lambda: load.tally.statuses[200] > 100)
         killed.process.kill()
         killed.process.wait()
-        time.sleep(5)
+        time.sleep(5)  # until the proxy has noticed it
         fleet.replicas[0] = fleet.start(0, killed.port)
-        wait_until_ready(killed.port)
-        time.sleep(3)
+        wait_until(lambda: is_ready(killed.port))
+        time.sleep(NOTICED)
     # The replica writes the head of an answer before the body. If it dies in between, the proxy
     # has already sent the head, and it can only close the connection: status 0.
     assert load.tally.statuses.keys() <= {200, 502, 0}
@@ -166,13 +134,13 @@ def test_a_rolling_update_of_the_settings_loses_and_mixes_nothing(
 ) -> None:
     with load:
         for number, old in enumerate(fleet.replicas):
-            time.sleep(3)  # until the proxy has noticed that the other replica is ready
+            time.sleep(NOTICED)
             old.process.terminate()
             assert old.process.wait(timeout=30) == -signal.SIGTERM
             old.client.close()
             settings = {"SCENE_MAX_OBJECTS": "9"}
             fleet.replicas[number] = fleet.start(number, old.port, **settings)
-            wait_until_ready(old.port)
+            wait_until(lambda port=old.port: is_ready(port))
     assert load.tally.faults == []
     assert load.tally.statuses[200] == load.tally.sent
     for replica in fleet.replicas:

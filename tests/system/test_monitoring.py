@@ -185,7 +185,7 @@ def test_images_are_pinned_and_configuration_is_read_only(
         assert volume.endswith(":ro") or not volume.startswith("."), volume
 
 
-def test_nobody_can_log_into_grafana(compose: dict[str, Any]) -> None:
+def test_grafana_has_no_login(compose: dict[str, Any]) -> None:
     environment = compose["services"]["grafana"]["environment"]
     # Its administrator has a password that everybody knows.
     assert environment["GF_AUTH_BASIC_ENABLED"] == "false"

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import socket
-import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,83 +21,16 @@ from app.settings import Settings
 from scene_client import Client
 from tests.chaos.wire import BODY, Wire, exchange, wires
 from tests.http.stores import make_store
-from tests.services import ADMIN_KEY, LiveService, launch, wait_until
+from tests.services import ADMIN_KEY, LiveService, is_ready, launch, wait_until
+from tests.system.conftest import Proxy, StartProxy
 
 pytestmark = pytest.mark.system
-
-FindTool = Callable[[str], Path]
 
 API_KEY = "incorrect-zebra-capacitor-nail"
 CONNECTIONS, REQUESTS = 30, 400
 SCENE = {"objects": ["bed", "lamp"]}
 HEAD = b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 LIVE = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
-
-
-@dataclass
-class Proxy:
-    """A running proxy.
-
-    Attributes:
-        service: in front of which it stands.
-    """
-
-    process: subprocess.Popen[str]
-    port: int
-    log: Path
-    service: LiveService
-
-    @property
-    def address(self) -> str:
-        """Where to ask."""
-        return f"http://127.0.0.1:{self.port}"
-
-
-@pytest.fixture(scope="module")
-def configuration(repository: Path) -> Path:
-    return repository / "deploy" / "haproxy" / "haproxy.cfg"
-
-
-@pytest.fixture(scope="module")
-def haproxy(require_system_tool: FindTool, configuration: Path) -> Callable[..., Any]:
-    """Start the proxy in front of a service; variables as in its configuration."""
-    # Debian keeps it where only administrators look.
-    os.environ["PATH"] += os.pathsep + "/usr/sbin"
-    program = require_system_tool("haproxy")
-
-    @contextmanager
-    def start(service: LiveService, log: Path, **variables: str) -> Iterator[Proxy]:
-        with socket.create_server(("127.0.0.1", 0)) as probe:
-            port = probe.getsockname()[1]
-        environment = os.environ | {
-            "PROXY_LISTEN": f"127.0.0.1:{port}",
-            "PROXY_BACKEND": f"127.0.0.1:{service.port}",
-            "PROXY_REPLICAS": "1",
-            **variables,
-        }
-        with log.open("w") as output:
-            process = subprocess.Popen(
-                [program, "-db", "-f", configuration],
-                env=environment,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                text=True,
-            )
-        proxy = Proxy(process, port, log, service)
-        try:
-            wait_until(lambda: is_ready(proxy), log)
-            yield proxy
-        finally:
-            process.terminate()
-            process.wait(timeout=30)
-
-    return start
-
-
-def is_ready(proxy: Proxy) -> bool:
-    with suppress(httpx.TransportError):
-        return httpx.get(f"{proxy.address}/health/ready").status_code == 200
-    return False
 
 
 @pytest.fixture(scope="module")
@@ -111,13 +41,24 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
 
 
 @pytest.fixture(scope="module")
+def behind(haproxy: StartProxy, configuration: Path) -> StartProxy:
+    """Return a function that starts the proxy in front of a service."""
+
+    def start(service: LiveService, log: Path, **variables: str) -> Any:
+        backend = f"127.0.0.1:{service.port}"
+        return haproxy(configuration, log, PROXY_BACKEND=backend, PROXY_REPLICAS="1", **variables)
+
+    return start
+
+
+@pytest.fixture(scope="module")
 def proxy(
-    haproxy: Callable[..., Any], service: LiveService, tmp_path_factory: pytest.TempPathFactory
+    behind: StartProxy, service: LiveService, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Proxy]:
     """A proxy of little patience and no limit on rates."""
     log = tmp_path_factory.mktemp("proxy") / "log"
     variables = {"PROXY_HEAD_TIMEOUT": "1s", "PROXY_TIMEOUT": "2s", "PROXY_REQUESTS": "1000000"}
-    with haproxy(service, log, PROXY_CONNECTIONS=str(CONNECTIONS), **variables) as proxy:
+    with behind(service, log, PROXY_CONNECTIONS=str(CONNECTIONS), **variables) as proxy:
         yield proxy
 
 
@@ -153,11 +94,13 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
 
 
 @pytest.mark.slow
-def test_an_answer_may_take_longer_than_a_client_may_pause(proxy: Proxy) -> None:
-    service = proxy.service.process
-    service.send_signal(signal.SIGSTOP)
+def test_an_answer_may_take_longer_than_a_client_may_pause(
+    proxy: Proxy, service: LiveService
+) -> None:
+    process = service.process
+    process.send_signal(signal.SIGSTOP)
     try:
-        resume = threading.Timer(2.5, service.send_signal, [signal.SIGCONT])
+        resume = threading.Timer(2.5, process.send_signal, [signal.SIGCONT])
         resume.start()
         response = httpx.post(f"{proxy.address}/outliers", json=SCENE, timeout=60)
     finally:
@@ -228,7 +171,7 @@ def test_the_old_protocol_has_no_chunks(proxy: Proxy) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_wrong_below_http_reaches_nobody(proxy: Proxy) -> None:
+def test_requests_below_http_are_refused(proxy: Proxy, service: LiveService) -> None:
     """Every refusal is a client's error; no request hides in another."""
     with ThreadPoolExecutor(8) as pool:
         exchanges = [(wire, pool.submit(exchange, proxy.port, wire)) for wire in wires()]
@@ -239,25 +182,25 @@ def test_what_is_wrong_below_http_reaches_nobody(proxy: Proxy) -> None:
         assert max(statuses, default=0) < 500, wire.name
         assert wire.expected in (None, statuses), wire.name
         assert is_closed or not wire.closes, wire.name
-    log = proxy.service.log.read_text()
+    log = service.log.read_text()
     assert '"smuggled"' not in log
     assert "Traceback" not in log
 
 
-def test_unread_pipelined_requests_are_not_queued(proxy: Proxy) -> None:
+def test_unread_pipelined_requests_are_not_queued(proxy: Proxy, service: LiveService) -> None:
     """The service sees few of 20,000 requests whose answers are not read; the connection ends."""
-    before = lines(proxy.service)
+    before = lines(service)
     with socket.socket() as connection:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         connection.settimeout(0.5)
         connection.connect(("127.0.0.1", proxy.port))
         with suppress(TimeoutError, ConnectionError):
             connection.sendall(LIVE.replace(b"/health/live", b"/docs") * 20_000)
-        assert is_ready(proxy)
+        assert is_ready(proxy.port)
         began = time.monotonic()
         wait_until(lambda: '"ended": "c' in proxy.log.read_text())
         assert time.monotonic() - began < 10
-    assert lines(proxy.service) - before < 2_000
+    assert lines(service) - before < 2_000
 
 
 def lines(service: LiveService) -> int:
@@ -289,7 +232,7 @@ def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
 
 
 def test_one_address_has_so_many_connections(proxy: Proxy) -> None:
-    wait_until(lambda: is_ready(proxy))
+    wait_until(lambda: is_ready(proxy.port))
     with ExitStack() as held:
         answered = 0
         for _ in range(CONNECTIONS + 10):
@@ -299,14 +242,14 @@ def test_one_address_has_so_many_connections(proxy: Proxy) -> None:
                 connection.sendall(LIVE)
                 answered += connection.recv(4096).startswith(b"HTTP/1.1 200 ")
     assert CONNECTIONS - 5 <= answered <= CONNECTIONS
-    wait_until(lambda: is_ready(proxy))
+    wait_until(lambda: is_ready(proxy.port))
 
 
 def test_one_address_asks_so_often(
-    haproxy: Callable[..., Any], service: LiveService, tmp_path: Path
+    behind: StartProxy, service: LiveService, tmp_path: Path
 ) -> None:
     with (
-        haproxy(service, tmp_path / "log", PROXY_REQUESTS=str(REQUESTS)) as proxy,
+        behind(service, tmp_path / "log", PROXY_REQUESTS=str(REQUESTS)) as proxy,
         httpx.Client(base_url=proxy.address) as client,
     ):
         answers = [client.post("/missing", json=SCENE) for _ in range(REQUESTS + 100)]
@@ -336,9 +279,9 @@ HIDDEN = [
 
 @pytest.mark.parametrize(("method", "path"), HIDDEN)
 def test_administration_and_figures_are_not_for_the_outside(
-    proxy: Proxy, method: str, path: str
+    proxy: Proxy, service: LiveService, method: str, path: str
 ) -> None:
-    before = lines(proxy.service)
+    before = lines(service)
     request = (
         f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nX-Admin-Key: {ADMIN_KEY}\r\n"
         "Content-Type: application/json\r\nContent-Length: 2\r\nConnection: close\r\n\r\n{}"
@@ -346,7 +289,7 @@ def test_administration_and_figures_are_not_for_the_outside(
     answer = refused(proxy, request.encode(), 404)
     assert answer.headers["content-type"] == "application/problem+json"
     assert json.loads(answer.body)["type"] == "/problems/not-found"
-    added = proxy.service.log.read_text().splitlines()[before:]
+    added = service.log.read_text().splitlines()[before:]
     assert all("/health/" in line for line in added)
 
 
@@ -358,12 +301,12 @@ def test_an_escape_that_is_none_hides_no_route(proxy: Proxy) -> None:
 
 @pytest.mark.slow
 def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
-    haproxy: Callable[..., Any], tmp_path: Path
+    behind: StartProxy, tmp_path: Path
 ) -> None:
     store = make_store(tmp_path / "store")
     with (
         launch(store, tmp_path / "service", SCENE_API_KEY=API_KEY) as service,
-        haproxy(service, tmp_path / "log") as proxy,
+        behind(service, tmp_path / "log") as proxy,
         httpx.Client(base_url=proxy.address) as client,
     ):
         for headers in (
@@ -385,17 +328,15 @@ def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
 
 
 @pytest.mark.slow
-def test_a_service_that_is_not_ready_is_not_asked(
-    haproxy: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_service_that_is_not_ready_is_not_asked(behind: StartProxy, tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
     with (
         launch(store, tmp_path / "service") as service,
-        haproxy(service, tmp_path / "log") as proxy,
+        behind(service, tmp_path / "log") as proxy,
     ):
         service.process.kill()
         service.process.wait(timeout=30)
-        wait_until(lambda: not is_ready(proxy))
+        wait_until(lambda: not is_ready(proxy.port))
         answer = httpx.post(f"{proxy.address}/missing", json=SCENE)
         assert answer.status_code == 503
         assert answer.json()["type"] == "/problems/not-ready"

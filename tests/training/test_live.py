@@ -13,10 +13,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from typer.testing import CliRunner
 
-from training.cli import app
-from training.config import Config
+from tests.training.commands import invoke, small_config, write_config
+from training.config import Config, with_settings
 from training.live import Display, next_steps, sparkline, summarise
 from training.pipeline import prepare
 from training.runs import save_checkpoint
@@ -24,29 +23,10 @@ from training.trainer import Trainer
 
 ROOT = Path(__file__).parents[2]
 
-CONFIG = """
-name = "live"
-[data]
-sources = ["rooms"]
-vocabulary = "rooms"
-rooms = 60
-[machine]
-variant = "rbm"
-form = "local"
-H1 = 8
-H2 = 0
-[objective]
-name = "composite"
-[training]
-epochs = {epochs}
-batch_size = 16
-"""
-
 
 def small(epochs: int) -> Config:
-    import tomllib
-
-    return Config.model_validate(tomllib.loads(CONFIG.format(epochs=epochs)))
+    settings = {"training.epochs": epochs, "training.batch_size": 16}
+    return with_settings(small_config("live", "rbm"), settings)
 
 
 def test_a_line_of_blocks_rises_with_its_values() -> None:
@@ -82,7 +62,7 @@ def test_a_run_shows_its_scores_and_what_to_do_next(tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_nobody_who_asks_for_no_logs_waits_for_tensorboard() -> None:
+def test_tensorboard_is_imported_only_for_logs() -> None:
     code = "import sys; import training.cli; assert 'torch.utils.tensorboard' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
@@ -91,8 +71,7 @@ def test_nobody_who_asks_for_no_logs_waits_for_tensorboard() -> None:
 def test_ctrl_c_while_an_epoch_is_kept_counts_those_that_were(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int
 ) -> None:
-    config = tmp_path / "live.toml"
-    config.write_text(CONFIG.format(epochs=4))
+    config = write_config(tmp_path / "live.toml", small(4))
     saved: list[Path] = []
 
     def save(path: Path, state: dict[str, Any]) -> None:
@@ -102,6 +81,5 @@ def test_ctrl_c_while_an_epoch_is_kept_counts_those_that_were(
         save_checkpoint(path, state)
 
     monkeypatch.setattr("training.trainer.save_checkpoint", save)
-    result = CliRunner().invoke(app, ["train", str(config), "--runs", str(tmp_path)])
-    assert result.exit_code == 130
-    assert f"stopped after epoch {kept};" in " ".join(result.output.split())
+    output = invoke("train", config, "--runs", tmp_path, code=130)
+    assert f"stopped after epoch {kept};" in output

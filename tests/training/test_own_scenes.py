@@ -14,21 +14,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from app.registry import Store
 from tests.services import launch, serve
-from training.cli import app
+from tests.training.commands import invoke
 
 pytestmark = [pytest.mark.slow, pytest.mark.anyio]
 
 BENCH = ["electronics bench", "soldering irons", "multimeter", "lab stool"]
-
-
-def invoke(*arguments: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == code, result.output
-    return " ".join(result.output.split())
 
 
 class Workplace:

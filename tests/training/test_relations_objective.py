@@ -58,12 +58,12 @@ def whole(scenes):
     return scenes.batch(torch.arange(len(scenes)))
 
 
-def trained(machine, scenes, config=CONFIG, words=None, steps=400):
+def trained(machine, scenes, config=CONFIG, words=None, steps=200):
     objective = RelationLikelihood(config, machine, scenes, words)
     for name, weight in machine.named_parameters():
         weight.requires_grad_(name not in ("b", "c1", "c2", "W", "J", "Q"))
     chosen = [p for p in machine.parameters() if p.requires_grad and p.numel()]
-    optimiser = torch.optim.Adam([*chosen, *objective.parameters()], lr=0.05)
+    optimiser = torch.optim.Adam([*chosen, *objective.parameters()], lr=0.1)
     generator, batch = torch.Generator().manual_seed(0), whole(scenes)
     for _ in range(steps):
         loss = objective.loss(machine, batch, generator)

@@ -19,7 +19,7 @@ def small_config(**training) -> Config:
     return Config.model_validate(
         {
             "name": "small-triway",
-            "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 150},
+            "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 90},
             "machine": {"variant": "triway", "form": "local", "H1": 12, "H2": 6, "K": 4},
             "objective": {"name": "composite", "relation_weight": 0.1},
             "training": {"epochs": 3, "batch_size": 32, "averaging": 0.9, **training},
@@ -99,7 +99,6 @@ def test_phases_resume_to_the_same_bits_wherever_they_were_interrupted(worded, t
     """Among the objects nothing is kept; after them, the objects are."""
     config = phased()
     whole = state(Trainer(config, worded).run().machine)
-    assert same(whole, state(Trainer(config, worded).run().machine))
 
     def stop(_):
         raise KeyboardInterrupt

@@ -159,7 +159,7 @@ def related():
     return tensors(
         [
             scene([0, 1, 2], [(ON_TOP, 0, 1), (LEFT, 0, 2)]),
-            scene([0, 1], [(ON_TOP, 0, 1)], counts=[1, 3]),
+            scene([0, 1, 1, 1], [(ON_TOP, 0, 1)]),
             scene([0, 1, 9], [(ON_TOP, 0, 9)]),
             scene([0, 1], annotated=False),
         ]

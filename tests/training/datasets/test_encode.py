@@ -67,7 +67,7 @@ def test_rooms_without_a_type(room_type: str | None) -> None:
     assert found.evidence.room_type is None
 
 
-def test_what_people_annotate_is_complete() -> None:
+def test_stated_relations_are_complete() -> None:
     found = encoded(
         things("desk", "monitor", "monitor", "pencil"),
         relations=((1, "on-top", 0), (0, "under", 1), (2, "behind", 1)),
@@ -81,7 +81,7 @@ def test_what_people_annotate_is_complete() -> None:
     assert (found.evidence.observed == ~np.diag(single)).all()
 
 
-def test_what_is_said_both_ways_round_says_nothing() -> None:
+def test_contradictory_relations_are_unobserved() -> None:
     found = encoded(
         things("desk", "monitor", "pencil"),
         relations=((0, "front", 1), (0, "behind", 1), (2, "on-top", 0), (1, "on-top", 0)),
@@ -138,7 +138,7 @@ def test_without_sizes_nothing_vertical_is_observed() -> None:
     assert not found.evidence.observed[[ON_TOP, ABOVE]].any()
 
 
-def test_what_lies_in_a_drawer_is_on_its_desk() -> None:
+def test_an_object_in_a_drawer_is_on_top_of_the_desk() -> None:
     objects = (
         AnnotatedObject("d", "desk", **DESK_BOX),
         # Inside the desk: by the boxes alone the pencil would be left of it.

@@ -84,7 +84,7 @@ def test_both_margins_are_kept_exactly(scenes, seed):
 
 @settings(deadline=None)
 @given(scene_sets(), seeds)
-def test_what_comes_out_is_valid_and_the_rest_stays(scenes, seed):
+def test_shuffled_scenes_are_valid_and_keep_other_fields(scenes, seed):
     after = shuffle_objects(scenes, STRUCTURE, seed)
     for old, new in zip(scenes, after, strict=True):
         e = new.evidence

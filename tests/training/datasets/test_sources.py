@@ -43,7 +43,7 @@ def test_people_mention_few_of_the_relations_that_hold(source: str) -> None:
     assert off(found) == {(ON_TOP, 0, 1), (ABOVE, 0, 1), (ABOVE, 1, 0)} | beside
 
 
-def test_what_stands_on_a_thing_may_be_listed_beside_it_too() -> None:
+def test_an_object_on_a_support_may_also_be_listed_beside_it() -> None:
     found = encoded("nr3d", relations=((1, "on-top", 0), (1, "left", 0)))
     assert found.instance_holds[[ON_TOP, LEFT], 1, 0].all()
     assert (LEFT, 0, 1) in off(found)

@@ -7,10 +7,9 @@ import json
 from dataclasses import replace
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.training.commands import invoke
 from tests.training.domain.scenes import scene
-from training.cli import app
 from training.config import ConfigError, data_folder, load_config
 from training.datasets import generate_rooms
 from training.datasets.jsonl import write_jsonl
@@ -28,13 +27,7 @@ def file(tmp_path):
     return path
 
 
-def invoke(*arguments: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == code, result.output
-    return " ".join(result.output.split())
-
-
-def test_what_is_proposed_can_be_trained_on(file, tmp_path) -> None:
+def test_a_proposed_configuration_can_be_trained(file, tmp_path) -> None:
     folder, report = tmp_path / "lab", tmp_path / "report.json"
     output = invoke("init", "lab", file, "--output", folder, "--terms", "ours", "--json", report)
     assert "train" in output
@@ -126,7 +119,7 @@ def test_every_bad_line_is_named_up_to_a_bound(tmp_path) -> None:
         (("lab", "--format", "csv"), "unknown format"),
     ],
 )
-def test_what_cannot_be_is_refused(file, tmp_path, arguments, message) -> None:
+def test_invalid_arguments_are_refused(file, tmp_path, arguments, message) -> None:
     name, *options = arguments
     assert message in invoke("init", name, file, "--output", tmp_path / "o", *options, code=1)
     assert not (tmp_path / "o").exists()

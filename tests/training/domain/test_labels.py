@@ -39,7 +39,7 @@ def test_a_rare_slip_of_a_frequent_label_is_proposed_as_its_alias() -> None:
     assert (pair.name, pair.like, pair.mentions) == ("osciloscope", "oscilloscope", (2, 30))
 
 
-def test_what_may_be_two_things_is_only_pointed_at() -> None:
+def test_uncertain_lookalikes_are_not_merged() -> None:
     both = many("pallet rack", 30) + many("pallet jack", 2) + many("pallet rack", 1, "pallet jack")
     assert not pairs(both)["pallet jack", "pallet rack"].merged
     frequent = pairs(many("hammers", 30) + many("hamper", 12))

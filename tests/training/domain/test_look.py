@@ -59,7 +59,7 @@ def test_both_sides_of_a_pair_contradict_each_other_in_either_wording() -> None:
     assert finding("both directions", agreed) == (0, [])
 
 
-def test_what_carries_its_own_carrier_is_found() -> None:
+def test_cycles_of_supports_are_found() -> None:
     circle = [(0, "on-top", 1), (1, "on-top", 2), (2, "on-top", 0), (3, "on-top", 0)]
     count, (example,) = finding("cycle", scene("a", "cup", "tray", "box", "pen", relations=circle))
     assert count == 1

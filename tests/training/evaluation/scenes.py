@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -33,6 +34,7 @@ def scene(
     group: str = "g",
     name: str | None = None,
     relations: int = 4,
+    annotated: bool = True,
 ) -> EncodedScene:
     """One instance of each entry of `classes`; triples (a, i, j) name classes, first instances."""
     n = len(classes)
@@ -40,7 +42,7 @@ def scene(
     for a, i, j in triples:
         holds[a, classes.index(i), classes.index(j)] = True
     labels = np.array(classes, dtype=np.int64)
-    observed = np.broadcast_to(~np.eye(n, dtype=np.bool_), holds.shape).copy()
+    observed = np.broadcast_to(~np.eye(n, dtype=np.bool_) & annotated, holds.shape).copy()
     evidence = pool_instances(labels, np.ones(n), holds, observed)
     cut = {"holds": evidence.holds[:relations], "observed": evidence.observed[:relations]}
     return EncodedScene(
@@ -48,12 +50,10 @@ def scene(
         source=source,
         group=group,
         room_type=room,
-        evidence=type(evidence)(
-            evidence.classes, evidence.counts, evidence.confidence, **cut, room_type=None
-        ),
+        evidence=replace(evidence, **cut),
         instance_classes=labels,
-        instance_holds=holds,
-        instance_observed=observed,
+        instance_holds=holds[:relations],
+        instance_observed=observed[:relations],
         unknown=unknown,
     )
 

@@ -52,7 +52,7 @@ def test_relations_are_compared_with_what_was_listed():
     assert found.truth[ours].tolist() == listed
 
 
-def test_relations_that_nobody_knows_of_are_not_judged():
+def test_unknown_relations_are_not_judged():
     """A source of sentences lists what holds: of no unlisted relation is anything known."""
     vague = [replace(entry, source="coco_captions", complete=False) for entry in DATA.scenes]
     vague = [replace(entry, instance_observed=entry.instance_holds) for entry in vague]

@@ -5,21 +5,14 @@ from __future__ import annotations
 import json
 import re
 import runpy
-import socket
 import sys
-import threading
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import uvicorn
 
-from app.main import create_app
 from app.questions import relations
 from app.registry import Store, load_model_set
 from app.scene import Scene, SceneObject, opposite
-from app.settings import Settings
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from training.evaluation import everyday
 from training.evaluation.everyday import (
@@ -74,24 +67,6 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
-@pytest.fixture(scope="module")
-def service() -> Iterator[str]:
-    """The address of a service of the shipped store, in this process."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    app = create_app(Settings(store=STORE, access_log=False))
-    server = uvicorn.Server(uvicorn.Config(app, port=port, log_config=None))
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    deadline = time.monotonic() + 60
-    while not server.started and time.monotonic() < deadline:
-        time.sleep(0.02)
-    yield f"http://127.0.0.1:{port}"
-    server.should_exit = True
-    thread.join()
-
-
 def score(monkeypatch, capsys, *arguments: str) -> dict[str, tuple[int, int]]:
     """What the script that came with the facts prints."""
     monkeypatch.setattr(sys, "argv", ["score.py", *arguments])
@@ -110,12 +85,11 @@ needs_facts = pytest.mark.skipif(facts_file(FOLDER) is None, reason="the facts a
 
 @needs_facts
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["indoor-triway", "indoor-rbm"])
-@pytest.mark.parametrize("made", [False, True], ids=["the facts", "made ones"])
-def test_the_service_gives_the_same_eleven_lines(service, model, made, folder, monkeypatch, capsys):
+@pytest.mark.parametrize(("model", "made"), [("indoor-triway", False), ("indoor-rbm", True)])
+def test_the_service_gives_the_same_eleven_lines(shipped, model, made, folder, monkeypatch, capsys):
     place = folder if made else FOLDER
     artifact = load_model_set(Store(STORE)).resolve(model)
-    expected = score(monkeypatch, capsys, service, str(place / "facts.json"), "--model", model)
+    expected = score(monkeypatch, capsys, shipped.url, str(place / "facts.json"), "--model", model)
     found = ask_everyday(artifact, place)
     assert found == expected
     assert tuple(found) == LINES

@@ -84,7 +84,7 @@ def test_metrics_survive_json(metric):
     assert again.figure() == metric.figure()
 
 
-def test_what_is_no_metric_is_an_error():
+def test_unknown_metrics_are_refused():
     with pytest.raises(ValueError, match="kind must be"):
         metric_from_dict({"kind": "guess"})
     with pytest.raises(ValueError, match="unknown statistic"):

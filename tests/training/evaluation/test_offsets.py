@@ -103,7 +103,7 @@ def test_the_card_s_figures_are_those_of_each_source():
     assert near["distance (m)"] < 0.9 * near["distance (m), relation alone"]
 
 
-def test_what_is_published_holds_the_offsets_of_each_source():
+def test_a_published_model_has_the_offsets_of_each_source():
     train = draws(MEAN, STD, 40, 0)
     artifact = contender(train).artifact
     test = draws(MEAN, STD, 6, 1, source="a") + draws(MEAN, STD, 6, 2, source="b")

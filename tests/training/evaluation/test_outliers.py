@@ -120,7 +120,7 @@ def test_intruders_are_absent_and_no_structure():
     assert (len(scores.scene), scores.skipped) == (0, 2)
 
 
-def test_what_is_added_depends_on_the_scene_alone():
+def test_the_intruder_depends_on_the_scene_alone():
     scenes = [scene([0, 1], []), *(scene([0, 1, 2]) for _ in range(9))]
     together = draw_intruders(tensors(scenes), NO_STRUCTURE).tolist()
     assert together == [int(draw_intruders(tensors([s]), NO_STRUCTURE)[0]) for s in scenes]

@@ -92,7 +92,7 @@ def test_perfect_and_ignorant_scores():
     assert ignorant["log-loss"].value == pytest.approx(-np.log(listed.mean(1)).mean())
 
 
-def test_what_is_impossible_throughout_is_a_guess():
+def test_pairs_without_a_possible_relation_count_as_a_guess():
     data = tensors([scene([0, 1], [(ON, 1, 0)])])
 
     def never(batch):

@@ -119,7 +119,7 @@ def test_structure_is_no_end_of_a_relation():
     assert placement_scores(data, FLOOR, flat).scene.tolist() == [0, 0]
 
 
-def test_what_is_scored_sees_no_relation():
+def test_relation_scores_are_asked_without_relations():
     """T1a asks with all relations hidden, and with nobody having counted if so wished."""
     spy = Spy()
     data = tensors([scene([0, 1, 1], [(0, 0, 1)])])

@@ -126,7 +126,7 @@ def test_every_machine_can_be_evaluated(name):
     assert set(report_of(contender, silent, asked).outcomes.values()) == {None}
 
 
-def test_who_takes_no_part_is_none():
+def test_a_contender_without_scores_has_no_outcome():
     assert set(report_of(Contender(), SETTING).outcomes.values()) == {None}
 
 
@@ -190,7 +190,7 @@ def test_publishing_measures_the_tasks_of_a_card_on_every_source():
 
 
 @pytest.mark.slow
-def test_what_is_published_is_the_calibrated_artifact_s():
+def test_published_figures_are_those_of_the_calibrated_artifact():
     """Another default threshold, other alarms; and no more scenes than the limit allows."""
 
     def alarms(threshold, limit=100):
@@ -201,8 +201,9 @@ def test_what_is_published_is_the_calibrated_artifact_s():
         (row,) = (row for row in rows if row.metric == "alarms in untouched scenes")
         return row
 
-    assert (alarms(0.0).value, alarms(1.0).value) == (1.0, 0.0)
-    assert (alarms(0.5).n, alarms(0.5, limit=7).n) == (40, 7)
+    every, none = alarms(0.0), alarms(1.0, limit=7)
+    assert (every.value, none.value) == (1.0, 0.0)
+    assert (every.n, none.n) == (40, 7)
 
 
 def test_completion_has_the_metrics_of_relations():
@@ -234,7 +235,7 @@ def test_a_skill_that_is_undefined_is_left_out(tmp_path, monkeypatch):
     assert (tmp_path / "toy.json").exists()
 
 
-def test_some_scenes_are_the_same_for_everybody():
+def test_a_sample_of_scenes_is_always_the_same():
     some = some_scenes(DATA, 7)
     assert [s.scene_id for s in some.scenes] == [s.scene_id for s in some_scenes(DATA, 7).scenes]
     assert len(some) == 7

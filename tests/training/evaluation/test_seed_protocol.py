@@ -48,7 +48,7 @@ def test_every_machine_is_asked_every_question(name):
             assert again.metrics[metric].value == value.value
 
 
-def test_who_cannot_sample_takes_no_part():
+def test_a_contender_without_a_machine_has_no_outcome():
     assert [task(Contender(), SETTING) for task in SEED_TASKS.values()] == [None] * 3
 
 

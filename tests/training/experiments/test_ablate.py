@@ -5,33 +5,14 @@ from __future__ import annotations
 import json
 
 import pytest
-from typer.testing import CliRunner
 
-from training.cli import app
+from tests.training.commands import invoke, small_config, write_config
 from training.experiments.ablate import PRIMARY
 from training.runs import load_run
 from training.trainer import Trainer
 
 pytestmark = pytest.mark.slow
 
-CONFIG = """
-name = "rooms-triway"
-[data]
-sources = ["rooms"]
-vocabulary = "rooms"
-rooms = 60
-[machine]
-variant = "triway"
-form = "local"
-H1 = 6
-H2 = 0
-K = 2
-[objective]
-name = "composite"
-[training]
-epochs = 5
-learning_rate = 0.03
-"""
 ROWS = """
 [[row]]
 name = "seed-form"
@@ -42,10 +23,6 @@ name = "no-counts"
 what = "instances are not counted"
 changes = { "machine.without" = ["n"] }
 [[row]]
-name = "rbm"
-what = "an RBM"
-changes = { "machine.variant" = "rbm" }
-[[row]]
 name = "diverging"
 what = "far too fast"
 changes = { "training.learning_rate" = 1e30 }
@@ -53,25 +30,20 @@ changes = { "training.learning_rate" = 1e30 }
 
 
 def arguments(folder, *, rows=ROWS):
-    config, path = folder / "config.toml", folder / "rows.toml"
-    config.write_text(CONFIG)
+    path = folder / "rows.toml"
     path.write_text(rows)
-    where = ("--rows", str(path), "--folder", str(folder / "ablation"))
+    settings = {"training.epochs": 5, "training.learning_rate": 0.03}
+    config = write_config(folder / "config.toml", small_config(), settings)
     # In this process, where tests can look on.
-    return "ablate", str(config), *where, "--epochs", "2", "--workers", "1"
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, list(arguments))
-    return result.exit_code, " ".join(result.output.split())
+    where = ("--rows", path, "--folder", folder / "ablation", "--epochs", "2", "--workers", "1")
+    return "ablate", config, *where
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """The folder of a finished ablation, most of it made by two workers."""
     folder = tmp_path_factory.mktemp("ablation")
-    code, output = run(*arguments(folder), "--workers", "2")
-    assert code == 0, output
+    invoke(*arguments(folder), "--workers", "2")
     return folder
 
 
@@ -87,7 +59,7 @@ def test_every_row_is_compared_with_the_full_model_on_both_parts(finished):
         for cell in found["cells"]
     }
     sources = {f"{part} {name}" for part in ("validation", "test") for name in ("rooms", "pooled")}
-    rows = {"rooms-triway", "seed-form", "no-counts", "rbm"}
+    rows = {"rooms-triway", "seed-form", "no-counts"}
     # Some parts hold no pair that training tells little of.
     little = ("accuracy, unseen pairs", "accuracy, rare classes")
     metrics = {(task, name) for task, names in PRIMARY.items() for name in names} - {
@@ -126,7 +98,7 @@ def test_the_table_has_the_row_minus_the_full_model(finished):
         "weights", "validation pooled", "test pooled", "validation rooms", "test rooms",
     ]  # fmt: skip
     assert [line.split(" |")[0].strip("| ") for line in lines] == [
-        "**rooms-triway**", "seed-form", "no-counts", "rbm",
+        "**rooms-triway**", "seed-form", "no-counts",
     ]  # fmt: skip
     gap = next(
         d["figure"]
@@ -154,10 +126,9 @@ def test_costs_count_trained_weights_alone(finished):
 
 def test_the_same_command_trains_nothing_again(finished, monkeypatch):
     before = results(finished)
-    rows = ("--row", "seed-form", "--row", "no-counts", "--row", "rbm")
+    rows = ("--row", "seed-form", "--row", "no-counts")
     monkeypatch.setattr(Trainer, "run", None)
-    code, output = run(*arguments(finished), *rows)
-    assert code == 0, output
+    invoke(*arguments(finished), *rows)
     after = results(finished)
     assert (after["cells"], after["differences"]) == (before["cells"], before["differences"])
     assert after["failures"] == {}
@@ -174,11 +145,8 @@ def test_an_interrupted_ablation_goes_on(finished, tmp_path, monkeypatch):
 
     chosen = ("--row", "no-counts")
     monkeypatch.setattr(Trainer, "_epoch", interrupted)
-    code, output = run(*arguments(tmp_path), *chosen)
-    assert code == 130
-    assert "to continue" in output
-    code, output = run(*arguments(tmp_path), *chosen)
-    assert code == 0, output
+    assert "to continue" in invoke(*arguments(tmp_path), *chosen, code=130)
+    invoke(*arguments(tmp_path), *chosen)
     assert epochs[-2:] == [("no-counts", 1), ("no-counts", 1)]
     first, again = (
         [cell for cell in results(folder)["cells"] if cell["row"] == "no-counts"]
@@ -198,6 +166,5 @@ def test_bad_requests_are_named(finished, tmp_path):
         (("ablate", config), "TOML file of ablations with --rows"),
         ((*arguments(finished), "--limit", "20"), "another configuration of rooms-triway"),
     ):
-        code, output = run(*request)
-        assert (code, message in output) == (1, True)
+        assert message in invoke(*request, code=1)
     assert not (tmp_path / "ablation").exists()

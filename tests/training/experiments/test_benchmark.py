@@ -7,10 +7,9 @@ import json
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
+from tests.training.commands import invoke, small_config, write_config
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
-from training.cli import app
 from training.config import ConfigError
 from training.evaluation.metrics import Figure, Ratio
 from training.evaluation.report import SourceReport
@@ -33,23 +32,6 @@ from training.trainer import Trainer
 
 pytestmark = pytest.mark.slow
 
-CONFIG = """
-name = "rooms-{variant}"
-[data]
-sources = ["rooms"]
-vocabulary = "rooms"
-rooms = {rooms}
-[machine]
-variant = "{variant}"
-form = "local"
-H1 = 8
-H2 = 0
-K = 4
-[objective]
-name = "composite"
-[training]
-epochs = {epochs}
-"""
 BASELINES = ("--baseline", "popularity", "--baseline", "EASE")
 # In this process, where tests can look on; workers have a test of their own.
 HERE = ("--workers", "1")
@@ -58,14 +40,9 @@ REFERENCES = {"independent classes", "held-out scenes (floor)"}
 
 
 def write(folder, *, variant="triway", rooms=60, epochs=2):
-    path = folder / f"{variant}-{rooms}-{epochs}.toml"
-    path.write_text(CONFIG.format(variant=variant, rooms=rooms, epochs=epochs))
-    return str(path)
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, ["benchmark", *arguments])
-    return result.exit_code, " ".join(result.output.split())
+    settings = {"training.epochs": epochs, "machine.H1": 8, "machine.K": 4}
+    config = small_config(f"rooms-{variant}", variant, rooms=rooms)
+    return write_config(folder / f"{variant}-{rooms}-{epochs}.toml", config, settings)
 
 
 @pytest.fixture(scope="module")
@@ -75,11 +52,10 @@ def finished(tmp_path_factory):
     where = folder / "reports"
     arguments = (
         *(write(folder, variant=variant) for variant in ("triway", "rbm")),
-        "--folder", str(where), "--quick",
+        "--folder", where, "--quick",
         "--seed-protocol", "--shuffled", *HERE,
     )  # fmt: skip
-    code, output = run(*arguments)
-    assert code == 0, output
+    invoke("benchmark", *arguments)
     return arguments, where / "rooms"
 
 
@@ -206,8 +182,7 @@ def test_finished_rows_are_never_trained_again(finished, monkeypatch):
     before = [json.loads((folder / "results.json").read_text()), json.loads(report.read_text())]
     report.unlink()
     monkeypatch.setattr(Trainer, "run", None)
-    code, output = run(*arguments)
-    assert code == 0, output
+    invoke("benchmark", *arguments)
     after = [json.loads((folder / "results.json").read_text()), json.loads(report.read_text())]
     assert after[0] == before[0]
     outcomes = [found["tasks"]["T2 missing"]["outcome"] for found in (before[1], after[1])]
@@ -231,22 +206,20 @@ def test_every_trial_is_kept(finished):
     ],
 )
 def test_bad_requests_are_named(tmp_path, others, message):
-    code, output = run(write(tmp_path), "--folder", str(tmp_path / "x"), "--quick", *HERE, *others)
-    assert (code, message in output) == (1, True)
+    where = ("--folder", tmp_path / "x", "--quick", *HERE)
+    assert message in invoke("benchmark", write(tmp_path), *where, *others, code=1)
 
 
 def test_some_tasks_are_measured_and_the_rest_later(tmp_path, monkeypatch):
     arguments = (
-        write(tmp_path, epochs=1), "--folder", str(tmp_path), "--quick", "--baseline", "none",
+        write(tmp_path, epochs=1), "--folder", tmp_path, "--quick", "--baseline", "none",
         *HERE,
     )  # fmt: skip
-    code, output = run(*arguments, "--task", "T2 missing")
-    assert code == 0, output
+    invoke("benchmark", *arguments, "--task", "T2 missing")
     tasks = json.loads((tmp_path / "rooms/rooms-triway/seed-0/rooms.json").read_text())["tasks"]
     assert set(tasks) == {"T2 missing"}
     monkeypatch.setattr(Trainer, "run", None)
-    code, output = run(*arguments, "--task", "T1")
-    assert code == 0, output
+    invoke("benchmark", *arguments, "--task", "T1")
     more = json.loads((tmp_path / "rooms/rooms-triway/seed-0/rooms.json").read_text())["tasks"]
     assert set(more) == {
         "T2 missing", "T1a relations", "T1 pairs", "T1 with evidence", "T1b completion",
@@ -257,9 +230,8 @@ def test_some_tasks_are_measured_and_the_rest_later(tmp_path, monkeypatch):
 
 def test_workers_find_what_one_process_finds(finished, tmp_path):
     (first, *_), folder = finished
-    arguments = (first, "--folder", str(tmp_path), "--quick", *BASELINES, "--task", "T2 missing")
-    code, output = run(*arguments, "--workers", "2")
-    assert code == 0, output
+    arguments = (first, "--folder", tmp_path, "--quick", *BASELINES, "--task", "T2 missing")
+    invoke("benchmark", *arguments, "--workers", "2")
     for row in ("rooms-triway", "ease"):
         ours, theirs = (
             json.loads((place / row / "seed-0/rooms.json").read_text())["tasks"]["T2 missing"]
@@ -275,7 +247,7 @@ def test_configurations_of_one_data_section_are_a_domain(tmp_path):
     with pytest.raises(ConfigError, match="two configurations have the name indoor-rbm"):
         read_domains(["indoor-rbm", "indoor-rbm"])
     with pytest.raises(ConfigError, match="different data sections"):
-        read_domains([write(tmp_path), write(tmp_path, variant="rbm", rooms=50)])
+        read_domains([str(write(tmp_path)), str(write(tmp_path, variant="rbm", rooms=50))])
 
 
 def test_the_default_domain_begins_with_its_triway_machine():

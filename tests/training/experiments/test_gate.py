@@ -70,7 +70,7 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
         (("T2 missing",), "T2 missing", 0),  # nor does what is served know of any
     ],
 )
-def test_what_was_measured_at_relations_gives_way_to_nothing_that_was_not(
+def test_a_model_without_relation_metrics_replaces_no_model_with_them(
     measured, task, expected
 ) -> None:
     manifest = SimpleNamespace(metrics=[SimpleNamespace(task=name) for name in measured])

@@ -83,7 +83,7 @@ def test_an_earlier_version_of_the_data_is_no_matter_where_the_split_is_stable(t
     assert {stable_part(scene.group, 0) for scene in found.scenes} == {"test"}
 
 
-def test_where_it_is_not_that_is_said(tmp_path) -> None:
+def test_another_version_of_the_data_without_a_stable_split_is_uncertain(tmp_path) -> None:
     before = side("before", {"rooms": "0" * 64}, split="group")
     found = held_out(side("now", split="stable"), before, SCENES, tmp_path)
     assert not found.certain
@@ -102,6 +102,6 @@ def test_a_model_of_other_sources_has_seen_nothing(tmp_path) -> None:
     assert held_out(side("a"), BASELINES, SCENES, tmp_path).certain
 
 
-def test_who_does_not_say_what_was_held_out_cannot_come_first(tmp_path) -> None:
+def test_the_first_side_must_record_its_split(tmp_path) -> None:
     with pytest.raises(ConfigError, match="does not record the split of its scenes"):
         held_out(BASELINES, side("b"), SCENES, tmp_path)

@@ -8,30 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from training.cli import app
+from tests.training.commands import invoke, small_config, write_config
 from training.config import ConfigError, DataConfig
 from training.experiments.benchmark import Options, compare_on_shuffled, read_domains
 from training.experiments.rows import Material, baseline_rows
 from training.pipeline import read_sources, split_and_encode
 
-CONFIG = """
-name = "flats-rbm"
-[data]
-sources = {sources}
-vocabulary = "source"
-[machine]
-variant = "rbm"
-form = "local"
-H1 = 4
-H2 = 0
-K = 2
-[objective]
-name = "composite"
-[training]
-epochs = 1
-"""
 LABELS = ["bed", "sink", "lamp", "oven", "sofa", "desk", "shelf", "towel", "plant", "chair"]
 
 
@@ -52,25 +35,8 @@ def write_scenes(folder, source, *, seed=0, relations=False):
         file.write("\n".join(lines))
 
 
-def arguments(folder, *others, sources=("flats",)):
-    path = folder / "config.toml"
-    path.write_text(CONFIG.format(sources=json.dumps(sources)))
-    return (
-        str(path), "--data", str(folder), "--folder", str(folder / "reports"), "--quick",
-        "--workers", "1", *others,
-    )  # fmt: skip
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, ["benchmark", *arguments])
-    return result.exit_code, " ".join(result.output.split())
-
-
 def rows_of(results):
     return {cell["row"] for cell in results["cells"]}
-
-
-ONE_TASK = ("--task", "T2 missing", "--baseline", "popularity")
 
 
 def material(folder, **settings):
@@ -123,8 +89,10 @@ def unrelated(tmp_path_factory):
     """Everything that a quick run does, on scenes without relations."""
     folder = tmp_path_factory.mktemp("unrelated")
     write_scenes(folder, "flats")
-    code, output = run(*arguments(folder, "--shuffled"))
-    assert code == 0, output
+    data = {"sources": ["flats"], "vocabulary": "source"}
+    config = write_config(folder / "config.toml", small_config("flats-rbm", "rbm", **data))
+    where = ("--data", folder, "--folder", folder / "reports", "--workers", "1")
+    invoke("benchmark", config, *where, "--quick", "--shuffled")
     return folder
 
 

@@ -43,7 +43,7 @@ def test_a_row_that_fails_stops_no_other(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_not_a_rows_own_failure_is_raised(tmp_path):
+def test_errors_other_than_failures_of_a_row_are_raised(tmp_path):
     entries = [Row("first", 0, "first", diverges), Row("second", 0, "second", answers)]
     with pytest.raises(FloatingPointError, match="loss is nan"):
         measure_rows(plan(tmp_path), entries, print, workers=2)

@@ -8,60 +8,31 @@ import json
 import numpy as np
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
-from training.cli import app
+from tests.training.commands import invoke, small_config, write_config
 from training.evaluation.metrics import Figure, Ratio
 from training.evaluation.report import SourceReport
 from training.evaluation.setting import Outcome
 from training.experiments.results import Asked, Cell, Difference, Results, remarks, summarise
 
-CONFIG = """
-name = "rooms-rbm"
-[data]
-sources = ["rooms"]
-vocabulary = "rooms"
-rooms = 60
-split = "{split}"
-[machine]
-variant = "rbm"
-form = "local"
-H1 = 4
-H2 = 0
-K = 2
-[objective]
-name = "composite"
-[training]
-epochs = 1
-"""
 
-
-def arguments(folder, *others, split="group"):
-    path = folder / f"{split}.toml"
-    path.write_text(CONFIG.format(split=split))
-    return (
-        str(path), "--folder", str(folder / "reports"), "--quick", "--workers", "1",
-        "--task", "T2 missing", "--baseline", "popularity", *others,
-    )  # fmt: skip
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, ["benchmark", *arguments])
-    return result.exit_code, " ".join(result.output.split())
+def arguments(folder, *others):
+    config = small_config("rooms-rbm", "rbm", split="random")
+    path = write_config(folder / "random.toml", config, {"training.epochs": 1})
+    where = ("--folder", folder / "reports", "--quick", "--workers", "1")
+    return "benchmark", path, *where, "--task", "T2 missing", "--baseline", "popularity", *others
 
 
 def test_a_random_split_fills_no_table(tmp_path):
     for others in ((), ("--shuffled",), ("--shuffled", "--seed-protocol")):
-        code, output = run(*arguments(tmp_path, *others, split="random"))
-        assert code == 1
+        output = invoke(*arguments(tmp_path, *others), code=1)
         assert "rooms-rbm: data.split" in output
         assert "--seed-protocol" in output
     assert not (tmp_path / "reports").exists()
 
 
 def test_a_random_split_is_asked_as_the_seed_paper_asks(tmp_path):
-    code, output = run(*arguments(tmp_path, "--seed-protocol", split="random"))
-    assert code == 0, output
+    invoke(*arguments(tmp_path, "--seed-protocol"))
     folder = tmp_path / "reports/rooms"
     assert not (folder / "results.json").exists()
     assert json.loads((folder / "seed-protocol/results.json").read_text())["cells"]
@@ -101,7 +72,7 @@ def test_a_verdict_needs_the_whole_interval_on_the_better_side(metric, low, high
     assert Difference("a", "T", "x", metric, figure).verdict == verdict
 
 
-def test_what_was_asked_is_in_the_results():
+def test_results_list_the_questions():
     metrics = {"MMD²": Ratio(np.array([0.5]), np.ones(1))}
     outcome = Outcome(metrics, 7, 2, {"bandwidth": 4.0})
     report = SourceReport("x", "", {"T4 generate": outcome, "Density": None})

@@ -11,46 +11,24 @@ import optuna
 import pytest
 from optuna.distributions import CategoricalDistribution
 from optuna.storages.journal import JournalFileBackend
-from typer.testing import CliRunner
 
-from training.cli import app
+from tests.training.commands import invoke, small_config, write_config
 from training.config import load_config
 from training.experiments.tune import Search
 from training.pipeline import prepare
 from training.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[3]
-CONFIG = """
-name = "rooms-triway"
-[data]
-sources = ["rooms"]
-vocabulary = "rooms"
-rooms = {rooms}
-[machine]
-variant = "triway"
-form = "local"
-H1 = 6
-H2 = 0
-K = 2
-[objective]
-name = "composite"
-[training]
-epochs = 7
-"""
+TWO_EPOCHS = ("--epochs", "2", "--no-prune")
 SPACE = '"training.learning_rate" = [0.03, 1e30]\n"machine.H1" = { low = 3, high = 5 }\n'
 
 
 def arguments(folder, *, rooms=60, space=SPACE):
-    config, path = folder / "config.toml", folder / "space.toml"
-    config.write_text(CONFIG.format(rooms=rooms))
+    path = folder / "space.toml"
     path.write_text(space)
-    where = ("--space", str(path), "--folder", str(folder / "tuning"))
-    return "tune", str(config), *where, "--epochs", "2", "--no-prune"
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, list(arguments))
-    return result.exit_code, " ".join(result.output.split())
+    settings = {"training.epochs": 7}
+    config = write_config(folder / "config.toml", small_config(rooms=rooms), settings)
+    return "tune", config, "--space", path, "--folder", folder / "tuning", *TWO_EPOCHS
 
 
 def recorded(place):
@@ -69,8 +47,7 @@ def settings_of(folder):
 def finished(tmp_path_factory):
     """The folder of a finished search of six trials beside the configuration as it is."""
     folder = tmp_path_factory.mktemp("tune")
-    code, output = run(*arguments(folder), "--trials", "6")
-    assert code == 0, output
+    invoke(*arguments(folder), "--trials", "6")
     return folder
 
 
@@ -103,8 +80,7 @@ def test_the_best_configuration_loads_and_keeps_its_own_epochs(finished):
 def test_the_same_command_runs_nothing_again(finished, monkeypatch):
     before = settings_of(finished)
     monkeypatch.setattr(Trainer, "run", None)
-    code, output = run(*arguments(finished), "--trials", "6")
-    assert code == 0, output
+    invoke(*arguments(finished), "--trials", "6")
     assert settings_of(finished) == before
 
 
@@ -120,30 +96,26 @@ def test_an_interrupted_search_goes_on_within_its_trial(tmp_path, monkeypatch):
 
     space = '"machine.H1" = [4]\n'
     monkeypatch.setattr(Trainer, "_epoch", interrupted)
-    code, output = run(*arguments(tmp_path, space=space), "--trials", "1")
-    assert code == 130
-    assert "to continue" in output
+    search = (*arguments(tmp_path, space=space), "--trials", "1")
+    assert "to continue" in invoke(*search, code=130)
     assert settings_of(tmp_path) == [{}]
-    code, output = run(*arguments(tmp_path, space=space), "--trials", "1")
-    assert code == 0, output
+    invoke(*search)
     assert epochs == [(6, 0), (6, 1), (4, 0), None, (4, 1)]
     assert settings_of(tmp_path) == [{}, {"machine.H1": 4}]
     assert not list(tmp_path.rglob("checkpoint.pt"))
 
 
 def test_bad_requests_are_refused_before_anything_runs(tmp_path):
-    code, output = run(*arguments(tmp_path, space='"training.rate" = [0.1]'))
-    assert (code, "no setting 'training.rate'" in output) == (1, True)
+    unknown = arguments(tmp_path, space='"training.rate" = [0.1]')
+    assert "no setting 'training.rate'" in invoke(*unknown, code=1)
     assert not (tmp_path / "tuning").exists()
     _, config, *_ = arguments(tmp_path)
-    code, output = run("tune", config)
-    assert (code, "Pass a TOML file with --space" in output) == (1, True)
+    assert "Pass a TOML file with --space" in invoke("tune", config, code=1)
 
 
 def test_other_scenes_are_another_search(finished, tmp_path):
     other = arguments(tmp_path, rooms=70)
-    code, output = run(*other, "--folder", str(finished / "tuning"))
-    assert code == 1
+    output = invoke(*other, "--folder", finished / "tuning", code=1)
     assert "another configuration, scenes or metric" in output
 
 
@@ -152,7 +124,7 @@ def test_other_scenes_are_another_search(finished, tmp_path):
 def test_two_processes_share_a_study(tmp_path):
     """Together they run as many trials as asked, each trial once."""
     space = '"training.learning_rate" = { low = 0.001, high = 0.1, log = true }\n'
-    command = (sys.executable, "-m", "training", *arguments(tmp_path, space=space))
+    command = (sys.executable, "-m", "training", *map(str, arguments(tmp_path, space=space)))
     journal = tmp_path / "shared.log"
     both = [
         subprocess.Popen([*command, "--trials", "5", "--study", str(journal)], cwd=ROOT)

@@ -1,0 +1,63 @@
+"""HAProxy with the shipped configuration."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.services import free_port, is_ready, wait_until
+
+
+@dataclass
+class Proxy:
+    """A running proxy."""
+
+    port: int
+    log: Path
+
+    @property
+    def address(self) -> str:
+        """Where to ask."""
+        return f"http://127.0.0.1:{self.port}"
+
+
+StartProxy = Callable[..., AbstractContextManager[Proxy]]
+
+
+@pytest.fixture(scope="session")
+def configuration(repository: Path) -> Path:
+    """The shipped configuration of the proxy."""
+    return repository / "deploy" / "haproxy" / "haproxy.cfg"
+
+
+@pytest.fixture(scope="session")
+def haproxy(require_system_tool: Callable[[str], Path]) -> StartProxy:
+    """Return a function that starts the proxy; variables as in its configuration."""
+    # Debian keeps it where only administrators look.
+    os.environ["PATH"] += os.pathsep + "/usr/sbin"
+    program = require_system_tool("haproxy")
+
+    @contextmanager
+    def start(configuration: Path, log: Path, **variables: str) -> Iterator[Proxy]:
+        port = free_port()
+        with log.open("w") as output:
+            process = subprocess.Popen(
+                [program, "-db", "-f", configuration],
+                env=os.environ | {"PROXY_LISTEN": f"127.0.0.1:{port}", **variables},
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+        try:
+            wait_until(lambda: is_ready(port), log)
+            yield Proxy(port, log)
+        finally:
+            process.terminate()
+            process.wait(timeout=30)
+
+    return start

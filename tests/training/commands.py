@@ -1,0 +1,37 @@
+"""`python -m training` in this process, and the configuration of a small machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from typer.testing import CliRunner
+
+from training.cli import app
+from training.config import Config, config_toml, with_settings
+
+
+def invoke(*arguments: object, code: int = 0) -> str:
+    """Run a command that must end with `code`, and return its output in one line."""
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == code, result.output
+    return " ".join(result.output.split())
+
+
+def small_config(name: str = "rooms-triway", variant: str = "triway", **data: Any) -> Config:
+    """A local machine of one layer on 60 generated rooms."""
+    return Config.model_validate(
+        {
+            "name": name,
+            "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 60, **data},
+            "machine": {"variant": variant, "form": "local", "H1": 6, "H2": 0, "K": 2},
+            "objective": {"name": "composite"},
+            "training": {"epochs": 2},
+        }
+    )
+
+
+def write_config(path: Path, config: Config, settings: dict[str, Any] | None = None) -> Path:
+    """Write a configuration with changed settings, such as "training.epochs"."""
+    path.write_text(config_toml(with_settings(config, settings or {})))
+    return path
