@@ -8,17 +8,7 @@ from typing import Any
 from fastapi import FastAPI
 from starlette.types import Lifespan
 
-from app.api import (
-    batches,
-    health,
-    models,
-    monitoring,
-    openapi,
-    pages,
-    problems,
-    questions,
-    telemetry,
-)
+from app.api import health, models, openapi, pages, problems, questions, telemetry
 from app.api.body import Bodies, JSONRoute
 from app.api.gateway import Gateway
 from app.serving.runtime import Runtime
@@ -51,7 +41,7 @@ def build(
     app.state.runtime = runtime
     app.state.bodies = Bodies(settings)
     problems.install(app)
-    routes = (*questions.router.routes, *batches.router.routes)
+    routes = (*questions.router.routes, *questions.batches.routes)
     asked = [route for route in routes if isinstance(route, JSONRoute)]
     # FastAPI creates the OpenTelemetry traces, so traced requests must pass through its router.
     direct = (
@@ -69,7 +59,7 @@ def build(
         models.router,
         health.router,
         health.protocol,
-        *([monitoring.router] if settings.metrics else []),
+        *([health.monitoring] if settings.metrics else []),
     ]
     for router in routers:
         app.include_router(router)
