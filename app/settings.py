@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from importlib.util import find_spec
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 from urllib.parse import urlsplit
 
 from pydantic import (
@@ -158,6 +158,7 @@ class Settings(BaseSettings):
         validate_default=True,
         hide_input_in_errors=True,
     )
+    reads_environment: ClassVar[bool] = True
 
     host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
     """Address to listen on."""
@@ -242,6 +243,8 @@ class Settings(BaseSettings):
         **__: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Return the sources of the settings: first arguments, then environment variables."""
+        if not cls.reads_environment:
+            return (init_settings,)
         return init_settings, _Environment(settings_cls)
 
     @property

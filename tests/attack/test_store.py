@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from app.registry import ArtifactError, Store, StoreError, load_model_set
-from app.registry.aliases import MAX_ALIASES_BYTES
 from app.registry.artifact import MAX_MANIFEST_BYTES, load_artifact
+from app.registry.references import MAX_ALIASES_BYTES
 from app.registry.tensors import MAX_HEADER_BYTES, unpack
 from tests.registry.small_artifacts import (
     description,
