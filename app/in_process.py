@@ -16,7 +16,6 @@ from pydantic import SecretStr, ValidationError
 from app.main import create_app
 from app.settings import Settings
 from scene_client.errors import InvalidRequestError
-from scene_client.schemas import FieldError
 
 
 class _Given(Settings):
@@ -53,8 +52,7 @@ class InProcess(httpx.BaseTransport):
                 allowed_hosts=("*",),
             )
         except ValidationError:
-            fault = FieldError(pointer="#", message="the store must be an existing directory")
-            raise InvalidRequestError([fault]) from None
+            raise InvalidRequestError.about("the store must be an existing directory") from None
         app = create_app(settings)
         self._asgi = httpx.ASGITransport(app, raise_app_exceptions=False)
         started: Future[asyncio.AbstractEventLoop] = Future()

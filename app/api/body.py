@@ -20,7 +20,7 @@ from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
 from app.api import catalogue
-from app.api.gateway import ADMIN_KEY, carries, too_large
+from app.api.gateway import ADMIN_KEY, carries, too_large, unauthorized
 from app.api.problems import ProblemError, from_exception, invalid
 from app.serving.errors import Location, RequestError
 from app.settings import Settings
@@ -353,8 +353,4 @@ def check_admin(http: Request) -> None:
             no admin key.
     """
     if not carries(http.headers, ADMIN_KEY, http.app.state.settings.admin_key):
-        raise ProblemError(
-            catalogue.UNAUTHORIZED,
-            "This route needs the admin key of the service.",
-            headers={"WWW-Authenticate": "Bearer"},
-        )
+        raise unauthorized("This route needs the admin key of the service.")

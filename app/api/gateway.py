@@ -170,11 +170,8 @@ class Gateway:
         """Check the key and the size of a request, wait for admission, and answer every failure."""
         try:
             if self._settings.api_key is not None and not self._may_enter(scope):
-                raise ProblemError(
-                    catalogue.UNAUTHORIZED,
-                    "This service needs its API key, or the admin key for administration.",
-                    headers={"WWW-Authenticate": "Bearer"},
-                )
+                detail = "This service needs its API key, or the admin key for administration."
+                raise unauthorized(detail)
             allowed = size = None
             for name, value in scope["headers"]:
                 if name == b"x-request-timeout-ms":
@@ -268,6 +265,12 @@ def _completed(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) -> lis
     if b"cache-control" not in names and b"etag" not in names:
         found.append(_NOT_KEPT)
     return found
+
+
+def unauthorized(detail: str) -> ProblemError:
+    """Return the problem for a request without the required key."""
+    headers = {"WWW-Authenticate": "Bearer"}
+    return ProblemError(catalogue.UNAUTHORIZED, detail, headers=headers)
 
 
 def too_large(limit: int) -> ProblemError:
