@@ -10,7 +10,7 @@ from fastapi import FastAPI
 
 from app import __version__
 from app.api import health, models, openapi, pages, problems, questions, telemetry
-from app.api.body import Bodies, JSONRoute
+from app.api.body import Bodies
 from app.api.gateway import Gateway
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -68,16 +68,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 def _add_routes(app: FastAPI, settings: Settings, runtime: Runtime) -> None:
     """Add the middleware and the routes to the application."""
     problems.install(app)
-    routes = (*questions.router.routes, *questions.batches.routes)
-    asked = [route for route in routes if isinstance(route, JSONRoute)]
-    # FastAPI creates the OpenTelemetry traces, so traced requests must pass through its router.
-    direct = (
-        {}
-        if settings.opentelemetry
-        else {settings.root_path + route.path: route for route in asked}
-    )
-    app.add_middleware(Gateway, settings=settings, runtime=runtime, direct=direct)
-    app.router.routes.extend(asked)
+    app.add_middleware(Gateway, settings=settings, runtime=runtime)
+    app.router.routes.extend((*questions.router.routes, *questions.batches.routes))
     routers = [
         # `models.administration` stands before `models.router`, because both have the same paths.
         # The first route with a path sets the Allow header of a 405 response.

@@ -107,10 +107,8 @@ class Metrics:
         )
         self._infos: set[Info] = set()
         self._is_ready = False
-        # These dictionaries cache the series, because the look-up of a series by labels is slow.
-        self._of_request: dict[tuple[str, str, str], Counter] = {}
-        self._of_route: dict[str, Histogram] = {}
-        self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
+        # The questions that each served model has answered, for the removal of its series.
+        self._of_model: dict[Key, set[str]] = {}
 
     # ---------------------------------------------------------------------------- recording
 
@@ -130,7 +128,7 @@ class Metrics:
             self._queue.remove(*key)
             self._pending.remove(*key)
         for key, model in models.served.items():
-            self._of_model.setdefault(key, {})
+            self._of_model.setdefault(key, set())
             self._queue.labels(*key)
             self._pending.labels(*key).set_function(partial(getattr, model.queue, "rows"))
         infos = set(_infos(models))
@@ -165,15 +163,8 @@ class Metrics:
             serialised: time in seconds from the last answer of a model to the response. It is None
                 if no model has answered.
         """
-        key = (route, method, outcome)
-        counter = self._of_request.get(key)
-        if counter is None:
-            counter = self._of_request[key] = self._requests.labels(*key)
-        counter.inc()
-        histogram = self._of_route.get(route)
-        if histogram is None:
-            histogram = self._of_route[route] = self._latency.labels(route)
-        histogram.observe(seconds)
+        self._requests.labels(route, method, outcome).inc()
+        self._latency.labels(route).observe(seconds)
         if serialised is not None:
             self._serialisation.observe(serialised)
 
@@ -194,20 +185,12 @@ class Metrics:
             waited: time in seconds that the question waited before its computation.
             seconds: duration of the computation in seconds.
         """
-        series = self._of_model.get(key)
-        if series is None:
+        if key not in self._of_model:
             return
-        bound = series.get(question)
-        if bound is None:
-            bound = series[question] = (
-                self._queue.labels(*key),
-                self._compute.labels(*key, question),
-                self._rows.labels(*key, question),
-            )
-        queue, compute, size = bound
-        queue.observe(waited)
-        compute.observe(seconds)
-        size.observe(rows)
+        self._of_model[key].add(question)
+        self._queue.labels(*key).observe(waited)
+        self._compute.labels(*key, question).observe(seconds)
+        self._rows.labels(*key, question).observe(rows)
 
     # ---------------------------------------------------------------------------- reporting
 

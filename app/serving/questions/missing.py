@@ -90,7 +90,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
 
 
 def _missing_and_more(
-    artifact: Artifact, scene: Scene, *, axes: Axes | None, details: bool, **asked: Any
+    artifact: Artifact, scene: Scene, /, *, axes: Axes | None, details: bool, **asked: Any
 ) -> tuple[tuple[questions.MissingAnswer, ...], tuple[questions.More, ...]]:
     """Compute both lists of the answer. The list `more` is empty for questions about a place."""
     at = asked.pop("at")
