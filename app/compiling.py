@@ -44,9 +44,6 @@ _KERNELS: Final = ("inference", "scene")
 _KEPT: Final = 2
 # The service keeps each cache directory for at least this time in seconds after its last use.
 _RECENT: Final = 600.0
-# Maximum time in seconds to wait while another process compiles the kernels. After this time, both
-# processes compile the same kernels, which is safe.
-_PATIENCE: Final = 600.0
 
 
 def sources(package: Path) -> list[Path]:
@@ -215,7 +212,7 @@ def progress() -> Iterator[None]:
         return
     descriptor = os.open(_FOLDER / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
-        _wait(descriptor)
+        _lock(descriptor)
         if not (_FOLDER / "complete").exists():
             _logger.info("compiling kernels, which takes about a minute, once for this version")
         with event.install_listener("numba:compile", _Progress()):
@@ -223,6 +220,17 @@ def progress() -> Iterator[None]:
         (_FOLDER / "complete").touch()
     finally:
         os.close(descriptor)
+
+
+def _lock(descriptor: int) -> None:
+    """Lock a file. The kernel releases the lock when the process that holds the lock ends."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        _logger.info("waiting until another process has compiled the same kernels")
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    except OSError:  # the file system does not support file locks
+        return
 
 
 class _Progress(event.Listener):
@@ -245,19 +253,3 @@ class _Progress(event.Listener):
 
     def on_end(self, event: Any) -> None:
         """Ignore the end of a compilation."""
-
-
-def _wait(descriptor: int) -> None:
-    deadline, is_waiting = time.monotonic() + _PATIENCE, False
-    while time.monotonic() < deadline:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if not is_waiting:
-                _logger.info("waiting until another process has compiled the same kernels")
-                is_waiting = True
-            time.sleep(0.1)
-        except OSError:  # the file system does not support file locks
-            return
-        else:
-            return

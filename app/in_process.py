@@ -12,12 +12,10 @@ from threading import Thread
 import httpx
 from fastapi import FastAPI
 from pydantic import SecretStr, ValidationError
-from pydantic_settings import BaseSettings, PydanticBaseSettingsSource
 
 from app.main import create_app
 from app.settings import Settings
 from scene_client.errors import InvalidRequestError
-from scene_client.schemas import FieldError
 
 
 class _Given(Settings):
@@ -26,15 +24,7 @@ class _Given(Settings):
     Environment variables configure only services that run in a separate process.
     """
 
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        *_: PydanticBaseSettingsSource,
-        **__: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        return (init_settings,)
+    reads_environment = False
 
 
 class InProcess(httpx.BaseTransport):
@@ -62,8 +52,7 @@ class InProcess(httpx.BaseTransport):
                 allowed_hosts=("*",),
             )
         except ValidationError:
-            fault = FieldError(pointer="#", message="the store must be an existing directory")
-            raise InvalidRequestError([fault]) from None
+            raise InvalidRequestError.about("the store must be an existing directory") from None
         app = create_app(settings)
         self._asgi = httpx.ASGITransport(app, raise_app_exceptions=False)
         started: Future[asyncio.AbstractEventLoop] = Future()

@@ -1,13 +1,17 @@
-"""The application and its lifespan."""
+"""The application: wiring and lifespan."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
 
-from app import __version__, api
+from app import __version__
+from app.api import health, models, openapi, pages, problems, questions, telemetry
+from app.api.body import Bodies
+from app.api.gateway import Gateway
 from app.serving.runtime import Runtime
 from app.settings import Settings
 
@@ -41,11 +45,43 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         yield
         runtime.stop()
 
-    return api.build(
-        settings,
-        runtime,
-        lifespan,
+    app = openapi.DocumentedAPI(
+        lifespan=lifespan,
         title="Scene reasoning",
         description=_DESCRIPTION,
         version=__version__,
+        openapi_url="/openapi.json" if settings.docs else None,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        openapi_tags=list(openapi.TAGS),
+        generate_unique_id_function=openapi.operation_id,
+        telemetry=telemetry.configuration(enabled=settings.opentelemetry),
     )
+    app.state.settings = settings
+    app.state.runtime = runtime
+    app.state.bodies = Bodies(settings)
+    _add_routes(app, settings, runtime)
+    return app
+
+
+def _add_routes(app: FastAPI, settings: Settings, runtime: Runtime) -> None:
+    """Add the middleware and the routes to the application."""
+    problems.install(app)
+    app.add_middleware(Gateway, settings=settings, runtime=runtime)
+    app.router.routes.extend((*questions.router.routes, *questions.batches.routes))
+    routers = [
+        # `models.administration` stands before `models.router`, because both have the same paths.
+        # The first route with a path sets the Allow header of a 405 response.
+        models.administration,
+        models.changes,
+        models.router,
+        health.router,
+        health.protocol,
+        *([health.monitoring] if settings.metrics else []),
+    ]
+    for router in routers:
+        app.include_router(router)
+    pages.install(app, docs=settings.docs)
+    every = itertools.chain(app.routes, *(router.routes for router in routers))
+    app.state.paths = {route.path for route in every if hasattr(route, "path")}

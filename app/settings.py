@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from importlib.util import find_spec
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 from urllib.parse import urlsplit
 
 from pydantic import (
@@ -75,6 +75,8 @@ def _format_of_stderr() -> Literal["json", "plain"]:
 def _words(value: object) -> object:
     return tuple(value.replace(",", " ").split()) if isinstance(value, str) else value
 
+
+_Words = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_words)]
 
 LOOPBACK: Final = frozenset(("127.0.0.1", "localhost", "[::1]"))
 """Values of a Host header that mean the local machine."""
@@ -156,178 +158,81 @@ class Settings(BaseSettings):
         validate_default=True,
         hide_input_in_errors=True,
     )
+    reads_environment: ClassVar[bool] = True
 
-    host: Annotated[str, Field(min_length=1, description="address to listen on")] = "127.0.0.1"
-    port: Annotated[
-        int, Field(ge=0, le=65535, description="port to listen on; 0 = any free port")
-    ] = 8000
-    store: Annotated[Path, Field(description="folder of published models")] = Path("model_store")
-    store_poll: Annotated[
-        float,
-        Field(
-            ge=0,
-            le=3600,
-            allow_inf_nan=False,
-            description="seconds between two checks of the store for changes; 0 = never",
-        ),
-    ] = 5
-    admin_key: Annotated[
-        SecretStr | None,
-        Field(
-            description="key of the administration routes, at least 16 characters; without a key, "
-            "these routes refuse every request"
-        ),
-    ] = None
-    api_key: Annotated[
-        SecretStr | None,
-        Field(
-            description="key of all routes except health checks and pages, at least 16 characters, "
-            "different from the admin key; without a key, these routes are open"
-        ),
-    ] = None
-    cors_origins: Annotated[
-        tuple[str, ...],
-        NoDecode,
-        BeforeValidator(_words),
-        Field(
-            description="web origins whose pages may use the service, separated by commas, such as "
-            "`https://panel.example:8443`; none by default"
-        ),
-    ] = ()
-    allowed_hosts: Annotated[
-        tuple[str, ...],
-        NoDecode,
-        BeforeValidator(_words),
-        Field(
-            description="host names and addresses that clients may use for this service, separated "
-            "by commas, without ports; `*` allows all; default: the names of this machine, and "
-            "SCENE_HOST if it is a single address"
-        ),
-    ] = ()
-    max_connections: Annotated[
-        int,
-        Field(
-            ge=1,
-            le=2**20,
-            description="maximum number of connections; the service answers further ones with 503",
-        ),
-    ] = 1024
-    max_body_bytes: Annotated[
-        int, Field(ge=1024, le=64 * 2**20, description="maximum size of a request body in bytes")
-    ] = 2 * 2**20
-    max_scene_bytes: Annotated[
-        int,
-        Field(
-            ge=1024,
-            le=64 * 2**20,
-            description="maximum size in bytes of the body of a question about one scene",
-        ),
-    ] = 256 * 2**10
-    held_body_bytes: Annotated[
-        int,
-        Field(
-            ge=2**20,
-            le=2**36,
-            description="maximum total size in bytes of the bodies of all requests in progress",
-        ),
-    ] = 64 * 2**20
-    max_objects: Annotated[
-        int, Field(ge=1, le=MAX_OBJECTS, description="maximum number of objects in a scene")
-    ] = MAX_OBJECTS
-    max_relations: Annotated[
-        int,
-        Field(ge=0, le=MAX_RELATIONS, description="maximum number of stated relations in a scene"),
-    ] = 4096
-    max_answer_bytes: Annotated[
-        int, Field(ge=2**16, le=2**30, description="maximum size of an answer in bytes")
-    ] = 16 * 2**20
-    max_weights_bytes: Annotated[
-        int, Field(ge=1024, le=2**40, description="maximum size of a weights file in bytes")
-    ] = 2**30
-    queue_rows: Annotated[
-        int,
-        Field(
-            ge=256,
-            le=2**20,
-            description="maximum number of scenes per model that wait or are being computed",
-        ),
-    ] = 4096
-    queue_requests: Annotated[
-        int, Field(ge=1, le=2**20, description="maximum number of queued requests")
-    ] = 256
-    request_timeout_ms: Annotated[
-        int,
-        Field(
-            ge=1,
-            le=600_000,
-            description="time limit in milliseconds of a request without X-Request-Timeout-Ms",
-        ),
-    ] = 10_000
-    max_request_timeout_ms: Annotated[
-        int,
-        Field(
-            ge=1,
-            le=600_000,
-            description="maximum time limit in milliseconds that a client may choose",
-        ),
-    ] = 60_000
-    drain_seconds: Annotated[
-        float,
-        Field(
-            ge=0,
-            le=300,
-            description="seconds from SIGTERM until the listening socket closes. The readiness "
-            "check fails in this time, and requests are still answered",
-        ),
-    ] = 1.0
-    drain_timeout: Annotated[
-        int,
-        Field(
-            ge=1,
-            le=3600,
-            description="maximum seconds for requests in progress after the socket closes",
-        ),
-    ] = 25
-    client_timeout: Annotated[
-        float,
-        Field(
-            ge=0.1,
-            le=3600,
-            allow_inf_nan=False,
-            description="seconds that a client may take to send a request body, and to acknowledge "
-            "an answer",
-        ),
-    ] = 20
-    retry_after: Annotated[
-        int,
-        Field(
-            ge=1, le=3600, description="seconds in the Retry-After header of responses 429 and 503"
-        ),
-    ] = 2
-    metrics: Annotated[bool, Field(description="answer GET /metrics")] = True
-    opentelemetry: Annotated[
-        bool, Field(description="send traces to the collector in OTEL_EXPORTER_OTLP_ENDPOINT")
-    ] = False
-    docs: Annotated[
-        bool, Field(description="serve the scene editor, /docs, /redoc and /openapi.json")
-    ] = True
-    root_path: Annotated[
-        str, Field(description="path prefix that a reverse proxy strips", pattern=r"^(/[^/?#]+)*$")
-    ] = ""
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    """Address to listen on."""
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    """Port to listen on; 0 = any free port."""
+    store: Path = Path("model_store")
+    """Folder of published models."""
+    store_poll: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = 5
+    """Seconds between two checks of the store for changes; 0 = never."""
+    admin_key: SecretStr | None = None
+    """Key of the administration routes, at least 16 characters; without a key, these routes refuse
+    every request."""
+    api_key: SecretStr | None = None
+    """Key of all routes except health checks and pages, at least 16 characters, different from the
+    admin key; without a key, these routes are open."""
+    cors_origins: _Words = ()
+    """Web origins whose pages may use the service, separated by commas, such as
+    `https://panel.example:8443`; none by default."""
+    allowed_hosts: _Words = ()
+    """Host names and addresses that clients may use for this service, separated by commas, without
+    ports; `*` allows all; default: the names of this machine, and SCENE_HOST if it is a single
+    address."""
+    max_connections: Annotated[int, Field(ge=1, le=2**20)] = 1024
+    """Maximum number of connections; the service answers further ones with 503."""
+    max_body_bytes: Annotated[int, Field(ge=1024, le=64 * 2**20)] = 2 * 2**20
+    """Maximum size of a request body in bytes."""
+    max_scene_bytes: Annotated[int, Field(ge=1024, le=64 * 2**20)] = 256 * 2**10
+    """Maximum size in bytes of the body of a question about one scene."""
+    held_body_bytes: Annotated[int, Field(ge=2**20, le=2**36)] = 64 * 2**20
+    """Maximum total size in bytes of the bodies of all requests in progress."""
+    max_objects: Annotated[int, Field(ge=1, le=MAX_OBJECTS)] = MAX_OBJECTS
+    """Maximum number of objects in a scene."""
+    max_relations: Annotated[int, Field(ge=0, le=MAX_RELATIONS)] = 4096
+    """Maximum number of stated relations in a scene."""
+    max_answer_bytes: Annotated[int, Field(ge=2**16, le=2**30)] = 16 * 2**20
+    """Maximum size of an answer in bytes."""
+    max_weights_bytes: Annotated[int, Field(ge=1024, le=2**40)] = 2**30
+    """Maximum size of a weights file in bytes."""
+    queue_rows: Annotated[int, Field(ge=256, le=2**20)] = 4096
+    """Maximum number of scenes per model that wait or are being computed."""
+    queue_requests: Annotated[int, Field(ge=1, le=2**20)] = 256
+    """Maximum number of queued requests."""
+    request_timeout_ms: Annotated[int, Field(ge=1, le=600_000)] = 10_000
+    """Time limit in milliseconds of a request without X-Request-Timeout-Ms."""
+    max_request_timeout_ms: Annotated[int, Field(ge=1, le=600_000)] = 60_000
+    """Maximum time limit in milliseconds that a client may choose."""
+    drain_seconds: Annotated[float, Field(ge=0, le=300)] = 1.0
+    """Seconds from SIGTERM until the listening socket closes. The readiness check fails in this
+    time, and requests are still answered."""
+    drain_timeout: Annotated[int, Field(ge=1, le=3600)] = 25
+    """Maximum seconds for requests in progress after the socket closes."""
+    client_timeout: Annotated[float, Field(ge=0.1, le=3600, allow_inf_nan=False)] = 20
+    """Seconds that a client may take to send a request body, and to acknowledge an answer."""
+    retry_after: Annotated[int, Field(ge=1, le=3600)] = 2
+    """Seconds in the Retry-After header of responses 429 and 503."""
+    metrics: bool = True
+    """Answer GET /metrics."""
+    opentelemetry: bool = False
+    """Send traces to the collector in OTEL_EXPORTER_OTLP_ENDPOINT."""
+    docs: bool = True
+    """Serve the scene editor, /docs, /redoc and /openapi.json."""
+    root_path: Annotated[str, Field(pattern=r"^(/[^/?#]+)*$")] = ""
+    """Path prefix that a reverse proxy strips."""
     log_level: Annotated[
         Literal["debug", "info", "warning", "error", "critical"], BeforeValidator(_lower)
     ] = "info"
     log_format: Annotated[
         Literal["json", "plain"],
         BeforeValidator(_lower),
-        Field(
-            default_factory=_format_of_stderr,
-            description="by default, `plain` on a terminal, else `json`",
-        ),
+        Field(default_factory=_format_of_stderr),
     ]
-    access_log: Annotated[bool, Field(description="log one line per request, without payload")] = (
-        True
-    )
+    """By default, `plain` on a terminal, else `json`."""
+    access_log: bool = True
+    """Log one line per request, without payload."""
 
     @classmethod
     def settings_customise_sources(
@@ -338,6 +243,8 @@ class Settings(BaseSettings):
         **__: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Return the sources of the settings: first arguments, then environment variables."""
+        if not cls.reads_environment:
+            return (init_settings,)
         return init_settings, _Environment(settings_cls)
 
     @property

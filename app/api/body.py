@@ -20,13 +20,13 @@ from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
 from app.api import catalogue
-from app.api.gateway import ADMIN_KEY, carries, too_large
-from app.api.problems import ProblemError, from_exception, invalid, unfit
+from app.api.gateway import ADMIN_KEY, carries, too_large, unauthorized
+from app.api.problems import ProblemError, from_exception, invalid
 from app.serving.errors import Location, RequestError
 from app.settings import Settings
 from scene_client.schemas import FieldError
 from scene_client.schemas import Request as Form
-from scene_client.validation import MAX_ERRORS, PLAIN, pointer
+from scene_client.validation import MAX_ERRORS, PLAIN, field_errors, pointer
 
 FormT = TypeVar("FormT", bound=Form)
 
@@ -143,7 +143,8 @@ def validated(value: Any, form: type[FormT], *, at: Location = ()) -> FormT:
     try:
         return form.model_validate(value)
     except ValidationError as error:
-        raise unfit(error, value, form, at=at) from None
+        errors = field_errors(error, value, form, at=at)
+        raise invalid(catalogue.INVALID_REQUEST, errors) from None
 
 
 @cache
@@ -352,8 +353,4 @@ def check_admin(http: Request) -> None:
             no admin key.
     """
     if not carries(http.headers, ADMIN_KEY, http.app.state.settings.admin_key):
-        raise ProblemError(
-            catalogue.UNAUTHORIZED,
-            "This route needs the admin key of the service.",
-            headers={"WWW-Authenticate": "Bearer"},
-        )
+        raise unauthorized("This route needs the admin key of the service.")

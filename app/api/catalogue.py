@@ -45,21 +45,6 @@ BAD_REQUEST: Final = ProblemType(
     "invalid. This header must be a whole number of milliseconds, from 1 to "
     "SCENE_MAX_REQUEST_TIMEOUT_MS.",
 )
-REQUEST_TIMEOUT: Final = ProblemType(
-    "request-timeout",
-    408,
-    "The request did not arrive in time",
-    "The body of a request must arrive within SCENE_CLIENT_TIMEOUT seconds after its headers. "
-    "The service closes the connection. Send the request again on a new connection.",
-)
-HOST_REFUSED: Final = ProblemType(
-    "host-refused",
-    421,
-    "The service does not answer to this host name",
-    "The Host header must be one of the names in SCENE_ALLOWED_HOSTS. The service ignores the port "
-    "in this header. The default names are 127.0.0.1, localhost, [::1] and the address in "
-    "SCENE_HOST. Add the name that your clients use. Health checks answer to every host name.",
-)
 UNAUTHORIZED: Final = ProblemType(
     "unauthorized",
     401,
@@ -95,6 +80,13 @@ METHOD_NOT_ALLOWED: Final = ProblemType(
     405,
     "This route does not accept this method",
     "The Allow header lists the methods of the route.",
+)
+REQUEST_TIMEOUT: Final = ProblemType(
+    "request-timeout",
+    408,
+    "The request did not arrive in time",
+    "The body of a request must arrive within SCENE_CLIENT_TIMEOUT seconds after its headers. "
+    "The service closes the connection. Send the request again on a new connection.",
 )
 ALIAS_CONFLICT: Final = ProblemType(
     "alias-conflict",
@@ -140,14 +132,6 @@ BODY_TOO_LARGE: Final = ProblemType(
     "Send fewer scenes in one request. SCENE_MAX_SCENE_BYTES limits the body of a question about "
     "one scene, and SCENE_MAX_BODY_BYTES all bodies. Both limits also apply to chunked bodies.",
 )
-BODIES_FULL: Final = ProblemType(
-    "bodies-full",
-    503,
-    "The service holds too many bytes of request bodies",
-    "All requests in progress share SCENE_HELD_BODY_BYTES for their bodies. The service always "
-    "accepts a body of at most 64 KiB that has arrived whole. Send the request again after the "
-    "time in Retry-After.",
-)
 UNSUPPORTED_MEDIA_TYPE: Final = ProblemType(
     "unsupported-media-type",
     415,
@@ -188,6 +172,50 @@ ANSWER_TOO_LARGE: Final = ProblemType(
     "`top_k`, `count` or the number of `objects`. Shorter ids also make the answer smaller. All "
     "scenes of a batch share one limit. Send the refused scenes in another request.",
 )
+HOST_REFUSED: Final = ProblemType(
+    "host-refused",
+    421,
+    "The service does not answer to this host name",
+    "The Host header must be one of the names in SCENE_ALLOWED_HOSTS. The service ignores the port "
+    "in this header. The default names are 127.0.0.1, localhost, [::1] and the address in "
+    "SCENE_HOST. Add the name that your clients use. Health checks answer to every host name.",
+)
+BODIES_FULL: Final = ProblemType(
+    "bodies-full",
+    503,
+    "The service holds too many bytes of request bodies",
+    "All requests in progress share SCENE_HELD_BODY_BYTES for their bodies. The service always "
+    "accepts a body of at most 64 KiB that has arrived whole. Send the request again after the "
+    "time in Retry-After.",
+)
+INTERNAL_ERROR: Final = ProblemType(
+    "internal-error",
+    500,
+    "The service failed",
+    "This is a defect of the service. Search the log of the service for the request id to find the "
+    "details.",
+)
+NOT_READY: Final = ProblemType(
+    "not-ready",
+    503,
+    "The service is not ready",
+    "Either the service is still starting, or its default model is not usable. GET /models gives "
+    "the reason. Send the request again after the time in Retry-After.",
+)
+MODEL_UNAVAILABLE: Final = ProblemType(
+    "model-unavailable",
+    503,
+    "This model is not usable",
+    "The version is in the store, but the service refused to load it. GET /models gives the "
+    "reason. Other models may still be usable.",
+)
+DRAINING: Final = ProblemType(
+    "draining",
+    503,
+    "The service is shutting down",
+    "The service soon closes its socket. Use another instance, or send the request again after the "
+    "time in Retry-After.",
+)
 QUEUE_FULL: Final = ProblemType(
     "queue-full",
     429,
@@ -204,64 +232,8 @@ DEADLINE_PASSED: Final = ProblemType(
     "The answer was not complete within the time limit of the request. X-Request-Timeout-Ms sets "
     "this limit. The default is SCENE_REQUEST_TIMEOUT_MS. The service has stopped the computation.",
 )
-DRAINING: Final = ProblemType(
-    "draining",
-    503,
-    "The service is shutting down",
-    "The service soon closes its socket. Use another instance, or send the request again after the "
-    "time in Retry-After.",
-)
-NOT_READY: Final = ProblemType(
-    "not-ready",
-    503,
-    "The service is not ready",
-    "Either the service is still starting, or its default model is not usable. GET /models gives "
-    "the reason. Send the request again after the time in Retry-After.",
-)
-MODEL_UNAVAILABLE: Final = ProblemType(
-    "model-unavailable",
-    503,
-    "This model is not usable",
-    "The version is in the store, but the service refused to load it. GET /models gives the "
-    "reason. Other models may still be usable.",
-)
-INTERNAL_ERROR: Final = ProblemType(
-    "internal-error",
-    500,
-    "The service failed",
-    "This is a defect of the service. Search the log of the service for the request id to find the "
-    "details.",
-)
 
-PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
-    kind.slug: kind
-    for kind in (
-        NOT_JSON,
-        BAD_REQUEST,
-        UNAUTHORIZED,
-        ORIGIN_REFUSED,
-        NOT_FOUND,
-        MODEL_NOT_FOUND,
-        METHOD_NOT_ALLOWED,
-        REQUEST_TIMEOUT,
-        ALIAS_CONFLICT,
-        MODEL_UNUSABLE,
-        REFRESH_REFUSED,
-        STORE_NOT_WRITABLE,
-        STORE_BUSY,
-        BODY_TOO_LARGE,
-        UNSUPPORTED_MEDIA_TYPE,
-        INVALID_REQUEST,
-        UNKNOWN_LABELS,
-        CONTRADICTORY_EVIDENCE,
-        ANSWER_TOO_LARGE,
-        HOST_REFUSED,
-        BODIES_FULL,
-        INTERNAL_ERROR,
-        NOT_READY,
-        MODEL_UNAVAILABLE,
-        DRAINING,
-        QUEUE_FULL,
-        DEADLINE_PASSED,
-    )
+PROBLEM_TYPES: Final = {
+    kind.slug: kind for kind in tuple(vars().values()) if isinstance(kind, ProblemType)
 }
+"""All problem types by slug, in the order of this module."""

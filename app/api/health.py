@@ -1,17 +1,21 @@
 """Liveness and readiness, on `/health` routes and on the routes of the Open Inference Protocol.
 
 The process is live if it answers a request. The process is ready if its default model has answered
-a question during the warm-up.
+a question during the warm-up. The module also has the route of the metrics.
 """
 
 from __future__ import annotations
 
+import asyncio
+
 from fastapi import APIRouter
+from fastapi.responses import PlainTextResponse
 
 from app import __version__
 from app.api import catalogue
 from app.api.models import Reference, RuntimeDep
 from app.api.openapi import problems, queued
+from app.serving.metrics import CONTENT_TYPE
 from scene_client.schemas import (
     Health,
     ModelMetadata,
@@ -23,6 +27,7 @@ from scene_client.schemas import (
 
 router = APIRouter(tags=["health"])
 protocol = APIRouter(prefix="/v2", tags=["inference protocol"])
+monitoring = APIRouter(tags=["monitoring"])
 
 # Maximum number of failures in an answer, because load balancers ask often and without a key.
 _FAILURES = 10
@@ -100,3 +105,19 @@ async def model_ready(name: Reference, runtime: RuntimeDep) -> ModelReady:
     """Return status 200 if the model is usable, 404 if it does not exist, or else 503."""
     model = runtime.models.resolve(name)
     return ModelReady(name=model.reference.name, ready=True)
+
+
+@monitoring.get(
+    "/metrics",
+    summary="Metrics for Prometheus",
+    response_class=PlainTextResponse,
+    responses=problems(),
+)
+async def show_metrics(runtime: RuntimeDep) -> PlainTextResponse:
+    """Return counters, gauges and histograms in the text format of Prometheus.
+
+    docs/operations.md explains each metric.
+    """
+    # The formatting runs in a thread, because it takes more than 10 ms for many series.
+    text = await asyncio.to_thread(runtime.metrics.exposition)
+    return PlainTextResponse(text, media_type=CONTENT_TYPE)

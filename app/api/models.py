@@ -12,7 +12,7 @@ from starlette.requests import Request
 from app.api import catalogue
 from app.api.body import AdminJSONRoute, check_admin
 from app.api.gateway import ADMIN_KEY
-from app.api.openapi import queued
+from app.api.openapi import BODY, queued
 from app.serving import describe
 from app.serving.runtime import Runtime
 from scene_client.schemas import (
@@ -129,7 +129,6 @@ async def refresh_models(http: Request) -> RefreshAnswer:
     "/aliases/{alias}",
     summary="Point an alias at another version",
     responses=queued(
-        catalogue.NOT_JSON,
         catalogue.UNAUTHORIZED,
         catalogue.MODEL_NOT_FOUND,
         catalogue.ALIAS_CONFLICT,
@@ -137,12 +136,7 @@ async def refresh_models(http: Request) -> RefreshAnswer:
         catalogue.REFRESH_REFUSED,
         catalogue.STORE_NOT_WRITABLE,
         catalogue.STORE_BUSY,
-        catalogue.REQUEST_TIMEOUT,
-        catalogue.BODY_TOO_LARGE,
-        catalogue.BODIES_FULL,
-        catalogue.UNSUPPORTED_MEDIA_TYPE,
-        catalogue.INVALID_REQUEST,
-        catalogue.NOT_READY,
+        *BODY,
     ),
     response_model=AliasAnswer,
 )

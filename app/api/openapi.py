@@ -40,6 +40,16 @@ _KEY_SCHEMES: Final = {
     "api-key": {"type": "apiKey", "in": "header", "name": API_KEY},
     "api-key-as-bearer-token": {"type": "http", "scheme": "bearer"},
 }
+BODY: Final = (
+    catalogue.NOT_JSON,
+    catalogue.REQUEST_TIMEOUT,
+    catalogue.BODY_TOO_LARGE,
+    catalogue.BODIES_FULL,
+    catalogue.UNSUPPORTED_MEDIA_TYPE,
+    catalogue.INVALID_REQUEST,
+    catalogue.NOT_READY,
+)
+"""Problems of every `JSONRoute`."""
 TAGS: Final = [
     {"name": "questions", "description": "The four questions about one scene."},
     {"name": "batches", "description": "The same questions about many scenes in one request."},
@@ -77,12 +87,7 @@ def problems(*kinds: ProblemType) -> Responses:
 
 def queued(*kinds: ProblemType) -> Responses:
     """Return the error responses of a route, including the problems of admission control."""
-    return problems(
-        *kinds,
-        catalogue.BAD_REQUEST,
-        catalogue.QUEUE_FULL,
-        catalogue.DEADLINE_PASSED,
-    )
+    return problems(*kinds, catalogue.BAD_REQUEST, catalogue.QUEUE_FULL, catalogue.DEADLINE_PASSED)
 
 
 def described(example: Example) -> dict[str, Any]:

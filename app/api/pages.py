@@ -24,36 +24,20 @@ STATIC: Final = Path(__file__).parents[1] / "static"
 _BOARD: Final = "board.html"
 _VENDOR: Final = "vendor/"
 
+_NO_FRAMES: Final = "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 # Policy of the API documentation. Swagger UI and Redoc need inline styles. Redoc searches in a web
 # worker, which Redoc creates from a blob. The policy forbids inline scripts.
-_POLICY: Final = "; ".join(
-    (
-        "default-src 'none'",
-        "script-src 'self'",
-        "style-src 'self' 'unsafe-inline'",
-        "img-src 'self' data:",
-        "font-src 'self' data:",
-        "connect-src 'self'",
-        "worker-src blob:",
-        "base-uri 'none'",
-        "form-action 'none'",
-        "frame-ancestors 'none'",
-    )
+_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data:; font-src 'self' data:; connect-src 'self'; worker-src blob:; "
+    + _NO_FRAMES
 )
 _HEADERS: Final = {"Content-Security-Policy": _POLICY}
 
 # Policy of the scene editor (board.html), which needs no inline styles.
-_STRICT_POLICY: Final = "; ".join(
-    (
-        "default-src 'none'",
-        "script-src 'self'",
-        "style-src 'self'",
-        "img-src 'self' data:",
-        "connect-src 'self'",
-        "base-uri 'none'",
-        "form-action 'none'",
-        "frame-ancestors 'none'",
-    )
+_STRICT_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; " + _NO_FRAMES
 )
 
 _PAGE: Final = """<!doctype html>

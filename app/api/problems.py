@@ -6,12 +6,11 @@ A problem document never contains a traceback, a file name or a copy of the inpu
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, Final
 
 from fastapi import FastAPI
-from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
@@ -38,8 +37,7 @@ from app.serving.errors import (
     UnknownModelError,
 )
 from scene_client.schemas import Failure, FieldError, Problem
-from scene_client.schemas import Request as Form
-from scene_client.validation import MAX_ERRORS, field_errors, pointer
+from scene_client.validation import MAX_ERRORS, pointer
 
 MEDIA_TYPE: Final = "application/problem+json"
 
@@ -50,6 +48,19 @@ _OF_STATUS: Final = {
     404: catalogue.NOT_FOUND,
     405: catalogue.METHOD_NOT_ALLOWED,
     413: catalogue.BODY_TOO_LARGE,
+}
+_OF_ERROR: Final[Mapping[type[ServingError], ProblemType]] = {
+    AliasConflictError: catalogue.ALIAS_CONFLICT,
+    DeadlinePassedError: catalogue.DEADLINE_PASSED,
+    DisconnectedError: catalogue.BAD_REQUEST,
+    DrainingError: catalogue.DRAINING,
+    ModelUnavailableError: catalogue.MODEL_UNAVAILABLE,
+    ModelUnusableError: catalogue.MODEL_UNUSABLE,
+    NotReadyError: catalogue.NOT_READY,
+    QueueFullError: catalogue.QUEUE_FULL,
+    StoreBusyError: catalogue.STORE_BUSY,
+    StoreNotWritableError: catalogue.STORE_NOT_WRITABLE,
+    UnknownModelError: catalogue.MODEL_NOT_FOUND,
 }
 _OF_REASON: Final = {
     Reason.INVALID: catalogue.INVALID_REQUEST,
@@ -116,31 +127,11 @@ def from_exception(error: Exception, *, at: Location = (), body: Any = None) -> 
                 for fault in error.faults[:MAX_ERRORS]
             ]
             return invalid(kind, errors)
-        case UnknownModelError():
-            return ProblemError(catalogue.MODEL_NOT_FOUND, str(error))
-        case ModelUnavailableError():
-            return ProblemError(catalogue.MODEL_UNAVAILABLE, str(error))
-        case NotReadyError():
-            return ProblemError(catalogue.NOT_READY, str(error))
-        case QueueFullError():
-            return ProblemError(catalogue.QUEUE_FULL, str(error))
-        case DeadlinePassedError():
-            return ProblemError(catalogue.DEADLINE_PASSED, str(error))
-        case DrainingError():
-            return ProblemError(catalogue.DRAINING, str(error))
-        case DisconnectedError():
-            return ProblemError(catalogue.BAD_REQUEST, str(error))
-        case AliasConflictError():
-            return ProblemError(catalogue.ALIAS_CONFLICT, str(error))
-        case ModelUnusableError():
-            return ProblemError(catalogue.MODEL_UNUSABLE, str(error))
-        case StoreNotWritableError():
-            return ProblemError(catalogue.STORE_NOT_WRITABLE, str(error))
-        case StoreBusyError():
-            return ProblemError(catalogue.STORE_BUSY, str(error))
         case RefreshRefusedError():
             detail = "The service still serves the previous versions. `failures` gives the reasons."
             return ProblemError(catalogue.REFRESH_REFUSED, detail, failures=error.failures)
+        case ServingError():
+            return ProblemError(_OF_ERROR[type(error)], str(error))
         case HTTPException() if error.status_code in _OF_STATUS:
             kind, headers = _OF_STATUS[error.status_code], error.headers or {}
             detail = f"{kind.title}."
@@ -166,39 +157,21 @@ def invalid(kind: ProblemType, errors: list[FieldError]) -> ProblemError:
     return ProblemError(kind, detail, errors=errors)
 
 
-def unfit(
-    error: ValidationError, body: Any, form: type[Form], *, at: Location = ()
-) -> ProblemError:
-    """Return the problem for a body that does not match its schema.
-
-    Args:
-        error: the validation error.
-        body: the value that does not match the schema.
-        form: the schema.
-        at: location of ``body`` in a batch request. It is empty for other requests.
-    """
-    return invalid(catalogue.INVALID_REQUEST, field_errors(error, body, form, at=at))
-
-
 def report_defect(error: Exception, request_id: str) -> None:
     """Log an internal error. The client receives only the problem type, without details."""
     _logger.error("request failed", exc_info=error, extra={"request_id": request_id})
 
 
-def _request_id(request: Request) -> str:
-    return str(request.scope.get("state", {}).get("request_id", ""))
-
-
 def respond(request: Request, problem: ProblemError) -> Response:
     """Return a response with the problem. Store the problem's slug in the request's record."""
-    record = request.scope.get("state", {}).get("record")
-    if record is not None:
+    state = request.scope.get("state", {})
+    if (record := state.get("record")) is not None:
         record.outcome = problem.kind.slug
     headers = dict(problem.headers or {})
     if problem.status_code in (429, 503):
         headers["Retry-After"] = str(request.app.state.settings.retry_after)
     return Response(
-        problem.describe(_request_id(request)).model_dump_json(exclude_none=True),
+        problem.describe(state.get("request_id", "")).model_dump_json(exclude_none=True),
         problem.status_code,
         headers=headers,
         media_type=MEDIA_TYPE,
@@ -218,9 +191,6 @@ async def _handle(request: Request, error: Exception) -> Response:
         if similar:
             problem.detail += f" Similar paths: {', '.join(similar)}."
     return respond(request, problem)
-
-
-Handler = Callable[[Request, Exception], Any]
 
 
 def install(app: FastAPI) -> None:

@@ -1,39 +1,50 @@
-"""Routes of the questions about one scene: one `POST` route for each entry of `QUESTIONS`."""
+"""Routes of the questions: one `POST` route for one scene, and one for a batch of scenes.
+
+The answer to a batch has one entry for each scene.
+"""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from fastapi import APIRouter
+from pydantic_core import to_json
 from starlette.requests import Request
 
 from app.api import catalogue
-from app.api.body import JSONRoute
-from app.api.openapi import operation_id, queued
+from app.api.body import BatchRoute, JSONRoute, validated
+from app.api.openapi import BODY, operation_id, queued
+from app.api.problems import from_exception, report_defect
 from app.serving import request as serving
 from app.serving.answers import written
+from app.serving.models import DEFAULT
 from app.serving.questions import QUESTIONS, Question
+from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest
 
-PROBLEMS: Final = queued(
-    catalogue.NOT_JSON,
+RequestT = TypeVar("RequestT", bound=SceneRequest)
+_Endpoint = Callable[..., Awaitable[bytes]]
+
+_PROBLEMS: Final = queued(
+    *BODY,
     catalogue.MODEL_NOT_FOUND,
-    catalogue.REQUEST_TIMEOUT,
-    catalogue.BODY_TOO_LARGE,
-    catalogue.BODIES_FULL,
-    catalogue.UNSUPPORTED_MEDIA_TYPE,
-    catalogue.INVALID_REQUEST,
     catalogue.UNKNOWN_LABELS,
     catalogue.CONTRADICTORY_EVIDENCE,
     catalogue.ANSWER_TOO_LARGE,
-    catalogue.NOT_READY,
     catalogue.MODEL_UNAVAILABLE,
 )
 
 router = APIRouter(
     tags=["questions"],
     route_class=JSONRoute,
-    responses=PROBLEMS,
+    responses=_PROBLEMS,
+    generate_unique_id_function=operation_id,
+)
+batches = APIRouter(
+    tags=["batches"],
+    route_class=BatchRoute,
+    responses=queued(*BODY),
     generate_unique_id_function=operation_id,
 )
 
@@ -54,24 +65,93 @@ def begin(http: Request) -> serving.Request:
     return found
 
 
-def _answering(question: Question[Any]) -> Callable[..., Awaitable[bytes]]:
-    """Create the endpoint function of a question."""
+async def _answer_each(
+    http: Request,
+    batch: BatchRequest[RequestT],
+    question: Question[RequestT],
+) -> bytes:
+    request = begin(http)
+
+    def count(outcome: str) -> None:
+        request.metrics.entry_answered(question.name, outcome)
+
+    results: list[bytes] = []
+    left = request.limits.answer_bytes
+    with request.for_batch([_reference(scene) for scene in batch.scenes]) as held:
+        for place, scene in enumerate(batch.scenes):
+            try:
+                held.check()
+                one = held.with_answer_bytes(left)
+                # Only this validation may fail because of the client. Any later validation error is
+                # a defect of the service.
+                asked = validated(scene, question.request, at=("scenes", place))
+                answer = written(await question.answer(one, asked))
+                results.append(b'{"status":200,"result":%b}' % answer)
+                count(serving.SUCCESS)
+            except Exception as error:  # noqa: BLE001 — any error fails only this scene
+                outcome, failed = _failed(error, place, scene, request.id)
+                count(outcome)
+                results.append(failed)
+            left = max(0, left - len(results[-1]))
+            # Let other tasks, such as health checks, run between two scenes.
+            await asyncio.sleep(0)
+    return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
+
+
+def _failed(error: Exception, place: int, scene: Any, request_id: str) -> tuple[str, bytes]:
+    """Return the outcome for the metrics and the answer's entry of a failed scene.
+
+    This is a separate function, because an error refers to the frame of `_answer_each`. A local
+    variable of that frame must not refer to the error, to avoid a reference cycle.
+    """
+    failure = from_exception(error, at=("scenes", place), body=scene)
+    problem = failure.describe(request_id)
+    if problem.status == 500:
+        report_defect(error, request_id)
+    body = problem.model_dump_json(exclude_none=True).encode()
+    return failure.kind.slug, b'{"status":%d,"problem":%b}' % (problem.status, body)
+
+
+def _reference(scene: Any) -> str:
+    """Return the field `model` of a scene that is not validated yet, or the default model."""
+    found = scene.get("model", DEFAULT) if isinstance(scene, dict) else DEFAULT
+    return found if isinstance(found, str) else DEFAULT
+
+
+def _endpoints(question: Question[Any]) -> tuple[_Endpoint, _Endpoint]:
+    """Create the endpoint functions of a question: for one scene, and for a batch."""
 
     async def answer(asked: Any, http: Request) -> bytes:
         return written(await question.answer(begin(http), asked))
 
+    async def answer_batch(asked: Any, http: Request) -> bytes:
+        return await _answer_each(http, asked, question)
+
     # FastAPI reads the schema of the body from the annotations.
     answer.__annotations__ |= {"asked": question.request, "http": Request}
-    return answer
+    form = BatchRequest[question.request]  # type: ignore[name-defined]
+    answer_batch.__annotations__ |= {"asked": form, "http": Request}
+    return answer, answer_batch
 
 
 for _question in QUESTIONS:
+    _answer, _answer_batch = _endpoints(_question)
     router.add_api_route(
         f"/{_question.name}",
-        _answering(_question),
+        _answer,
         methods=["POST"],
         name=_question.name,
         summary=_question.summary,
         description=_question.description,
         response_model=_question.response,
     )
+    if _question.has_batch:
+        batches.add_api_route(
+            f"/{_question.name}/batch",
+            _answer_batch,
+            methods=["POST"],
+            name=f"{_question.name}_batch",
+            summary=f"POST /{_question.name} for many scenes",
+            description=f"Answer up to {MAX_BATCH} scenes, each like `POST /{_question.name}`.",
+            response_model=BatchAnswer[_question.response],  # type: ignore[name-defined]
+        )

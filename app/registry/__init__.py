@@ -18,7 +18,7 @@ from app.registry.description import (
 from app.registry.errors import ArtifactError, RegistryError, StoreError
 from app.registry.examples import Example
 from app.registry.manifest import Manifest
-from app.registry.models import ArtifactFailure, ModelSet, StoreFailure, load_model_set
+from app.registry.models import ArtifactFailure, ModelSet, load_model_set
 from app.registry.offsets import Offsets
 from app.registry.references import AliasTarget
 from app.registry.store import Store, StoreState
@@ -45,7 +45,6 @@ __all__ = [
     "Slope",
     "Store",
     "StoreError",
-    "StoreFailure",
     "StoreState",
     "Thresholds",
     "VocabularyEntry",

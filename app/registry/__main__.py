@@ -55,9 +55,8 @@ def _list(store: Store) -> None:
 
 
 def _target(reference: str) -> AliasTarget:
-    name, at, version = reference.partition("@")
     try:
-        return AliasTarget(name=name, version=version if at else None)
+        return AliasTarget.of(reference)
     except ValueError:
         raise StoreError("invalid_reference", f"'{reference}' is not name@version") from None
 

@@ -27,13 +27,12 @@ from app.inference.weights import layout
 from app.registry.card import render_card
 from app.registry.counts import PREFIX as COUNTS
 from app.registry.counts import Counts
-from app.registry.description import Calibration, Description
+from app.registry.description import Calibration, Description, RelationSlopes
 from app.registry.durable import sync_directory, write_file
 from app.registry.errors import ArtifactError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
 from app.registry.offsets import PREFIX as OFFSETS
 from app.registry.offsets import Offsets
-from app.registry.slopes import RelationSlopes
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
 from app.scene.scene import Scene
 from app.scene.vocabulary import Vocabulary
@@ -189,11 +188,10 @@ def load_artifact(
     Raises:
         ArtifactError: the artifact is invalid. The exception describes the first error found.
     """
-    files = read_verified(directory, max_weights_bytes)
-    if previous is not None and previous.digest == files.digest:
+    manifest, digest, stored, card = read_verified(directory, max_weights_bytes)
+    if previous is not None and previous.digest == digest:
         return previous
-    manifest = files.manifest
-    tensors = unpack(files.weights, manifest.tensors)
+    tensors = unpack(stored, manifest.tensors)
     offsets, counts = _taken(tensors, OFFSETS), _taken(tensors, COUNTS)
     weights = _weights(manifest, tensors)
     return Artifact(
@@ -201,8 +199,8 @@ def load_artifact(
         weights=weights,
         vocabulary=manifest.vocabulary.vocabulary(),
         calibration=manifest.calibration,
-        digest=files.digest,
-        card=files.card,
+        digest=digest,
+        card=card,
         path=directory,
         offsets=Offsets.from_tensors(offsets, weights.spec.A, weights.spec.V) if offsets else None,
         counts=Counts.from_tensors(counts, weights.spec.V, len(manifest.vocabulary.room_types))
@@ -239,31 +237,17 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
     return weights
 
 
-@dataclass(frozen=True, slots=True)
-class VerifiedFiles:
-    """The contents of an artifact's files, verified by their checksums.
-
-    Attributes:
-        manifest: the parsed manifest.
-        digest: SHA-256 of the manifest's bytes as a hexadecimal string. The digest identifies all
-            files, because the manifest contains their checksums.
-        weights: bytes of the safetensors file.
-        card: the model card in Markdown.
-    """
-
-    manifest: Manifest
-    digest: str
-    weights: bytes
-    card: str
-
-
-def read_verified(directory: Path, max_weights_bytes: int = MAX_WEIGHTS_BYTES) -> VerifiedFiles:
+def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, str, bytes, str]:
     """Read and verify the files of an artifact.
 
     Args:
         directory: directory of the artifact.
         max_weights_bytes: maximum size of the weights file. The function checks the size before it
             reads the file.
+
+    Returns:
+        The parsed manifest, the digest of its bytes (see `Artifact`), the bytes of the weights file
+        and the model card.
 
     Raises:
         ArtifactError: a file is missing, unexpected, unreadable, too large, truncated or altered,
@@ -290,7 +274,7 @@ def read_verified(directory: Path, max_weights_bytes: int = MAX_WEIGHTS_BYTES) -
         page = card.decode()
     except UnicodeDecodeError:
         raise ArtifactError("invalid_manifest", f"{CARD} is not UTF-8") from None
-    return VerifiedFiles(manifest, hashlib.sha256(text).hexdigest(), weights, page)
+    return manifest, hashlib.sha256(text).hexdigest(), weights, page
 
 
 def _require_no_other_file(folder: int) -> None:

@@ -2,14 +2,21 @@
 
 A rename is atomic for readers. To survive a power failure, the bytes of a file must be on disk
 before the rename. The directory entry must be on disk after the rename. The calls of fsync write
-the bytes and the directory entry to disk.
+the bytes and the directory entry to disk. A lock between processes lets only one process at a time
+write to a store.
 """
 
 from __future__ import annotations
 
+import fcntl
 import os
 import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from app.registry.errors import StoreError
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -69,3 +76,41 @@ def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
         rename(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def exclusive(path: Path, timeout: float) -> Iterator[None]:
+    """Hold an exclusive lock on a file.
+
+    The kernel releases the lock when the process ends, even after a crash.
+
+    Args:
+        path: the lock file. The function creates it if it is missing, and never removes it.
+        timeout: time in seconds to wait for another process that holds the lock.
+
+    Raises:
+        StoreError: `locked`, if another process still holds the lock after ``timeout``.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+    try:
+        _wait(descriptor, timeout)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _wait(descriptor: int, timeout: float) -> None:
+    deadline = time.monotonic() + timeout
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= deadline:
+                waited = (
+                    f"another process still holds the lock of the store after {timeout:g} s; try "
+                    "again later"
+                )
+                raise StoreError("locked", waited) from None
+            time.sleep(0.01)
+        else:
+            return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 ArtifactCode = Literal[
     "missing_file",
@@ -40,46 +40,32 @@ StoreCode = Literal[
 ]
 
 
-class RegistryError(Exception):
-    """Base class of the registry's errors. The code and the reason never contain absolute paths."""
+CodeT = TypeVar("CodeT", bound=str)
 
-    code: str
-    reason: str
+
+class RegistryError(Exception, Generic[CodeT]):
+    """Base class of the registry's errors. The code and the reason never contain absolute paths.
+
+    Attributes:
+        code: machine-readable kind of failure.
+        reason: description of the failure. It may name a file or a tensor, but not the folder.
+    """
+
+    def __init__(self, code: CodeT, reason: str) -> None:
+        super().__init__(code, reason)
+        self.code: CodeT = code
+        self.reason = reason
 
     def __str__(self) -> str:
         return f"{self.code}: {self.reason}"
 
 
-class ArtifactError(RegistryError):
-    """An artifact (the files of one model version) is invalid or cannot be read.
-
-    Attributes:
-        code: machine-readable kind of failure.
-        reason: description of the failure. It names the file or tensor, but not the folder.
-    """
-
-    code: ArtifactCode
-
-    def __init__(self, code: ArtifactCode, reason: str) -> None:
-        super().__init__(code, reason)
-        self.code = code
-        self.reason = reason
+class ArtifactError(RegistryError[ArtifactCode]):
+    """An artifact (the files of one model version) is invalid or cannot be read."""
 
 
-class StoreError(RegistryError):
-    """A reference (alias, name or name@version) does not resolve, or the store refused a change.
-
-    Attributes:
-        code: machine-readable kind of failure.
-        reason: description of the failure.
-    """
-
-    code: StoreCode
-
-    def __init__(self, code: StoreCode, reason: str) -> None:
-        super().__init__(code, reason)
-        self.code = code
-        self.reason = reason
+class StoreError(RegistryError[StoreCode]):
+    """A reference (alias, name or name@version) does not resolve, or the store refused a change."""
 
 
 def cause(error: OSError) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, StringConstraints, field_validator, model_validator
 
@@ -36,35 +36,19 @@ Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Extent = Annotated[float, Field(gt=0, le=1e4)]
 
 
-class Point(Frozen):
-    """A point in metres."""
-
-    x: Metres
-    y: Metres
-    z: Metres
+Point = Annotated[dict[Literal["x", "y", "z"], Metres], Field(min_length=3)]
+Extents = Annotated[dict[Literal["x", "y", "z"], Extent], Field(min_length=3)]
 
 
-class Extents(Frozen):
-    """The extents of a box in metres."""
-
-    x: Extent
-    y: Extent
-    z: Extent
+def _unit(rotation: dict[str, float]) -> dict[str, float]:
+    if abs(math.hypot(*rotation.values()) - 1) > 0.01:
+        raise ValueError("the orientation must be a unit quaternion (length 1)")
+    return rotation
 
 
-class Quaternion(Frozen):
-    """A rotation as a unit quaternion."""
-
-    x: float
-    y: float
-    z: float
-    w: float
-
-    @model_validator(mode="after")
-    def _unit(self) -> Self:
-        if abs(math.hypot(self.x, self.y, self.z, self.w) - 1) > 0.01:
-            raise ValueError("the orientation must be a unit quaternion (length 1)")
-        return self
+Quaternion = Annotated[
+    dict[Literal["x", "y", "z", "w"], float], Field(min_length=4), AfterValidator(_unit)
+]
 
 
 class View(Frozen):

@@ -9,7 +9,7 @@ from functools import cached_property
 from types import MappingProxyType
 
 from app.registry.artifact import Artifact
-from app.registry.errors import ArtifactCode, ArtifactError, RegistryError, StoreCode, StoreError
+from app.registry.errors import ArtifactCode, ArtifactError, StoreError
 from app.registry.references import AliasTarget, resolve_reference, version_key
 from app.registry.store import Store
 
@@ -27,14 +27,6 @@ class ArtifactFailure:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class StoreFailure:
-    """The reason why the store or its table of aliases could not be read."""
-
-    code: StoreCode
-    reason: str
-
-
 @dataclass(frozen=True, eq=False)
 class ModelSet:
     """The state of a store at one moment.
@@ -43,13 +35,13 @@ class ModelSet:
         entries: maps each published (name, version) to its artifact, or to the reason why the
             version is not usable.
         aliases: maps each alias to its target.
-        failure: reason why the store or its aliases could not be read. None means that they could
-            be read.
+        failure: reason why the store or its aliases could not be read, without stack frames. None
+            means that they could be read.
     """
 
     entries: Mapping[tuple[str, str], Artifact | ArtifactFailure]
     aliases: Mapping[str, AliasTarget]
-    failure: StoreFailure | None = None
+    failure: StoreError | None = None
 
     @cached_property
     def versions(self) -> Mapping[str, tuple[str, ...]]:
@@ -93,23 +85,6 @@ class ModelSet:
         """Return the versions of a model in ascending order, unusable versions first."""
         return sorted(self.versions.get(name, ()), key=lambda v: (name, v) not in self.failures)
 
-    @cached_property
-    def default_failure(self) -> str | None:
-        """The reason why the default model was not loaded, or None if it was loaded.
-
-        The default model is the target of the alias "default".
-        """
-        try:
-            self.resolve("default")
-        except RegistryError as error:
-            return str(error)
-        return None
-
-    @property
-    def ready(self) -> bool:
-        """Whether the default model was loaded."""
-        return self.default_failure is None
-
 
 def load_model_set(store: Store, previous: ModelSet | None = None) -> ModelSet:
     """Load and verify every version of a store.
@@ -123,23 +98,23 @@ def load_model_set(store: Store, previous: ModelSet | None = None) -> ModelSet:
             artifacts of this snapshot whose digest is unchanged. None means that there is no
             earlier snapshot.
     """
-    failure: StoreFailure | None = None
+    failure: StoreError | None = None
     aliases: Mapping[str, AliasTarget]
     try:
         # Aliases are read before versions. Writers publish a version before its alias, so the list
         # of versions contains the target of each alias.
         aliases = store.aliases()
     except StoreError as error:
-        aliases, failure = {}, StoreFailure(error.code, error.reason)
+        aliases, failure = {}, StoreError(error.code, error.reason)
     keys: list[tuple[str, str]] = []
     try:
         for name in store.names():
             try:
                 keys += [(name, version) for version in store.versions(name)]
             except StoreError as error:  # only this model's folder is unreadable
-                failure = StoreFailure(error.code, error.reason)
+                failure = StoreError(error.code, error.reason)
     except StoreError as error:
-        failure = StoreFailure(error.code, error.reason)
+        failure = StoreError(error.code, error.reason)
     known = previous.entries if previous is not None else {}
     entries = {key: _load(store, *key, known.get(key)) for key in keys}
     return ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure)

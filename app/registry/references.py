@@ -2,17 +2,26 @@
 
 A reference is an alias, `name` (the newest usable version of the model) or `name@version`. Every
 valid name is also a safe file name, because it is in lower case, without path separators or dots.
+
+The table of aliases is a small JSON file that maps each alias to a model version. Each change of an
+alias replaces the whole file. Format of the file:
+
+    {"default": {"name": "...", "version": "..." or null for the newest usable version}}
 """
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Final, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from app.registry.errors import StoreError
+from app.registry.errors import StoreError, cause
+
+MAX_ALIASES_BYTES: Final = 256 * 2**10
 
 _NAME = re.compile(r"[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?")
 _VERSION = re.compile(r"(?:0|[1-9][0-9]{0,8})(?:\.(?:0|[1-9][0-9]{0,8})){2}")
@@ -61,8 +70,17 @@ class AliasTarget(BaseModel):
     name: ModelName
     version: Version | None = None
 
+    @classmethod
+    def of(cls, reference: str) -> Self:
+        """Return the target with the text `name` or `name@version`; ValueError if it is invalid."""
+        name, at, version = reference.partition("@")
+        return cls(name=name, version=version if at else None)
+
     def __str__(self) -> str:
         return self.name if self.version is None else f"{self.name}@{self.version}"
+
+
+_TABLE: Final = TypeAdapter(dict[ModelName, AliasTarget])
 
 
 def check_name(text: str, what: str = "model name") -> str:
@@ -138,3 +156,46 @@ def _pick(target: AliasTarget, versions: Callable[[str], Sequence[str]]) -> tupl
             "unknown_version", f"model '{target.name}' does not have version {target.version}"
         )
     return target.name, target.version
+
+
+def read_aliases(path: Path) -> dict[str, AliasTarget]:
+    """Return the target of each alias. The result is empty if the file does not exist.
+
+    Raises:
+        StoreError: `invalid_aliases` if the file is not a valid table of aliases.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        with os.fdopen(descriptor, "rb") as file:
+            text = file.read(MAX_ALIASES_BYTES + 1)
+        if len(text) > MAX_ALIASES_BYTES:
+            raise StoreError(
+                "invalid_aliases",
+                f"{path.name} has more than the maximum of {MAX_ALIASES_BYTES} bytes",
+            )
+        return _TABLE.validate_json(text)
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise StoreError("invalid_aliases", f"{path.name} cannot be read: {cause(error)}") from None
+    except ValidationError as error:
+        detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        raise StoreError(
+            "invalid_aliases", f"{path.name} is not a valid table of aliases: {detail['msg']}"
+        ) from None
+
+
+def aliases_to_bytes(aliases: Mapping[str, AliasTarget]) -> bytes:
+    """Return the contents of the file for a table of aliases.
+
+    Raises:
+        StoreError: `not_writable` if `read_aliases` would refuse the size of the file.
+    """
+    text = _TABLE.dump_json(dict(sorted(aliases.items())), indent=2) + b"\n"
+    if len(text) > MAX_ALIASES_BYTES:
+        raise StoreError(
+            "not_writable",
+            f"the table of aliases would have more than the maximum of {MAX_ALIASES_BYTES} bytes; "
+            "remove an alias first",
+        )
+    return text

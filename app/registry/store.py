@@ -23,19 +23,19 @@ from typing import Final, Literal, TypeAlias
 
 from numpy.typing import ArrayLike
 
-from app.registry.aliases import aliases_to_bytes, read_aliases
 from app.registry.artifact import MAX_WEIGHTS_BYTES, Artifact, load_artifact, write_artifact
 from app.registry.description import Description
-from app.registry.durable import make_directory, rename, replace_file
+from app.registry.durable import exclusive, make_directory, rename, replace_file
 from app.registry.errors import ArtifactError, StoreError, cause
-from app.registry.locking import exclusive
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS
 from app.registry.references import (
     AliasTarget,
+    aliases_to_bytes,
     check_name,
     check_version,
     is_name,
     is_version,
+    read_aliases,
     resolve_reference,
     version_key,
 )
@@ -264,12 +264,8 @@ class Store:
             resolve_reference(str(target), {}, self.versions)
             self._replace_table(self._changed_table(alias, target))
 
-    def remove_alias(self, alias: str, *, expected: AliasTarget | Literal["any"] = "any") -> None:
+    def remove_alias(self, alias: str) -> None:
         """Remove an alias.
-
-        Args:
-            alias: name of the alias.
-            expected: target that the alias must have before the change. "any" accepts every target.
 
         Raises:
             StoreError: `unknown_model` if the alias does not exist. For other codes, see
@@ -279,7 +275,6 @@ class Store:
         with self._writing():
             if alias not in self.aliases():
                 raise StoreError("unknown_model", f"no alias has the name '{alias}'")
-            self._require_expected(alias, expected)
             self._replace_table(self._changed_table(alias, None))
 
     # -- inside ---------------------------------------------------------------------------------

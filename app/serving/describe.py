@@ -8,7 +8,6 @@ from typing import cast
 
 from app.registry import AliasTarget
 from app.scene.relations import opposite
-from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
 from app.serving.models import ServedModel, ServedModels
 from scene_client.schemas import (
     ContextsAnswer,
@@ -173,18 +172,7 @@ def _version_summary(models: ServedModels, name: str, number: str) -> VersionSum
     return VersionSummary(
         version=number,
         status="ready",
-        aliases=_aliases(models, served),
+        aliases=models.aliases[name, number],
         variant=served.reference.variant,
         digest=served.reference.digest,
     )
-
-
-def _aliases(models: ServedModels, served: ServedModel) -> list[str]:
-    found = []
-    for alias in sorted(models.store.aliases):
-        try:
-            if models.resolve(alias) is served:
-                found.append(alias)
-        except (UnknownModelError, ModelUnavailableError, NotReadyError):
-            continue
-    return found

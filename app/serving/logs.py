@@ -32,16 +32,12 @@ class JSONFormatter(logging.Formatter):
         super().__init__()
         # In a JSON line, a secret has the escaped form of a JSON string.
         self.secrets = [json.dumps(secret)[1:-1] for secret in secrets]
-        self._second, self._text = -1, ""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the log record as one line of JSON."""
-        second = int(record.created)
-        if second != self._second:
-            self._second = second
-            self._text = datetime.fromtimestamp(second, UTC).isoformat().removesuffix("+00:00")
+        created = datetime.fromtimestamp(record.created, UTC)
         entry: dict[str, Any] = {
-            "time": f"{self._text}.{int(record.msecs):03d}+00:00",
+            "time": created.isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
             "process": record.process,
             "logger": record.name,

@@ -22,7 +22,6 @@ from prometheus_client import (
     generate_latest,
 )
 
-from app.serving.errors import ServingError
 from app.serving.models import DEFAULT, Key, ServedModels
 
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
@@ -37,7 +36,6 @@ _SECONDS: Final = (
 )
 _ROWS: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 _MODEL: Final = ("model", "version")
-_INFO: Final = "scene_model_info"
 
 # By default, the library adds a second series to each counter, the creation time. Prometheus does
 # not need this series, because it detects restarts itself.
@@ -52,87 +50,65 @@ class Metrics:
     """
 
     def __init__(self) -> None:
-        self.registry = registry = CollectorRegistry()
-        self._requests = Counter(
-            "scene_requests_total",
-            "Requests answered",
-            ("route", "method", "outcome"),
-            registry=registry,
+        self.registry = CollectorRegistry()
+        counter = partial(Counter, registry=self.registry)
+        gauge = partial(Gauge, registry=self.registry)
+        histogram = partial(Histogram, registry=self.registry, buckets=_SECONDS)
+        self._requests = counter(
+            "scene_requests_total", "Requests answered", ("route", "method", "outcome")
         )
-        self._latency = Histogram(
+        self._latency = histogram(
             "scene_request_duration_seconds",
             "Seconds from the first byte of the request to the last byte of the response",
             ("route",),
-            buckets=_SECONDS,
-            registry=registry,
         )
-        self._entries = Counter(
-            "scene_batch_entries_total",
-            "Scenes of batch requests",
-            ("question", "outcome"),
-            registry=registry,
+        self._entries = counter(
+            "scene_batch_entries_total", "Scenes of batch requests", ("question", "outcome")
         )
-        self._queue = Histogram(
+        self._queue = histogram(
             "scene_queue_duration_seconds",
             "Seconds that a scene waited before its computation",
             _MODEL,
-            buckets=_SECONDS,
-            registry=registry,
         )
-        self._compute = Histogram(
+        self._compute = histogram(
             "scene_compute_duration_seconds",
             "Seconds that a model computed for one question",
             (*_MODEL, "question"),
-            buckets=_SECONDS,
-            registry=registry,
         )
-        self._rows = Histogram(
+        self._rows = histogram(
             "scene_batch_rows",
             "Scenes computed for one question: 1, or the number of generated scenes",
             (*_MODEL, "question"),
             buckets=_ROWS,
-            registry=registry,
         )
-        self._serialisation = Histogram(
+        self._serialisation = histogram(
             "scene_serialisation_duration_seconds",
             "Seconds from the last answer of a model to the first byte of the response",
-            buckets=_SECONDS,
-            registry=registry,
         )
-        self._pending = Gauge(
-            "scene_pending_rows",
-            "Scenes that wait for a model or are being computed",
-            _MODEL,
-            registry=registry,
+        self._pending = gauge(
+            "scene_pending_rows", "Scenes that wait for a model or are being computed", _MODEL
         )
-        self._info = Gauge(
-            _INFO,
+        self._info = gauge(
+            "scene_model_info",
             "1 for each served model, with one series per alias",
             (*_MODEL, "variant", "digest", "alias"),
-            registry=registry,
         )
-        self._reloads = Counter(
+        self._reloads = counter(
             "scene_reloads_total",
             "Attempts to change the served models: refreshes, alias changes, polls of the store",
             ("change", "outcome"),
-            registry=registry,
         )
-        self._started = Gauge(
-            "scene_start_time_seconds",
-            "Unix time when the process began to load its models",
-            registry=registry,
+        self._started = gauge(
+            "scene_start_time_seconds", "Unix time when the process began to load its models"
         )
-        self._ready = Gauge(
+        self._ready = gauge(
             "scene_ready_time_seconds",
             "Unix time when the default model first answered; 0 before",
-            registry=registry,
         )
         self._infos: set[Info] = set()
         self._is_ready = False
-        # These dictionaries cache the series, because the look-up of a series by labels is slow.
-        self._of_request: dict[tuple[str, str, str], Counter] = {}
-        self._of_route: dict[str, Histogram] = {}
-        self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
+        # The questions that each served model has answered, for the removal of its series.
+        self._of_model: dict[Key, set[str]] = {}
 
     # ---------------------------------------------------------------------------- recording
 
@@ -152,7 +128,7 @@ class Metrics:
             self._queue.remove(*key)
             self._pending.remove(*key)
         for key, model in models.served.items():
-            self._of_model.setdefault(key, {})
+            self._of_model.setdefault(key, set())
             self._queue.labels(*key)
             self._pending.labels(*key).set_function(partial(getattr, model.queue, "rows"))
         infos = set(_infos(models))
@@ -187,15 +163,8 @@ class Metrics:
             serialised: time in seconds from the last answer of a model to the response. It is None
                 if no model has answered.
         """
-        key = (route, method, outcome)
-        counter = self._of_request.get(key)
-        if counter is None:
-            counter = self._of_request[key] = self._requests.labels(*key)
-        counter.inc()
-        histogram = self._of_route.get(route)
-        if histogram is None:
-            histogram = self._of_route[route] = self._latency.labels(route)
-        histogram.observe(seconds)
+        self._requests.labels(route, method, outcome).inc()
+        self._latency.labels(route).observe(seconds)
         if serialised is not None:
             self._serialisation.observe(serialised)
 
@@ -216,20 +185,12 @@ class Metrics:
             waited: time in seconds that the question waited before its computation.
             seconds: duration of the computation in seconds.
         """
-        series = self._of_model.get(key)
-        if series is None:
+        if key not in self._of_model:
             return
-        bound = series.get(question)
-        if bound is None:
-            bound = series[question] = (
-                self._queue.labels(*key),
-                self._compute.labels(*key, question),
-                self._rows.labels(*key, question),
-            )
-        queue, compute, size = bound
-        queue.observe(waited)
-        compute.observe(seconds)
-        size.observe(rows)
+        self._of_model[key].add(question)
+        self._queue.labels(*key).observe(waited)
+        self._compute.labels(*key, question).observe(seconds)
+        self._rows.labels(*key, question).observe(rows)
 
     # ---------------------------------------------------------------------------- reporting
 
@@ -240,14 +201,7 @@ class Metrics:
 
 def _infos(models: ServedModels) -> Iterable[Info]:
     """Yield label values for each pair of model and alias. A model without alias has alias ""."""
-    aliases: dict[Key, list[str]] = {key: [] for key in models.served}
-    for alias in models.store.aliases:
-        try:
-            reference = models.resolve(alias).reference
-        except ServingError:
-            continue
-        aliases[reference.name, reference.version].append(alias)
     for key, model in models.served.items():
         reference = model.reference
-        for alias in aliases[key] or [""]:
+        for alias in models.aliases[key] or [""]:
             yield (*key, reference.variant, reference.digest, alias)

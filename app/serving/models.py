@@ -11,6 +11,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -23,6 +24,7 @@ from app.serving.admission import WorkQueue
 from app.serving.errors import (
     ModelUnavailableError,
     NotReadyError,
+    ServingError,
     UnknownModelError,
     some_of,
 )
@@ -146,6 +148,15 @@ class ServedModels:
         # The cache contains only valid references, because clients can send any number of invalid
         # references. The contents of the store limit the number of valid references.
         return {}
+
+    @cached_property
+    def aliases(self) -> Mapping[Key, list[str]]:
+        """Maps each served model to the sorted aliases that point at it."""
+        found: dict[Key, list[str]] = {key: [] for key in self.served}
+        for alias in sorted(self.store.aliases):
+            with suppress(ServingError):
+                found[self.resolve(alias).key].append(alias)
+        return found
 
     @cached_property
     def usable(self) -> frozenset[str]:

@@ -7,9 +7,9 @@ import ctypes
 import gc
 import logging
 import sys
-from collections.abc import Awaitable, Callable, Iterable
-from functools import wraps
-from typing import Concatenate, Literal, ParamSpec, TypeVar
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from contextlib import asynccontextmanager
+from typing import Literal
 
 from app.compiling import check_cache, progress
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
@@ -29,17 +29,13 @@ from app.serving.errors import (
     StoreNotWritableError,
     UnknownModelError,
 )
-from app.serving.metrics import Change as Counted
-from app.serving.metrics import Metrics
+from app.serving.metrics import Change, Metrics
 from app.serving.models import DEFAULT, Key, ServedModels
 from app.serving.reading import Limits
 from app.serving.request import Record, Request
 from app.serving.warm_up import prepare
 from app.settings import Settings
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 _logger = logging.getLogger("app.serving")
 
@@ -49,35 +45,6 @@ _LOCK_TIMEOUT = 5.0
 # Time in seconds after which the interpreter switches from a worker thread to the event loop.
 # Python's default of 5 ms would delay answers by a quarter of a robot's control cycle (20 ms).
 _SWITCH_INTERVAL = 5e-4
-
-
-def _counted(
-    change: Counted,
-) -> Callable[
-    [Callable[Concatenate[Runtime, P], Awaitable[T]]],
-    Callable[Concatenate[Runtime, P], Awaitable[T]],
-]:
-    """Return a decorator that counts the outcomes of a method that changes the served models."""
-
-    def decorate(
-        method: Callable[Concatenate[Runtime, P], Awaitable[T]],
-    ) -> Callable[Concatenate[Runtime, P], Awaitable[T]]:
-        @wraps(method)
-        async def attempt(self: Runtime, /, *args: P.args, **kwargs: P.kwargs) -> T:
-            try:
-                answer = await method(self, *args, **kwargs)
-            except ServingError:
-                self.metrics.reloaded(change, "refused")
-                raise
-            except Exception:
-                self.metrics.reloaded(change, "failed")
-                raise
-            self.metrics.reloaded(change, "success")
-            return answer
-
-        return attempt
-
-    return decorate
 
 
 class Runtime:
@@ -190,7 +157,6 @@ class Runtime:
             self._polling.cancel()
         self._threads.stop()
 
-    @_counted("refresh")
     async def refresh(self, request_id: str) -> RefreshAnswer:
         """Load the current state of the store and serve it, or keep the served models.
 
@@ -201,7 +167,7 @@ class Runtime:
             RefreshRefusedError: the service refused the new state. The served models are unchanged.
             NotReadyError: the service has not loaded the models yet.
         """
-        async with self._changing:
+        async with self._change("refresh"):
             # These sets contain only names, so Python can free the memory of the old snapshot.
             failed, served = set(self.models.failures), set(self.models.served)
             new = await self._take_over(lambda subject: subject == DEFAULT or subject not in failed)
@@ -213,7 +179,6 @@ class Runtime:
                 failures=list(new.failures.values()),
             )
 
-    @_counted("alias")
     async def move_alias(self, alias: str, request: AliasRequest, request_id: str) -> AliasAnswer:
         """Point an alias at a served version, in the store and in this process.
 
@@ -227,7 +192,7 @@ class Runtime:
             StoreBusyError: another process is writing to the store.
             NotReadyError: the models are not loaded yet.
         """
-        async with self._changing:
+        async with self._change("alias"):
             target = self._target(request.model)
             expected = _expected(request)
             try:
@@ -261,7 +226,6 @@ class Runtime:
             except Exception:
                 _logger.exception("the service could not load the changes in the store")
 
-    @_counted("poll")
     async def _take_over_changes(self) -> None:
         """Serve the changes in the store, if every usable version and alias stays usable.
 
@@ -272,8 +236,22 @@ class Runtime:
             RefreshRefusedError: a usable version or alias would become unusable. The served models
                 are unchanged.
         """
-        async with self._changing:
+        async with self._change("poll"):
             await self._take_over(self.models.usable.__contains__)
+
+    @asynccontextmanager
+    async def _change(self, change: Change) -> AsyncIterator[None]:
+        """Hold the lock for a change of the served models, and count the outcome of the change."""
+        try:
+            async with self._changing:
+                yield
+        except ServingError:
+            self.metrics.reloaded(change, "refused")
+            raise
+        except Exception:
+            self.metrics.reloaded(change, "failed")
+            raise
+        self.metrics.reloaded(change, "success")
 
     async def _take_over(self, matters: Callable[[str], bool]) -> ServedModels:
         """Load the state of the store and serve it.
@@ -333,9 +311,8 @@ def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
         return "any"
     if request.expected is None:
         return None
-    name, at, version = request.expected.partition("@")
     try:
-        return AliasTarget(name=name, version=version if at else None)
+        return AliasTarget.of(request.expected)
     except ValueError:
         raise AliasConflictError("`expected` is not the name of a model or version.") from None
 

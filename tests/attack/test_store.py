@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from app.registry import ArtifactError, Store, StoreError, load_model_set
-from app.registry.aliases import MAX_ALIASES_BYTES
 from app.registry.artifact import MAX_MANIFEST_BYTES, load_artifact
+from app.registry.references import MAX_ALIASES_BYTES
 from app.registry.tensors import MAX_HEADER_BYTES, unpack
 from tests.registry.small_artifacts import (
     description,
@@ -150,7 +150,7 @@ def test_any_failure_of_one_version_is_that_version_s(
 
     monkeypatch.setattr(Store, "load", fail)
     models = load_model_set(Store(published))
-    assert models.ready
+    models.resolve("default")
     assert {key: failure.code for key, failure in models.failures.items()} == {
         ("hostile", "1.0.0"): "unexpected_error"
     }
@@ -260,7 +260,7 @@ def test_a_manifest_of_a_million_empty_objects_is_refused_in_little_memory(
     (folder / "manifest.json").write_bytes(data)
     with at_most(400):
         models = load_model_set(Store(published))
-    assert models.ready
+    models.resolve("default")
     # Free JSON of the trainer may hold anything.
     assert bool(models.failures) == (place != "training.x")
 

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from app.questions import missing, outliers, relations
 from app.questions.calibration import relation_probability
-from app.registry.description import Calibration, CountSlope, PairSlope, Slope
-from app.registry.slopes import RelationSlopes
+from app.registry.description import Calibration, CountSlope, PairSlope, RelationSlopes, Slope
 from tests.questions.artifacts import larger_artifact, scene_of
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final
+from typing import Any, Final
 
 from app import questions
 from app.questions.missing import VIEWER
@@ -90,31 +90,12 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
 
 
 def _missing_and_more(
-    artifact: Artifact,
-    scene: Scene,
-    *,
-    top_k: int,
-    candidates: Sequence[int] | None,
-    at: tuple[str, int] | None,
-    axes: Axes | None,
-    coverage: float | None,
-    details: bool,
+    artifact: Artifact, scene: Scene, /, *, axes: Axes | None, details: bool, **asked: Any
 ) -> tuple[tuple[questions.MissingAnswer, ...], tuple[questions.More, ...]]:
     """Compute both lists of the answer. The list `more` is empty for questions about a place."""
-    found = questions.missing(
-        artifact,
-        scene,
-        top_k=top_k,
-        candidates=candidates,
-        at=at,
-        axes=axes,
-        coverage=coverage,
-        details=details,
-    )
-    if at is not None:
-        return found, ()
-    further = questions.more(artifact, scene, top_k=top_k, candidates=candidates, coverage=coverage)
-    return found, further
+    at = asked.pop("at")
+    found = questions.missing(artifact, scene, at=at, axes=axes, details=details, **asked)
+    return found, () if at is not None else questions.more(artifact, scene, **asked)
 
 
 def _notable(entry: questions.MissingAnswer, scene: Scene) -> questions.MissingAnswer:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from time import monotonic
-from types import TracebackType
 from typing import Final, Self, Unpack, overload
 
 import anyio
 import httpx
 
-from scene_client.calls import Call, Objects, T, ask, ask_each, promote, segment
+from scene_client import calls
+from scene_client.calls import Call, Objects, T, segment
 from scene_client.connection import RETRIES, Options, async_deadline, async_transport
 from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
 from scene_client.schemas import (
@@ -105,9 +105,7 @@ class AsyncClient:
         **fields: Unpack[RelationsFields],
     ) -> RelationsAnswer:
         """Return the likely spatial relations between the objects."""
-        call = ask(
-            "/relations", RelationsRequest, RelationsAnswer, objects, fields, self.options.model
-        )
+        call = calls.ask(calls.RELATIONS, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def missing(
@@ -118,8 +116,7 @@ class AsyncClient:
         **fields: Unpack[MissingFields],
     ) -> MissingAnswer:
         """Return classes that are probably missing from the scene, and their likely places."""
-        form, answer = MissingRequest, MissingAnswer
-        call = ask("/missing", form, answer, objects, fields, self.options.model)
+        call = calls.ask(calls.MISSING, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def outliers(
@@ -130,9 +127,7 @@ class AsyncClient:
         **fields: Unpack[OutliersFields],
     ) -> OutliersAnswer:
         """Return how well each object fits the scene, and the relations that are probably false."""
-        call = ask(
-            "/outliers", OutliersRequest, OutliersAnswer, objects, fields, self.options.model
-        )
+        call = calls.ask(calls.OUTLIERS, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def generate(
@@ -143,9 +138,7 @@ class AsyncClient:
         **fields: Unpack[GenerateFields],
     ) -> GenerateAnswer:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
-        call = ask(
-            "/generate", GenerateRequest, GenerateAnswer, objects, fields, self.options.model
-        )
+        call = calls.ask(calls.GENERATE, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     # -------------------------------------------------------------------------------- batches
@@ -157,8 +150,7 @@ class AsyncClient:
         timeout: float | None = None,
     ) -> BatchAnswer[RelationsAnswer]:
         """Ask `relations` about up to 256 scenes. Each scene has its own answer or problem."""
-        form, answer = RelationsRequest, BatchAnswer[RelationsAnswer]
-        call = ask_each("/relations", form, answer, scenes, self.options.model)
+        call = calls.ask_each(calls.RELATIONS, scenes, self.options.model)
         return await self._call(call, timeout)
 
     async def missing_batch(
@@ -168,8 +160,7 @@ class AsyncClient:
         timeout: float | None = None,
     ) -> BatchAnswer[MissingAnswer]:
         """Ask `missing` about up to 256 scenes. Each scene has its own answer or problem."""
-        form, answer = MissingRequest, BatchAnswer[MissingAnswer]
-        call = ask_each("/missing", form, answer, scenes, self.options.model)
+        call = calls.ask_each(calls.MISSING, scenes, self.options.model)
         return await self._call(call, timeout)
 
     async def outliers_batch(
@@ -179,8 +170,7 @@ class AsyncClient:
         timeout: float | None = None,
     ) -> BatchAnswer[OutliersAnswer]:
         """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
-        form, answer = OutliersRequest, BatchAnswer[OutliersAnswer]
-        call = ask_each("/outliers", form, answer, scenes, self.options.model)
+        call = calls.ask_each(calls.OUTLIERS, scenes, self.options.model)
         return await self._call(call, timeout)
 
     # --------------------------------------------------------------------------------- models
@@ -245,7 +235,7 @@ class AsyncClient:
             **fields: optional field ``expected``, the required current target of the alias. None
                 means that the alias must not exist yet.
         """
-        return await self._call(promote(alias, {"model": model, **fields}), timeout)
+        return await self._call(calls.promote(alias, {"model": model, **fields}), timeout)
 
     # --------------------------------------------------------------------------------- health
 
@@ -334,10 +324,5 @@ class AsyncClient:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()

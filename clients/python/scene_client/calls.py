@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from random import random
-from typing import Any, Final, Generic, TypeAlias, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeAlias, TypeVar
 from urllib.parse import quote
 
 import httpx
@@ -25,9 +25,17 @@ from scene_client.schemas import (
     AliasAnswer,
     AliasRequest,
     Answer,
+    BatchAnswer,
     Body,
     Detection,
-    FieldError,
+    GenerateAnswer,
+    GenerateRequest,
+    MissingAnswer,
+    MissingRequest,
+    OutliersAnswer,
+    OutliersRequest,
+    RelationsAnswer,
+    RelationsRequest,
     Request,
     SceneRequest,
 )
@@ -117,23 +125,30 @@ def segment(name: str) -> str:
     """
     # In a URL, the segments "." and ".." refer to folders, so they cannot be names.
     if not name or set(name) <= {"."}:
-        raise InvalidRequestError(
-            [
-                FieldError(
-                    pointer="#", message="a name must not be empty, and must not contain only dots"
-                )
-            ]
-        )
+        message = "a name must not be empty, and must not contain only dots"
+        raise InvalidRequestError.about(message)
     return quote(name, safe="")
 
 
 # -------------------------------------------------------------------------------------- questions
 
 
+class Question(NamedTuple, Generic[RequestT, AnswerT]):
+    """One of the four questions: the path of its route, and the classes of request and answer."""
+
+    path: str
+    form: type[RequestT]
+    answer: type[AnswerT]
+
+
+RELATIONS: Final = Question("/relations", RelationsRequest, RelationsAnswer)
+MISSING: Final = Question("/missing", MissingRequest, MissingAnswer)
+OUTLIERS: Final = Question("/outliers", OutliersRequest, OutliersAnswer)
+GENERATE: Final = Question("/generate", GenerateRequest, GenerateAnswer)
+
+
 def ask(
-    path: str,
-    form: type[RequestT],
-    answer: type[AnswerT],
+    question: Question[RequestT, AnswerT],
     scene: Any,
     fields: Mapping[str, Any],
     model: str | None = None,
@@ -141,8 +156,7 @@ def ask(
     """Build one question about one scene.
 
     Args:
-        path: path of the question's route.
-        form, answer: classes of the request and of the answer.
+        question: the question.
         scene: list of objects, or a whole request as a ``form`` or a dictionary.
         fields: other fields of the request, if ``scene`` is a list of objects.
         model: model for requests without the field ``model``.
@@ -150,30 +164,28 @@ def ask(
     Raises:
         InvalidRequestError: the request is invalid.
     """
-    return Call("POST", path, answer, _json(_request(form, scene, fields, model)))
+    body = _json(_request(question.form, scene, fields, model))
+    return Call("POST", question.path, question.answer, body)
 
 
 def ask_each(
-    path: str,
-    form: type[SceneRequest],
-    answer: type[T],
-    scenes: Iterable[Any],
-    model: str | None = None,
-) -> Call[T]:
+    question: Question[RequestT, AnswerT], scenes: Iterable[Any], model: str | None = None
+) -> Call[BatchAnswer[AnswerT]]:
     """Build a batch request: one question about many scenes. `ask` describes the arguments.
 
     Raises:
         InvalidRequestError: the batch or the request about one of its scenes is invalid.
     """
     requests = [
-        _json(_request(form, scene, {}, model, ("scenes", place)))
+        _json(_request(question.form, scene, {}, model, ("scenes", place)))
         for place, scene in enumerate(scenes)
     ]
     if not 1 <= len(requests) <= MAX_BATCH:
         message = f"a batch must contain from 1 to {MAX_BATCH} scenes"
-        raise InvalidRequestError([FieldError(pointer="#/scenes", message=message)])
+        raise InvalidRequestError.about(message, "#/scenes")
     body = f'{{"scenes":[{",".join(requests)}]}}'
-    return Call("POST", f"{path}/batch", answer, body)
+    answer = BatchAnswer[question.answer]  # type: ignore[name-defined]
+    return Call("POST", f"{question.path}/batch", answer, body)
 
 
 def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
@@ -209,7 +221,7 @@ def _request(
         if fields:
             names = ", ".join(fields)
             message = f"these fields must be members of the whole request: {names}"
-            raise InvalidRequestError([FieldError(pointer="#", message=message)])
+            raise InvalidRequestError.about(message)
         given = _plain(scene)
     else:
         given = {"objects": scene, **fields}

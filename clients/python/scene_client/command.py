@@ -40,7 +40,6 @@ from scene_client.errors import (
     InvalidRequestError,
     ProblemError,
     UnreachableError,
-    problem_text,
 )
 from scene_client.offline import OfflineClient
 from scene_client.ros_fields import WELL_KNOWN, MessageError, read_label_map
@@ -567,7 +566,7 @@ def _failing(request: Any) -> Iterator[None]:
     except ProblemError as problem:
         errors = [_quoted(error, request) for error in problem.errors]
         known = (problem.type, problem.status, problem.title, problem.detail)
-        _fail(problem_text(*known, errors), _status(problem))
+        _fail(str(ProblemError(*known, errors=errors)), _status(problem))
     except UnreachableError as error:
         _fail(f"the service cannot be reached: {error}", UNREACHABLE)
     except DeadlineError as error:

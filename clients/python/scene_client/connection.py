@@ -23,7 +23,6 @@ import httpx
 
 from scene_client.calls import Call, T
 from scene_client.errors import InvalidRequestError, UnreachableError
-from scene_client.schemas import FieldError
 
 MAX_TIMEOUT: Final = 600.0
 """Maximum timeout of a call in seconds. The service has the same maximum."""
@@ -39,6 +38,9 @@ KEEP_ALIVE: Final = 4.0
 
 By default, uvicorn closes an idle connection after five seconds, and a request sent at that moment
 would be lost."""
+
+
+_refused: Final = InvalidRequestError.about
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,10 +120,6 @@ class Options:
         # The message must not contain the user name and the password of the URL.
         host = parts.netloc.rpartition("@")[2]
         return UnreachableError(f"{parts.scheme}://{host}: {str(error) or type(error).__name__}")
-
-
-def _refused(message: str) -> InvalidRequestError:
-    return InvalidRequestError([FieldError(pointer="#", message=message)])
 
 
 # ---------------------------------------------------------------------------------- coroutines

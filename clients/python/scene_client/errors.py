@@ -7,7 +7,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from http import HTTPStatus
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from pydantic import ValidationError
 
@@ -33,6 +33,11 @@ class InvalidRequestError(ClientError, ValueError):
     def __init__(self, errors: Sequence[FieldError]) -> None:
         super().__init__("; ".join(_placed(error) for error in errors))
         self.errors = list(errors)
+
+    @classmethod
+    def about(cls, message: str, pointer: str = "#") -> Self:
+        """Return the exception for one error, by default an error of the whole request."""
+        return cls([FieldError(pointer=pointer, message=message)])
 
 
 MOST_SHOWN: Final = 10
@@ -71,7 +76,11 @@ class ProblemError(ClientError):
         request_id: str = "",
         retry_after: float | None = None,
     ) -> None:
-        super().__init__(problem_text(type, status, title, detail, errors))
+        lines = [f"{status} {title} ({type}): {detail}"]
+        lines += [f"{error.pointer}: {_worded(error)}" for error in errors[:MOST_SHOWN]]
+        if len(errors) > MOST_SHOWN:
+            lines.append(f"and {len(errors) - MOST_SHOWN} more errors")
+        super().__init__("\n  ".join(lines))
         self.type = type
         self.status = status
         self.title = title
@@ -101,21 +110,6 @@ class DeadlineError(ClientError):
 
 class AnswerError(ClientError):
     """The client cannot read the answer of the service."""
-
-
-def problem_text(
-    type: str,  # noqa: A002 — the name in RFC 9457
-    status: int,
-    title: str,
-    detail: str,
-    errors: Sequence[FieldError],
-) -> str:
-    """Return the text of an exception for a problem; see `ProblemError`."""
-    lines = [f"{status} {title} ({type}): {detail}"]
-    lines += [f"{error.pointer}: {_worded(error)}" for error in errors[:MOST_SHOWN]]
-    if len(errors) > MOST_SHOWN:
-        lines.append(f"and {len(errors) - MOST_SHOWN} more errors")
-    return "\n  ".join(lines)
 
 
 def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemError:

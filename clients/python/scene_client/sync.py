@@ -6,12 +6,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from time import monotonic
-from types import TracebackType
 from typing import Final, Self, Unpack, overload
 
 import httpx
 
-from scene_client.calls import Call, Objects, T, ask, ask_each, promote, segment
+from scene_client import calls
+from scene_client.calls import Call, Objects, T, segment
 from scene_client.connection import RETRIES, DeadlineTransport, Options, deadline
 from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
 from scene_client.schemas import (
@@ -106,9 +106,7 @@ class Client:
         **fields: Unpack[RelationsFields],
     ) -> RelationsAnswer:
         """Return the likely spatial relations between the objects."""
-        call = ask(
-            "/relations", RelationsRequest, RelationsAnswer, objects, fields, self.options.model
-        )
+        call = calls.ask(calls.RELATIONS, objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def missing(
@@ -119,8 +117,7 @@ class Client:
         **fields: Unpack[MissingFields],
     ) -> MissingAnswer:
         """Return classes that are probably missing from the scene, and their likely places."""
-        form, answer = MissingRequest, MissingAnswer
-        call = ask("/missing", form, answer, objects, fields, self.options.model)
+        call = calls.ask(calls.MISSING, objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def outliers(
@@ -131,9 +128,7 @@ class Client:
         **fields: Unpack[OutliersFields],
     ) -> OutliersAnswer:
         """Return how well each object fits the scene, and the relations that are probably false."""
-        call = ask(
-            "/outliers", OutliersRequest, OutliersAnswer, objects, fields, self.options.model
-        )
+        call = calls.ask(calls.OUTLIERS, objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def generate(
@@ -144,9 +139,7 @@ class Client:
         **fields: Unpack[GenerateFields],
     ) -> GenerateAnswer:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
-        call = ask(
-            "/generate", GenerateRequest, GenerateAnswer, objects, fields, self.options.model
-        )
+        call = calls.ask(calls.GENERATE, objects, fields, self.options.model)
         return self._call(call, timeout)
 
     # -------------------------------------------------------------------------------- batches
@@ -158,8 +151,7 @@ class Client:
         timeout: float | None = None,
     ) -> BatchAnswer[RelationsAnswer]:
         """Ask `relations` about up to 256 scenes. Each scene has its own answer or problem."""
-        form, answer = RelationsRequest, BatchAnswer[RelationsAnswer]
-        call = ask_each("/relations", form, answer, scenes, self.options.model)
+        call = calls.ask_each(calls.RELATIONS, scenes, self.options.model)
         return self._call(call, timeout)
 
     def missing_batch(
@@ -169,8 +161,7 @@ class Client:
         timeout: float | None = None,
     ) -> BatchAnswer[MissingAnswer]:
         """Ask `missing` about up to 256 scenes. Each scene has its own answer or problem."""
-        form, answer = MissingRequest, BatchAnswer[MissingAnswer]
-        call = ask_each("/missing", form, answer, scenes, self.options.model)
+        call = calls.ask_each(calls.MISSING, scenes, self.options.model)
         return self._call(call, timeout)
 
     def outliers_batch(
@@ -180,8 +171,7 @@ class Client:
         timeout: float | None = None,
     ) -> BatchAnswer[OutliersAnswer]:
         """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
-        form, answer = OutliersRequest, BatchAnswer[OutliersAnswer]
-        call = ask_each("/outliers", form, answer, scenes, self.options.model)
+        call = calls.ask_each(calls.OUTLIERS, scenes, self.options.model)
         return self._call(call, timeout)
 
     # --------------------------------------------------------------------------------- models
@@ -242,7 +232,7 @@ class Client:
             **fields: optional field ``expected``, the required current target of the alias. None
                 means that the alias must not exist yet.
         """
-        return self._call(promote(alias, {"model": model, **fields}), timeout)
+        return self._call(calls.promote(alias, {"model": model, **fields}), timeout)
 
     # --------------------------------------------------------------------------------- health
 
@@ -331,10 +321,5 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -13,7 +13,7 @@ from scene_client.schemas.requests import Finite, Probability, RelationName, Sta
 class Reply(BaseModel):
     """Base class of all parts of an answer."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
 
 # ---------------------------------------------------------------------------------- problems
@@ -22,45 +22,38 @@ class Reply(BaseModel):
 class FieldError(Reply):
     """One error in a request."""
 
-    pointer: Annotated[
-        str,
-        Field(description="JSON pointer into the body, as a URI fragment (RFC 6901, section 6)"),
-    ]
+    pointer: str
+    """JSON pointer into the body, as a URI fragment (RFC 6901, section 6)"""
     message: str
-    suggestions: Annotated[list[str], Field(description="similar known names, best first")] = []
+    suggestions: list[str] = []
+    """similar known names, best first"""
 
 
 class Failure(Reply):
     """An unusable version or alias of the model store, with the reason."""
 
-    subject: Annotated[
-        str, Field(description="name of the unusable entry: `name@version`, an alias, or `store`")
-    ]
-    reason: Annotated[str, Field(description="stable code of the reason")]
+    subject: str
+    """name of the unusable entry: `name@version`, an alias, or `store`"""
+    reason: str
+    """stable code of the reason"""
     detail: str
 
 
 class Problem(Reply):
     """Problem details (RFC 9457), media type `application/problem+json`."""
 
-    type: Annotated[
-        str,
-        Field(description="path of the problem type's page, which never changes"),
-    ]
+    type: str
+    """path of the problem type's page, which never changes"""
     title: str
     status: int
     detail: str
-    instance: Annotated[
-        str, Field(description="path of the problem's page with the request id as fragment")
-    ]
+    instance: str
+    """path of the problem's page with the request id as fragment"""
     request_id: str
-    errors: Annotated[
-        list[FieldError] | None, Field(description="errors in the request, at most 100")
-    ] = None
-    failures: Annotated[
-        list[Failure] | None,
-        Field(description="versions and aliases that a refresh refused, with reasons"),
-    ] = None
+    errors: list[FieldError] | None = None
+    """errors in the request, at most 100"""
+    failures: list[Failure] | None = None
+    """versions and aliases that a refresh refused, with reasons"""
 
 
 # ----------------------------------------------------------------------------------- answers
@@ -71,8 +64,10 @@ class ModelReference(Reply):
 
     name: str
     version: str
-    variant: Annotated[str, Field(description="rbm, gbm or triway")]
-    digest: Annotated[str, Field(description="SHA-256 digest of the model's manifest")]
+    variant: str
+    """rbm, gbm or triway"""
+    digest: str
+    """SHA-256 digest of the model's manifest"""
 
 
 @dataclass(slots=True)
@@ -91,18 +86,12 @@ class Mapped(Reply):
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, serialize_by_alias=True)
 
-    label: Annotated[
-        str, Field(description="unlisted label of an object or candidate, or room type")
-    ]
-    class_: Annotated[str, Field(alias="class", description="canonical label of the class")]
-    similarity: Annotated[
-        float,
-        Field(
-            ge=0,
-            le=1,
-            description="similarity of the label and the class. 1 means that the rule is certain",
-        ),
-    ]
+    label: str
+    """unlisted label of an object or candidate, or room type"""
+    class_: Annotated[str, Field(alias="class")]
+    """canonical label of the class"""
+    similarity: Annotated[float, Field(ge=0, le=1)]
+    """similarity of the label and the class. 1 means that the rule is certain"""
     rule: Annotated[
         Literal["qualifier", "alternative", "article", "instance", "prompt", "spelling", "head"],
         Field(
@@ -131,23 +120,20 @@ class SceneWarning(Reply):
         ),
     ]
     message: str
-    objects: Annotated[
-        list[str],
-        Field(
-            description="ids of the objects that the warning concerns; empty for the whole scene"
-        ),
-    ]
+    objects: list[str]
+    """ids of the objects that the warning concerns; empty for the whole scene"""
 
 
 class Answer(Reply):
     """Base class of the answers, with the fields that every answer has."""
 
     model: ModelReference
-    request_id: Annotated[
-        str, Field(description="id of the request: its X-Request-Id header, or a random id")
-    ]
-    frame_id: Annotated[str | None, Field(description="`frame_id` of the request")] = None
-    stamp: Annotated[Stamp | None, Field(description="`stamp` of the request")] = None
+    request_id: str
+    """id of the request: its X-Request-Id header, or a random id"""
+    frame_id: str | None = None
+    """`frame_id` of the request"""
+    stamp: Stamp | None = None
+    """`stamp` of the request"""
     ignored: Annotated[
         list[str],
         Field(
@@ -163,13 +149,10 @@ class Answer(Reply):
             "replaces it. Guesses need `nearest` or `nearest-or-ignore` as `unknown_labels`"
         ),
     ] = []
-    warnings: Annotated[
-        list[SceneWarning], Field(description="probable mistakes in the scene")
-    ] = []
-    observed_relations: Annotated[
-        list[ObservedRelation] | None,
-        Field(description="relations derived from positions; absent without positions"),
-    ] = None
+    warnings: list[SceneWarning] = []
+    """probable mistakes in the scene"""
+    observed_relations: list[ObservedRelation] | None = None
+    """relations derived from positions; absent without positions"""
 
 
 class ScoredRelation(Reply):

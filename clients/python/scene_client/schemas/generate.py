@@ -61,10 +61,8 @@ class GeneratedScene(Reply):
     objects: list[str]
     relations: list[Relation]
     log_score: Finite
-    context: Annotated[
-        dict[str, list[int]],
-        Field(description="hidden units that are on: maps the name of each layer to unit numbers"),
-    ]
+    context: dict[str, list[int]]
+    """hidden units that are on: maps the name of each layer to unit numbers"""
 
 
 class GenerateAnswer(Answer):

@@ -140,27 +140,23 @@ class MoreInstances(Reply):
     """
 
     label: str
-    listed_count: Annotated[int, Field(ge=1, description="number of listed objects of the class")]
-    expected_count: Annotated[
-        Finite,
-        Id,
-        Field(description="expected number of objects of the class, including the listed objects"),
-    ]
-    low: Annotated[int, Field(ge=1, description="lower limit of an 80 % interval of the number")]
-    high: Annotated[int, Field(ge=1, description="upper limit of the interval")]
-    probability: Annotated[
-        Probability,
-        Field(description="probability that the scene has more than the listed objects"),
-    ]
+    listed_count: Annotated[int, Field(ge=1)]
+    """number of listed objects of the class"""
+    expected_count: Finite
+    """expected number of objects of the class, including the listed objects"""
+    low: Annotated[int, Field(ge=1)]
+    """lower limit of an 80 % interval of the number"""
+    high: Annotated[int, Field(ge=1)]
+    """upper limit of the interval"""
+    probability: Probability
+    """probability that the scene has more than the listed objects"""
 
 
 class MissingAnswer(Answer):
     """Unlisted classes, most probable first. Their probabilities do not sum to one."""
 
-    coverage: Annotated[
-        Probability | None,
-        Field(description="value of `coverage` that the service has used"),
-    ] = None
+    coverage: Probability | None = None
+    """value of `coverage` that the service has used"""
     missing: list[MissingObject]
     more: Annotated[
         list[MoreInstances],

@@ -40,13 +40,14 @@ class VersionSummary(Reply):
 
     version: str
     status: Literal["ready", "refused"]
-    aliases: Annotated[list[str], Field(description="aliases that point at this version")]
+    aliases: list[str]
+    """aliases that point at this version"""
     variant: str | None = None
     digest: str | None = None
-    reason: Annotated[
-        str | None, Field(description="stable code of the reason for the refusal")
-    ] = None
-    detail: Annotated[str | None, Field(description="the reason for the refusal in words")] = None
+    reason: str | None = None
+    """stable code of the reason for the refusal"""
+    detail: str | None = None
+    """the reason for the refusal in words"""
 
 
 class ModelSummary(Reply):
@@ -60,20 +61,12 @@ class ModelList(Reply):
     """The models and the aliases of the service."""
 
     models: list[ModelSummary]
-    aliases: Annotated[
-        dict[str, str],
-        Field(
-            description="target of each alias: `name@version`, or `name` for the newest usable "
-            "version"
-        ),
-    ]
-    failures: Annotated[
-        list[Failure], Field(description="unusable entries of the store, with reasons")
-    ] = []
-    generation: Annotated[
-        str,
-        Field(description="digest of all versions and aliases; equal for replicas of equal state"),
-    ] = ""
+    aliases: dict[str, str]
+    """target of each alias: `name@version`, or `name` for the newest usable version"""
+    failures: list[Failure] = []
+    """unusable entries of the store, with reasons"""
+    generation: str = ""
+    """digest of all versions and aliases; equal for replicas of equal state"""
 
 
 class VersionDetails(VersionSummary):
@@ -81,11 +74,15 @@ class VersionDetails(VersionSummary):
 
     name: str
     created: datetime | None = None
-    parameters: Annotated[int | None, Field(description="number of weights")] = None
+    parameters: int | None = None
+    """number of weights"""
     metrics: list[Metric] = []
-    data: Annotated[list[TrainingSource], Field(description="sources of the training scenes")] = []
-    terms: Annotated[str | None, Field(description="terms of use of the weights")] = None
-    card: Annotated[str | None, Field(description="the model card, in Markdown")] = None
+    data: list[TrainingSource] = []
+    """sources of the training scenes"""
+    terms: str | None = None
+    """terms of use of the weights"""
+    card: str | None = None
+    """the model card, in Markdown"""
 
 
 class VocabularyEntry(Reply):
@@ -94,23 +91,16 @@ class VocabularyEntry(Reply):
     label: str
     aliases: list[str]
     structure: bool
-    size: Annotated[
-        Size | None,
-        Field(description="typical extents in metres, for detections without a size"),
-    ] = None
+    size: Size | None = None
+    """typical extents in metres, for detections without a size"""
 
 
 class ExampleScene(Reply):
     """An example scene of the model, for `client.missing(example.scene)`."""
 
     name: str
-    scene: Annotated[
-        dict[str, Any],
-        Field(
-            description="fields of a request: objects and optionally relations, room_type, "
-            "frame_id and viewpoint"
-        ),
-    ]
+    scene: dict[str, Any]
+    """fields of a request: objects and optionally relations, room_type, frame_id and viewpoint"""
 
 
 class VocabularyAnswer(Reply):
@@ -120,9 +110,8 @@ class VocabularyAnswer(Reply):
     objects: list[VocabularyEntry]
     relations: list[RelationName]
     room_types: list[str]
-    examples: Annotated[
-        list[ExampleScene], Field(description="example scenes; older models have none")
-    ] = []
+    examples: list[ExampleScene] = []
+    """example scenes; older models have none"""
 
 
 class WeightedLabel(Reply):
@@ -145,9 +134,8 @@ class ContextUnit(Reply):
     """A hidden unit with the objects, relations and room types of largest weight."""
 
     unit: int
-    name: Annotated[
-        str, Field(description="name made of the objects and the relation with the largest weights")
-    ]
+    name: str
+    """name made of the objects and the relation with the largest weights"""
     objects: list[WeightedLabel]
     relations: Annotated[
         list[WeightedRelation],
@@ -170,15 +158,14 @@ class RefreshAnswer(Reply):
     """The changes made by a refresh."""
 
     request_id: str
-    default: Annotated[
-        ModelReference, Field(description="model to which the alias `default` refers")
-    ]
-    added: Annotated[list[str], Field(description="new versions, as `name@version`")]
-    removed: Annotated[list[str], Field(description="versions no longer served, as `name@version`")]
-    failures: Annotated[
-        list[Failure],
-        Field(description="entries of the store that were unusable before and still are"),
-    ] = []
+    default: ModelReference
+    """model to which the alias `default` refers"""
+    added: list[str]
+    """new versions, as `name@version`"""
+    removed: list[str]
+    """versions no longer served, as `name@version`"""
+    failures: list[Failure] = []
+    """entries of the store that were unusable before and still are"""
 
 
 class AliasAnswer(Reply):
@@ -197,13 +184,8 @@ class Health(Reply):
     """The status of the service."""
 
     status: Literal["live", "ready"]
-    failures: Annotated[
-        list[Failure] | None,
-        Field(
-            description="in readiness checks, up to 10 unusable entries of the store; "
-            "`GET /models` lists all"
-        ),
-    ] = None
+    failures: list[Failure] | None = None
+    """in readiness checks, up to 10 unusable entries of the store; `GET /models` lists all"""
 
 
 class ServerMetadata(Reply):

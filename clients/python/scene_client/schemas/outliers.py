@@ -63,18 +63,15 @@ class Outlier(Reply):
             "3. For an outlier, they lower its log-odds. Otherwise, they raise its log-odds"
         ),
     ] = []
-    usually_with: Annotated[
-        list[str],
-        Field(description="for an outlier: absent classes that would make it likely, at most 3"),
-    ] = []
+    usually_with: list[str] = []
+    """for an outlier: absent classes that would make it likely, at most 3"""
 
 
 class MisplacedRelation(ScoredRelation):
     """A relation in the form of the request, and the probability that the relation is false."""
 
-    is_misplaced: Annotated[
-        bool, Field(description="true if `probability` reaches the threshold for `sensitivity`")
-    ] = False
+    is_misplaced: bool = False
+    """true if `probability` reaches the threshold for `sensitivity`"""
 
 
 class OutliersAnswer(Answer):
@@ -86,10 +83,8 @@ class OutliersAnswer(Answer):
     warning says so.
     """
 
-    threshold: Annotated[
-        Probability | None,
-        Field(description="minimum probability of an outlier that the service has used"),
-    ] = None
+    threshold: Probability | None = None
+    """minimum probability of an outlier that the service has used"""
     outliers: list[Outlier]
     misplaced: list[MisplacedRelation]
 

@@ -73,10 +73,8 @@ class Disagreement:
 class ExpectedRelation(ScoredRelation):
     """A relation and the probability that it holds, given that both objects are in the scene."""
 
-    observed: Annotated[
-        bool,
-        Field(description="true if the request states the relation or the positions show it"),
-    ] = False
+    observed: bool = False
+    """true if the request states the relation or the positions show it"""
 
 
 class RelationsAnswer(Answer):
