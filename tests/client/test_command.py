@@ -386,7 +386,7 @@ def test_it_is_a_program(repository: Path, url: str) -> None:
         timeout=60,
     )
     assert done.returncode == 0, done.stderr
-    assert "because" in done.stdout
+    assert "log-odds" in done.stdout
 
 
 def shown(renderable: Any) -> str:
