@@ -377,16 +377,11 @@ def _so_many_best(values: NDArray[np.floating[Any]], count: int) -> float:
 def fit_misplaced(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> dict[str, Any]:
-    """Fit the probability that an observed relation is false, and the thresholds for an alarm.
+    """Fit `misplaced` and `misplaced_thresholds` to log-odds given the rest of the scene.
 
-    The input is the log-odds of the relation given the rest of the scene. Each scene takes part
-    twice, untouched and with one false relation. A threshold gives an alarm in a fixed share of
-    untouched scenes, measured on the data source with the most alarms, but see `thresholds`.
-
-    Returns:
-        The entries `misplaced` and `misplaced_thresholds`. Both are None if fewer than
-        `_JUDGED_SCENES` scenes have relations, or if false relations are not less likely than true
-        relations. The model then judges no relation.
+    Each scene takes part untouched and with one false relation. `thresholds` gives the minimum of a
+    threshold. Both entries are None if fewer than `_JUDGED_SCENES` scenes have relations, or if
+    false relations are not less likely than true relations. The model then judges no relation.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure

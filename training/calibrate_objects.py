@@ -54,7 +54,6 @@ WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
 # from .47 to .35.
 ALPHAS = (0.0, 0.125, 0.25, 0.375)
 PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
-
 # Minimum thresholds. If the scores of intruders and other objects do not overlap, as in scenes that
 # hardly vary, the target shares would need alarms for objects that probably belong to the scene.
 LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}

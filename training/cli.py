@@ -262,10 +262,7 @@ def evaluate_command(
             test = subset(some[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:
                 tables[reference] = evaluate(
-                    artifact,
-                    test,
-                    tensors.structure,
-                    tensors.train,
+                    *(artifact, test, tensors.structure, tensors.train),
                     everyday=EVERYDAY,
                     progress=status.update,
                 )

@@ -109,19 +109,14 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
 def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
     """Return the vocabulary with the curated synonyms of its classes, and of kinds that it lacks.
 
-    The classes, their order and their sizes stay the same. The function also renews the aliases of
-    a published model: publish its artifact again with the result as `vocabulary`.
-
-    Args:
-        vocabulary: the classes.
-        names: the curated names. None means those of `vocabularies/names.toml`.
+    The classes, their order and their sizes stay the same. The default of `names` is
+    `vocabularies/names.toml`.
     """
     names = names or curated_names()
     objects = []
     for entry in vocabulary.objects:
-        new = [
-            name for name in names.aliases.get(entry.label, ()) if vocabulary.index(name) is None
-        ]
+        names_of = names.aliases.get(entry.label, ())
+        new = [name for name in names_of if vocabulary.index(name) is None]
         objects.append(replace(entry, aliases=(*entry.aliases, *new)))
     found = Vocabulary(objects, vocabulary.room_types)
     objects = [_with_kinds(entry, found, names) for entry in found.objects]

@@ -36,13 +36,7 @@ SOURCE_SCENES = 200
 
 @dataclass(frozen=True)
 class Alarms:
-    """The number of untouched scenes with an alarm.
-
-    Attributes:
-        source: data source of the scenes, or "the smaller sources".
-        scenes: number of scenes, at most one of each group.
-        alarms: number of these scenes with an alarm.
-    """
+    """The number of scenes of a source (at most one of each group), and of those with an alarm."""
 
     source: str
     sensitivity: Sensitivity
@@ -73,9 +67,8 @@ def untouched_alarms(
 ) -> Iterator[Alarms]:
     """Ask about untouched scenes with their relations, and count the scenes with an alarm.
 
-    The scenes of a group are not independent, so one random scene of each group takes part. Objects
-    count in scenes with a complete object list, and relations in all scenes. Sources with fewer
-    than `SOURCE_SCENES` scenes count together, as they do in the choice of the thresholds.
+    One random scene of each group takes part, because its scenes are not independent. Objects
+    count only if the object list is complete. Sources of few scenes count together.
     """
     rng = np.random.default_rng(seed)
     sizes = Counter(scene.source for scene in scenes)
