@@ -135,13 +135,3 @@ def test_spellings_of_ordinary_length_are_compared_and_longer_ones_are_not() -> 
     assert vocabulary.suggest(known + "bc") == ()
     # Words are compared whatever the length: they cost little.
     assert vocabulary.suggest("very " * 15 + "special lamp") == ("lamp",)
-
-
-def test_the_vocabulary_compares_a_long_name_quickly() -> None:
-    """A character that folds to 18 made the name 1,800 characters long."""
-    names = Vocabulary([type(VOCABULARY.objects[0])(word) for word in words(3_000, 12)])
-    names.nearest("warm up")
-    began = process_time()
-    for number in range(20):
-        names.nearest("\ufdfa" * 95 + str(number))
-    assert process_time() - began < 0.1

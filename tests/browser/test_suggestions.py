@@ -204,26 +204,6 @@ def test_a_pillow_stands_on_the_bed_or_nowhere(open_board: OpenBoard) -> None:
     assert none == []
 
 
-@pytest.mark.parametrize("example", range(1, 4))
-def test_suggestions_of_the_examples_have_free_places(open_board: OpenBoard, example: int) -> None:
-    board = open_board(scene=None)
-    board.page.get_by_label("Example").select_option(index=example)
-    board.settle()
-    assert len(board.ghosts) >= 3
-    ghosts = [one.bounding_box() for one in board.page.locator("#board .ghost rect").all()]
-    robot = board.page.locator("#board .robot .body").bounding_box()
-    # A box has the width of its outline around it.
-    areas = [
-        (one["x"] + 2, one["y"] + 2, one["x"] + one["width"] - 2, one["y"] + one["height"] - 2)
-        for one in [*ghosts, robot]
-        if one
-    ]
-    assert len(areas) == len(ghosts) + 1
-    for number, a in enumerate(areas):
-        for b in areas[:number]:
-            assert a[0] >= b[2] or b[0] >= a[2] or a[1] >= b[3] or b[1] >= a[3]
-
-
 def test_a_suggestion_without_a_place_says_so(open_board: OpenBoard) -> None:
     def crowded(route: Any) -> None:
         response = route.fetch()

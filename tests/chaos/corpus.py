@@ -306,24 +306,20 @@ def nonsense() -> Iterator[Hostile]:
         "far away": (
             {
                 "objects": [
-                    {"label": name, "position": {"x": sign * 1e8, "y": sign * 1e8, "z": 1e8}}
+                    {"label": name, "position": [sign * 1e8, sign * 1e8, 1e8]}
                     for name, sign in (("bed", 1), ("lamp", -1), ("desk", 1))
                 ]
             },
             {200},
         ),
         "one place": (
-            {"objects": [{"label": name, "position": {"x": 0, "y": 0, "z": 0}} for name in names]},
+            {"objects": [{"label": name, "position": [0, 0, 0]} for name in names]},
             {200},
         ),
         "flat": (
             {
                 "objects": [
-                    {
-                        "label": name,
-                        "position": {"x": 0, "y": 0, "z": 0},
-                        "size": {"x": 5e-324, "y": 1e4, "z": 5e-324},
-                    }
+                    {"label": name, "position": [0, 0, 0], "size": [5e-324, 1e4, 5e-324]}
                     for name in names
                 ]
             },
@@ -331,17 +327,11 @@ def nonsense() -> Iterator[Hostile]:
         ),
         "faint": ({"objects": [{"label": name, "confidence": 5e-324} for name in names]}, {200}),
         "too many relations": (
-            {
-                "objects": names,
-                "relations": [{"subject": "bed", "relation": "left", "object": "lamp"}] * 4097,
-            },
+            {"objects": names, "relations": [["bed", "left", "lamp"]] * 4097},
             {422},
         ),
         "relations of nobody": (
-            {
-                "objects": names,
-                "relations": [{"subject": MARKER, "relation": "left", "object": MARKER}] * 4096,
-            },
+            {"objects": names, "relations": [[MARKER, "left", MARKER]] * 4096},
             {422},
         ),
         "relations full of what nobody knows": (
@@ -360,7 +350,7 @@ def nonsense() -> Iterator[Hostile]:
             {
                 "objects": names,
                 "relations": [
-                    {"subject": s, "relation": relation, "object": o}
+                    [s, relation, o]
                     for relation in ("left", "front", "on-top", "above")
                     for i, s in enumerate(names)
                     for o in names[i + 1 :]
@@ -371,8 +361,7 @@ def nonsense() -> Iterator[Hostile]:
         ),
     }
     for number, triples in enumerate(contradictions):
-        relations = [{"subject": s, "relation": r, "object": o} for s, r, o in triples]
-        bodies[f"contradiction {number}"] = ({"objects": names, "relations": relations}, {422})
+        bodies[f"contradiction {number}"] = ({"objects": names, "relations": triples}, {422})
     for path in QUESTIONS:
         extra = {"steps": 2} if path == "/generate" else {}
         for name, (body, expected) in bodies.items():

@@ -28,7 +28,7 @@ from scene_client import (
 from scene_client.calls import LONGEST_PAUSE, Call
 from scene_client.connection import RETRIES
 from scene_client.errors import problem_of
-from scene_client.schemas import FieldError, ModelList
+from scene_client.schemas import FieldError
 
 Received = tuple[int, dict[str, str], bytes]
 Outcome = Received | Exception
@@ -102,12 +102,6 @@ class World:
 
 def promote(client: Client) -> Any:
     return client.promote("default", "home")
-
-
-def test_an_answer_is_read_into_its_class() -> None:
-    world = World(FINE)
-    assert world.run() == ModelList(models=[], aliases={})
-    assert len(world.told) == 1
 
 
 def test_an_answer_of_a_newer_service_may_say_more() -> None:

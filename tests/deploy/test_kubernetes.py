@@ -139,18 +139,8 @@ def test_ports_are_those_of_the_image(
         assert (port["port"], port["targetPort"]) == (exposed, container["ports"][0]["name"])
 
 
-def test_every_variable_is_a_setting(
-    repository: Path, rendered: dict[str, str], overlay: str
-) -> None:
+def test_every_variable_is_a_setting(rendered: dict[str, str], overlay: str) -> None:
     assert set(re.findall(r"\bSCENE_[A-Z0-9_]+", rendered[overlay])) <= SETTINGS
-    compose = (repository / "docker-compose.yml").read_text("utf-8")
-    assert set(re.findall(r"\bSCENE_[A-Z0-9_]+", compose)) <= SETTINGS
-
-
-def test_compose_passes_all_settings(repository: Path) -> None:
-    services = yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))["services"]
-    assert services["scene"]["env_file"] == [{"path": ".env", "required": False}]
-    assert "/.env" in {f"/{line}" for line in (repository / ".gitignore").read_text().splitlines()}
 
 
 def test_the_values_are_valid_settings(
@@ -187,23 +177,6 @@ def environment_of(manifests: Manifests, container: dict[str, Any]) -> dict[str,
             value = re.sub(r"\$\((\w+)\)", lambda match: known[match[1]], variable["value"])
             known[variable["name"]] = value
     return data | known
-
-
-def test_variables_of_the_service_discovery_do_not_change_settings(pod: dict[str, Any]) -> None:
-    # For a Service `scene`, Kubernetes would set SCENE_PORT=tcp://10.0.0.1:8000.
-    assert pod["enableServiceLinks"] is False
-
-
-def test_keys_come_from_an_optional_secret(container: dict[str, Any]) -> None:
-    secrets = {
-        variable["name"]: variable["valueFrom"]["secretKeyRef"]
-        for variable in container["env"]
-        if "secretKeyRef" in variable.get("valueFrom", {})
-    }
-    assert secrets == {
-        "SCENE_API_KEY": {"name": "scene", "key": "api-key", "optional": True},
-        "SCENE_ADMIN_KEY": {"name": "scene", "key": "admin-key", "optional": True},
-    }
 
 
 def test_the_grace_period_covers_the_end_of_the_service(
@@ -331,22 +304,6 @@ def test_the_sidecar_copies_what_the_service_loads(
     finally:
         process.terminate()
         assert process.wait(timeout=10) is not None
-
-
-def test_an_update_and_a_drained_node_leave_replicas(manifests: Manifests) -> None:
-    rolling = manifests["Deployment", "scene"]["spec"]["strategy"]["rollingUpdate"]
-    assert rolling["maxUnavailable"] == 0
-    assert manifests["PodDisruptionBudget", "scene"]["spec"]["maxUnavailable"] == 1
-
-
-def test_images_have_a_digest_except_on_a_laptop(pod: dict[str, Any], overlay: str) -> None:
-    images = {one["image"] for one in [*pod["containers"], *pod.get("initContainers", ())]}
-    images = {image for image in images if not re.fullmatch(r"rclone/rclone:\d+\.\d+\.\d+", image)}
-    (image,) = images
-    if overlay == "local":
-        assert image == "scene-boltzmann:local"
-    else:
-        assert re.fullmatch(r"registry\.example/scene-boltzmann@sha256:[0-9a-f]{64}", image)
 
 
 def test_the_autoscaler_alone_sets_the_number_of_replicas(manifests: Manifests) -> None:

@@ -77,14 +77,6 @@ def test_a_published_message_is_answered(
     assert errors == []
 
 
-def test_an_invalid_message_is_reported_and_the_program_continues(repository: Path) -> None:
-    message = {"op": "publish", "topic": "/x", "msg": {"objects": []}}
-    with bridge(message) as (url, _):
-        answers, errors = run(repository, url, "/x")
-    assert answers == []
-    assert errors == ["MessageError: the message must have a list of detections"]
-
-
 def test_frames_that_say_nothing_are_left_out_and_complaints_are_handed_on(
     repository: Path,
 ) -> None:

@@ -201,7 +201,9 @@ def test_numbers_wait_for_their_labels(
     assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}
 
 
-def test_labels_may_be_listed_in_the_parameters(run: Callable[..., Running]) -> None:
+def test_labels_and_a_viewpoint_may_stand_in_the_parameters(run: Callable[..., Running]) -> None:
+    assert run(viewpoint=[1.0, 2.0, 0.5]).node.viewpoint == (1.0, 2.0, 0.5)
+    assert run(viewpoint=[math.nan] * 3).node.viewpoint is None
     assert run(class_names=["desk", "chair"]).node.advisor.label_map == ["desk", "chair"]
     assert run(label_map="coco").node.advisor.label_map == "coco"
     with pytest.raises(ValueError, match="imagenet"):
@@ -242,13 +244,6 @@ def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
     running.hear("detections", recorded)
     running.tick_until(lambda: len(running.said("~/answers")) == 3)
     assert horizontal(running.said("~/answers")[2]) == set()
-
-
-def test_a_camera_that_stands_still_has_its_viewpoint_in_the_parameters(
-    run: Callable[..., Running],
-) -> None:
-    assert run(viewpoint=[1.0, 2.0, 0.5]).node.viewpoint == (1.0, 2.0, 0.5)
-    assert run(viewpoint=[math.nan] * 3).node.viewpoint is None
 
 
 def test_images_are_heard_where_the_parameters_say_so(

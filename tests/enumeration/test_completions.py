@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from app.inference.completions import Completions
 from app.inference.objects import ContextScorer
@@ -124,24 +122,6 @@ def test_the_same_scene_gets_the_same_bits():
     again = prepared(machine, NOTHING)
     ask(again, machine, [0], 0.3)
     np.testing.assert_array_equal(ask(again, machine, [1, 4], 0.5), first)
-
-
-@given(
-    st.integers(0, 5),
-    st.sets(st.integers(0, SPEC.V - 1), max_size=5),
-    st.floats(0, 0.98),
-    st.floats(0, 0.98),
-)
-@settings(max_examples=60, deadline=None)
-def test_the_lower_the_coverage_the_more_classes_are_expected(seed, listed, one, other):
-    """But for the sampling error of 256 completions, of a sum of up to seven probabilities."""
-    machine, listed = machine_of(1024, seed=seed), sorted(listed)
-    rest = np.setdiff1d(np.arange(SPEC.V), listed)
-    completions = prepared(machine, NOTHING, 256)
-    low, high = sorted((one, other))
-    many, few = (ask(completions, machine, listed, c)[rest] for c in (low, high))
-    assert ((many > 0) & (many < 1) & (few > 0) & (few < 1)).all()
-    assert many.sum() >= few.sum() - 0.05
 
 
 def test_structure_is_never_added_and_tells_nothing_where_it_is_unlisted():

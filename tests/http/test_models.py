@@ -162,26 +162,6 @@ async def test_a_broken_new_version_changes_nothing(store: Path, admin: dict[str
         assert (await client.get("/health/ready")).status_code == 200
 
 
-async def test_a_served_version_that_rots_on_disk_goes_on_answering(
-    store: Path, admin: dict[str, str]
-) -> None:
-    async with serve(store) as client:
-        corrupt(store, "plain", "1.0.0")
-        document = problem(
-            await client.post("/models/refresh", headers=admin), 409, "refresh-refused"
-        )
-        assert [failure["subject"] for failure in document["failures"]] == ["plain@1.0.0"]
-        body = {"objects": ["bed"], "model": "plain"}
-        assert (await client.post("/relations", json=body)).status_code == 200
-
-
-async def test_broken_aliases_change_nothing(store: Path, admin: dict[str, str]) -> None:
-    async with serve(store) as client:
-        (store / "aliases.json").write_text("{")
-        problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
-        assert await default(client) == "home@1.0.0"
-
-
 async def test_a_version_that_cannot_answer_is_refused(
     store: Path, admin: dict[str, str], replace: Replace
 ) -> None:
@@ -349,19 +329,21 @@ async def test_of_two_that_expect_the_same_one_wins(store: Path) -> None:
         assert sorted(response.status_code for response in responses) == [200, 409]
 
 
-async def test_an_alias_cannot_have_a_models_name(client: httpx.AsyncClient) -> None:
-    problem(await put(client, "plain", model="home"), 409, "alias-conflict")
-
-
-async def test_an_alias_is_spelt_as_a_name(client: httpx.AsyncClient) -> None:
-    for alias in ("UPPER", "-x", "x" * 65, "a b", "a%2e"):
-        problem(await put(client, alias, model="home"), 422, "invalid-request")
-
-
-async def test_an_alias_cannot_lead_to_nothing(client: httpx.AsyncClient) -> None:
-    for model in ("nobody", "home@9.9.9", "HOME"):
-        problem(await put(client, "default", model=model), 404, "model-not-found")
-    problem(await put(client, "default"), 422, "invalid-request")
+@pytest.mark.parametrize(
+    ("alias", "body", "status", "slug"),
+    [
+        *[(alias, {"model": "home"}, 422, "invalid-request")
+          for alias in ("UPPER", "-x", "x" * 65, "a b", "a%2e")],
+        *[("default", {"model": model}, 404, "model-not-found")
+          for model in ("nobody", "home@9.9.9", "HOME")],
+        ("default", {}, 422, "invalid-request"),
+        ("plain", {"model": "home"}, 409, "alias-conflict"),
+    ],
+)  # fmt: skip
+async def test_an_alias_has_a_name_of_its_own_and_leads_to_a_model(
+    client: httpx.AsyncClient, alias: str, body: dict[str, str], status: int, slug: str
+) -> None:
+    problem(await put(client, alias, **body), status, slug)
 
 
 async def test_an_alias_cannot_lead_to_a_refused_version(store: Path) -> None:

@@ -71,8 +71,12 @@ async def test_the_documented_example_is_of_this_service(shared_store: Path) -> 
         assert line.rpartition(" ")[0] in text if line[0] != "#" else line in text
 
 
-async def test_requests_are_told_by_template_method_and_outcome(shared_store: Path) -> None:
+async def test_requests_are_told_by_template_method_and_outcome(
+    shared_store: Path, replace: Replace
+) -> None:
     async with serve(shared_store) as client:
+        replace("outliers", defect)
+        await client.post("/outliers", json=SCENE)
         await client.post("/missing", json=SCENE)
         await client.post("/missing", json=SCENE)
         await client.post("/missing", json={"objects": ["nosuchthing"]})
@@ -89,6 +93,7 @@ async def test_requests_are_told_by_template_method_and_outcome(shared_store: Pa
         found = await told(client)
     version = "/models/{name}/versions/{version}"
     assert requests(found) == {
+        ("POST", "internal-error", "/outliers"): 1,
         ("POST", "success", "/missing"): 2,
         ("POST", "unknown-labels", "/missing"): 1,
         ("POST", "not-json", "/missing"): 1,
@@ -122,14 +127,6 @@ async def test_addresses_and_methods_that_are_made_up_add_no_series(
     for number in range(1, 20):
         await ask(number)
     assert set(await told(client)) == before
-
-
-async def test_a_defect_is_told(shared_store: Path, replace: Replace) -> None:
-    async with serve(shared_store) as client:
-        replace("missing", defect)
-        problem(await client.post("/missing", json=SCENE), 500, "internal-error")
-        found = await told(client)
-    assert requests(found) == {("POST", "internal-error", "/missing"): 1}
 
 
 async def test_work_is_told_by_model_and_question(shared_store: Path) -> None:

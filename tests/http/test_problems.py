@@ -143,7 +143,6 @@ UNFIT: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"objects": ["be\0d"]}, "objects/0"),
         ({"objects": ["be\nd"]}, "objects/0"),
         ({"objects": ["x" * 200_000]}, "objects/0"),
-        ({"objects": ["bed"] * 257}, "objects"),
         ({"objects": [{}]}, "objects/0/label"),
         ({"objects": [BED | {"id": ""}]}, "objects/0/id"),
         ({"objects": [BED | {"id": "a"}, {"id": "a", "label": "lamp"}]}, "objects/1/id"),
@@ -284,6 +283,8 @@ ON_TOP = {"subject": "lamp", "relation": "on_top", "object": "bed"}
         ({"objects": [["bed"]]}, "objects/0", "JSON object with the field `label`, not an arr", []),
         ({"objects": [{"name": "bed"}]}, "objects/0/name", "`label`, `confidence`", []),
         ({"object": ["bed"]}, "object", "unknown field", ["objects"]),
+        ({"topk": 3}, "topk", "unknown field", ["top_k"]),
+        ({"objects": [BED | {"labl": 1}]}, "objects/0/labl", "unknown field", ["label"]),
         (
             {"objects": [BED | {"position": [1, 2]}]},
             "objects/0/position",
@@ -337,14 +338,6 @@ async def test_numbers_that_are_not_json_are_pointed_at(client: httpx.AsyncClien
     assert len(document["errors"]) == 32
 
 
-async def test_misspelt_fields_are_pointed_at_with_suggestions(client: httpx.AsyncClient) -> None:
-    body = {"objects": [{"label": "bed", "confidense": 1}], "topk": 3}
-    document = problem(await client.post("/relations", json=body), 422, "invalid-request")
-    found = {error["pointer"]: error["suggestions"] for error in document["errors"]}
-    assert found["#/topk"][0] == "top_k"
-    assert found["#/objects/0/confidense"][0] == "confidence"
-
-
 @pytest.mark.parametrize(
     "key", ["<script>" + MARKER, MARKER + " x", MARKER * 20, MARKER + "\u202e"]
 )
@@ -357,22 +350,16 @@ async def test_pointers_do_not_repeat_what_is_no_plain_name(
     assert [error["pointer"] for error in document["errors"]] == ["#"]
 
 
-async def test_at_most_32_faults_are_listed(client: httpx.AsyncClient) -> None:
-    document = problem(
-        await client.post("/relations", json={"objects": [1] * 256}), 422, "invalid-request"
-    )
-    assert len(document["errors"]) == 32
-
-
 # ----------------------------------------------------------------------------- models, routes
 
 
-@pytest.mark.parametrize("model", ["nobody", "home@9.9.9", "home@", "@", "../x", "home@1", "HOME"])
+@pytest.mark.parametrize("model", ["nobody", "home@9.9.9", "home@", "@", "../x", "home@1", "hoome"])
 async def test_unknown_models_are_not_found(client: httpx.AsyncClient, model: str) -> None:
     body = {"objects": ["bed"], "model": model}
     document = problem(await client.post("/missing", json=body), 404, "model-not-found")
     named = "1.0.0, 1.1.0" if model.startswith("home@") else "Models: deep, home, plain."
     assert named in document["detail"]
+    assert ("Similar names: home." in document["detail"]) == (model == "hoome")
 
 
 @pytest.mark.parametrize(
@@ -396,11 +383,6 @@ async def test_unknown_models_are_not_found(client: httpx.AsyncClient, model: st
 )
 async def test_unknown_routes_are_not_found(client: httpx.AsyncClient, path: str) -> None:
     problem(await client.get(path), 404, "not-found")
-
-
-async def test_a_misspelt_model_is_answered_with_similar_names(client: httpx.AsyncClient) -> None:
-    response = await client.post("/missing", json={"objects": ["bed"], "model": "hoome"})
-    assert "Similar names: home." in problem(response, 404, "model-not-found")["detail"]
 
 
 async def test_misspelt_ids_are_answered_with_similar_ids(client: httpx.AsyncClient) -> None:
@@ -460,13 +442,7 @@ async def test_other_methods_are_not_allowed(
 # ---------------------------------------------------------------------------------- too large
 
 
-async def test_declared_bodies_over_the_limit_are_refused(shared_store: Path) -> None:
-    async with serve(shared_store, max_body_bytes=2048) as client:
-        problem(await post(client, b" " * 2049), 413, "body-too-large")
-        assert (await post(client, b'{"objects": ["bed"]}'.ljust(2048))).status_code == 200
-
-
-async def test_chunked_bodies_over_the_limit_are_refused(shared_store: Path) -> None:
+async def test_bodies_over_the_limit_are_refused(shared_store: Path) -> None:
     async def chunks(size: int) -> AsyncIterator[bytes]:
         yield b'{"objects": ["bed"]}'
         for _ in range(size - 20):
@@ -474,6 +450,8 @@ async def test_chunked_bodies_over_the_limit_are_refused(shared_store: Path) -> 
 
     headers = {"Content-Type": "application/json"}
     async with serve(shared_store, max_body_bytes=2048) as client:
+        problem(await post(client, b" " * 2049), 413, "body-too-large")
+        assert (await post(client, b'{"objects": ["bed"]}'.ljust(2048))).status_code == 200
         for path in ("/relations", "/generate", "/missing/batch"):
             response = await client.post(path, content=chunks(2049), headers=headers)
             problem(response, 413, "body-too-large")

@@ -19,12 +19,23 @@ from tests.services import Replace, serve
 
 pytestmark = pytest.mark.anyio
 
+
+def at(x: float, y: float, z: float) -> dict[str, float]:
+    return {"x": x, "y": y, "z": z}
+
+
 ANSWERS = {question.name: question.response for question in QUESTIONS}
 SCENE: dict[str, Any] = {
     "objects": ["bed", "chair", "chair", {"id": "l", "label": "lamp", "confidence": 0.5}],
     "relations": [{"subject": "l", "relation": "on-top", "object": "bed"}],
     "room_type": "bedroom",
 }
+LAMP_ON_DESK: list[dict[str, Any]] = [
+    {"id": id_, "label": label, "position": at(*position), "size": at(*size)}
+    for id_, label, position, size in (
+        ("d", "desk", (2, 0, 0.4), (0.7, 1.4, 0.8)), ("l", "lamp", (2, 0.5, 1), (0.2, 0.2, 0.4)),
+    )
+]  # fmt: skip
 MODELS = ["home", "home@1.1.0", "candidate", "plain", "deep@0.1.0"]
 
 
@@ -57,21 +68,7 @@ async def test_every_model_answers_every_question(
 
 @pytest.mark.parametrize("question", ANSWERS)
 async def test_observed_relations_are_returned(client: httpx.AsyncClient, question: str) -> None:
-    objects = [
-        {
-            "id": "d",
-            "label": "desk",
-            "position": {"x": 2, "y": 0, "z": 0.4},
-            "size": {"x": 0.7, "y": 1.4, "z": 0.8},
-        },
-        {
-            "id": "l",
-            "label": "lamp",
-            "position": {"x": 2, "y": 0.5, "z": 1},
-            "size": {"x": 0.2, "y": 0.2, "z": 0.4},
-        },
-    ]
-    answer = await ask(client, question, objects=objects)
+    answer = await ask(client, question, objects=LAMP_ON_DESK)
     assert answer["observed_relations"] == [{"subject": "l", "relation": "on-top", "object": "d"}]
     assert "observed_relations" not in await ask(client, question, objects=["desk", "lamp"])
 
@@ -108,13 +105,6 @@ async def test_disagreements_name_the_pairs_as_they_were_stated(
 
 
 # ----------------------------------------------------------------------------------- missing
-
-
-async def test_placements_name_objects_of_the_scene(client: httpx.AsyncClient) -> None:
-    found = (await ask(client, "missing", **SCENE))["missing"]
-    anchors = {place["object"] for entry in found for place in entry["placements"]}
-    assert anchors <= {"bed", "chair_1", "chair_2", "l"}
-    assert anchors
 
 
 async def test_only_likely_places_and_strong_reasons_are_listed(
@@ -167,11 +157,6 @@ async def test_a_drawn_seed_is_reported_and_draws_the_same_again(client: httpx.A
     again = await ask(client, "generate", count=3, seed=first["seed"])
     assert first["scenes"] == again["scenes"]
     assert (await ask(client, "generate", count=3))["seed"] != first["seed"]
-
-
-async def test_a_scene_can_be_drawn_from_nothing(client: httpx.AsyncClient) -> None:
-    for request in ({}, {"objects": []}):
-        assert len((await ask(client, "generate", **request))["scenes"]) == 1
 
 
 # -------------------------------------------------------------------------- small vocabularies

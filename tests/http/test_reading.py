@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.http.test_problems import problem
-from tests.http.test_questions import ask
+from tests.http.test_questions import LAMP_ON_DESK, ask, at
 from tests.scene.turns import Turn, about, after
 from tests.services import serve
 
@@ -39,10 +39,6 @@ async def read(client: httpx.AsyncClient, **scene: Any) -> tuple[dict[str, str],
 async def observed(client: httpx.AsyncClient, **scene: Any) -> Triples:
     """The relations that are derived from poses."""
     return triples((await ask(client, "outliers", **scene)).get("observed_relations", []))
-
-
-def at(x: float, y: float, z: float) -> dict[str, float]:
-    return {"x": x, "y": y, "z": z}
 
 
 def relation(subject: str, name: str, other: str) -> dict[str, str]:
@@ -250,11 +246,6 @@ async def test_a_scene_of_the_training_is_a_request(client: httpx.AsyncClient) -
     ]
     assert yaw | {"request_id": ""} == orientation | {"request_id": ""}
 
-
-LAMP_ON_DESK = [
-    {"id": "d", "label": "desk", "position": at(2, 0, 0.4), "size": at(0.7, 1.4, 0.8)},
-    {"id": "l", "label": "lamp", "position": at(2, 0.5, 1.0), "size": at(0.2, 0.2, 0.4)},
-]
 
 # From body axes to those of a camera: x right, y down, z forward.
 TO_OPTICAL: Turn = (0.5, -0.5, 0.5, 0.5)

@@ -65,16 +65,6 @@ def test_instances_count_in_relations():
     assert p[0, 1] == pytest.approx(sigmoid(-2 - 0.5 * math.log(9)), abs=1e-6)
 
 
-def test_intruders_by_log_odds_and_size():
-    entry = CountSlope(intercept=0.5, slope=-0.7, log_count=0.3)
-    artifact = larger_artifact("triway-local", outlier=entry)
-    found = outliers(artifact, scene_of([0, 1, 1, 2])).outliers
-    for answer in found:
-        z = 0.5 - 0.7 * answer.log_odds + 0.3 * math.log(3)
-        assert answer.probability == pytest.approx(sigmoid(z), abs=1e-5)
-    assert [a.probability for a in found] == sorted((a.probability for a in found), reverse=True)
-
-
 def test_false_relations():
     scene = scene_of([0, 1, 2], [(2, 1, 0), (0, 1, 2)])
     plain = outliers(larger_artifact("triway-local"), scene).misplaced

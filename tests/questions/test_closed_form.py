@@ -209,18 +209,6 @@ def test_weighted_answers_are_those_of_draws(
         assert np.abs(found).max() < bound
 
 
-def test_a_class_is_judged_without_the_relations_that_it_is_in() -> None:
-    """Without class 1 none is left."""
-    artifact = sharing("triway-wide", "relations", objects=0.4)
-    (found,) = (
-        one.log_odds
-        for one in outliers(artifact, scene_of([0, 1, 2], [(2, 1, 0)])).outliers
-        if one.object == 1
-    )
-    bare = outliers(artifact, scene_of([0, 1, 2])).outliers
-    assert found == pytest.approx(next(x.log_odds for x in bare if x.object == 1), abs=1e-4)
-
-
 @pytest.mark.parametrize("largest", [70.0, 1.0])
 def test_weights_too_large_for_products_have_no_closed_form(largest: float) -> None:
     """Nor has the seed form."""

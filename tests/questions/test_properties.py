@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.questions import misplaced, missing, outliers, relations
-from app.registry.description import Thresholds
 from app.scene import CANONICAL, OPPOSITES, RELATIONS, Scene, canonicalise, contradiction
 from tests.questions.artifacts import LABELS, LARGER, STRUCTURE, larger_artifact, scene_of
 
@@ -269,15 +268,6 @@ def test_the_threshold_decides(name, scene, threshold):
     assert found.threshold == threshold
     for answer in found.outliers:
         assert answer.is_outlier == (answer.probability >= threshold)
-
-
-def test_the_default_threshold_is_the_calibrated_one():
-    for threshold in (0.0, 1.0):
-        presets = Thresholds(low=0.5, medium=threshold, high=0.5)
-        artifact = larger_artifact("triway-local", outlier_thresholds=presets)
-        found = outliers(artifact, scene_of([0, 1, 2]))
-        assert found.threshold == threshold
-        assert {answer.is_outlier for answer in found.outliers} == {threshold == 0.0}
 
 
 @few

@@ -72,15 +72,11 @@ def test_lists_names_and_versions_in_order(store: Store) -> None:
 def test_never_overwrites_a_version(store: Store) -> None:
     publish(store)
     before = tree(store.root)
-    with refused("version_exists"):
-        publish(store, seed=1)
+    (store.root / "tiny" / "2.0.0").mkdir()
+    for version in ("1.0.0", "2.0.0"):
+        with refused("version_exists"):
+            publish(store, version, seed=1)
     assert tree(store.root) == before
-
-
-def test_does_not_even_overwrite_what_is_broken(store: Store) -> None:
-    (store.root / "tiny" / "1.0.0").mkdir(parents=True)
-    with refused("version_exists"):
-        publish(store)
 
 
 def test_publishes_nothing_that_would_be_refused(store: Store) -> None:

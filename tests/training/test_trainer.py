@@ -148,13 +148,10 @@ def test_an_object_phase_that_diverges_says_so(data):
         Trainer(config, data).run()
 
 
-def test_a_checkpoint_of_another_configuration_is_refused(data, tmp_path):
+def test_a_checkpoint_that_is_broken_or_another_configuration_s_is_refused(data, tmp_path):
     Trainer(small_config(epochs=1), data, tmp_path).run()
     with pytest.raises(RunError, match="another configuration"):
         Trainer(small_config(epochs=2), data, tmp_path).resume()
-
-
-def test_a_broken_checkpoint_is_refused(data, tmp_path):
     (tmp_path / "checkpoint.pt").write_bytes(b"not a checkpoint")
     with pytest.raises(RunError, match="cannot be read"):
         Trainer(small_config(), data, tmp_path).resume()

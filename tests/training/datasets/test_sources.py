@@ -56,18 +56,14 @@ def test_two_listed_vertical_relations_of_one_pair_both_hold() -> None:
     assert not {(a, i, j) for a, i, j in off(found) if a in VERTICAL and (i, j) == (1, 0)}
 
 
-def test_denied_relations_are_off() -> None:
+def test_denied_relations_are_off_and_listed_ones_of_them_unobserved() -> None:
+    one = ((1, "on-top", 0),)
+    assert not encoded("vsr", relations=one, false_relations=one).instance_observed.any()
     found = encoded("vsr", relations=(), false_relations=((1, "under", 0), (2, "right", 0)))
     assert off(found) == {(ON_TOP, 0, 1), (LEFT, 0, 2)}
     assert not found.instance_holds.any()
     # Nobody listed relations, somebody denied one.
     assert off(encoded("robot", false_relations=((1, "on-top", 0),))) == {(ON_TOP, 1, 0)}
-
-
-def test_listed_and_denied_is_unobserved() -> None:
-    one = ((1, "on-top", 0),)
-    found = encoded("vsr", relations=one, false_relations=one)
-    assert not found.instance_observed.any()
 
 
 def test_3dssg_annotates_supports_throughout_and_sides_of_related_pairs() -> None:

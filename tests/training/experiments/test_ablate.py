@@ -124,16 +124,6 @@ def test_costs_count_trained_weights_alone(finished):
     assert "| no-counts | instances are not counted | " in markdown(finished)
 
 
-def test_the_same_command_trains_nothing_again(finished, monkeypatch):
-    before = results(finished)
-    rows = ("--row", "seed-form", "--row", "no-counts")
-    monkeypatch.setattr(Trainer, "run", None)
-    invoke(*arguments(finished), *rows)
-    after = results(finished)
-    assert (after["cells"], after["differences"]) == (before["cells"], before["differences"])
-    assert after["failures"] == {}
-
-
 def test_an_interrupted_ablation_goes_on(finished, tmp_path, monkeypatch):
     whole, epochs = Trainer._epoch, []
 
