@@ -54,6 +54,8 @@ SCENE: Final[dict[str, Any]] = {
             "position": {"x": 1.0, "y": 0.5, "z": 1.0},
             "size": {"x": 0.2, "y": 0.2, "z": 0.4},
             "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+            "yaw": None,
+            "supported_by": "desk_1",
         },
         {"id": "desk_1", "label": "desk"},
     ],
@@ -69,6 +71,10 @@ SCENE: Final[dict[str, Any]] = {
     "model": "default",
     "seed": 7,
     "unknown_labels": "error",
+    "scene_id": "scene 1",
+    "source": "robot",
+    "group": "home",
+    "viewer_frame": True,
 }
 VALID: Final[dict[str, dict[str, Any]]] = {
     "/relations": SCENE
@@ -341,7 +347,7 @@ def nonsense() -> Iterator[Hostile]:
                     {"subject": "bed", "relation": "left", "object": "lamp"}
                     | {f"{k:x}": 0 for k in range(29)}
                 ]
-                * 4096,
+                * 600,
             },
             {422},
         ),

@@ -484,7 +484,6 @@ def expected_corners(box: dict[str, Any]) -> list[tuple[float, float]]:
     ("box", "message"),
     [
         ({"coeffs": np.array([[1.0, 0.5]])}, r"coeffs must be finite, of shape \(3,\)"),
-        ({"coeffs": np.array([[1.0, 0.5, -0.1]])}, "must not be negative"),
         ({"centroid": np.array([[1.0, math.nan, 0.0]])}, "centroid must be finite"),
         ({"basis": "none"}, "basis is not numeric"),
         ({"classname": ""}, "classname must be a non-empty string"),
