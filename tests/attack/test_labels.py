@@ -131,10 +131,11 @@ async def test_long_labels_cost_little(client: httpx.AsyncClient, letter: str) -
 def test_spellings_of_ordinary_length_are_compared_and_longer_ones_are_not() -> None:
     known = "a" * (LONGEST - 1)
     vocabulary = Vocabulary([*VOCABULARY.objects, type(VOCABULARY.objects[0])(known)])
-    assert vocabulary.suggest(known + "b") == (known,)
-    assert vocabulary.suggest(known + "bc") == ()
+    assert [vocabulary.labels[match.entry] for match in vocabulary.nearest(known + "b")] == [known]
+    assert vocabulary.nearest(known + "bc") == ()
     # Words are compared whatever the length: they cost little.
-    assert vocabulary.suggest("very " * 15 + "special lamp") == ("lamp",)
+    (match,) = vocabulary.nearest("very " * 15 + "special lamp")
+    assert vocabulary.labels[match.entry] == "lamp"
 
 
 def test_the_vocabulary_compares_a_long_name_quickly() -> None:
