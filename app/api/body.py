@@ -7,7 +7,6 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from email.message import Message
 from functools import cache
 from itertools import islice
@@ -212,17 +211,14 @@ def _not_finite(body: bytes) -> list[FieldError]:
         return []
 
 
-@dataclass(frozen=True, slots=True)
-class _Constant:
+class _Constant(str):
     """NaN, Infinity or -Infinity in a body."""
-
-    name: str
 
 
 def _constants(value: Any) -> Iterator[tuple[str, list[str | int]]]:
     """Yield the name of each constant in a value, and the steps from the constant to the root."""
     if isinstance(value, _Constant):
-        yield value.name, []
+        yield value, []
     elif isinstance(value, dict | list):
         parts: Iterable[tuple[str | int, Any]] = (
             value.items() if isinstance(value, dict) else enumerate(value)

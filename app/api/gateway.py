@@ -43,19 +43,8 @@ health check contains only a status, so it reveals no data.
 
 # Paths that need no API key. Orchestrators send health checks without credentials. The HTML pages
 # contain no private data. docs/security.md gives the reasons.
-OPEN_ROUTES: Final = frozenset(
-    {
-        "/health/live",
-        "/health/ready",
-        "/v2/health/live",
-        "/v2/health/ready",
-        "/",
-        "/docs",
-        "/redoc",
-        "/openapi.json",
-        "/problems",
-    }
-)
+_PAGES: Final = ("/", "/docs", "/redoc", "/openapi.json", "/problems")
+OPEN_ROUTES: Final = frozenset((*_PAGES, *HEALTH, *(f"/v2{path}" for path in HEALTH)))
 _OPEN_FOLDERS: Final = ("/docs/", "/redoc/", "/static/", "/problems/")
 # Suffixes of the paths without admission control. These are suffixes, because some proxies add a
 # prefix to the path.

@@ -16,14 +16,7 @@ from app.api import catalogue
 from app.api.models import Reference, RuntimeDep
 from app.api.openapi import problems, queued
 from app.serving.metrics import CONTENT_TYPE
-from scene_client.schemas import (
-    Health,
-    ModelMetadata,
-    ModelReady,
-    ServerLive,
-    ServerMetadata,
-    ServerReady,
-)
+from scene_client import schemas
 
 router = APIRouter(tags=["health"])
 protocol = APIRouter(prefix="/v2", tags=["inference protocol"])
@@ -44,9 +37,9 @@ _NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MOD
     responses=problems(),
     response_model_exclude_none=True,
 )
-async def health_live() -> Health:
+async def health_live() -> schemas.Health:
     """Return status 200 while the process runs, even if the models are not usable."""
-    return Health(status="live")
+    return schemas.Health(status="live")
 
 
 @router.head("/health/ready", include_in_schema=False, response_model_exclude_none=True)
@@ -56,43 +49,43 @@ async def health_live() -> Health:
     responses=_NOT_READY,
     response_model_exclude_none=True,
 )
-async def health_ready(runtime: RuntimeDep) -> Health:
+async def health_ready(runtime: RuntimeDep) -> schemas.Health:
     """Return status 200 if the default model is usable, else status 503.
 
     The answer lists refused versions and unusable aliases with their reasons.
     """
     runtime.check_ready()
     failures = list(runtime.models.failures.values())[:_FAILURES]
-    return Health(status="ready", failures=failures or None)
+    return schemas.Health(status="ready", failures=failures or None)
 
 
 @protocol.get("", summary="Server metadata", responses=queued())
-async def server_metadata() -> ServerMetadata:
+async def server_metadata() -> schemas.ServerMetadata:
     """Return the name and the version of the server."""
-    return ServerMetadata(name="scene-boltzmann", version=__version__, extensions=[])
+    return schemas.ServerMetadata(name="scene-boltzmann", version=__version__, extensions=[])
 
 
 @protocol.head("/health/live", include_in_schema=False)
 @protocol.get("/health/live", summary="Is the process alive?", responses=problems())
-async def server_live() -> ServerLive:
+async def server_live() -> schemas.ServerLive:
     """Run the same check as `GET /health/live`."""
-    return ServerLive(live=True)
+    return schemas.ServerLive(live=True)
 
 
 @protocol.head("/health/ready", include_in_schema=False)
 @protocol.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
-async def server_ready(runtime: RuntimeDep) -> ServerReady:
+async def server_ready(runtime: RuntimeDep) -> schemas.ServerReady:
     """Run the same check as `GET /health/ready`."""
     runtime.check_ready()
-    return ServerReady(ready=True)
+    return schemas.ServerReady(ready=True)
 
 
 @protocol.get("/models/{name}", summary="Model metadata", responses=_NO_MODEL)
-async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
+async def model_metadata(name: Reference, runtime: RuntimeDep) -> schemas.ModelMetadata:
     """Return versions and variant of a model, named by an alias, `name` or `name@version`."""
     models = runtime.models
     reference = models.resolve(name).reference
-    return ModelMetadata(
+    return schemas.ModelMetadata(
         name=reference.name,
         versions=list(models.store.versions[reference.name]),
         platform=f"numpy_{reference.variant}",
@@ -101,10 +94,10 @@ async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
 
 @protocol.head("/models/{name}/ready", include_in_schema=False)
 @protocol.get("/models/{name}/ready", summary="Is this model usable?", responses=_NO_MODEL)
-async def model_ready(name: Reference, runtime: RuntimeDep) -> ModelReady:
+async def model_ready(name: Reference, runtime: RuntimeDep) -> schemas.ModelReady:
     """Return status 200 if the model is usable, 404 if it does not exist, or else 503."""
     model = runtime.models.resolve(name)
-    return ModelReady(name=model.reference.name, ready=True)
+    return schemas.ModelReady(name=model.reference.name, ready=True)
 
 
 @monitoring.get(

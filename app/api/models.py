@@ -15,16 +15,7 @@ from app.api.gateway import ADMIN_KEY
 from app.api.openapi import BODY, queued
 from app.serving import describe
 from app.serving.runtime import Runtime
-from scene_client.schemas import (
-    AliasAnswer,
-    AliasRequest,
-    ContextsAnswer,
-    ModelList,
-    ModelSummary,
-    RefreshAnswer,
-    VersionDetails,
-    VocabularyAnswer,
-)
+from scene_client import schemas
 
 _PROBLEMS: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY)
 _USABLE: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
@@ -70,13 +61,13 @@ changes = APIRouter(
     responses=queued(catalogue.NOT_READY),
     response_model_exclude_none=True,
 )
-async def list_models(runtime: RuntimeDep) -> ModelList:
+async def list_models(runtime: RuntimeDep) -> schemas.ModelList:
     """List the models, versions and aliases of the store. Each refused version has a reason."""
     return describe.everything(runtime.models)
 
 
 @router.get("/{name}", summary="One model", responses=_PROBLEMS, response_model_exclude_none=True)
-async def show_model(name: Reference, runtime: RuntimeDep) -> ModelSummary:
+async def show_model(name: Reference, runtime: RuntimeDep) -> schemas.ModelSummary:
     """List the versions of a model, newest version first."""
     return describe.model(runtime.models, name)
 
@@ -87,19 +78,21 @@ async def show_model(name: Reference, runtime: RuntimeDep) -> ModelSummary:
     responses=_PROBLEMS,
     response_model_exclude_none=True,
 )
-async def show_version(name: Reference, version: Version, runtime: RuntimeDep) -> VersionDetails:
+async def show_version(
+    name: Reference, version: Version, runtime: RuntimeDep
+) -> schemas.VersionDetails:
     """Return metrics, training data, terms and model card of a version, or why it is refused."""
     return describe.version(runtime.models, name, version)
 
 
 @router.get("/{name}/vocabulary", summary="The vocabulary of a model", responses=_USABLE)
-async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> VocabularyAnswer:
+async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> schemas.VocabularyAnswer:
     """List the object classes with their aliases, the relations and the room types of a model."""
     return describe.vocabulary(runtime.models.resolve(name))
 
 
 @router.get("/{name}/contexts", summary="The hidden units of a model", responses=_USABLE)
-async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
+async def show_contexts(name: Reference, runtime: RuntimeDep) -> schemas.ContextsAnswer:
     """List the hidden units of a model with the classes of their largest weights.
 
     The field `context` of `POST /generate` accepts the numbers of these units.
@@ -114,7 +107,7 @@ async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
     responses=queued(catalogue.UNAUTHORIZED, catalogue.REFRESH_REFUSED),
     response_model_exclude_none=True,
 )
-async def refresh_models(http: Request) -> RefreshAnswer:
+async def refresh_models(http: Request) -> schemas.RefreshAnswer:
     """Load, verify and warm up all versions in the store, then replace all served models at once.
 
     The previous models answer requests until then. If a new model fails, the service keeps the
@@ -138,7 +131,7 @@ async def refresh_models(http: Request) -> RefreshAnswer:
         catalogue.STORE_BUSY,
         *BODY,
     ),
-    response_model=AliasAnswer,
+    response_model=schemas.AliasAnswer,
 )
 async def move_alias(
     alias: Annotated[
@@ -148,7 +141,7 @@ async def move_alias(
             openapi_examples={"default": {"summary": "the default model", "value": "default"}},
         ),
     ],
-    asked: AliasRequest,
+    asked: schemas.AliasRequest,
     http: Request,
 ) -> bytes:
     """Point an alias at a served version, and save the alias in the store."""

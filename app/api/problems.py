@@ -18,24 +18,7 @@ from starlette.types import Receive, Scope, Send
 
 from app.api import catalogue
 from app.api.catalogue import ProblemType
-from app.serving.errors import (
-    AliasConflictError,
-    DeadlinePassedError,
-    DisconnectedError,
-    DrainingError,
-    Location,
-    ModelUnavailableError,
-    ModelUnusableError,
-    NotReadyError,
-    QueueFullError,
-    Reason,
-    RefreshRefusedError,
-    RequestError,
-    ServingError,
-    StoreBusyError,
-    StoreNotWritableError,
-    UnknownModelError,
-)
+from app.serving import errors as serving
 from scene_client.schemas import Failure, FieldError, Problem
 from scene_client.validation import MAX_ERRORS, pointer
 
@@ -49,24 +32,24 @@ _OF_STATUS: Final = {
     405: catalogue.METHOD_NOT_ALLOWED,
     413: catalogue.BODY_TOO_LARGE,
 }
-_OF_ERROR: Final[Mapping[type[ServingError], ProblemType]] = {
-    AliasConflictError: catalogue.ALIAS_CONFLICT,
-    DeadlinePassedError: catalogue.DEADLINE_PASSED,
-    DisconnectedError: catalogue.BAD_REQUEST,
-    DrainingError: catalogue.DRAINING,
-    ModelUnavailableError: catalogue.MODEL_UNAVAILABLE,
-    ModelUnusableError: catalogue.MODEL_UNUSABLE,
-    NotReadyError: catalogue.NOT_READY,
-    QueueFullError: catalogue.QUEUE_FULL,
-    StoreBusyError: catalogue.STORE_BUSY,
-    StoreNotWritableError: catalogue.STORE_NOT_WRITABLE,
-    UnknownModelError: catalogue.MODEL_NOT_FOUND,
+_OF_ERROR: Final[Mapping[type[serving.ServingError], ProblemType]] = {
+    serving.AliasConflictError: catalogue.ALIAS_CONFLICT,
+    serving.DeadlinePassedError: catalogue.DEADLINE_PASSED,
+    serving.DisconnectedError: catalogue.BAD_REQUEST,
+    serving.DrainingError: catalogue.DRAINING,
+    serving.ModelUnavailableError: catalogue.MODEL_UNAVAILABLE,
+    serving.ModelUnusableError: catalogue.MODEL_UNUSABLE,
+    serving.NotReadyError: catalogue.NOT_READY,
+    serving.QueueFullError: catalogue.QUEUE_FULL,
+    serving.StoreBusyError: catalogue.STORE_BUSY,
+    serving.StoreNotWritableError: catalogue.STORE_NOT_WRITABLE,
+    serving.UnknownModelError: catalogue.MODEL_NOT_FOUND,
 }
 _OF_REASON: Final = {
-    Reason.INVALID: catalogue.INVALID_REQUEST,
-    Reason.UNKNOWN_LABELS: catalogue.UNKNOWN_LABELS,
-    Reason.CONTRADICTION: catalogue.CONTRADICTORY_EVIDENCE,
-    Reason.ANSWER_TOO_LARGE: catalogue.ANSWER_TOO_LARGE,
+    serving.Reason.INVALID: catalogue.INVALID_REQUEST,
+    serving.Reason.UNKNOWN_LABELS: catalogue.UNKNOWN_LABELS,
+    serving.Reason.CONTRADICTION: catalogue.CONTRADICTORY_EVIDENCE,
+    serving.Reason.ANSWER_TOO_LARGE: catalogue.ANSWER_TOO_LARGE,
 }
 
 
@@ -105,7 +88,9 @@ class ProblemError(HTTPException):
         )
 
 
-def from_exception(error: Exception, *, at: Location = (), body: Any = None) -> ProblemError:
+def from_exception(
+    error: Exception, *, at: serving.Location = (), body: Any = None
+) -> ProblemError:
     """Return the problem for an exception, or an internal error for an unexpected exception.
 
     Args:
@@ -116,7 +101,7 @@ def from_exception(error: Exception, *, at: Location = (), body: Any = None) -> 
     match error:
         case ProblemError():
             return error
-        case RequestError():
+        case serving.RequestError():
             kind = _OF_REASON[error.reason]
             errors = [
                 FieldError(
@@ -127,10 +112,10 @@ def from_exception(error: Exception, *, at: Location = (), body: Any = None) -> 
                 for fault in error.faults[:MAX_ERRORS]
             ]
             return invalid(kind, errors)
-        case RefreshRefusedError():
+        case serving.RefreshRefusedError():
             detail = "The service still serves the previous versions. `failures` gives the reasons."
             return ProblemError(catalogue.REFRESH_REFUSED, detail, failures=error.failures)
-        case ServingError():
+        case serving.ServingError():
             return ProblemError(_OF_ERROR[type(error)], str(error))
         case HTTPException() if error.status_code in _OF_STATUS:
             kind, headers = _OF_STATUS[error.status_code], error.headers or {}
@@ -199,5 +184,5 @@ def install(app: FastAPI) -> None:
     `app.api.gateway.Gateway` answers unexpected exceptions. FastAPI would answer an unexpected
     exception and then raise the exception again. The server would then close the connection.
     """
-    for kind in (HTTPException, ServingError):
+    for kind in (HTTPException, serving.ServingError):
         app.add_exception_handler(kind, _handle)

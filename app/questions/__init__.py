@@ -16,9 +16,8 @@ from __future__ import annotations
 from app.questions.contexts import ContextUnit, contexts
 from app.questions.counts import More, more
 from app.questions.generate import GeneratedScene, generate
-from app.questions.missing import MissingAnswer, Offset, Placement, missing
+from app.questions.missing import MissingAnswer, Placement, missing
 from app.questions.outliers import (
-    MisplacedAnswer,
     OutlierAnswer,
     OutliersFound,
     Sensitivity,
@@ -33,10 +32,8 @@ __all__ = [
     "ContextUnit",
     "Disagreement",
     "GeneratedScene",
-    "MisplacedAnswer",
     "MissingAnswer",
     "More",
-    "Offset",
     "OutlierAnswer",
     "OutliersFound",
     "Placement",

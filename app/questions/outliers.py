@@ -251,11 +251,7 @@ def _affordable(given: Posterior) -> int:
 def _reasons(
     given: Posterior, explained: list[int], is_outlier: NDArray[np.bool_]
 ) -> dict[int, tuple[Because, ...]]:
-    """Return the strongest reasons for each explained class.
-
-    A reason is an object that changes the log-odds of the explained class. The reasons for an
-    outlier lower its log-odds. The reasons for other classes raise their log-odds.
-    """
+    """Return the strongest reasons for each explained class; see `OutlierAnswer`."""
     if len(given.present.classes) < 2:
         return dict.fromkeys(explained, ())
     rows = np.array(explained, dtype=np.int64)
@@ -315,11 +311,7 @@ def _companions(
 ) -> list[tuple[str, ...]]:
     """Return the labels of the companions of each outlier, best first; see the module.
 
-    Args:
-        artifact: the model.
-        present: class indices of the scene. These classes and structural classes are never
-            companions.
-        flagged: class indices of the outliers.
+    The classes in ``present``, those of the scene, and structural classes are never companions.
     """
     usable = ~artifact.vocabulary.structure
     usable[present] = False

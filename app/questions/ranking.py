@@ -203,16 +203,10 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
 
 @compiled
 def strongest(change, rows, count):
-    """Return the indices and values of the k changes with the largest absolute values.
+    """Return the indices and values of the k <= `count` largest absolute changes, each (N, k).
 
-    Both arrays have the shape (N explained classes, k).
-
-    Args:
-        change: (N, n) change of each explained class's log-odds by each of the n classes of the
-            scene.
-        rows: (N,) index of each explained class among the n classes. The result leaves out the
-            change of a class by itself. If the explained classes are absent, rows is empty.
-        count: maximum of k.
+    `strongest_reasons` describes ``change`` and ``rows``, which is empty for absent classes. The
+    result leaves out the change of a class by itself.
     """
     N, n = change.shape
     kept = min(count, n - (len(rows) > 0))

@@ -170,16 +170,8 @@ def _disagreements(
 
     Disagreements with the largest ratio of `probability` to `observed_probability` come first. If a
     pair has several observed relations, the first of them in `CANONICAL` defines the subject of the
-    disagreement. A relation is never expected if the machine has no unit for it.
-
-    Args:
-        artifact: the model.
-        scene: the scene.
-        given: posterior of the scene.
-        asked: (N, N) bool, True for the ordered pairs of objects to judge. The function judges a
-            pair if one of its two orders is True.
-        top_k: maximum number of disagreements.
-        min_probability: minimum probability of an expected relation.
+    disagreement. A relation is never expected if the machine has no unit for it. ``asked`` is
+    (N, N) bool. The function judges a pair of objects if one of its two orders is True.
     """
     A = artifact.spec.A
     stated = [triple for triple in scene.relations or () if triple[0] < A]

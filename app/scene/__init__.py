@@ -1,7 +1,6 @@
 """Scenes, canonical relations, vocabularies and geometry, independent of any trained model."""
 
 from app.scene.evidence import ClassEvidence, class_evidence, pool_instances
-from app.scene.frames import body_pose, is_optical, is_world_fixed, viewer_axes
 from app.scene.geometry import PoseRelations, Viewpoint, derive_relations, to_viewer_frame
 from app.scene.labels import head_of, label_key
 from app.scene.observe import observe
@@ -27,18 +26,14 @@ __all__ = [
     "SceneObject",
     "Viewpoint",
     "Vocabulary",
-    "body_pose",
     "canonicalise",
     "class_evidence",
     "contradiction",
     "derive_relations",
     "head_of",
-    "is_optical",
-    "is_world_fixed",
     "label_key",
     "observe",
     "opposite",
     "pool_instances",
     "to_viewer_frame",
-    "viewer_axes",
 ]

@@ -36,37 +36,26 @@ _NOT_PLURAL_ENDINGS: Final = (
 # means spectacles, but "wine glasses" is a plural.
 _NOT_PLURAL: Final = frozenset({"glasses", "gas", "news", "series", "vhs", "gps", "ups"})
 # Irregular plurals and their singulars. Compounds can end with these plurals ("bookshelves").
-_IRREGULAR: Final = (
-    ("shelves", "shelf"),
-    ("knives", "knife"),
-    ("leaves", "leaf"),
-    ("loaves", "loaf"),
-    ("scarves", "scarf"),
-    ("wolves", "wolf"),
-    ("calves", "calf"),
-    ("women", "woman"),
-    ("men", "man"),
-    ("people", "person"),
-    ("children", "child"),
-    ("feet", "foot"),
-    ("teeth", "tooth"),
-    ("geese", "goose"),
-    ("mice", "mouse"),
-    ("buses", "bus"),
-    ("lenses", "lens"),
-    ("skis", "ski"),
-    ("taxis", "taxi"),
-    ("menus", "menu"),
-    ("cookies", "cookie"),
-    ("brownies", "brownie"),
-    ("movies", "movie"),
-    ("hoodies", "hoodie"),
-    ("selfies", "selfie"),
-    ("smoothies", "smoothie"),
-    ("shoes", "shoe"),
-    ("canoes", "canoe"),
+_ONLY_S: Final = (
+    *("ski", "taxi", "menu", "shoe", "canoe"),
+    *("cookie", "brownie", "movie", "hoodie", "selfie", "smoothie"),
 )
-_IRREGULAR_ENDINGS: Final = tuple(plural for plural, _ in _IRREGULAR)
+_IRREGULAR: Final = {
+    **{f"{word}s": word for word in _ONLY_S},
+    **{f"{stem}ves": f"{stem}f" for stem in ("shel", "lea", "loa", "scar", "wol", "cal")},
+    "knives": "knife",
+    "women": "woman",
+    "men": "man",
+    "people": "person",
+    "children": "child",
+    "feet": "foot",
+    "teeth": "tooth",
+    "geese": "goose",
+    "mice": "mouse",
+    "buses": "bus",
+    "lenses": "lens",
+}
+_IRREGULAR_ENDINGS: Final = tuple(_IRREGULAR)
 
 
 _OF: Final = re.compile(r"[\s_\-.]+of[\s_\-.]+", re.IGNORECASE)
@@ -103,7 +92,7 @@ def singular(word: str) -> str:
     list of irregular plurals. docs/decisions/data.md compares it with a general inflection library.
     """
     if word.endswith(_IRREGULAR_ENDINGS):
-        for plural, single in _IRREGULAR:
+        for plural, single in _IRREGULAR.items():
             if word.endswith(plural):
                 return word[: -len(plural)] + single
     if (

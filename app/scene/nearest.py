@@ -176,22 +176,16 @@ class NameIndex:
     def nearest(self, name: str, limit: int) -> tuple[Match, ...]:
         """Return at most ``limit`` plausible entries, most similar first."""
         words = split_words(name)
-        best: dict[int, float] = {}
+        found: list[tuple[float, int]] = []
         joined = "".join(words)
         if len(joined) <= LONGEST:
-            found = process.extract(
-                joined,
-                self._keys,
-                scorer=OSA.normalized_similarity,
-                limit=None,
-                score_cutoff=_LEAST,
-            )
-            for key, similarity, place in found:
-                begins_alike = key[:1] == joined[:1]
-                _keep(best, self._entries[place], similarity * (1 if begins_alike else _BY_REST))
+            for key, similarity, place in _alike(joined, self._keys):
+                factor = 1 if key[:1] == joined[:1] else _BY_REST
+                found.append((similarity * factor, self._entries[place]))
         for place in self._by_head.get(words[-1], ()) if words else ():
             common = len({*words} & {*self._words[place]}) / len({*words, *self._words[place]})
-            _keep(best, self._entries[place], 0.5 + common / 2)
+            found.append((0.5 + common / 2, self._entries[place]))
+        best = {entry: similarity for similarity, entry in sorted(found)}
         ranked = sorted(best.items(), key=lambda entry: (-entry[1], entry[0]))[:limit]
         least = max(_LEAST, ranked[0][1] - _FARTHER) if ranked else 0.0
         return tuple(Match(*entry) for entry in ranked if entry[1] >= least)
@@ -199,18 +193,16 @@ class NameIndex:
 
 def spelt_alike(name: str, known: Sequence[str], limit: int = 3) -> list[str]:
     """Return known names with a similar spelling, most similar first, without reading words."""
-    found = process.extract(
-        name[:LONGEST],
-        [other[:LONGEST] for other in known],
-        scorer=OSA.normalized_similarity,
-        limit=limit,
-        score_cutoff=_LEAST,
-    )
+    found = _alike(name[:LONGEST], [other[:LONGEST] for other in known], limit)
     return [known[place] for _, _, place in found]
 
 
-def _keep(best: dict[int, float], index: int, similarity: float) -> None:
-    best[index] = max(similarity, best.get(index, 0.0))
+def _alike(
+    name: str, known: Sequence[str], limit: int | None = None
+) -> list[tuple[str, float, int]]:
+    """Return triples (known name, similarity, index of the name), most similar first."""
+    similarity = OSA.normalized_similarity
+    return process.extract(name, known, scorer=similarity, limit=limit, score_cutoff=_LEAST)
 
 
 def _allowed(known: str) -> int:

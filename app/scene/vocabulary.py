@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -170,16 +170,16 @@ class Vocabulary:
             found = self._by_key.get(label_key(head))
         return found
 
-    def read(self, label: str) -> Guess | None:
-        """Return the class that a detector's label names for certain, or None.
+    def read(self, label: str, *, is_room: bool = False) -> Guess | None:
+        """Return the class or room type that a detector's label names for certain, or None.
 
         The method reads the syntax of detectors (`readings`) if `index` does not know the label.
         """
-        return _read(label, self.index)
-
-    def read_room(self, room: str) -> Guess | None:
-        """Return the room type that a label names for certain, or None."""
-        return _read(room, self.room_index)
+        index = self.room_index if is_room else self.index
+        for rule, name in readings(label):
+            if (found := index(name)) is not None:
+                return Guess(found, 1.0, rule)
+        return None
 
     def room_index(self, room: str) -> int | None:
         """Return the index of a room type, or None for an unknown room type.
@@ -202,28 +202,25 @@ class Vocabulary:
             ]
         )
 
-    def nearest(self, label: str, limit: int = 3) -> tuple[Match, ...]:
-        """Return plausible classes with names similar to ``label``, most similar first.
+    def nearest(self, label: str, limit: int = 3, *, is_room: bool = False) -> tuple[Match, ...]:
+        """Return plausible classes or room types with similar names, most similar first.
 
         The method compares ``label`` with every label and alias, so it is much slower than `index`.
         """
-        return self._names.nearest(label, limit)
+        return (self._room_names if is_room else self._names).nearest(label, limit)
 
-    def nearest_room(self, room: str, limit: int = 3) -> tuple[Match, ...]:
-        """Return plausible room types with names similar to ``room``, most similar first."""
-        return self._room_names.nearest(room, limit)
+    def guess(self, label: str, *, is_room: bool = False) -> Guess | None:
+        """Return the class or room type that an unknown label probably stands for, or None.
 
-    def guess(self, label: str) -> Guess | None:
-        """Return the class that an unknown label probably stands for, or None."""
-        return _guess(label, self._names)
-
-    def guess_room(self, room: str) -> Guess | None:
-        """Return the room type that an unknown label probably stands for, or None."""
-        return _guess(room, self._room_names)
-
-    def suggest(self, label: str, limit: int = 3) -> tuple[str, ...]:
-        """Return the labels of classes with names similar to ``label``, for error messages."""
-        return tuple(self._objects[match.entry].label for match in self.nearest(label, limit))
+        The method guesses each alternative of a label, or the name in the syntax of detectors.
+        """
+        names = self._room_names if is_room else self._names
+        found = list(readings(label))
+        inner = [name for rule, name in found if rule == "alternative"]
+        for name in inner or [name for _, name in found][-1:] or [label]:
+            if (guess := names.guess(name)) is not None:
+                return guess
+        return None
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-compatible values that `from_dict` accepts."""
@@ -265,23 +262,6 @@ class Vocabulary:
         ):
             raise ValueError("'room_aliases' must map room types to lists of strings")
         return cls([_object_class(entry) for entry in values["objects"]], rooms, aliases)
-
-
-def _read(label: str, index: Callable[[str], int | None]) -> Guess | None:
-    for rule, name in readings(label):
-        if (found := index(name)) is not None:
-            return Guess(found, 1.0, rule)
-    return None
-
-
-def _guess(label: str, names: NameIndex) -> Guess | None:
-    """Guess each alternative of a label, or the name that the syntax of detectors contains."""
-    found = list(readings(label))
-    inner = [name for rule, name in found if rule == "alternative"]
-    for name in inner or [name for _, name in found][-1:] or [label]:
-        if (guess := names.guess(name)) is not None:
-            return guess
-    return None
 
 
 def _are_extents(size: Sequence[float]) -> bool:

@@ -9,28 +9,12 @@ from typing import cast
 from app.registry import AliasTarget
 from app.scene.relations import opposite
 from app.serving.models import ServedModel, ServedModels
-from scene_client.schemas import (
-    ContextsAnswer,
-    ContextUnit,
-    ExampleScene,
-    Metric,
-    ModelList,
-    ModelSummary,
-    RelationName,
-    Size,
-    TrainingSource,
-    VersionDetails,
-    VersionSummary,
-    VocabularyAnswer,
-    VocabularyEntry,
-    WeightedLabel,
-    WeightedRelation,
-)
+from scene_client import schemas
 
 
-def everything(models: ServedModels) -> ModelList:
+def everything(models: ServedModels) -> schemas.ModelList:
     """List all models, versions, aliases and failures."""
-    return ModelList(
+    return schemas.ModelList(
         generation=models.generation,
         models=[_summary(models, name) for name in models.store.versions],
         aliases={alias: str(target) for alias, target in sorted(models.store.aliases.items())},
@@ -38,7 +22,7 @@ def everything(models: ServedModels) -> ModelList:
     )
 
 
-def model(models: ServedModels, reference: str) -> ModelSummary:
+def model(models: ServedModels, reference: str) -> schemas.ModelSummary:
     """Describe the model with a name or an alias, even if the service refused all its versions.
 
     Raises:
@@ -47,7 +31,7 @@ def model(models: ServedModels, reference: str) -> ModelSummary:
     return _summary(models, _name(models, reference))
 
 
-def version(models: ServedModels, reference: str, number: str) -> VersionDetails:
+def version(models: ServedModels, reference: str, number: str) -> schemas.VersionDetails:
     """Describe one version of the model with a name or an alias.
 
     Raises:
@@ -60,28 +44,28 @@ def version(models: ServedModels, reference: str, number: str) -> VersionDetails
     summary = _version_summary(models, name, number)
     served = models.served.get((name, number))
     if served is None:
-        return VersionDetails(name=name, **dict(summary))
+        return schemas.VersionDetails(name=name, **dict(summary))
     manifest = served.artifact.manifest
-    return VersionDetails(
+    return schemas.VersionDetails(
         name=name,
         **dict(summary),
         created=manifest.created,
         parameters=sum(math.prod(tensor.shape) for tensor in manifest.weights.values()),
-        metrics=[Metric(**metric.model_dump()) for metric in manifest.metrics],
-        data=[TrainingSource(**source.model_dump()) for source in manifest.data],
+        metrics=[schemas.Metric(**metric.model_dump()) for metric in manifest.metrics],
+        data=[schemas.TrainingSource(**source.model_dump()) for source in manifest.data],
         terms=manifest.terms,
         card=served.artifact.card,
     )
 
 
-def vocabulary(served: ServedModel) -> VocabularyAnswer:
+def vocabulary(served: ServedModel) -> schemas.VocabularyAnswer:
     """List the object classes, relations and room types of a model."""
     canonical = served.artifact.manifest.vocabulary.relations
     names = (*canonical, *map(opposite, canonical))
-    return VocabularyAnswer(
+    return schemas.VocabularyAnswer(
         model=served.reference,
         objects=[
-            VocabularyEntry(
+            schemas.VocabularyEntry(
                 label=entry.label,
                 aliases=list(entry.aliases),
                 structure=entry.structure,
@@ -89,29 +73,29 @@ def vocabulary(served: ServedModel) -> VocabularyAnswer:
             )
             for entry in served.vocabulary.objects
         ],
-        relations=[cast("RelationName", name) for name in names],
+        relations=[cast("schemas.RelationName", name) for name in names],
         room_types=list(served.vocabulary.room_types),
         examples=[
-            ExampleScene(name=example.name, scene=example.request())
+            schemas.ExampleScene(name=example.name, scene=example.request())
             for example in served.artifact.manifest.examples
         ],
     )
 
 
-def contexts(served: ServedModel) -> ContextsAnswer:
+def contexts(served: ServedModel) -> schemas.ContextsAnswer:
     """List the hidden units of a model with the objects and relations of their largest weights."""
-    return ContextsAnswer(
+    return schemas.ContextsAnswer(
         model=served.reference,
         layers={
             layer: [
-                ContextUnit(
+                schemas.ContextUnit(
                     unit=unit.unit,
                     name=unit.name,
                     objects=_weighted(unit.objects),
                     relations=[
-                        WeightedRelation(
+                        schemas.WeightedRelation(
                             subject=subject,
-                            relation=cast("RelationName", relation),
+                            relation=cast("schemas.RelationName", relation),
                             object=other,
                             weight=weight,
                         )
@@ -126,15 +110,12 @@ def contexts(served: ServedModel) -> ContextsAnswer:
     )
 
 
-def _size(extents: Sequence[float] | None) -> Size | None:
-    if extents is None:
-        return None
-    x, y, z = extents
-    return Size(x=x, y=y, z=z)
+def _size(extents: Sequence[float] | None) -> schemas.Size | None:
+    return None if extents is None else schemas.Size(**dict(zip("xyz", extents, strict=True)))
 
 
-def _weighted(pairs: Sequence[tuple[str, float]]) -> list[WeightedLabel]:
-    return [WeightedLabel(label=label, weight=weight) for label, weight in pairs]
+def _weighted(pairs: Sequence[tuple[str, float]]) -> list[schemas.WeightedLabel]:
+    return [schemas.WeightedLabel(label=label, weight=weight) for label, weight in pairs]
 
 
 def _name(models: ServedModels, reference: str) -> str:
@@ -148,8 +129,8 @@ def _name(models: ServedModels, reference: str) -> str:
     return name
 
 
-def _summary(models: ServedModels, name: str) -> ModelSummary:
-    return ModelSummary(
+def _summary(models: ServedModels, name: str) -> schemas.ModelSummary:
+    return schemas.ModelSummary(
         name=name,
         versions=[
             _version_summary(models, name, number)
@@ -158,18 +139,18 @@ def _summary(models: ServedModels, name: str) -> ModelSummary:
     )
 
 
-def _version_summary(models: ServedModels, name: str, number: str) -> VersionSummary:
+def _version_summary(models: ServedModels, name: str, number: str) -> schemas.VersionSummary:
     served = models.served.get((name, number))
     if served is None:
         failure = models.failures[f"{name}@{number}"]
-        return VersionSummary(
+        return schemas.VersionSummary(
             version=number,
             status="refused",
             aliases=[],
             reason=failure.reason,
             detail=failure.detail,
         )
-    return VersionSummary(
+    return schemas.VersionSummary(
         version=number,
         status="ready",
         aliases=models.aliases[name, number],

@@ -93,9 +93,7 @@ class Faults:
             RequestError: the request has errors. The exception contains all errors of one kind, the
                 first kind in `Reason` with errors.
         """
-        if not self.found:
-            return
-        for reason in Reason:
+        for reason in Reason if self.found else ():
             if reason in self.found:
                 raise RequestError(reason, self.found[reason])
 
@@ -128,8 +126,7 @@ class LookUps:
         if key not in self._guesses:
             if len(self._guesses) >= MAX_MAPPED:
                 raise OverflowError
-            guess = vocabulary.guess_room if is_room else vocabulary.guess
-            self._guesses[key] = guess(label)
+            self._guesses[key] = vocabulary.guess(label, is_room=is_room)
         return self._guesses[key]
 
     def similar(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> tuple[Match, ...]:
@@ -138,8 +135,7 @@ class LookUps:
         if key not in self._similar:
             if len(self._similar) >= MAX_SUGGESTED:
                 return ()
-            look_up = vocabulary.nearest_room if is_room else vocabulary.nearest
-            self._similar[key] = look_up(label)
+            self._similar[key] = vocabulary.nearest(label, is_room=is_room)
         return self._similar[key]
 
 
@@ -181,19 +177,15 @@ class Unknown:
         Returns:
             Index of the class or room type. None means that the label is ignored or refused.
         """
-        vocabulary = self.vocabulary
-        found = vocabulary.read_room(label) if is_room else vocabulary.read(label)
+        found = self.vocabulary.read(label, is_room=is_room)
         if found is None and self.treatment.startswith("nearest"):
             found = self._guess(label, is_room=is_room)
         if found is not None:
-            known = vocabulary.room_types if is_room else vocabulary.labels
-            self.mapped[label, is_room] = Mapped(
-                label=label,
-                class_=known[found.entry],
-                similarity=found.similarity,
-                rule=found.rule,
-            )
-            return found.entry
+            entry, similarity, rule = found
+            name = (self.vocabulary.room_types if is_room else self.vocabulary.labels)[entry]
+            mapped = Mapped(label=label, class_=name, similarity=similarity, rule=rule)
+            self.mapped[label, is_room] = mapped
+            return entry
         if self.treatment.endswith("ignore"):
             self.ignored.append(name)
         else:
@@ -260,7 +252,7 @@ class Reading:
     @cached_property
     def names(self) -> Names:
         """Look-up of objects by id or label. The first access builds the look-up tables."""
-        return Names(self.scene.objects, self.left_out, self.unknown)
+        return Names(self)
 
     def longest_name(self) -> int:
         """Return the maximum size in bytes of an id or label in the JSON text of the answer."""
@@ -271,32 +263,15 @@ class Reading:
             longest = max(len(to_json(name)) for name in self.ids)
         return max(longest, self.unknown.vocabulary.longest_label) + 1
 
-    @property
-    def ignored(self) -> tuple[str, ...]:
-        """Names of the ignored objects."""
-        return tuple(self.unknown.ignored)
-
 
 class Names:
-    """Look-up of objects by id, or by label if only one object has the label.
+    """Look-up of the objects of a scene by id, or by label if only one object has the label."""
 
-    Args:
-        objects: objects of the scene.
-        ignored: pairs (id, label) of the ignored objects.
-        unknown: classes of the model, and the number of suggestions so far.
-    """
-
-    def __init__(
-        self,
-        objects: Sequence[SceneObject],
-        ignored: Sequence[tuple[str, str]],
-        unknown: Unknown,
-    ) -> None:
-        self._vocabulary = unknown.vocabulary
-        self._look_ups = unknown.look_ups
-        self._objects = objects
-        self._ignored_ids = {name for name, _ in ignored}
-        self._ignored_labels = {label_key(label) for _, label in ignored}
+    def __init__(self, reading: Reading) -> None:
+        self._unknown = reading.unknown
+        self._objects = reading.scene.objects
+        self._ignored_ids = {name for name, _ in reading.left_out}
+        self._ignored_labels = {label_key(label) for _, label in reading.left_out}
 
     # The first access builds each table. Most requests never need the tables, because most requests
     # do not refer to objects by name.
@@ -335,7 +310,7 @@ class Names:
             return place
         places = self._by_label.get(name)
         if places is None:
-            index = self._vocabulary.index(name)
+            index = self._unknown.vocabulary.index(name)
             places = [] if index is None else self._by_class.get(index, [])
         if len(places) == 1:
             return places[0]
@@ -352,9 +327,9 @@ class Names:
 
     def _similar(self, name: str) -> list[str]:
         """Return similar ids for the first `MAX_SUGGESTED` unknown names of a request."""
-        if self._look_ups.suggestions >= MAX_SUGGESTED:
+        if self._unknown.look_ups.suggestions >= MAX_SUGGESTED:
             return []
-        self._look_ups.suggestions += 1
+        self._unknown.look_ups.suggestions += 1
         return spelt_alike(name, self._plain_ids)
 
     def is_ignored(self, name: str) -> bool:
@@ -411,11 +386,12 @@ def read_scene(
             has_detections = True
             has_poses = has_poses or entry.position is not None
             objects.append(_scene_object(ids[place], entry, index, optical=optical))
-    room = None if request.room_type is None else _room(request.room_type, unknown, faults)
+    room, name = None, request.room_type
+    if name is not None and (room := vocabulary.room_index(name)) is None:
+        room = unknown.resolve(name, name, ("room_type",), faults, is_room=True)
     if not objects and not may_be_empty and not faults.found:
         faults.add(Reason.INVALID, ("objects",), "the model does not know any of these objects")
-    if faults.found:
-        faults.raise_any()
+    faults.raise_any()
 
     reading.scene = Scene(tuple(objects), None, False, room)
     if reading.left_out:
@@ -432,25 +408,13 @@ def read_scene(
 
 
 def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
-    if len(request.objects) > limits.objects:
-        faults.add(
-            Reason.INVALID, ("objects",), f"the scene must have at most {limits.objects} objects"
-        )
-    if request.relations is None:
-        if request.relations_complete:
-            faults.add(
-                Reason.INVALID,
-                ("relations_complete",),
-                "`relations_complete` requires the field `relations`",
-            )
-    elif len(request.relations) > limits.relations:
-        faults.add(
-            Reason.INVALID,
-            ("relations",),
-            f"the scene must have at most {limits.relations} relations",
-        )
-    if faults.found:
-        faults.raise_any()
+    for name, most in (("objects", limits.objects), ("relations", limits.relations)):
+        if len(getattr(request, name) or ()) > most:
+            faults.add(Reason.INVALID, (name,), f"the scene must have at most {most} {name}")
+    if request.relations is None and request.relations_complete:
+        message = "`relations_complete` requires the field `relations`"
+        faults.add(Reason.INVALID, ("relations_complete",), message)
+    faults.raise_any()
 
 
 def _derive(
@@ -507,11 +471,9 @@ def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
             continue
         label = name = entry if isinstance(entry, str) else entry.label
         if repeats[name] > 1 or name in taken:
-            while True:
+            while name == label or name in taken:
                 last[label] += 1
                 name = f"{label}_{last[label]}"
-                if name not in taken:
-                    break
         taken[name] = None
         ids.append(name)
     return ids
@@ -540,13 +502,6 @@ def _scene_object(
     )
 
 
-def _room(name: str, unknown: Unknown, faults: Faults) -> int | None:
-    room = unknown.vocabulary.room_index(name)
-    if room is not None:
-        return room
-    return unknown.resolve(name, name, ("room_type",), faults, is_room=True)
-
-
 def _stated(
     request: SceneRequest, ids: Sequence[str]
 ) -> list[tuple[Location, str, RelationName, str]] | None:
@@ -565,13 +520,8 @@ def _stated(
     if request.relations is None and (has_positions or not supports):
         return None
     relations = enumerate(request.relations or ())
-    return [
-        *(
-            (("relations", place), one.subject, one.relation, one.object)
-            for place, one in relations
-        ),
-        *supports,
-    ]
+    stated = [(("relations", n), one.subject, one.relation, one.object) for n, one in relations]
+    return [*stated, *supports]
 
 
 def _triples(

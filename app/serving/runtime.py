@@ -13,22 +13,8 @@ from typing import Literal
 
 from app.compiling import check_cache, progress
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
+from app.serving import errors
 from app.serving.admission import Backlog, Threads, WorkQueue
-from app.serving.errors import (
-    AliasConflictError,
-    DrainingError,
-    Fault,
-    ModelUnavailableError,
-    ModelUnusableError,
-    NotReadyError,
-    Reason,
-    RefreshRefusedError,
-    RequestError,
-    ServingError,
-    StoreBusyError,
-    StoreNotWritableError,
-    UnknownModelError,
-)
 from app.serving.metrics import Change, Metrics
 from app.serving.models import DEFAULT, Key, ServedModels
 from app.serving.reading import Limits
@@ -85,7 +71,7 @@ class Runtime:
             NotReadyError: the service has not loaded the models yet.
         """
         if self._models is None:
-            raise NotReadyError("The service is starting.")
+            raise errors.NotReadyError("The service is starting.")
         return self._models
 
     def request(
@@ -128,7 +114,7 @@ class Runtime:
             DrainingError: the service is shutting down.
         """
         if self.draining:
-            raise DrainingError("The service is shutting down.")
+            raise errors.DrainingError("The service is shutting down.")
         self.models.resolve(DEFAULT)
 
     def drain(self) -> None:
@@ -217,7 +203,7 @@ class Runtime:
                     changed = await asyncio.to_thread(self._store.state) != self._seen
                 if changed:
                     await self._take_over_changes()
-            except RefreshRefusedError as error:
+            except errors.RefreshRefusedError as error:
                 for failure in error.failures:
                     _logger.error(
                         "the service refused the changes in the store: %s: %s: %s",
@@ -231,10 +217,6 @@ class Runtime:
 
         If a new version fails, the service lists this version as refused and serves the other
         changes.
-
-        Raises:
-            RefreshRefusedError: a usable version or alias would become unusable. The served models
-                are unchanged.
         """
         async with self._change("poll"):
             await self._take_over(self.models.usable.__contains__)
@@ -245,7 +227,7 @@ class Runtime:
         try:
             async with self._changing:
                 yield
-        except ServingError:
+        except errors.ServingError:
             self.metrics.reloaded(change, "refused")
             raise
         except Exception:
@@ -267,7 +249,7 @@ class Runtime:
         new = await asyncio.to_thread(self._load, self.models)
         worse = [failure for subject, failure in new.failures.items() if matters(subject)]
         if worse:
-            raise RefreshRefusedError(worse)
+            raise errors.RefreshRefusedError(worse)
         self._serve(new)
         return new
 
@@ -297,8 +279,8 @@ class Runtime:
     def _target(self, reference: str) -> AliasTarget:
         try:
             found = self.models.resolve(reference).reference
-        except (ModelUnavailableError, NotReadyError):
-            raise ModelUnusableError(
+        except (errors.ModelUnavailableError, errors.NotReadyError):
+            raise errors.ModelUnusableError(
                 f"The service refused to load {reference}; GET /models gives the reason."
             ) from None
         # If the reference is a name without a version, the alias follows the newest usable version.
@@ -314,23 +296,27 @@ def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
     try:
         return AliasTarget.of(request.expected)
     except ValueError:
-        raise AliasConflictError("`expected` is not the name of a model or version.") from None
+        raise errors.AliasConflictError(
+            "`expected` is not the name of a model or version."
+        ) from None
 
 
 def _refusal(error: StoreError) -> Exception:
     match error.code:
         case "alias_conflict":
-            return AliasConflictError("The alias points to another version than expected.")
+            return errors.AliasConflictError("The alias points to another version than expected.")
         case "name_conflict":
-            return AliasConflictError("A model already has the name of this alias.")
+            return errors.AliasConflictError("A model already has the name of this alias.")
         case "invalid_reference":
-            return RequestError(Reason.INVALID, [Fault((), error.reason)])
+            return errors.RequestError(errors.Reason.INVALID, [errors.Fault((), error.reason)])
         case "unknown_model" | "unknown_version":
-            return UnknownModelError("The store no longer contains this version.")
+            return errors.UnknownModelError("The store no longer contains this version.")
         case "locked":
-            return StoreBusyError("Another process is writing to the store.")
+            return errors.StoreBusyError("Another process is writing to the store.")
         case _:
-            return StoreNotWritableError(f"The service cannot write the aliases: {error.reason}.")
+            return errors.StoreNotWritableError(
+                f"The service cannot write the aliases: {error.reason}."
+            )
 
 
 def _names(keys: Iterable[Key]) -> list[str]:

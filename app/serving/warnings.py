@@ -16,6 +16,19 @@ from scene_client.schemas import SceneRequest, SceneWarning
 _SAME_DEPTH: Final = 1e-3  # maximum difference in m of depths that count as equal
 _LEAST_FLAT: Final = 3  # minimum number of objects for the warning flat-scene
 
+_TOO_FAR: Final = (
+    f"the object is more than {MOST_DISTANT:g} m from the viewer; positions must be in metres"
+)
+_ODD_SIZE: Final = (
+    f"all sides of the object are below {SMALLEST * 1e3:g} mm, so its size is unknown, or a side "
+    f"is above {LARGEST:g} m; sizes must be in metres"
+)
+_FLAT: Final = "all objects have the same depth along the optical axis; the depth may be missing"
+_UNSIZED: Final = (
+    "the service cannot derive vertical relations of this object: the object has no size, and its "
+    "class has no typical size"
+)
+
 Code = Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"]
 
 
@@ -31,50 +44,22 @@ def scene_warnings(
         vocabulary: classes of the model, with their typical sizes.
         request: the request that contains the scene.
     """
-    found: list[SceneWarning] = []
-    sized = [thing for thing in scene.objects if thing.size is not None]
     # Python loops are fast enough, because most scenes have no poses or pass all checks.
     placed = [thing for thing in scene.objects if thing.position is not None]
-    if placed:
-        _add(
-            found,
-            "implausible-position",
-            f"the object is more than {MOST_DISTANT:g} m from the viewer; positions must be in "
-            "metres",
-            _distant(given, request),
-        )
-    if sized:
-        _add(
-            found,
-            "implausible-size",
-            f"all sides of the object are below {SMALLEST * 1e3:g} mm, so its size is unknown, or "
-            f"a side is above {LARGEST:g} m; sizes must be in metres",
-            [thing for thing in sized if not _is_plausible(thing.size)],
-        )
-    if request.frame_id is not None and is_optical(request.frame_id) and _is_flat(given):
-        _add(
-            found,
-            "flat-scene",
-            "all objects have the same depth along the optical axis; the depth may be missing",
-            placed,
-        )
-    if scene.poses is not None and len(placed) > 1:
-        _add(
-            found,
-            "unknown-sizes",
-            "the service cannot derive vertical relations of this object: the object has no size, "
-            "and its class has no typical size",
-            _unsized(placed, vocabulary),
-        )
-    return found
-
-
-def _add(
-    found: list[SceneWarning], code: Code, message: str, objects: Sequence[SceneObject]
-) -> None:
-    if objects:
-        ids = [thing.id for thing in objects]
-        found.append(SceneWarning(code=code, message=message, objects=ids))
+    odd = [thing for thing in scene.objects if not _is_plausible(thing.size)]
+    is_seen_flat = request.frame_id is not None and is_optical(request.frame_id) and _is_flat(given)
+    has_poses = scene.poses is not None and len(placed) > 1
+    found: list[tuple[Code, str, Sequence[SceneObject]]] = [
+        ("implausible-position", _TOO_FAR, _distant(given, request) if placed else ()),
+        ("implausible-size", _ODD_SIZE, odd),
+        ("flat-scene", _FLAT, placed if is_seen_flat else ()),
+        ("unknown-sizes", _UNSIZED, _unsized(placed, vocabulary) if has_poses else ()),
+    ]
+    return [
+        SceneWarning(code=code, message=message, objects=[thing.id for thing in objects])
+        for code, message, objects in found
+        if objects
+    ]
 
 
 def _distant(given: Scene, request: SceneRequest) -> list[SceneObject]:

@@ -131,7 +131,7 @@ async def test_long_labels_cost_little(client: httpx.AsyncClient, letter: str) -
 def test_spellings_of_ordinary_length_are_compared_and_longer_ones_are_not() -> None:
     known = "a" * (LONGEST - 1)
     vocabulary = Vocabulary([*VOCABULARY.objects, type(VOCABULARY.objects[0])(known)])
-    assert vocabulary.suggest(known + "b") == (known,)
-    assert vocabulary.suggest(known + "bc") == ()
+    assert [vocabulary.labels[match.entry] for match in vocabulary.nearest(known + "b")] == [known]
+    assert vocabulary.nearest(known + "bc") == ()
     # Words are compared whatever the length: they cost little.
     assert vocabulary.suggest("very " * 15 + "special lamp") == ("lamp",)

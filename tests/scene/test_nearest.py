@@ -127,9 +127,12 @@ def test_the_indoor_vocabulary_understands_detectors(label: str, right: str) -> 
 
 
 def test_only_plausible_names_are_suggested_best_first() -> None:
-    assert VOCABULARY.suggest("fridgee") == ("fridge",)
-    assert VOCABULARY.suggest("swivel chair")[0] == "chair"
-    assert VOCABULARY.suggest("droid") == ()
+    def suggest(label: str) -> list[str]:
+        return [VOCABULARY.labels[match.entry] for match in VOCABULARY.nearest(label)]
+
+    assert suggest("fridgee") == ["fridge"]
+    assert suggest("swivel chair")[0] == "chair"
+    assert suggest("droid") == []
     assert len(VOCABULARY.nearest("chair of fridge", limit=1)) <= 1
     similarities = [match.similarity for match in VOCABULARY.nearest("desk chairs x", limit=9)]
     assert similarities == sorted(similarities, reverse=True)
@@ -137,9 +140,9 @@ def test_only_plausible_names_are_suggested_best_first() -> None:
 
 
 def test_room_types_have_neighbours_too() -> None:
-    assert [match.entry for match in VOCABULARY.nearest_room("bedrom")] == [0]
-    assert VOCABULARY.nearest_room("garage") == ()
-    found = VOCABULARY.guess_room("bedrom")
+    assert [match.entry for match in VOCABULARY.nearest("bedrom", is_room=True)] == [0]
+    assert VOCABULARY.nearest("garage", is_room=True) == ()
+    found = VOCABULARY.guess("bedrom", is_room=True)
     assert found is not None
     assert found.entry == 0
-    assert VOCABULARY.guess_room("garage") is None
+    assert VOCABULARY.guess("garage", is_room=True) is None

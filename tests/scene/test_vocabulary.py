@@ -64,7 +64,7 @@ def test_rooms_have_synonyms() -> None:
     aliases = {"storage room": ["pantry", "storeroom"]}
     words = Vocabulary([ObjectClass("box")], ["bedroom", "storage room"], aliases)
     assert [words.room_index(name) for name in ("Store Room", "pantry", "storage_room")] == [1] * 3
-    assert words.nearest_room("storerom")[0].entry == 1
+    assert words.nearest("storerom", is_room=True)[0].entry == 1
     assert Vocabulary.from_dict(words.to_dict()) == words
     with pytest.raises(ValueError, match="unknown room types"):
         Vocabulary([ObjectClass("box")], ["bedroom"], aliases)

@@ -9,23 +9,10 @@ from typing import Final
 from app import questions
 from app.registry import Artifact
 from app.scene.scene import Scene
-from app.serving.answers import (
-    OBJECT_BYTES,
-    RELATION_BYTES,
-    Answer,
-    envelope,
-    require_size,
-    rounded,
-)
+from app.serving import answers
 from app.serving.errors import Reason
 from app.serving.models import ServedModel
-from app.serving.questions.question import (
-    BEDROOM,
-    POSES,
-    REFUSED,
-    Example,
-    Question,
-)
+from app.serving.questions.question import BEDROOM, POSES, REFUSED, Example, Question
 from app.serving.reading import Faults
 from app.serving.request import Request
 from scene_client.schemas import GenerateAnswer, GenerateRequest
@@ -40,7 +27,7 @@ _WARM_UP_STEPS: Final = 1  # one Gibbs sweep compiles all kernels
 _UNIT_BYTES = 12  # maximum size in bytes of the number of one hidden unit
 
 
-async def generate(request: Request, asked: GenerateRequest) -> Answer:
+async def generate(request: Request, asked: GenerateRequest) -> answers.Answer:
     """Sample scenes that contain the given objects and relations. Equal seeds give equal scenes."""
     model, reading = await request.read(asked, may_be_empty=True)
     _check_context(asked, model)
@@ -59,8 +46,8 @@ async def generate(request: Request, asked: GenerateRequest) -> Answer:
         )
 
     drawn = await request.draw(asked.count, model, "generate", draw)
-    require_size(_size(drawn), reading, request.limits.answer_bytes, "count")
-    answer = envelope(asked, request.id, model.reference, reading)
+    answers.require_size(_size(drawn), reading, request.limits.answer_bytes, "count")
+    answer = answers.envelope(asked, request.id, model.reference, reading)
     answer["seed"] = seed
     answer["scenes"] = [
         {
@@ -69,7 +56,7 @@ async def generate(request: Request, asked: GenerateRequest) -> Answer:
                 {"subject": subject, "relation": relation, "object": other}
                 for subject, relation, other in scene.relations
             ],
-            "log_score": rounded(scene.log_score),
+            "log_score": answers.rounded(scene.log_score),
             "context": scene.context,
         }
         for scene in drawn
@@ -101,7 +88,9 @@ def _size(drawn: Sequence[questions.GeneratedScene]) -> Callable[[int], int]:
     objects = sum([len(scene.objects) for scene in drawn])
     relations = sum([len(scene.relations) for scene in drawn])
     units = sum([len(layer) for scene in drawn for layer in scene.context.values()])
-    fixed = len(drawn) * OBJECT_BYTES + relations * RELATION_BYTES + units * _UNIT_BYTES
+    fixed = (
+        len(drawn) * answers.OBJECT_BYTES + relations * answers.RELATION_BYTES + units * _UNIT_BYTES
+    )
     return lambda name: fixed + (objects + 2 * relations) * name
 
 

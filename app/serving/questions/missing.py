@@ -13,25 +13,10 @@ from app.registry import Artifact
 from app.scene.frames import Axes, viewer_axes
 from app.scene.relations import opposite
 from app.scene.scene import Scene
-from app.serving.answers import (
-    CAUSE_BYTES,
-    OBJECT_BYTES,
-    RELATION_BYTES,
-    Answer,
-    envelope,
-    reasons,
-    require_size,
-    rounded,
-)
+from app.serving import answers
 from app.serving.errors import Reason
 from app.serving.models import ServedModel
-from app.serving.questions.question import (
-    LABELS,
-    REFUSED,
-    SCENES,
-    Example,
-    Question,
-)
+from app.serving.questions.question import LABELS, REFUSED, SCENES, Example, Question
 from app.serving.reading import Faults, Reading
 from app.serving.request import Request
 from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
@@ -41,7 +26,7 @@ _LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of th
 _LEAST_CHANGE: Final = math.log(3)  # substantial evidence: a Bayes factor of at least 3
 
 
-async def missing(request: Request, asked: MissingRequest) -> Answer:
+async def missing(request: Request, asked: MissingRequest) -> answers.Answer:
     """Rank the classes that the scene does not list, most probable first, with likely places.
 
     The list `more` contains listed classes that probably have further instances, such as a second
@@ -73,16 +58,16 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         details=asked.detail == "full",
     )
     found = tuple([_notable(entry, reading.scene) for entry in found])
-    require_size(_size(found, further), reading, request.limits.answer_bytes, "top_k")
-    answer = envelope(asked, request.id, model.reference, reading)
+    answers.require_size(_size(found, further), reading, request.limits.answer_bytes, "top_k")
+    answer = answers.envelope(asked, request.id, model.reference, reading)
     coverage = asked.coverage
     answer["coverage"] = model.artifact.calibration.coverage if coverage is None else coverage
     answer["missing"] = _entries(found, reading.ids, full=asked.detail == "full")
     answer["more"] = [
         entry._asdict()
         | {
-            "expected_count": rounded(entry.expected_count),
-            "probability": rounded(entry.probability),
+            "expected_count": answers.rounded(entry.expected_count),
+            "probability": answers.rounded(entry.probability),
         }
         for entry in further
     ]
@@ -112,7 +97,7 @@ def _notable(entry: questions.MissingAnswer, scene: Scene) -> questions.MissingA
 
 def _entries(
     found: Sequence[questions.MissingAnswer], ids: Sequence[str], *, full: bool
-) -> list[Answer]:
+) -> list[answers.Answer]:
     """Return the entries of the list `missing`, with rounded numbers."""
     numbers: list[float] = []
     for _, probability, log_odds, placements, because in found:
@@ -124,12 +109,12 @@ def _entries(
                 numbers += offset[1]
         numbers += [change for _, change in because]
     numbered = iter(significant(numbers))
-    entries: list[Answer] = []
+    entries: list[answers.Answer] = []
     for label, _, _, placements, because in found:
         entry = {"label": label, "probability": next(numbered), "log_odds": next(numbered)}
         if full:
             entry["placements"] = [_placement(place, ids, numbered) for place in placements]
-            entry["because"] = reasons(because, ids, numbered)
+            entry["because"] = answers.reasons(because, ids, numbered)
         entries.append(entry)
     return entries
 
@@ -172,15 +157,21 @@ def _size(
     for entry in found:
         places += len(entry.placements)
         causes += len(entry.because)
-    fixed = places * (RELATION_BYTES + _OFFSET_BYTES) + causes * CAUSE_BYTES
+    fixed = places * (answers.RELATION_BYTES + _OFFSET_BYTES) + causes * answers.CAUSE_BYTES
     names = len(found) + len(further)
-    fixed += names * OBJECT_BYTES
+    fixed += names * answers.OBJECT_BYTES
     return lambda name: fixed + (places + causes + names) * name
 
 
-def _placement(place: questions.Placement, ids: Sequence[str], numbered: Iterator[float]) -> Answer:
+def _placement(
+    place: questions.Placement, ids: Sequence[str], numbered: Iterator[float]
+) -> answers.Answer:
     relation, object_, _, offset = place
-    entry: Answer = {"relation": relation, "object": ids[object_], "probability": next(numbered)}
+    entry: answers.Answer = {
+        "relation": relation,
+        "object": ids[object_],
+        "probability": next(numbered),
+    }
     if offset is not None:
         mean = {"x": next(numbered), "y": next(numbered), "z": next(numbered)}
         std = {"x": next(numbered), "y": next(numbered), "z": next(numbered)}

@@ -10,29 +10,14 @@ from app.questions.ranking import significant
 from app.registry import Artifact, Calibration
 from app.scene.relations import CANONICAL, opposite
 from app.scene.scene import Scene
-from app.serving.answers import (
-    CAUSE_BYTES,
-    OBJECT_BYTES,
-    RELATION_BYTES,
-    Answer,
-    envelope,
-    reasons,
-    require_size,
-    rounded,
-)
-from app.serving.questions.question import (
-    REFUSED,
-    SCENES,
-    WITH_TOILET,
-    Example,
-    Question,
-)
+from app.serving import answers
+from app.serving.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Question
 from app.serving.reading import Reading
 from app.serving.request import Request
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
 
 
-async def outliers(request: Request, asked: OutliersRequest) -> Answer:
+async def outliers(request: Request, asked: OutliersRequest) -> answers.Answer:
     """Return probabilities that each object is an outlier and that each observed relation is false.
 
     The list `outliers` starts with the most probable outlier. All instances of a class have the
@@ -48,13 +33,13 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
         threshold=asked.threshold,
         details=asked.detail == "full",
     )
-    require_size(_size(found), reading, request.limits.answer_bytes, "objects")
-    answer = envelope(asked, request.id, model.reference, reading)
+    answers.require_size(_size(found), reading, request.limits.answer_bytes, "objects")
+    answer = answers.envelope(asked, request.id, model.reference, reading)
     ids = reading.ids
     if unjudged := _unjudged(model.artifact.calibration, reading.scene):
         answer["warnings"] = [*reading.warnings, *unjudged]
     if found.threshold is not None:
-        answer["threshold"] = rounded(found.threshold)
+        answer["threshold"] = answers.rounded(found.threshold)
     numbers: list[float] = []
     for entry in found.outliers:
         numbers += entry.probability, entry.log_odds
@@ -71,7 +56,7 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
             "is_outlier": is_outlier,
         }
         if asked.detail == "full":
-            judged["because"] = reasons(because, ids, numbered)
+            judged["because"] = answers.reasons(because, ids, numbered)
             judged["usually_with"] = list(usually_with)
         answer["outliers"].append(judged)
     answer["misplaced"] = [
@@ -90,11 +75,15 @@ def _size(found: questions.OutliersFound) -> Callable[[int], int]:
     for entry in found.outliers:
         causes += len(entry.because) + len(entry.usually_with)
     judged, misplaced = len(found.outliers), len(found.misplaced)
-    fixed = judged * OBJECT_BYTES + causes * CAUSE_BYTES + misplaced * RELATION_BYTES
+    fixed = (
+        judged * answers.OBJECT_BYTES
+        + causes * answers.CAUSE_BYTES
+        + misplaced * answers.RELATION_BYTES
+    )
     return lambda name: fixed + (2 * judged + causes + 2 * misplaced) * name
 
 
-def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> Answer:
+def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> answers.Answer:
     """Convert a canonical relation to the name, subject and object that the request uses."""
     ids = reading.ids
     if (CANONICAL.index(relation), subject, object_) in reading.flipped:

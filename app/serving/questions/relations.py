@@ -12,14 +12,7 @@ from app.scene.relations import canonicalise, opposite
 from app.scene.scene import Scene
 from app.serving.answers import RELATION_BYTES, Answer, envelope, require_size, rounded
 from app.serving.errors import Location, Reason
-from app.serving.questions.question import (
-    BEDROOM,
-    LABELS,
-    REFUSED,
-    SCENES,
-    Example,
-    Question,
-)
+from app.serving.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Question
 from app.serving.reading import Faults, Reading
 from app.serving.request import Request
 from scene_client.schemas import RelationsAnswer, RelationsRequest

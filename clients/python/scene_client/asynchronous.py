@@ -4,50 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from time import monotonic
-from typing import Final, Self, Unpack, overload
+from typing import Self, Unpack, overload
 
 import anyio
 import httpx
 
-from scene_client import calls
-from scene_client.calls import Call, Objects, T, segment
-from scene_client.connection import RETRIES, Options, async_deadline, async_transport
+from scene_client import calls, schemas
+from scene_client.calls import Call, Scene, T, segment
+from scene_client.connection import MAX_ANSWER, RETRIES, Options, async_deadline, async_transport
 from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
-from scene_client.schemas import (
-    AliasAnswer,
-    AliasFields,
-    BatchAnswer,
-    Body,
-    ContextsAnswer,
-    GenerateAnswer,
-    GenerateFields,
-    GenerateRequest,
-    Health,
-    MissingAnswer,
-    MissingFields,
-    MissingRequest,
-    ModelList,
-    ModelSummary,
-    OutliersAnswer,
-    OutliersFields,
-    OutliersRequest,
-    RefreshAnswer,
-    RelationsAnswer,
-    RelationsFields,
-    RelationsRequest,
-    VersionDetails,
-    VocabularyAnswer,
-)
-
-MAX_ANSWER: Final = 256 * 2**20
-"""Maximum size of an answer in bytes.
-
-The answer to a batch of 256 scenes with 4,096 relations each is smaller.
-"""
-
-
-def _late(limit: float) -> str:
-    return f"The answer did not arrive within {limit:g} s."
 
 
 class AsyncClient:
@@ -99,44 +64,44 @@ class AsyncClient:
 
     async def relations(
         self,
-        objects: Objects | RelationsRequest | Body,
+        objects: Scene[schemas.RelationsRequest],
         *,
         timeout: float | None = None,
-        **fields: Unpack[RelationsFields],
-    ) -> RelationsAnswer:
+        **fields: Unpack[schemas.RelationsFields],
+    ) -> schemas.RelationsAnswer:
         """Return the likely spatial relations between the objects."""
         call = calls.ask(calls.RELATIONS, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def missing(
         self,
-        objects: Objects | MissingRequest | Body,
+        objects: Scene[schemas.MissingRequest],
         *,
         timeout: float | None = None,
-        **fields: Unpack[MissingFields],
-    ) -> MissingAnswer:
+        **fields: Unpack[schemas.MissingFields],
+    ) -> schemas.MissingAnswer:
         """Return classes that are probably missing from the scene, and their likely places."""
         call = calls.ask(calls.MISSING, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def outliers(
         self,
-        objects: Objects | OutliersRequest | Body,
+        objects: Scene[schemas.OutliersRequest],
         *,
         timeout: float | None = None,
-        **fields: Unpack[OutliersFields],
-    ) -> OutliersAnswer:
+        **fields: Unpack[schemas.OutliersFields],
+    ) -> schemas.OutliersAnswer:
         """Return how well each object fits the scene, and the relations that are probably false."""
         call = calls.ask(calls.OUTLIERS, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def generate(
         self,
-        objects: Objects | GenerateRequest | Body = (),
+        objects: Scene[schemas.GenerateRequest] = (),
         *,
         timeout: float | None = None,
-        **fields: Unpack[GenerateFields],
-    ) -> GenerateAnswer:
+        **fields: Unpack[schemas.GenerateFields],
+    ) -> schemas.GenerateAnswer:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
         call = calls.ask(calls.GENERATE, objects, fields, self.options.model)
         return await self._call(call, timeout)
@@ -144,76 +109,67 @@ class AsyncClient:
     # -------------------------------------------------------------------------------- batches
 
     async def relations_batch(
-        self,
-        scenes: Iterable[Objects | RelationsRequest | Body],
-        *,
-        timeout: float | None = None,
-    ) -> BatchAnswer[RelationsAnswer]:
+        self, scenes: Iterable[Scene[schemas.RelationsRequest]], *, timeout: float | None = None
+    ) -> schemas.BatchAnswer[schemas.RelationsAnswer]:
         """Ask `relations` about up to 256 scenes. Each scene has its own answer or problem."""
         call = calls.ask_each(calls.RELATIONS, scenes, self.options.model)
         return await self._call(call, timeout)
 
     async def missing_batch(
-        self,
-        scenes: Iterable[Objects | MissingRequest | Body],
-        *,
-        timeout: float | None = None,
-    ) -> BatchAnswer[MissingAnswer]:
+        self, scenes: Iterable[Scene[schemas.MissingRequest]], *, timeout: float | None = None
+    ) -> schemas.BatchAnswer[schemas.MissingAnswer]:
         """Ask `missing` about up to 256 scenes. Each scene has its own answer or problem."""
         call = calls.ask_each(calls.MISSING, scenes, self.options.model)
         return await self._call(call, timeout)
 
     async def outliers_batch(
-        self,
-        scenes: Iterable[Objects | OutliersRequest | Body],
-        *,
-        timeout: float | None = None,
-    ) -> BatchAnswer[OutliersAnswer]:
+        self, scenes: Iterable[Scene[schemas.OutliersRequest]], *, timeout: float | None = None
+    ) -> schemas.BatchAnswer[schemas.OutliersAnswer]:
         """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
         call = calls.ask_each(calls.OUTLIERS, scenes, self.options.model)
         return await self._call(call, timeout)
 
     # --------------------------------------------------------------------------------- models
 
-    async def models(self, *, timeout: float | None = None) -> ModelList:
+    async def models(self, *, timeout: float | None = None) -> schemas.ModelList:
         """Return the models of the service, their versions and their aliases."""
-        return await self._call(Call("GET", "/models", ModelList), timeout)
+        return await self._call(Call("GET", "/models", schemas.ModelList), timeout)
 
     @overload
-    async def model(self, name: str, *, timeout: float | None = None) -> ModelSummary: ...
+    async def model(self, name: str, *, timeout: float | None = None) -> schemas.ModelSummary: ...
 
     @overload
     async def model(
         self, name: str, version: str, *, timeout: float | None = None
-    ) -> VersionDetails: ...
+    ) -> schemas.VersionDetails: ...
 
     async def model(
         self, name: str, version: str | None = None, *, timeout: float | None = None
-    ) -> ModelSummary | VersionDetails:
+    ) -> schemas.ModelSummary | schemas.VersionDetails:
         """Return the versions of a model, or the details of one version."""
         path = f"/models/{segment(name)}"
         if version is None:
-            return await self._call(Call("GET", path, ModelSummary), timeout)
+            return await self._call(Call("GET", path, schemas.ModelSummary), timeout)
         path += f"/versions/{segment(version)}"
-        return await self._call(Call("GET", path, VersionDetails), timeout)
+        return await self._call(Call("GET", path, schemas.VersionDetails), timeout)
 
     async def vocabulary(
         self, name: str | None = None, *, timeout: float | None = None
-    ) -> VocabularyAnswer:
+    ) -> schemas.VocabularyAnswer:
         """Return the object classes, relations and room types of a model."""
         path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
-        return await self._call(Call("GET", path, VocabularyAnswer), timeout)
+        return await self._call(Call("GET", path, schemas.VocabularyAnswer), timeout)
 
     async def contexts(
         self, name: str | None = None, *, timeout: float | None = None
-    ) -> ContextsAnswer:
+    ) -> schemas.ContextsAnswer:
         """Return each hidden unit of a model with the classes of its largest weights."""
         path = f"/models/{segment(name or self.options.model or 'default')}/contexts"
-        return await self._call(Call("GET", path, ContextsAnswer), timeout)
+        return await self._call(Call("GET", path, schemas.ContextsAnswer), timeout)
 
-    async def refresh(self, *, timeout: float | None = None) -> RefreshAnswer:
+    async def refresh(self, *, timeout: float | None = None) -> schemas.RefreshAnswer:
         """Make the service load the current state of its store. The call needs the admin key."""
-        call = Call("POST", "/models/refresh", RefreshAnswer, administers=True)
+        call = Call("POST", "/models/refresh", schemas.RefreshAnswer, administers=True)
         return await self._call(call, timeout)
 
     async def promote(
@@ -222,8 +178,8 @@ class AsyncClient:
         model: str,
         *,
         timeout: float | None = None,
-        **fields: Unpack[AliasFields],
-    ) -> AliasAnswer:
+        **fields: Unpack[schemas.AliasFields],
+    ) -> schemas.AliasAnswer:
         """Point an alias at a model or at one version of the model. The call needs the admin key.
 
         The client does not retry after a connection error, because the service may already have
@@ -253,11 +209,11 @@ class AsyncClient:
         Raises:
             UnreachableError, DeadlineError, ProblemError: the default model is not ready.
         """
-        await self._call(Call("GET", "/health/ready", Health), timeout, retries=0)
+        await self._call(Call("GET", "/health/ready", schemas.Health), timeout, retries=0)
 
     async def _is(self, health: str, timeout: float | None) -> bool:
         try:
-            await self._call(Call("GET", f"/health/{health}", Health), timeout, retries=0)
+            await self._call(Call("GET", f"/health/{health}", schemas.Health), timeout, retries=0)
         except (UnreachableError, DeadlineError):
             return False
         except ProblemError as problem:
@@ -272,7 +228,7 @@ class AsyncClient:
         """Return the answer of a call. Retry as long as the timeout allows."""
         retries = self.options.retries if retries is None else retries
         limit = self.options.limit(timeout)
-        ends = monotonic() + limit
+        late, ends = f"The answer did not arrive within {limit:g} s.", monotonic() + limit
         attempt = 0
         while (left := ends - monotonic()) > 0:
             try:
@@ -280,7 +236,7 @@ class AsyncClient:
             except (TimeoutError, httpx.TimeoutException):
                 break
             except DeadlineError as error:
-                raise DeadlineError(f"{_late(limit)} {error}", error.request_id) from None
+                raise DeadlineError(f"{late} {error}", error.request_id) from None
             except (ProblemError, UnreachableError) as error:
                 pause = call.retry_pause(error, attempt)
                 if pause is None or attempt == retries or pause >= ends - monotonic():
@@ -291,7 +247,7 @@ class AsyncClient:
                 # If the client has read the answer only after the deadline, the call fails.
                 if monotonic() < ends:
                     return answer
-        raise DeadlineError(_late(limit))
+        raise DeadlineError(late)
 
     async def _attempt(self, call: Call[T], left: float) -> T:
         """Send a call once and return the answer. The attempt takes at most `left` seconds."""
@@ -300,7 +256,7 @@ class AsyncClient:
             try:
                 async with self._http.stream(
                     call.method,
-                    options.address(call),
+                    options.url.rstrip("/") + call.path,
                     content=call.body,
                     headers=options.headers(call, left),
                     timeout=left,

@@ -12,6 +12,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import BaseModel, ValidationError
 
+from scene_client import schemas
 from scene_client.errors import (
     AnswerError,
     DeadlineError,
@@ -19,25 +20,6 @@ from scene_client.errors import (
     ProblemError,
     UnreachableError,
     problem_of,
-)
-from scene_client.schemas import (
-    MAX_BATCH,
-    AliasAnswer,
-    AliasRequest,
-    Answer,
-    BatchAnswer,
-    Body,
-    Detection,
-    GenerateAnswer,
-    GenerateRequest,
-    MissingAnswer,
-    MissingRequest,
-    OutliersAnswer,
-    OutliersRequest,
-    RelationsAnswer,
-    RelationsRequest,
-    Request,
-    SceneRequest,
 )
 from scene_client.validation import field_errors
 
@@ -48,16 +30,17 @@ LONGEST_PAUSE: Final = 2.0
 The pause is random. Its upper limit starts at `FIRST_PAUSE` and doubles with each attempt.
 """
 
-Objects: TypeAlias = Iterable[str | Detection | Body]
+Objects: TypeAlias = Iterable[str | schemas.Detection | schemas.Body]
 """Objects of a scene: labels, `Detection` objects, or dictionaries with the same fields."""
 
 
-# ------------------------------------------------------------------------------------ one call
-
 T = TypeVar("T", bound=BaseModel)
-AnswerT = TypeVar("AnswerT", bound=Answer)
-RequestT = TypeVar("RequestT", bound=SceneRequest)
-FormT = TypeVar("FormT", bound=Request)
+AnswerT = TypeVar("AnswerT", bound=schemas.Answer)
+RequestT = TypeVar("RequestT", bound=schemas.SceneRequest)
+FormT = TypeVar("FormT", bound=schemas.Request)
+
+Scene: TypeAlias = Objects | RequestT | schemas.Body
+"""A list of objects, or a whole request as an object or a dictionary."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +108,7 @@ def segment(name: str) -> str:
     """
     # In a URL, the segments "." and ".." refer to folders, so they cannot be names.
     if not name or set(name) <= {"."}:
-        message = "a name must not be empty, and must not contain only dots"
-        raise InvalidRequestError.about(message)
+        raise InvalidRequestError.about("a name must not be empty, and must not contain only dots")
     return quote(name, safe="")
 
 
@@ -141,10 +123,10 @@ class Question(NamedTuple, Generic[RequestT, AnswerT]):
     answer: type[AnswerT]
 
 
-RELATIONS: Final = Question("/relations", RelationsRequest, RelationsAnswer)
-MISSING: Final = Question("/missing", MissingRequest, MissingAnswer)
-OUTLIERS: Final = Question("/outliers", OutliersRequest, OutliersAnswer)
-GENERATE: Final = Question("/generate", GenerateRequest, GenerateAnswer)
+RELATIONS: Final = Question("/relations", schemas.RelationsRequest, schemas.RelationsAnswer)
+MISSING: Final = Question("/missing", schemas.MissingRequest, schemas.MissingAnswer)
+OUTLIERS: Final = Question("/outliers", schemas.OutliersRequest, schemas.OutliersAnswer)
+GENERATE: Final = Question("/generate", schemas.GenerateRequest, schemas.GenerateAnswer)
 
 
 def ask(
@@ -170,7 +152,7 @@ def ask(
 
 def ask_each(
     question: Question[RequestT, AnswerT], scenes: Iterable[Any], model: str | None = None
-) -> Call[BatchAnswer[AnswerT]]:
+) -> Call[schemas.BatchAnswer[AnswerT]]:
     """Build a batch request: one question about many scenes. `ask` describes the arguments.
 
     Raises:
@@ -180,15 +162,15 @@ def ask_each(
         _json(_request(question.form, scene, {}, model, ("scenes", place)))
         for place, scene in enumerate(scenes)
     ]
-    if not 1 <= len(requests) <= MAX_BATCH:
-        message = f"a batch must contain from 1 to {MAX_BATCH} scenes"
+    if not 1 <= len(requests) <= schemas.MAX_BATCH:
+        message = f"a batch must contain from 1 to {schemas.MAX_BATCH} scenes"
         raise InvalidRequestError.about(message, "#/scenes")
     body = f'{{"scenes":[{",".join(requests)}]}}'
-    answer = BatchAnswer[question.answer]  # type: ignore[name-defined]
+    answer = schemas.BatchAnswer[question.answer]  # type: ignore[name-defined]
     return Call("POST", f"{question.path}/batch", answer, body)
 
 
-def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
+def promote(alias: str, fields: Mapping[str, Any]) -> Call[schemas.AliasAnswer]:
     """Build the call that points the alias ``alias`` at a model or a version.
 
     Raises:
@@ -197,8 +179,8 @@ def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
     return Call(
         "PUT",
         f"/models/aliases/{segment(alias)}",
-        AliasAnswer,
-        _json(validated(AliasRequest, dict(fields))),
+        schemas.AliasAnswer,
+        _json(validated(schemas.AliasRequest, dict(fields))),
         administers=True,
         # If the first attempt has changed the alias, a second attempt with `expected` would fail.
         repeatable=False,
@@ -217,7 +199,7 @@ def _request(
     model: str | None,
     at: tuple[str | int, ...] = (),
 ) -> RequestT:
-    if isinstance(scene, SceneRequest | Mapping):
+    if isinstance(scene, schemas.SceneRequest | Mapping):
         if fields:
             names = ", ".join(fields)
             message = f"these fields must be members of the whole request: {names}"

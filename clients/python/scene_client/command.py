@@ -1,14 +1,6 @@
 """The command ``scene``. It sends questions to the service from the command line.
 
-The command writes errors to standard error. It has these exit statuses:
-
-0. The service has answered.
-1. The service refused the request.
-2. The usage of the command is wrong.
-3. The service cannot be reached.
-4. The answer did not arrive in time.
-5. The service is busy or not ready.
-6. Any other error.
+The command writes errors to standard error. The help text of `app` lists the exit statuses.
 """
 
 from __future__ import annotations
@@ -77,7 +69,6 @@ class _Group(TyperGroup):
         return parsed
 
 
-T = TypeVar("T")
 AnswerT = TypeVar("AnswerT", bound=BaseModel)
 
 app = typer.Typer(
@@ -102,17 +93,8 @@ class Asked:
     timeout: float
     as_json: bool
 
-    def ask(self, question: Callable[[Client], T], request: Any = None) -> T:
-        """Return the answer to a question. An error ends the program.
-
-        Args:
-            question: function that sends the question.
-            request: body of the request, for the messages of errors.
-        """
-        with _failing(request), self._client() as client:
-            return question(client)
-
-    def _client(self) -> Client:
+    def client(self) -> Client:
+        """Return the client that sends the question."""
         if self.store is not None:
             return OfflineClient(self.store, timeout=self.timeout, model=self.model)
         # An environment variable sets the API key, because other users of the machine can read the
@@ -120,25 +102,35 @@ class Asked:
         key = os.environ.get("SCENE_API_KEY") or None
         return Client(self.url, timeout=self.timeout, model=self.model, api_key=key)
 
-    def show(
-        self,
-        question: Callable[[Client], AnswerT],
-        table: Callable[[AnswerT], RenderableType],
-        request: Any = None,
-    ) -> AnswerT:
-        """Ask a question, and print the answer as JSON or as a table."""
-        answer = self.ask(question, request)
-        if self.as_json:
-            print(answer.model_dump_json(exclude_unset=True))
-            return answer
-        console = Console(markup=False, highlight=False, emoji=False)
-        if not console.is_terminal:
-            # The output goes to a file or a program, so rich must not cut or wrap the table.
-            console.width = 10_000
-        console.print(table(answer))
-        for note in tables.notes(answer):
-            print(note, file=sys.stderr)
+
+def _show(
+    context: typer.Context,
+    question: Callable[[Client], AnswerT],
+    table: Callable[[AnswerT], RenderableType],
+    request: Any = None,
+) -> AnswerT:
+    """Print the answer to a question as JSON or as a table. An error ends the program.
+
+    Args:
+        context: context of the command, with the general options.
+        question: function that sends the question.
+        table: function that returns the table.
+        request: body of the request, for the messages of errors.
+    """
+    asked: Asked = context.obj
+    with _failing(request), asked.client() as client:
+        answer = question(client)
+    if asked.as_json:
+        print(answer.model_dump_json(exclude_unset=True))
         return answer
+    console = Console(markup=False, highlight=False, emoji=False)
+    if not console.is_terminal:
+        # The output goes to a file or a program, so rich must not cut or wrap the table.
+        console.width = 10_000
+    console.print(table(answer))
+    for note in tables.notes(answer):
+        print(note, file=sys.stderr)
+    return answer
 
 
 def _version(wanted: bool) -> None:
@@ -233,13 +225,11 @@ def relations(
 ) -> None:
     """List the likely spatial relations between the objects."""
     scene = _scene(things, relations, room_type, unknown_labels, label_map)
+    opposites = include_opposites or None
     request = scene | _named(
-        top_k=top_k,
-        min_probability=min_probability,
-        include_opposites=include_opposites or None,
+        top_k=top_k, min_probability=min_probability, include_opposites=opposites
     )
-    asked: Asked = context.obj
-    asked.show(lambda client: client.relations(request), tables.relations, request)
+    _show(context, lambda client: client.relations(request), tables.relations, request)
 
 
 @app.command()
@@ -272,9 +262,8 @@ def missing(
         candidates=candidates or None,
         detail=detail,
     )
-    asked: Asked = context.obj
     shown = partial(tables.missing, asked_place=request.get("at") is not None)
-    asked.show(lambda client: client.missing(request), shown, request)
+    _show(context, lambda client: client.missing(request), shown, request)
 
 
 @app.command()
@@ -295,13 +284,8 @@ def outliers(
 ) -> None:
     """List objects that do not fit the scene, and relations that are probably false."""
     scene = _scene(things, relations, room_type, unknown_labels, label_map)
-    request = scene | _named(
-        sensitivity=sensitivity,
-        threshold=threshold,
-        detail=detail,
-    )
-    asked: Asked = context.obj
-    asked.show(lambda client: client.outliers(request), tables.outliers, request)
+    request = scene | _named(sensitivity=sensitivity, threshold=threshold, detail=detail)
+    _show(context, lambda client: client.outliers(request), tables.outliers, request)
 
 
 @app.command()
@@ -329,12 +313,11 @@ def generate(
     label_map: LabelMap = None,
 ) -> None:
     """Sample scenes that contain the given objects."""
-    asked: Asked = context.obj
     if plot is not None and find_spec("matplotlib") is None:
         _fail("the option --plot needs matplotlib: run pip install matplotlib", MEANINGLESS)
     scene = _scene(things or [], relations, room_type, unknown_labels, label_map)
     request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
-    answer = asked.show(lambda client: client.generate(request), tables.generate, request)
+    answer = _show(context, lambda client: client.generate(request), tables.generate, request)
     if plot is not None:
         from scene_client.plot import draw
 
@@ -350,29 +333,27 @@ def generate(
 @app.command()
 def models(context: typer.Context) -> None:
     """List the models of the service."""
-    asked: Asked = context.obj
-    asked.show(Client.models, tables.models)
+    _show(context, Client.models, tables.models)
 
 
 @app.command()
 def vocabulary(context: typer.Context) -> None:
     """List the object classes and room types of the model."""
-    asked: Asked = context.obj
-    asked.show(Client.vocabulary, tables.vocabulary)
+    _show(context, Client.vocabulary, tables.vocabulary)
 
 
 @app.command()
 def contexts(context: typer.Context) -> None:
     """List the hidden units of the model with the classes of their largest weights."""
-    asked: Asked = context.obj
-    asked.show(Client.contexts, tables.contexts)
+    _show(context, Client.contexts, tables.contexts)
 
 
 @app.command()
 def ready(context: typer.Context) -> None:
     """Check that the service is ready. The only output is the exit status."""
     asked: Asked = context.obj
-    asked.ask(Client.check_ready)
+    with _failing(None), asked.client() as client:
+        client.check_ready()
 
 
 # ------------------------------------------------------------------------------------ reading

@@ -33,6 +33,9 @@ RETRIES: Final = 5
 MAX_CONNECTIONS: Final = 100
 """Maximum number of open connections of a client. Further calls wait for a free connection."""
 
+MAX_ANSWER: Final = 256 * 2**20
+"""Maximum size of an answer in bytes, above that of 256 scenes with 4,096 relations each."""
+
 KEEP_ALIVE: Final = 4.0
 """The client closes a connection after this idle time in seconds.
 
@@ -66,9 +69,8 @@ class Options:
             raise _refused("the URL must start with http:// or https:// and contain a host")
         if parts.query or parts.fragment:
             raise _refused("the URL must not have a query or a fragment")
-        if not all(
-            "!" <= letter <= "~" for letter in (self.api_key or "") + (self.admin_key or "")
-        ):
+        keys = (self.api_key or "") + (self.admin_key or "")
+        if not all("!" <= letter <= "~" for letter in keys):
             raise _refused("a key must have only ASCII characters, without spaces or line breaks")
         if self.retries < 0:
             raise _refused("the number of retries must not be negative")
@@ -91,10 +93,6 @@ class Options:
             return httpx.create_ssl_context()
         # For http, the CA bundle is not needed. To load it takes longer than a question.
         return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-
-    def address(self, call: Call[T]) -> str:
-        """Return the URL of a call."""
-        return self.url.rstrip("/") + call.path
 
     def headers(self, call: Call[T], left: float) -> dict[str, str]:
         """Return the HTTP headers of a call whose deadline is in `left` seconds."""

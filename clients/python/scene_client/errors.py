@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from http import HTTPStatus
+from http.client import responses
 from typing import Any, Final, Self
 
 from pydantic import ValidationError
@@ -50,18 +50,16 @@ class ProblemError(ClientError):
     The text of the exception contains the title, the detail and the first errors.
 
     Attributes:
-            type: path of the page about the problem type, such as ``/problems/unknown-labels``. The
-                path never changes, so programs can compare it. The type is ``about:blank`` if
-                another server, such as a proxy, has sent the answer.
-            status: HTTP status code of the response.
-            title: short summary. All problems of one type have the same title.
-            detail: description of this problem.
-            errors: errors in the request. Each error has a location and similar known names.
-            failures: versions and aliases of the model store that a refresh refused, with reasons.
-            request_id: id of the request in the log of the service. It is "" if the response does
-                not contain an id.
-            retry_after: time in seconds to wait before the next request, or None if the response
-                does not contain this time.
+        type: path of the page about the problem type, such as ``/problems/unknown-labels``. The
+            path never changes, so programs can compare it. The type is ``about:blank`` if another
+            server, such as a proxy, has sent the answer.
+        status: HTTP status code of the response.
+        title: short summary. All problems of one type have the same title.
+        detail: description of this problem.
+        errors: errors in the request. Each error has a location and similar known names.
+        failures: versions and aliases of the model store that a refresh refused, with reasons.
+        request_id: id of the request in the log of the service, or "" if the response has no id.
+        retry_after: seconds to wait before the next request, or None if the response has no time.
     """
 
     def __init__(
@@ -120,39 +118,30 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
         headers: headers of the response, with lower-case names.
         body: body of the response.
     """
-    retry_after = _seconds(headers.get("retry-after"))
-    with suppress(ValidationError):
-        problem = Problem.model_validate_json(body, extra="ignore")
-        return ProblemError(
-            problem.type,
-            status,
-            problem.title,
-            problem.detail,
-            errors=problem.errors or (),
-            failures=problem.failures or (),
-            request_id=problem.request_id,
-            retry_after=retry_after,
-        )
-    # The response comes from a proxy or another server. The error does not contain the text of the
-    # response, because this text may change at any time.
     try:
-        title = HTTPStatus(status).phrase
-    except ValueError:
-        title = "Unknown status"
+        problem = Problem.model_validate_json(body, extra="ignore")
+    except ValidationError:
+        # The response comes from a proxy or another server. The error does not contain the text of
+        # the response, because this text may change at any time.
+        problem = Problem(
+            type="about:blank",
+            status=status,
+            title=responses.get(status, "Unknown status"),
+            detail="The answer comes from another server, for example from a proxy.",
+            instance="",
+            request_id=headers.get("x-request-id", ""),
+        )
     return ProblemError(
-        "about:blank",
-        status,
-        title,
-        "The answer comes from another server, for example from a proxy.",
-        request_id=headers.get("x-request-id", ""),
-        retry_after=retry_after,
+        *(problem.type, status, problem.title, problem.detail),
+        errors=problem.errors or (),
+        failures=problem.failures or (),
+        request_id=problem.request_id,
+        retry_after=_seconds(headers.get("retry-after", "")),
     )
 
 
-def _seconds(retry_after: str | None) -> float | None:
+def _seconds(retry_after: str) -> float | None:
     """Return Retry-After (RFC 9110, section 10.2.3) in seconds from now."""
-    if retry_after is None:
-        return None
     if retry_after.isascii() and retry_after.isdigit():
         return float(retry_after)
     with suppress(ValueError):

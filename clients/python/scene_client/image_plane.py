@@ -77,8 +77,4 @@ def upright_box(centre: tuple[float, float], size: tuple[float, float], theta: f
 
 def _unit(box: Box, other: Box) -> float:
     """Return the mean diagonal of two boxes."""
-    return (_diagonal(box) + _diagonal(other)) / 2
-
-
-def _diagonal(box: Box) -> float:
-    return math.hypot(box[2] - box[0], box[3] - box[1])
+    return sum(math.hypot(right - left, low - high) for left, high, right, low in (box, other)) / 2

@@ -5,8 +5,7 @@ and infinity are null. The functions of this module return None for a field that
 the wrong type.
 
 Detectors report a class id as text, which is often a number ("56"). A label map contains the label
-of each class id. A label map is a mapping, a list of labels with the class ids as indices, a
-vision_msgs/LabelInfo message, or the name of a well-known list of labels.
+of each class id; `read_label_map` lists its forms.
 """
 
 from __future__ import annotations

@@ -10,20 +10,7 @@ from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from scene_client.schemas import (
-    Answer,
-    Because,
-    ContextsAnswer,
-    GenerateAnswer,
-    MissingAnswer,
-    ModelList,
-    OutliersAnswer,
-    Placement,
-    Relation,
-    RelationsAnswer,
-    VocabularyAnswer,
-    WeightedLabel,
-)
+from scene_client import schemas
 
 MOST_MISPLACED: Final = 10
 """Maximum number of table rows with probably false relations.
@@ -41,18 +28,9 @@ A table of answers about one place contains all places.
 """
 
 
-def relations(answer: RelationsAnswer) -> RenderableType:
+def relations(answer: schemas.RelationsAnswer) -> RenderableType:
     """Return a table of relations, most probable first, and a table of disagreements."""
-    rows = [
-        (
-            entry.subject,
-            entry.relation,
-            entry.object,
-            _share(entry.probability),
-            "observed" if entry.observed else "",
-        )
-        for entry in answer.relations
-    ]
+    rows = [(*_relation(entry), "observed" if entry.observed else "") for entry in answer.relations]
     stated = _table("subject", "relation", "object", "probability", "", rows=rows)
     doubted = [
         (
@@ -70,7 +48,7 @@ def relations(answer: RelationsAnswer) -> RenderableType:
     return Group(stated, _table(*columns, rows=doubted, title="disagreements"))
 
 
-def missing(answer: MissingAnswer, *, asked_place: bool = False) -> RenderableType:
+def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> RenderableType:
     """Return a table of missing objects with places and reasons, and a table of counts.
 
     Args:
@@ -99,12 +77,11 @@ def missing(answer: MissingAnswer, *, asked_place: bool = False) -> RenderableTy
         )
         for entry in answer.more
     ]
-    columns = ("more of", "listed", "expected", "probability")
-    counts = _table(*columns, rows=further)
+    counts = _table("more of", "listed", "expected", "probability", rows=further)
     return Group(found, counts) if rows else counts
 
 
-def outliers(answer: OutliersAnswer) -> RenderableType:
+def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
     """Return a table of objects, most probable outlier first, and a table of false relations."""
     rows = [
         (
@@ -123,13 +100,7 @@ def outliers(answer: OutliersAnswer) -> RenderableType:
     if not answer.misplaced:
         return found
     wrong = [
-        (
-            entry.subject,
-            entry.relation,
-            entry.object,
-            _share(entry.probability),
-            "misplaced" if entry.is_misplaced else "",
-        )
+        (*_relation(entry), "misplaced" if entry.is_misplaced else "")
         for entry in answer.misplaced[:MOST_MISPLACED]
     ]
     columns = ("subject", "relation", "object", "probability of being wrong", "")
@@ -141,7 +112,7 @@ def outliers(answer: OutliersAnswer) -> RenderableType:
 
 def notes(answer: BaseModel) -> list[str]:
     """Return one line for each mapped label and each warning of the answer."""
-    if not isinstance(answer, Answer):
+    if not isinstance(answer, schemas.Answer):
         return []
     mapped = [
         f"{entry.label}: read as {entry.class_} "
@@ -155,22 +126,17 @@ def notes(answer: BaseModel) -> list[str]:
     return mapped + warnings
 
 
-def generate(answer: GenerateAnswer) -> RenderableType:
+def generate(answer: schemas.GenerateAnswer) -> RenderableType:
     """Return a table of the sampled scenes."""
     rows = [
-        (
-            str(number),
-            ", ".join(scene.objects),
-            _relations(scene.relations),
-            f"{scene.log_score:.1f}",
-        )
-        for number, scene in enumerate(answer.scenes, 1)
+        (str(n), ", ".join(scene.objects), _relations(scene.relations), f"{scene.log_score:.1f}")
+        for n, scene in enumerate(answer.scenes, 1)
     ]
     title = f"seed {answer.seed}"
     return _table("scene", "objects", "relations", "log score", rows=rows, title=title)
 
 
-def _relations(relations: Sequence[Relation]) -> str:
+def _relations(relations: Sequence[schemas.Relation]) -> str:
     ranked = sorted(relations, key=lambda one: one.relation in {"left", "front"})
     lines = [f"{one.subject} {one.relation} {one.object}" for one in ranked[:MOST_RELATIONS]]
     if len(ranked) > MOST_RELATIONS:
@@ -178,7 +144,7 @@ def _relations(relations: Sequence[Relation]) -> str:
     return "\n".join(lines)
 
 
-def models(answer: ModelList) -> RenderableType:
+def models(answer: schemas.ModelList) -> RenderableType:
     """Return a table of versions with their aliases, and the unusable entries of the store."""
     rows = [
         (
@@ -197,7 +163,7 @@ def models(answer: ModelList) -> RenderableType:
     return Group(found, _table("failed", "reason", "detail", rows=failures))
 
 
-def contexts(answer: ContextsAnswer) -> RenderableType:
+def contexts(answer: schemas.ContextsAnswer) -> RenderableType:
     """Return a table of hidden units with the classes of their largest weights."""
     rows = [
         (layer, str(unit.unit), _weighted(unit.objects), _weighted(unit.room_types))
@@ -207,7 +173,7 @@ def contexts(answer: ContextsAnswer) -> RenderableType:
     return _table("layer", "unit", "objects", "room types", rows=rows)
 
 
-def vocabulary(answer: VocabularyAnswer) -> RenderableType:
+def vocabulary(answer: schemas.VocabularyAnswer) -> RenderableType:
     """Return a table of object classes with their aliases."""
     rows = [
         (entry.label, ", ".join(entry.aliases), "structure" if entry.structure else "")
@@ -233,11 +199,15 @@ def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = Non
     return table
 
 
+def _relation(entry: schemas.ScoredRelation) -> tuple[str, str, str, str]:
+    return entry.subject, entry.relation, entry.object, _share(entry.probability)
+
+
 def _share(probability: float) -> str:
     return f"{probability:.3f}"
 
 
-def _placement(placement: Placement) -> str:
+def _placement(placement: schemas.Placement) -> str:
     told = f"{placement.relation} {placement.object} {_share(placement.probability)}"
     # A model has no offsets if its training scenes have no positions.
     offset = placement.offset
@@ -250,9 +220,9 @@ def _placement(placement: Placement) -> str:
     return f"{told} ({', '.join(axes)} m)"
 
 
-def _reasons(because: Iterable[Because]) -> str:
+def _reasons(because: Iterable[schemas.Because]) -> str:
     return "\n".join(f"{reason.object} {reason.log_odds_change:+.2f}" for reason in because)
 
 
-def _weighted(labels: Iterable[WeightedLabel]) -> str:
+def _weighted(labels: Iterable[schemas.WeightedLabel]) -> str:
     return ", ".join(f"{entry.label} {entry.weight:+.2f}" for entry in labels)

@@ -62,11 +62,7 @@ _INDICES: Final = {"subject": 0, "relation": -2, "object": -1, "x": 0, "y": 1, "
 
 
 def field_errors(
-    error: ValidationError,
-    body: Any,
-    form: type[Request],
-    *,
-    at: tuple[str | int, ...] = (),
+    error: ValidationError, body: Any, form: type[Request], *, at: tuple[str | int, ...] = ()
 ) -> list[FieldError]:
     """Return the errors of a request, at most `MAX_ERRORS`.
 
@@ -81,9 +77,8 @@ def field_errors(
     """
     found = []
     for fault in _first_errors(error, body, form):
-        location = fault["loc"]
         message, suggestions = _worded(fault, form)
-        where = pointer(at) + pointer(location, body)[1:]
+        where = pointer(at) + pointer(fault["loc"], body)[1:]
         found.append(FieldError(pointer=where, message=message, suggestions=suggestions))
     return found
 

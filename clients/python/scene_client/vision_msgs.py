@@ -168,18 +168,10 @@ def from_message(
         MessageError: the message has another type, does not contain a valid scene, or an argument
             is invalid.
     """
+    options: Any = {"min_score": min_score, "unknown_labels": unknown_labels}
     if _is_flat(message):
-        return from_detection2d_array(
-            message, label_map, min_score=min_score, unknown_labels=unknown_labels
-        )
-    return from_detection3d_array(
-        message,
-        label_map,
-        min_score=min_score,
-        boxes=boxes,
-        viewpoint=viewpoint,
-        unknown_labels=unknown_labels,
-    )
+        return from_detection2d_array(message, label_map, **options)
+    return from_detection3d_array(message, label_map, boxes=boxes, viewpoint=viewpoint, **options)
 
 
 def is_message(value: Any) -> bool:
@@ -275,11 +267,8 @@ class _Reader:
             return sightings
         ranked = sorted(sightings, key=lambda seen: -seen.confidence)
         for seen in ranked[MAX_OBJECTS:]:
-            self.note(
-                seen.place,
-                "too-many",
-                f"{MAX_OBJECTS} other detections have equal or higher scores",
-            )
+            why = f"{MAX_OBJECTS} other detections have equal or higher scores"
+            self.note(seen.place, "too-many", why)
         return sorted(ranked[:MAX_OBJECTS], key=lambda seen: seen.place)
 
     def _ids(self) -> dict[int, str]:
@@ -302,14 +291,11 @@ class _Reader:
                 ids[seen.place] = name
         last: dict[str, int] = {}
         for seen in self.sightings:
-            if seen.place in ids:
-                continue
-            while True:
+            while seen.place not in ids:
                 last[seen.label] = last.get(seen.label, 0) + 1
                 name = f"{seen.label}_{last[seen.label]}"
                 if name not in own:
-                    break
-            ids[seen.place] = name
+                    ids[seen.place] = name
         return ids
 
     def _frame(self) -> str | None:
@@ -325,11 +311,7 @@ class _Reader:
         return frame_of(take(seen.detection, "header")) not in ("", self.frame)
 
     def object(self, seen: _Sighting) -> dict[str, Any]:
-        return {
-            "id": self.ids[seen.place],
-            "label": seen.label,
-            "confidence": seen.confidence,
-        }
+        return {"id": self.ids[seen.place], "label": seen.label, "confidence": seen.confidence}
 
     def pose(self, seen: _Sighting, boxes: bool) -> dict[str, Any]:
         """Return the fields position, size and orientation of a detection, as far as known."""
@@ -354,9 +336,7 @@ class _Reader:
         turn = numbers(take(pose, "orientation"), "xyzw")
         length = math.hypot(*turn) if turn else 0.0
         if turn and _MIN_NORM < length < math.inf:
-            found["orientation"] = {
-                axis: value / length for axis, value in zip("xyzw", turn, strict=True)
-            }
+            found["orientation"] = dict(zip("xyzw", (side / length for side in turn), strict=True))
         return found
 
     def image_relations(self, ids: list[str]) -> list[dict[str, str]]:
@@ -365,10 +345,8 @@ class _Reader:
         # If there are too many relations, the request contains those of the most confident objects.
         order = sorted(range(len(ids)), key=lambda i: -self.sightings[i].confidence)
         found = left_pairs(boxes, order)
-        if len(found) > MAX_RELATIONS:
-            self.note(
-                None, "too-many", f"the request leaves out {len(found) - MAX_RELATIONS} relations"
-            )
+        if (extra := len(found) - MAX_RELATIONS) > 0:
+            self.note(None, "too-many", f"the request leaves out {extra} relations")
         return [
             {"subject": ids[i], "relation": "left", "object": ids[j]}
             for i, j in sorted(found[:MAX_RELATIONS])
@@ -421,9 +399,7 @@ def _unwrapped(message: Any) -> Any:
 def _is_flat(message: Any) -> bool:
     """Return whether the message is a Detection2DArray, with boxes in an image."""
     detections = take(_unwrapped(message), "detections")
-    return any(
-        has(take(detection, "bbox"), "size_x") for detection in items(detections, "detections")
-    )
+    return any(has(take(one, "bbox"), "size_x") for one in items(detections, "detections"))
 
 
 def _is_number(label: str) -> bool:

@@ -22,19 +22,12 @@ from scene_client.schemas.requests import (
 class GenerateRequest(SceneRequest):
     """What would a scene like this look like?"""
 
-    objects: Annotated[
-        list[SceneObject],
-        Field(
-            max_length=256,
-            fail_fast=True,
-            description="objects in every sampled scene; [] is allowed",
-        ),
-    ] = []
-    count: Annotated[int, Field(ge=1, le=64, description="number of scenes to sample")] = 1
-    steps: Annotated[
-        int | None,
-        Field(ge=1, le=2000, description="number of Gibbs sweeps; default: the model's value"),
-    ] = None
+    objects: Annotated[list[SceneObject], Field(max_length=256, fail_fast=True)] = []
+    """objects in every sampled scene; [] is allowed"""
+    count: Annotated[int, Field(ge=1, le=64)] = 1
+    """number of scenes to sample"""
+    steps: Annotated[int | None, Field(ge=1, le=2000)] = None
+    """number of Gibbs sweeps; default: the model's value"""
     temperature: Annotated[
         float,
         Field(
@@ -47,12 +40,9 @@ class GenerateRequest(SceneRequest):
         ),
     ] = 1.0
     context: Annotated[
-        dict[Name, Annotated[list[UnitNumber], Field(max_length=4096)]] | None,
-        Field(
-            max_length=8,
-            description="hidden units that are on: maps the name of each layer to unit numbers",
-        ),
+        dict[Name, Annotated[list[UnitNumber], Field(max_length=4096)]] | None, Field(max_length=8)
     ] = None
+    """hidden units that are on: maps the name of each layer to unit numbers"""
 
 
 class GeneratedScene(Reply):

@@ -44,7 +44,8 @@ class MissingRequest(SceneRequest):
             "Default: the value of the model",
         ),
     ] = None
-    top_k: Annotated[int, Field(ge=1, description="maximum number of classes in the answer")] = 10
+    top_k: Annotated[int, Field(ge=1)] = 10
+    """maximum number of classes in the answer"""
     candidates: Annotated[
         list[Label] | None,
         Field(
@@ -54,13 +55,10 @@ class MissingRequest(SceneRequest):
             "contains them at any probability",
         ),
     ] = None
-    at: Annotated[
-        Annotated[Anchor, OrArray()] | None,
-        Field(description="limit the answer to objects missing at this place"),
-    ] = None
-    detail: Annotated[
-        Detail, Field(description="`scores` leaves `placements` and `because` out of the answer")
-    ] = "full"
+    at: Annotated[Anchor, OrArray()] | None = None
+    """limit the answer to objects missing at this place"""
+    detail: Detail = "full"
+    """`scores` leaves `placements` and `because` out of the answer"""
 
 
 @dataclass(slots=True)

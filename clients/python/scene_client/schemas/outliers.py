@@ -31,16 +31,10 @@ class OutliersRequest(SceneRequest):
             "most alarms, and also to short lists of objects"
         ),
     ] = "medium"
-    threshold: Annotated[
-        Probability | None,
-        Field(
-            description="minimum probability of an outlier; default: threshold of the model for "
-            "`sensitivity`",
-        ),
-    ] = None
-    detail: Annotated[
-        Detail, Field(description="`scores` leaves `because` and `usually_with` out of the answer")
-    ] = "full"
+    threshold: Probability | None = None
+    """minimum probability of an outlier; default: threshold of the model for `sensitivity`"""
+    detail: Detail = "full"
+    """`scores` leaves `because` and `usually_with` out of the answer"""
 
 
 class Outlier(Reply):

@@ -33,22 +33,17 @@ class RelationsRequest(SceneRequest):
     """Which spatial relations hold between these objects?"""
 
     objects: SomeObjects
-    top_k: Annotated[int, Field(ge=1, le=4096, description="maximum number of relations")] = 20
-    min_probability: Annotated[
-        Probability, Field(description="minimum probability of the relations in the answer")
-    ] = 0.0
+    top_k: Annotated[int, Field(ge=1, le=4096)] = 20
+    """maximum number of relations"""
+    min_probability: Probability = 0.0
+    """minimum probability of the relations in the answer"""
     pairs: Annotated[
         list[Annotated[Pair, OrArray()]] | None,
-        Field(
-            min_length=1,
-            max_length=4096,
-            fail_fast=True,
-            description="limit the answer to these pairs of subject and object",
-        ),
+        Field(min_length=1, max_length=4096, fail_fast=True),
     ] = None
-    include_opposites: Annotated[
-        bool, Field(description="also list right, behind, under and below")
-    ] = False
+    """limit the answer to these pairs of subject and object"""
+    include_opposites: bool = False
+    """also list right, behind, under and below"""
 
 
 @dataclass(slots=True)

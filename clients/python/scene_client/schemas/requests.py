@@ -83,7 +83,9 @@ Body: TypeAlias = Mapping[str, Any]
 class Request(BaseModel):
     """Base class of all parts of a request. Validation refuses unknown fields and wrong types."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+    model_config = ConfigDict(
+        strict=True, extra="forbid", frozen=True, use_attribute_docstrings=True
+    )
 
 
 class OrArray:
@@ -191,30 +193,18 @@ class Detection(Request):
             "if several objects have this label"
         ),
     ] = None
-    label: Annotated[Label, Field(description="label in any spelling that the vocabulary accepts")]
-    confidence: Annotated[
-        float,
-        Field(
-            gt=0,
-            le=1,
-            allow_inf_nan=False,
-            description="probability that the object exists",
-        ),
-    ] = 1.0
-    position: Annotated[
-        Annotated[Position, OrArray()] | None, Field(description="centre of the object's box")
-    ] = None
-    size: Annotated[
-        Annotated[Size, OrArray()] | None,
-        Field(description="default: the typical size of the class, if known"),
-    ] = None
-    orientation: Annotated[
-        Annotated[Quaternion, OrArray()] | None, Field(description="rotation of the object's box")
-    ] = None
-    yaw: Annotated[
-        Angle | None,
-        Field(description="rotation about the z axis in radians, instead of `orientation`"),
-    ] = None
+    label: Label
+    """label in any spelling that the vocabulary accepts"""
+    confidence: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 1.0
+    """probability that the object exists"""
+    position: Annotated[Position, OrArray()] | None = None
+    """centre of the object's box"""
+    size: Annotated[Size, OrArray()] | None = None
+    """default: the typical size of the class, if known"""
+    orientation: Annotated[Quaternion, OrArray()] | None = None
+    """rotation of the object's box"""
+    yaw: Angle | None = None
+    """rotation about the z axis in radians, instead of `orientation`"""
     supported_by: Annotated[
         Id | None,
         Field(
@@ -281,10 +271,10 @@ class SceneRequest(Request):
             "relations from positions. An empty list turns this derivation off",
         ),
     ] = None
-    relations_complete: Annotated[
-        bool, Field(description="whether every relation that `relations` does not list is false")
-    ] = False
-    room_type: Annotated[Label | None, Field(description="one of the model's room types")] = None
+    relations_complete: bool = False
+    """whether every relation that `relations` does not list is false"""
+    room_type: Label | None = None
+    """one of the model's room types"""
     frame_id: Annotated[
         str | None,
         Field(
@@ -293,24 +283,14 @@ class SceneRequest(Request):
             "contains the same name",
         ),
     ] = None
-    stamp: Annotated[
-        Stamp | None,
-        Field(description="time of the scene, as in std_msgs/Header; copied to the answer"),
-    ] = None
-    viewpoint: Annotated[
-        Viewpoint | None,
-        Field(
-            description="pose of the viewer; by default, the viewer is at the origin of the frame "
-            "and looks along x"
-        ),
-    ] = None
-    model: Annotated[ModelSpec, Field(description="an alias, `name` or `name@version`")] = "default"
-    seed: Annotated[
-        int | None,
-        Field(
-            ge=0, le=MAX_SEED, description="random seed of `/generate`; unused by other questions"
-        ),
-    ] = None
+    stamp: Stamp | None = None
+    """time of the scene, as in std_msgs/Header; copied to the answer"""
+    viewpoint: Viewpoint | None = None
+    """pose of the viewer; by default, the viewer is at the origin of the frame and looks along x"""
+    model: ModelSpec = "default"
+    """an alias, `name` or `name@version`"""
+    seed: Annotated[int | None, Field(ge=0, le=MAX_SEED)] = None
+    """random seed of `/generate`; unused by other questions"""
     unknown_labels: Annotated[
         UnknownLabels,
         Field(
@@ -330,10 +310,8 @@ class SceneRequest(Request):
     ] = None
     source: Unused = None
     group: Unused = None
-    viewer_frame: Annotated[
-        bool,
-        Field(description="whether the axes of a training scene are those of the viewer"),
-    ] = False
+    viewer_frame: bool = False
+    """whether the axes of a training scene are those of the viewer"""
 
     @model_validator(mode="before")
     @classmethod
@@ -364,9 +342,8 @@ class SceneFields(TypedDict, total=False):
 class AliasRequest(Request):
     """The new target of an alias."""
 
-    model: Annotated[
-        ModelSpec, Field(description="`name@version`, or `name` for the newest usable version")
-    ]
+    model: ModelSpec
+    """`name@version`, or `name` for the newest usable version"""
     expected: Annotated[
         ModelSpec | None,
         Field(
