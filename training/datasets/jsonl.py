@@ -193,7 +193,7 @@ def _object(values: Mapping[str, Any], name: str) -> AnnotatedObject:
         label=_text("label", values["label"]),
         position=_vector("position", values.get("position")),
         # Sides that are all below 1 mm mean an unknown size, as in a request.
-        size=size if size and max(map(abs, size)) >= SMALLEST else None,
+        size=None if size and all(abs(side) < SMALLEST for side in size) else size,
         yaw=float(yaw),
         supported_by=None if supported_by is None else _id(supported_by),
         box2d=_numbers("box2d", values.get("box2d"), 4),

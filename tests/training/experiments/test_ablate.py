@@ -152,8 +152,8 @@ def test_bad_requests_are_named(finished, tmp_path):
             (*arguments(tmp_path), "--row", "nobody"),
             "unknown rows ['nobody']: choose from seed-form",
         ),
-        ((*arguments(tmp_path), "--rows", "nowhere.toml"), "ablation file nowhere.toml"),
-        (("ablate", config), "TOML file of ablations with --rows"),
+        ((*arguments(tmp_path), "--rows", "nowhere.toml"), "nowhere.toml does not exist"),
+        (("ablate", config), "no shipped ablations"),
         ((*arguments(finished), "--limit", "20"), "another configuration of rooms-triway"),
     ):
         assert message in invoke(*request, code=1)
