@@ -66,8 +66,7 @@ _SEVERAL: Final = frozenset(("and", "or", "&", "+", "without"))
 _TOGETHER: Final = frozenset(("with", "in"))
 # A "toy trailer" is a toy, and a "puppet cat" is a puppet.
 _IMITATIONS: Final = frozenset(("toy", "stuffed", "plush", "puppet"))
-# A modifier changes the meaning of these words: a "jail cell" is no phone, and a "bottle cap" is no
-# hat.
+# A modifier changes the meaning of these words: "cell" means a phone, but "jail cell" means a room.
 _AMBIGUOUS: Final = frozenset(
     "bar board boat burner button can cap card cell chip cleaner conditioner console controller "  # noqa: SIM905
     "cooker cover cream cube cycle die disc dish disk draw dressing dryer equipment file "

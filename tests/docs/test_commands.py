@@ -15,7 +15,7 @@ from tests.conftest import REPOSITORY
 from training.cli import app as training
 
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
-PAGES.remove(REPOSITORY / "docs/upgrading.md")  # names what is gone
+PAGES.remove(REPOSITORY / "docs/upgrading.md")  # names removed settings and commands
 TARGETS = set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
 COMMANDS = typer.main.get_command(training).commands  # type: ignore[attr-defined]
 
