@@ -14,8 +14,8 @@ from typing import Final
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from app.errors import ServingError
 from app.main import create_app
-from app.serving.errors import ServingError
 from app.serving.logs import log_config
 from app.serving.runtime import Runtime
 from app.settings import Settings

@@ -21,7 +21,7 @@ from starlette.types import Receive, Scope, Send
 from app.api import catalogue
 from app.api.gateway import ADMIN_KEY, carries, too_large, unauthorized
 from app.api.problems import ProblemError, from_exception, invalid
-from app.serving.errors import Location, RequestError
+from app.errors import Location, RequestError
 from app.settings import Settings
 from scene_client.schemas import FieldError
 from scene_client.schemas import Request as Form

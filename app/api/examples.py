@@ -2,15 +2,15 @@
 
 The dictionaries map an operation id to its examples. The documentation page and the tests send the
 example requests unchanged. Figures in the example answers are only illustrative. The module of each
-question in `app.serving.questions` contains the examples of this question.
+question in `app.questions` contains the examples of this question.
 """
 
 from __future__ import annotations
 
 from typing import Any, Final
 
-from app.serving.questions import QUESTIONS
-from app.serving.questions.question import BATCH, Example
+from app.questions import QUESTIONS
+from app.questions.question import BATCH, Example
 
 _ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
 _MODEL: Final = {
@@ -67,7 +67,7 @@ def _batch(result: dict[str, Any]) -> dict[str, Any]:
 
 REQUESTS: Final[dict[str, dict[str, Example]]] = {
     **{question.name: dict(question.examples) for question in QUESTIONS},
-    **{f"{question.name}_batch": BATCH for question in QUESTIONS if question.has_batch},
+    **{f"{question.name}_batch": BATCH for question in QUESTIONS if not question.samples},
     "move_alias": {
         "promote": Example("point the alias at a version", {"model": "home@1.1.0"}),
         "guarded": Example(
@@ -90,7 +90,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     **{
         f"{question.name}_batch": _batch(_OF_QUESTIONS[question.name])
         for question in QUESTIONS
-        if question.has_batch
+        if not question.samples
     },
     "list_models": {
         "generation": "3f6d0f4be1a25c77",

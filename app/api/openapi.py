@@ -11,7 +11,7 @@ from app.api import catalogue, examples
 from app.api.catalogue import ProblemType
 from app.api.gateway import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE, ProblemError
-from app.serving.questions.question import Example
+from app.questions.question import Example
 from scene_client.schemas import MAX_SEED, FieldError, Problem
 
 Responses = dict[int | str, dict[str, Any]]

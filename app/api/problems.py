@@ -16,9 +16,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
+from app import errors as serving
 from app.api import catalogue
 from app.api.catalogue import ProblemType
-from app.serving import errors as serving
 from scene_client.schemas import Failure, FieldError, Problem
 from scene_client.validation import MAX_ERRORS, pointer
 

@@ -17,10 +17,10 @@ from app.api import catalogue
 from app.api.body import BatchRoute, JSONRoute, validated
 from app.api.openapi import BODY, operation_id, queued
 from app.api.problems import from_exception, report_defect
+from app.questions import QUESTIONS, Question
+from app.questions.answer import written
 from app.serving import request as serving
-from app.serving.answers import written
 from app.serving.models import DEFAULT
-from app.serving.questions import QUESTIONS, Question
 from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
@@ -53,16 +53,15 @@ batches = APIRouter(
 
 
 def begin(http: Request) -> serving.Request:
-    """Create the serving request of an HTTP request.
-
-    Raises:
-        NotReadyError: the models have not been loaded yet.
-    """
+    """Create the serving request of an HTTP request. It uses one snapshot of the models."""
     state, runtime = http.scope["state"], http.scope["app"].state.runtime
-    found: serving.Request = runtime.request(
-        state["deadline"], state["request_id"], state["record"], http.is_disconnected
+    return serving.Request(
+        *(state["deadline"], http.is_disconnected, state["request_id"]),
+        record=state["record"],
+        models=runtime.models,
+        limits=runtime.limits,
+        metrics=runtime.metrics,
     )
-    return found
 
 
 async def _answer_each(
@@ -85,7 +84,7 @@ async def _answer_each(
                 # Only this validation may fail because of the client. Any later validation error is
                 # a defect of the service.
                 asked = validated(scene, question.request, at=("scenes", place))
-                answer = written(await question.answer(one, asked))
+                answer = written(await one.answer(question, asked))
                 results.append(b'{"status":200,"result":%b}' % answer)
                 count(serving.SUCCESS)
             except Exception as error:  # noqa: BLE001 — any error fails only this scene
@@ -122,7 +121,7 @@ def _endpoints(question: Question[Any]) -> tuple[_Endpoint, _Endpoint]:
     """Create the endpoint functions of a question: for one scene, and for a batch."""
 
     async def answer(asked: Any, http: Request) -> bytes:
-        return written(await question.answer(begin(http), asked))
+        return written(await begin(http).answer(question, asked))
 
     async def answer_batch(asked: Any, http: Request) -> bytes:
         return await _answer_each(http, asked, question)
@@ -145,7 +144,7 @@ for _question in QUESTIONS:
         description=_question.description,
         response_model=_question.response,
     )
-    if _question.has_batch:
+    if not _question.samples:
         batches.add_api_route(
             f"/{_question.name}/batch",
             _answer_batch,

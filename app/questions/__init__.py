@@ -1,4 +1,4 @@
-"""The four questions, as functions of a published model and a scene.
+"""The four questions about a scene. The module of a question contains everything about it.
 
     relations   Which spatial relations hold between the objects of the scene?
     missing     Which unlisted objects are probably in the scene, and where? `more` adds the listed
@@ -6,44 +6,32 @@
     outliers    Which objects do not belong to the scene, and which stated relations are wrong?
     generate    Which other scenes contain these objects and relations?
 
-The first three questions compute expectations, in closed form or with fixed random numbers. So the
-same scene always gets the same answer. `generate` draws random scenes. Answers refer to an object
-by its index in `Scene.objects`.
+The function of a question takes a published model and a scene. It returns the fields of the answer,
+as `scene_client.schemas` defines them. The first three questions compute expectations, in closed
+form or with fixed random numbers. So the same scene always gets the same answer. `generate` draws
+random scenes. To add a question, add a module to this package and its record to `QUESTIONS`.
 """
 
 from __future__ import annotations
 
-from app.questions.contexts import ContextUnit, contexts
-from app.questions.counts import More, more
-from app.questions.generate import GeneratedScene, generate
-from app.questions.missing import MissingAnswer, Placement, missing
-from app.questions.outliers import (
-    OutlierAnswer,
-    OutliersFound,
-    Sensitivity,
-    misplaced,
-    outliers,
-)
-from app.questions.ranking import Because
-from app.questions.relations import Disagreement, RelationAnswer, relations
+from typing import Any, Final
+
+from app.questions.generate import GENERATE, generate
+from app.questions.missing import MISSING, missing
+from app.questions.outliers import OUTLIERS, Sensitivity, misplaced, outliers
+from app.questions.question import Question
+from app.questions.relations import RELATIONS, relations
+
+QUESTIONS: Final[tuple[Question[Any], ...]] = (RELATIONS, MISSING, OUTLIERS, GENERATE)
+"""All questions, in the order of the documentation."""
 
 __all__ = [
-    "Because",
-    "ContextUnit",
-    "Disagreement",
-    "GeneratedScene",
-    "MissingAnswer",
-    "More",
-    "OutlierAnswer",
-    "OutliersFound",
-    "Placement",
-    "RelationAnswer",
+    "QUESTIONS",
+    "Question",
     "Sensitivity",
-    "contexts",
     "generate",
     "misplaced",
     "missing",
-    "more",
     "outliers",
     "relations",
 ]

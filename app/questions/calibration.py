@@ -56,14 +56,14 @@ def relation_probability(
         slope, weight = slopes[a, 1], slopes[a, 2]
         intercept = np.float32(slopes[a, 0] + slopes[a, 3] * size)
         for b in range(len(p)):
-            row, found = log_odds[b, a], p[b, a]
+            row, logits = log_odds[b, a], p[b, a]
             for j in range(len(row)):
-                found[j] = intercept + slope * row[j] + weight * log_count[j]
-            bend(slopes[a], found)
+                logits[j] = intercept + slope * row[j] + weight * log_count[j]
+            bend(slopes[a], logits)
     # One loop over all rows is faster than one loop per row, because a row may be short.
-    logits = p.reshape(-1)
-    for e in range(len(logits)):
-        logits[e] = logistic(np.float32(logits[e]))
+    flat = p.reshape(-1)
+    for e in range(len(flat)):
+        flat[e] = logistic(np.float32(flat[e]))
     return p
 
 
@@ -75,6 +75,18 @@ def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
     """
     total = np.maximum(forward + backward, np.float32(1.0))
     return forward / total, backward / total
+
+
+def calibrated(entry: CountSlope, z: Floats, n: int | NDArray[np.integer[Any]]) -> Floats:
+    """Return the calibrated log-odds of N logits, (N,); see `CountSlope` for the formula.
+
+    Args:
+        entry: calibration of a question.
+        z: (N,) logits.
+        n: number n of the formula, or an array (N,) with a number for each logit.
+    """
+    log_odds: Floats = entry.intercept + entry.log_count * np.log(n) + entry.slope * z
+    return log_odds
 
 
 def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int) -> Floats:
@@ -90,8 +102,8 @@ def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int
     odds = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-7)))
     logits = intercept + gain * odds + weight * log_count + size * math.log(classes)
     bend(entry, logits)
-    found: Floats = -np.logaddexp(0.0, -logits)
-    return found
+    log_probability: Floats = -np.logaddexp(0.0, -logits)
+    return log_probability
 
 
 def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, listed: int) -> Floats:
@@ -103,18 +115,9 @@ def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, lis
         log_p: (N,) calibrated log p(relation holds | present) of each candidate class.
         listed: number of classes that the scene lists.
     """
-    both = log_p - np.logaddexp(0.0, -calibration.missing.log_odds(log_odds, listed))
-    found: Floats = both - np.log(-np.expm1(np.minimum(both, -1e-7)))
-    return found
-
-
-def intruder_line(entry: CountSlope, classes: int) -> tuple[float, float]:
-    """Return intercept and slope that convert log-odds of presence to log-odds of an intruder.
-
-    An intruder is an object that does not belong to the scene. The scene has `classes` distinct
-    classes. `entry` is `Calibration.outlier`.
-    """
-    return entry.intercept + entry.log_count * math.log(classes), entry.slope
+    both = log_p - np.logaddexp(0.0, -calibrated(calibration.missing, log_odds, listed))
+    logits: Floats = both - np.log(-np.expm1(np.minimum(both, -1e-7)))
+    return logits
 
 
 def false_log_odds(entry: Slope, log_odds: Floats) -> Floats:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL
+from scene_client.schemas import ContextUnit, RelationName, WeightedLabel, WeightedRelation
 
 OBJECTS = 8
 RELATIONS = 3
@@ -20,29 +20,10 @@ ROOM_TYPES = 3
 _NAMED = 3
 Floats = NDArray[np.float32]
 Named = TypeVar("Named")
+Weighted: TypeAlias = tuple[tuple[Named, float], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class ContextUnit:
-    """Description of a hidden unit by the classes, relations and room types that it favours.
-
-    Attributes:
-        unit: index of the unit in its layer.
-        name: readable name of the unit.
-        objects: (label, weight) of the object classes with the largest weights.
-        relations: ((subject, relation, object), weight) of the relations with the largest weights.
-            Each weight is the unit's weight minus the mean weight over the units of the layer.
-        room_types: (room type, weight) of the room types with the largest weights.
-    """
-
-    unit: int
-    name: str
-    objects: tuple[tuple[str, float], ...]
-    relations: tuple[tuple[tuple[str, str, str], float], ...]
-    room_types: tuple[tuple[str, float], ...]
-
-
-def contexts(artifact: Artifact) -> dict[str, tuple[ContextUnit, ...]]:
+def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
     """Describe the hidden units of each layer by their largest positive weights.
 
     The weights of a unit of layer h1 are its columns in W (objects), U (relations that occur in
@@ -72,9 +53,9 @@ def contexts(artifact: Artifact) -> dict[str, tuple[ContextUnit, ...]]:
         J = weights["J"]
         layers["h2"] = (objects @ J, standing @ J, rooms @ J)
     return {
-        layer: tuple(
-            ContextUnit(unit, _name(unit, things, triples), things, triples, places)
-            for unit, (things, triples, places) in enumerate(
+        layer: [
+            _described(unit, *columns)
+            for unit, columns in enumerate(
                 zip(
                     _strongest(to_objects, labels, OBJECTS),
                     _strongest(
@@ -84,25 +65,38 @@ def contexts(artifact: Artifact) -> dict[str, tuple[ContextUnit, ...]]:
                     strict=True,
                 )
             )
-        )
+        ]
         for layer, (to_objects, to_relations, to_rooms) in layers.items()
     }
 
 
-def _name(
+def _described(
     unit: int,
-    objects: Sequence[tuple[str, float]],
-    relations: Sequence[tuple[tuple[str, str, str], float]],
-) -> str:
-    """Return the readable name of a unit: its first three objects and its first relation."""
+    objects: Weighted[str],
+    relations: Weighted[tuple[str, str, str]],
+    rooms: Weighted[str],
+) -> ContextUnit:
+    """Return the description of a unit. Its name has its first objects and its first relation."""
     parts = [", ".join(label for label, _ in objects[:_NAMED])]
     parts += [" ".join(triple) for triple, _ in relations[:1]]
-    return "; ".join(filter(None, parts)) or f"unit {unit}"
+    return ContextUnit(
+        unit=unit,
+        name="; ".join(filter(None, parts)) or f"unit {unit}",
+        objects=[WeightedLabel(label=label, weight=weight) for label, weight in objects],
+        relations=[
+            WeightedRelation(
+                subject=subject,
+                relation=cast("RelationName", relation),
+                object=other,
+                weight=weight,
+            )
+            for (subject, relation, other), weight in relations
+        ],
+        room_types=[WeightedLabel(label=room, weight=weight) for room, weight in rooms],
+    )
 
 
-def _strongest(
-    weights: Floats, names: Sequence[Named], count: int
-) -> list[tuple[tuple[Named, float], ...]]:
+def _strongest(weights: Floats, names: Sequence[Named], count: int) -> list[Weighted[Named]]:
     """Return (name, weight) of the largest positive weights of each unit, largest first.
 
     Args:

@@ -19,11 +19,12 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Collection
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from app.questions.answer import Fields, significant
 from app.questions.posterior import present
 from app.registry.artifact import Artifact
 from app.registry.counts import INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
@@ -38,26 +39,6 @@ LIKELY: Final = 0.5
 _TAIL: Final = 0.1  # probability of a count below `low`, and of a count above `high`
 
 
-class More(NamedTuple):
-    """A listed class that probably has more instances than the scene lists.
-
-    Attributes:
-        label: canonical label of the class.
-        listed_count: number of listed objects of the class.
-        expected_count: expected number of instances in the scene, including the listed ones.
-        low, high: limits of the number of instances; the number is in this interval with a
-            probability of at least 0.8.
-        probability: probability that the scene has more instances than the request lists.
-    """
-
-    label: str
-    listed_count: int
-    expected_count: float
-    low: int
-    high: int
-    probability: float
-
-
 def more(
     artifact: Artifact,
     scene: Scene,
@@ -65,7 +46,7 @@ def more(
     top_k: int = 10,
     candidates: Collection[int] | None = None,
     coverage: float | None = None,
-) -> tuple[More, ...]:
+) -> list[Fields]:
     """Return the listed classes with probably more instances than listed, likeliest first.
 
     Listed objects count as present, whatever their confidence. The answer never contains structural
@@ -80,40 +61,50 @@ def more(
         coverage: probability that the request lists an object of the scene. Only values above the
             model's coverage change the answer. At 1, the scene has no further instances.
 
+    Returns:
+        The fields of `scene_client.schemas.MoreInstances`. `low` and `high` are limits of the
+        number of instances, which is between them with a probability of at least 0.8.
+
     Raises:
         ValueError: the machine does not know the class of an object or the room type.
     """
     if artifact.counts is None:
-        return ()
-    found = present(scene, artifact.spec)
-    plain = ~artifact.vocabulary.structure[found.classes]
-    classes, listed = found.classes[plain], found.counts[plain]
-    usual = artifact.calibration.coverage
-    unlisted = 1.0
+        return []
+    listing = present(scene, artifact.spec)
+    plain = ~artifact.vocabulary.structure[listing.classes]
+    classes, listed = listing.classes[plain], listing.counts[plain]
+    usual, unlisted = artifact.calibration.coverage, 1.0
     if coverage is not None and coverage > usual:
         unlisted = (1 - coverage) / (1 - usual)
     which, p = distribution(
         artifact.counts, artifact.spec.V, classes, listed, scene.room_type, unlisted
     )
-    if not len(which):
-        return ()
-    k, chosen = listed[which], classes[which]
-    number, below = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
-    beyond = 1 - p[np.arange(len(which)), k - 1]
-    usable = beyond >= LIKELY if candidates is None else np.isin(chosen, list(candidates))
+    classes, listed = classes[which], listed[which]
+    numbers, below = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
+    beyond = 1 - p[np.arange(len(p)), listed - 1]
+    usable = beyond >= LIKELY if candidates is None else np.isin(classes, list(candidates))
     order = np.flatnonzero(usable)
     order = order[np.argsort(-beyond[order], kind="stable")][:top_k]
-    return tuple(
-        More(
-            artifact.vocabulary.labels[chosen[row]],
-            int(k[row]),
-            float(p[row] @ number),
-            int((below[row] < _TAIL).sum()) + 1,
-            int((below[row] < 1 - _TAIL).sum()) + 1,
-            float(beyond[row]),
-        )
-        for row in order.tolist()
+    below = below[order]
+    columns = (
+        classes[order].tolist(),
+        listed[order].tolist(),
+        significant(p[order] @ numbers),
+        ((below < _TAIL).sum(axis=1) + 1).tolist(),
+        ((below < 1 - _TAIL).sum(axis=1) + 1).tolist(),
+        significant(beyond[order]),
     )
+    return [
+        {
+            "label": artifact.vocabulary.labels[index],
+            "listed_count": count,
+            "expected_count": expected,
+            "low": low,
+            "high": high,
+            "probability": probability,
+        }
+        for index, count, expected, low, high, probability in zip(*columns, strict=True)
+    ]
 
 
 def distribution(

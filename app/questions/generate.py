@@ -14,24 +14,34 @@ After `ATTEMPTS` draws for the same scene, the last draw is accepted in any case
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+import secrets
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
+from app.errors import Reason
 from app.inference import MachineSpec, Weights
 from app.inference.chains import ConditionedChains, Conditions, Drawn, random_stream
 from app.inference.elementary import softplus
+from app.questions.answer import (
+    OBJECT_BYTES,
+    RELATION_BYTES,
+    Fields,
+    SizeLimit,
+    rounded_number,
+)
+from app.questions.names import Faults
 from app.questions.outliers import intruders
 from app.questions.posterior import given_relations, present
+from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
+from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
 from app.scene.scene import Scene, SceneObject
-
-Triple = tuple[int, int, int]
+from scene_client.schemas import GenerateAnswer, GenerateRequest
 
 STEPS: Final = 50
 """Default number of Gibbs sweeps for one drawn scene."""
@@ -44,22 +54,13 @@ ATTEMPTS: Final = 8
 _DIRECTION: Final = np.array([{LEFT: 1, FRONT: 2}.get(a, 0) for a in range(len(CANONICAL))])
 
 
-@dataclass(frozen=True, slots=True)
-class GeneratedScene:
-    """A drawn scene.
+DRAWN_SEED_BITS: Final = 53
+"""Size in bits of a seed that the service chooses.
 
-    Attributes:
-        objects: canonical labels of the drawn classes, in the order of the vocabulary.
-        relations: drawn relations, each as (subject label, canonical relation, object label).
-        log_score: score of the scene; see `ConditionedChains.log_score`. Only scores of the same
-            model can be compared.
-        context: maps the name of each layer, "h1" or "h2", to the indices of its active units.
-    """
+A JSON reader may store numbers as doubles. A double represents an integer of 53 bits exactly.
+"""
 
-    objects: tuple[str, ...]
-    relations: tuple[tuple[str, str, str], ...]
-    log_score: float
-    context: dict[str, tuple[int, ...]]
+_UNIT_BYTES: Final = 12  # maximum size in bytes of the number of one hidden unit
 
 
 def generate(
@@ -72,7 +73,8 @@ def generate(
     temperature: float = 1.0,
     context: Mapping[str, Sequence[int]] | None = None,
     stop: Callable[[], bool] = lambda: False,
-) -> tuple[GeneratedScene, ...]:
+    size_limit: SizeLimit | None = None,
+) -> Fields:
     """Draw scenes that contain the evidence, by Gibbs chains.
 
     The chains start at samples that the model stores. Every drawn scene contains all objects and
@@ -98,10 +100,16 @@ def generate(
             held on.
         stop: function called between draws. After it returns True, `generate` returns the scenes
             drawn so far.
+        size_limit: limit on the size of the answer, or None.
+
+    Returns:
+        The fields `seed` and `scenes` of `scene_client.schemas.GenerateAnswer`. For `log_score`,
+        see `ConditionedChains.log_score`. Only scores of the same model can be compared.
 
     Raises:
         ValueError: a number is out of range, or the machine does not have a layer or unit in
             `context`.
+        RequestError: the answer would exceed `size_limit`.
     """
     steps = STEPS if steps is None else steps
     if count < 1:
@@ -118,7 +126,7 @@ def generate(
     shown[conditions.classes] = True
     of = [thing.class_index or 0 for thing in scene.objects]
     given = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
-    scenes: list[GeneratedScene] = []
+    scenes: list[Fields] = []
     plausible = Plausible(artifact, scene)
     while len(scenes) < count and not stop():
         stream = random_stream(seed, len(scenes))
@@ -128,7 +136,9 @@ def generate(
             if plausible(drawn.classes[seen].tolist()) or stop() or attempt == ATTEMPTS - 1:
                 scenes.append(_scene(artifact, conditioned, drawn, seen, given))
                 break
-    return tuple(scenes)
+    if size_limit is not None:
+        size_limit.check("count", *_size(scenes))
+    return {"seed": seed, "scenes": scenes}
 
 
 def _conditions(
@@ -140,9 +150,9 @@ def _conditions(
         ValueError: the machine does not have a layer or unit in `context`.
     """
     spec, classes = artifact.spec, present(scene, artifact.spec)
-    sizes = {"h1": spec.H1, "h2": spec.H2}
+    sizes = _layer_sizes(spec)
     for layer, units in context.items():
-        if not sizes.get(layer):
+        if layer not in sizes:
             raise ValueError(
                 f"the model has no layer {layer!r}; layers are h1, and h2 in two-layer models"
             )
@@ -152,7 +162,7 @@ def _conditions(
                     f"unit {unit} of {layer} does not exist: a unit must be at least 0 and below "
                     f"{sizes[layer]}"
                 )
-    held = [np.unique(np.array(context.get(layer, ()), dtype=np.int64)) for layer in sizes]
+    held = [np.unique(np.array(context.get(layer, ()), dtype=np.int64)) for layer in ("h1", "h2")]
     return Conditions(
         classes.classes,
         classes.log_counts,
@@ -169,7 +179,8 @@ def _scene(
     drawn: Drawn,
     shown: NDArray[np.bool_],
     given: set[Triple],
-) -> GeneratedScene:
+) -> Fields:
+    """Return the fields of `scene_client.schemas.GeneratedScene` for a drawn scene."""
     labels = artifact.vocabulary.labels
     units = np.nonzero(drawn.r & shown[:, None] & shown)
     a, i, j = units
@@ -178,19 +189,20 @@ def _scene(
     kept = np.zeros_like(drawn.r)
     kept[units] = stay
     triples = sorted({*map(tuple, named[stay].tolist()), *given})
-    return GeneratedScene(
-        objects=tuple(labels[index] for index in drawn.classes[shown].tolist()),
-        relations=tuple((labels[i], CANONICAL[a], labels[j]) for a, i, j in triples),
-        log_score=chains.log_score(drawn, shown, kept),
-        context=_layers(artifact.spec, drawn),
-    )
+    return {
+        "objects": [labels[index] for index in drawn.classes[shown].tolist()],
+        "relations": [
+            {"subject": labels[i], "relation": CANONICAL[a], "object": labels[j]}
+            for a, i, j in triples
+        ],
+        "log_score": rounded_number(chains.log_score(drawn, shown, kept)),
+        "context": {layer: getattr(drawn, layer).tolist() for layer in _layer_sizes(artifact.spec)},
+    }
 
 
-def _layers(spec: MachineSpec, drawn: Drawn) -> dict[str, tuple[int, ...]]:
-    layers = {"h1": tuple(drawn.h1.tolist())}
-    if spec.H2:
-        layers["h2"] = tuple(drawn.h2.tolist())
-    return layers
+def _layer_sizes(spec: MachineSpec) -> dict[str, int]:
+    """Map the name of each hidden layer to its number of units."""
+    return {"h1": spec.H1, "h2": spec.H2} if spec.H2 else {"h1": spec.H1}
 
 
 def staying(
@@ -331,3 +343,84 @@ def room_fit(weights: Weights, v: NDArray[np.float32], room: int) -> NDArray[np.
     change = softplus(x + weights["Q"][room]) - softplus(x)
     found: NDArray[np.float64] = np.sum(change, axis=1, dtype=np.float64)
     return found
+
+
+def _size(scenes: Sequence[Fields]) -> tuple[int, int]:
+    """Return the size of the scenes in bytes without names, and the number of names."""
+    objects = sum([len(scene["objects"]) for scene in scenes])
+    relations = sum([len(scene["relations"]) for scene in scenes])
+    units = sum([len(layer) for scene in scenes for layer in scene["context"].values()])
+    fixed = len(scenes) * OBJECT_BYTES + relations * RELATION_BYTES + units * _UNIT_BYTES
+    return fixed, objects + 2 * relations
+
+
+def _read(request: GenerateRequest, artifact: Artifact, _: Reading) -> Options:
+    """Return the arguments of `generate` for a request."""
+    faults, sizes = Faults(), _layer_sizes(artifact.spec)
+    for layer, units in (request.context or {}).items():
+        size = sizes.get(layer)
+        if size is None:
+            message = "the model lacks this hidden layer"
+            faults.add(Reason.INVALID, ("context", layer), message, tuple(sizes))
+            continue
+        for position, unit in enumerate(units):
+            if unit >= size:
+                message = f"the hidden layer has only the units 0 to {size - 1}"
+                faults.add(Reason.INVALID, ("context", layer, position), message)
+    faults.raise_any()
+    return {
+        "count": request.count,
+        "seed": secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed,
+        "steps": request.steps,
+        "temperature": request.temperature,
+        "context": request.context,
+    }
+
+
+def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+    # One Gibbs sweep compiles all kernels.
+    yield generate(artifact, scenes[0], count=2, seed=0, steps=1)
+
+
+_EXAMPLES: Final = {
+    "room": Example("a bedroom", {"room_type": "bedroom", "count": 2, "seed": 7}),
+    "evidence": Example(
+        "scenes that contain these objects and this relation",
+        {**BEDROOM, "count": 2, "seed": 7},
+    ),
+    "poses": Example("scenes around the objects that the robot sees", {**POSES, "seed": 7}),
+    "context": Example(
+        "active hidden units (GET /models/{name}/contexts lists all units)",
+        {"context": {"h1": [0, 3]}, "seed": 7},
+    ),
+    "varied": Example(
+        "more Gibbs steps and a higher temperature, for more varied scenes",
+        {"objects": ["desk"], "steps": 100, "temperature": 1.5, "count": 4, "seed": 7},
+    ),
+    **REFUSED,
+}
+_EXAMPLE_ANSWER: Final = {
+    "seed": 7,
+    "scenes": [
+        {
+            "objects": ["bed", "nightstand", "lamp"],
+            "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
+            "log_score": -6.1,
+            "context": {"h1": [3, 17]},
+        }
+    ],
+}
+
+GENERATE: Final = Question(
+    generate,
+    _read,
+    _warm_up,
+    GenerateRequest,
+    GenerateAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+    description="""
+Sample scenes that contain the given objects and relations. Equal seeds give equal scenes.
+""",
+    samples=True,
+)

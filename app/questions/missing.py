@@ -9,92 +9,43 @@ placements.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled
-from app.inference.elementary import sigmoid
-from app.inference.relations import NO_UNIT
-from app.questions.calibration import placed_logits, placement_log_p
-from app.questions.posterior import Posterior, posterior
-from app.questions.ranking import (
+from app.errors import Reason
+from app.questions.answer import (
+    CAUSE_BYTES,
     EXPLAINED,
-    Because,
-    best,
-    entries,
-    likeliest_places,
-    strongest_reasons,
+    OBJECT_BYTES,
+    RELATION_BYTES,
+    Fields,
+    SizeLimit,
+    reasons,
+    significant,
 )
+from app.questions.calibration import calibrated, placed_logits
+from app.questions.counts import more
+from app.questions.names import Faults
+from app.questions.placements import Place, place_log_p, placements
+from app.questions.posterior import Posterior, posterior_of
+from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
+from app.questions.ranking import likeliest_classes
+from app.questions.reading import Reading
 from app.registry.artifact import Artifact
-from app.registry.offsets import NOTHING, Offsets, look_up
-from app.scene.frames import Axes, viewer_axes
-from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP, RELATIONS, canonicalise, opposite
+from app.scene.geometry import Axes, viewer_axes
+from app.scene.relations import opposite
 from app.scene.scene import Scene
+from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
 VIEWER = viewer_axes()
 """Axes of a viewer who looks along the x axis of the frame."""
 
 _BLOCK: Final = 32
-
-PLACES: Final = 3
-"""Maximum number of placements in the answer for one class."""
-
-_SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
-_UNTURNED: Final = np.eye(3)
-_PER_METRE: Final = 1000.0  # answers are rounded to millimetres
-
-
-class Offset(NamedTuple):
-    """Predicted vector from the centre of an anchor to the centre of a missing object, in metres.
-
-    Attributes:
-        mean: mean of the vector along x, y and z.
-        std: standard deviation of the vector along x, y and z.
-        scenes: number of training scenes that contain the two classes in this relation.
-    """
-
-    mean: tuple[float, float, float]
-    std: tuple[float, float, float]
-    scenes: int
-
-
-class Placement(NamedTuple):
-    """A place of a missing object, given by its relation to a listed object.
-
-    Attributes:
-        relation: relation from the missing object to the listed object.
-        object: index of the listed object in `Scene.objects`.
-        probability: probability that the relation holds if the missing object is present.
-        offset: vector from the listed object to the missing object, or None if unknown.
-    """
-
-    relation: str
-    object: int
-    probability: float
-    offset: Offset | None = None
-
-
-class MissingAnswer(NamedTuple):
-    """An unlisted class and the probability that it is present.
-
-    Attributes:
-        label: canonical label of the class.
-        probability: probability that the class is present although the scene does not list it. If
-            the request names a place, it is the probability that the class is present at this
-            place.
-        log_odds: log-odds that the class is present, before calibration.
-        placements: likeliest places of the class, likeliest first.
-        because: listed objects that change the log-odds most, in order of the absolute change.
-    """
-
-    label: str
-    probability: float
-    log_odds: float
-    placements: tuple[Placement, ...]
-    because: tuple[Because, ...]
+_LEAST_CHANGE: Final = math.log(3)  # substantial evidence: a Bayes factor of at least 3
+_OFFSET_BYTES: Final = 250
 
 
 def missing(
@@ -107,7 +58,8 @@ def missing(
     coverage: float | None = None,
     axes: Axes | None = VIEWER,
     details: bool = True,
-) -> tuple[MissingAnswer, ...]:
+    size_limit: SizeLimit | None = None,
+) -> Fields:
     """Rank the unlisted classes by the probability that they are present, likeliest first.
 
     The model assumes that a present class is listed with probability `coverage`. If the coverage is
@@ -117,7 +69,7 @@ def missing(
     Args:
         artifact: the model.
         scene: the listed objects, their relations and the room type.
-        top_k: maximum number of answers.
+        top_k: maximum number of classes in each list of the answer.
         candidates: indices of the classes to rank. Listed and structural classes are ignored. None
             means all classes.
         at: a place, as (relation, index of the anchor object). If set, `probability` is the
@@ -126,61 +78,86 @@ def missing(
             the model treats the other unlisted classes as absent.
         axes: viewer's axes in the frame of the offsets; see `viewer_axes`. None means that the
             viewing direction is unknown.
-        details: whether the answers contain `placements` and `because`.
+        details: whether the answer contains `placements` and `because`.
+        size_limit: limit on the size of the answer, or None.
+
+    Returns:
+        The fields `coverage`, `missing` and `more` of `scene_client.schemas.MissingAnswer`.
 
     Raises:
         ValueError: top_k is below 1, the coverage is outside [0, 1], a candidate is outside the
             vocabulary, the relation is unknown, or the anchor is outside the scene.
+        RequestError: the answer would exceed `size_limit`.
     """
-    spec, calibration = artifact.spec, artifact.calibration
     if top_k < 1:
         raise ValueError(f"top_k must be at least 1, not {top_k}")
-    coverage = calibration.coverage if coverage is None else coverage
-    if not 0 <= coverage <= 1:
-        raise ValueError(f"coverage must be in [0, 1], not {coverage}")
-    place = None if at is None else _place(scene, spec.A, at)
-    given = posterior(artifact, scene)
-    structure = artifact.vocabulary.structure
+    used = artifact.calibration.coverage if coverage is None else coverage
+    if not 0 <= used <= 1:
+        raise ValueError(f"coverage must be in [0, 1], not {used}")
+    place = None if at is None else Place.of(scene, artifact.spec.A, *at)
+    posterior = posterior_of(artifact, scene)
+    classes, probabilities, log_odds = _ranked(artifact, posterior, top_k, candidates, place, used)
+    labels = artifact.vocabulary.labels
+    columns = classes.tolist(), significant(probabilities), significant(log_odds)
+    entries: list[Fields] = [
+        {"label": labels[index], "probability": probability, "log_odds": value}
+        for index, probability, value in zip(*columns, strict=True)
+    ]
+    if details and entries:
+        for entry, places in zip(
+            entries, placements(artifact, posterior, scene, classes, axes, place), strict=True
+        ):
+            entry["placements"], entry["because"] = places, []
+        if len(posterior.present.classes):
+            explained = classes[:EXPLAINED]
+            change = posterior.reasons_for_absent(explained)
+            causes = reasons(scene, posterior.present, change, least=_LEAST_CHANGE)
+            for entry, because in zip(entries, causes, strict=False):
+                entry["because"] = because
+    further: list[Fields] = []
+    if at is None:
+        further = more(artifact, scene, top_k=top_k, candidates=candidates, coverage=coverage)
+    if size_limit is not None:
+        size_limit.check("top_k", *_size(entries, further))
+    return {"coverage": used, "missing": entries, "more": further}
+
+
+def _ranked(
+    artifact: Artifact,
+    posterior: Posterior,
+    top_k: int,
+    candidates: Sequence[int] | None,
+    place: Place | None,
+    coverage: float,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.floating[Any]]]:
+    """Return the likeliest candidates, likeliest first.
+
+    Returns:
+        The class indices, their probabilities, and their log-odds before calibration, each (k,).
+    """
+    structure, listed_classes = artifact.vocabulary.structure, posterior.present.classes
     usable = ~structure
-    usable[given.present.classes] = False
+    usable[listed_classes] = False
     absent = np.flatnonzero(usable)
     chosen = np.ones(len(absent), np.bool_)
     if candidates is not None:
-        chosen = _chosen(absent, spec.V, candidates)
+        chosen = _among(absent, artifact.spec.V, candidates)
     if not chosen.any():
-        return ()
-    log_odds = given.absent_posterior(absent, coverage)
-    listed = max(1, int(np.count_nonzero(~structure[given.present.classes])))
+        return absent[:0], np.zeros(0), np.zeros(0)
+    log_odds = posterior.absent_posterior(absent, coverage)
+    listed = max(1, int(np.count_nonzero(~structure[listed_classes])))
     if place is None:
-        logits = calibration.missing.log_odds(log_odds, listed)
+        logits = calibrated(artifact.calibration.missing, log_odds, listed)
     else:
-        logits = _at_place(artifact, given, place, absent, chosen, log_odds, listed, top_k)
-    # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
-    where = best(logits, chosen, top_k)
-    probabilities = sigmoid(logits[where].astype(np.float64))
-    found = absent[where]
-    labels = artifact.vocabulary.labels
-    standing: Sequence[tuple[Placement, ...]] = [()] * len(found)
-    because: Sequence[tuple[Because, ...]] = [()] * len(found)
-    if details:
-        standing = placements(artifact, given, found, axes, place, scene.relations or ())
-        because = _reasons(given, found)
-    return tuple(
-        entries(
-            MissingAnswer,
-            [labels[index] for index in found.tolist()],
-            probabilities.tolist(),
-            log_odds[where].tolist(),
-            standing,
-            because,
-        )
-    )
+        logits = _logits_at(artifact, posterior, place, absent, chosen, log_odds, listed, top_k)
+    first, probabilities = likeliest_classes(logits, chosen, top_k)
+    return absent[first], probabilities, log_odds[first]
 
 
-def _at_place(
+def _logits_at(
     artifact: Artifact,
-    given: Posterior,
-    place: tuple[int, int, bool],
+    posterior: Posterior,
+    place: Place,
     absent: NDArray[np.int64],
     chosen: NDArray[np.bool_],
     log_odds: NDArray[np.floating[Any]],
@@ -193,55 +170,21 @@ def _at_place(
     most p(present). So the function stops when p(present) of the next candidate is below the
     `top_k` largest products. The remaining candidates get the logit -inf.
     """
-    relation, anchor, outgoing = place
-    row = int(given.present.row[anchor])
-    there = artifact.calibration.missing.log_odds(log_odds, listed)
-    logits = np.full_like(there, -np.inf)
+    presence = calibrated(artifact.calibration.missing, log_odds, listed)
+    logits = np.full_like(presence, -np.inf)
     order = np.flatnonzero(chosen)
-    order = order[np.argsort(-there[order], kind="stable")]
+    order = order[np.argsort(-presence[order], kind="stable")]
     for start in range(0, len(order), _BLOCK):
-        some = order[start : start + _BLOCK]
-        likeliest = np.sort(logits[order[:start]])[-top_k:]
-        if len(likeliest) == top_k and there[some[0]] < likeliest[0]:
+        block = order[start : start + _BLOCK]
+        largest = np.sort(logits[order[:start]])[-top_k:]
+        if len(largest) == top_k and presence[block[0]] < largest[0]:
             break
-        log_p = place_log_p(artifact, given, absent[some], relation, row, outgoing=outgoing)
-        logits[some] = placed_logits(artifact.calibration, log_odds[some], log_p, listed)
+        log_p = place_log_p(artifact, posterior, absent[block], place)
+        logits[block] = placed_logits(artifact.calibration, log_odds[block], log_p, listed)
     return logits
 
 
-def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, ...]]:
-    """Return the listed objects that change the log-odds of each found class most."""
-    if not len(given.present.classes):
-        return [()] * len(found)
-    explained = found[:EXPLAINED]
-    reasons = strongest_reasons(given.present.first, given.reasons_for_absent(explained))
-    return reasons + [()] * (len(found) - len(explained))
-
-
-def _place(scene: Scene, relations: int, at: tuple[str, int]) -> tuple[int, int, bool]:
-    """Convert the place in a request to canonical form.
-
-    Returns:
-        The index of the canonical relation, the index of the anchor object, and True if the missing
-        object is the relation's subject.
-    """
-    name, anchor = at
-    if not 0 <= anchor < len(scene.objects):
-        raise ValueError(
-            f"anchor {anchor} is not the index of one of the {len(scene.objects)} objects"
-        )
-    relation, subject, _ = canonicalise("missing", name, "anchor")
-    if relation >= relations:
-        raise ValueError(
-            f"the model does not know the relation {name!r}; it knows only "
-            f"{CANONICAL[:relations]} and their opposites"
-        )
-    return relation, anchor, subject == "missing"
-
-
-def _chosen(
-    absent: NDArray[np.int64], classes: int, candidates: Sequence[int]
-) -> NDArray[np.bool_]:
+def _among(absent: NDArray[np.int64], classes: int, candidates: Sequence[int]) -> NDArray[np.bool_]:
     """Return a bool mask (N,) of the absent classes that are candidates."""
     for index in candidates:
         if not 0 <= index < classes:
@@ -251,168 +194,151 @@ def _chosen(
     return np.isin(absent, np.array(candidates, dtype=np.int64))
 
 
-def place_log_p(
-    artifact: Artifact,
-    given: Posterior,
-    candidates: NDArray[np.int64],
-    relation: int,
-    anchor: int,
-    *,
-    outgoing: bool,
-) -> NDArray[np.floating[Any]]:
-    """Return the calibrated log p(relation to the anchor | candidate is present), (N,).
-
-    Args:
-        artifact: the model.
-        given: posterior of the scene.
-        candidates: (N,) indices of absent classes.
-        relation: index of a canonical relation.
-        anchor: index of the anchor's class among the classes of the scene.
-        outgoing: True if the candidate is the relation's subject, False if the anchor is.
-    """
-    return placement_log_p(
-        artifact.relation_slopes.asked_place[relation],
-        given.placed_log_p(candidates, relation, anchor, outgoing=outgoing),
-        *(float(given.present.log_counts[anchor]), len(given.present.classes) + 1),
-    )
+def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:
+    """Return the arguments of `missing` for a request."""
+    faults, size = Faults(), len(artifact.vocabulary)
+    # Only the default of `top_k` may exceed the size of the vocabulary.
+    if request.top_k > size and "top_k" in request.model_fields_set:
+        message = f"`top_k` must be at most {size}, the size of the vocabulary"
+        faults.add(Reason.INVALID, ("top_k",), message)
+    candidates = at = None
+    if request.candidates is not None:
+        candidates = _candidates(request.candidates, reading, faults)
+    if request.at is not None:
+        at = _at(request.at, artifact, reading, faults)
+    faults.raise_any()
+    return {
+        "top_k": request.top_k,
+        "candidates": candidates,
+        "at": at,
+        "coverage": request.coverage,
+        "axes": _axes(request),
+        "details": request.detail == "full",
+    }
 
 
-def placements(
-    artifact: Artifact,
-    given: Posterior,
-    candidates: NDArray[np.int64],
-    axes: Axes | None,
-    at: tuple[int, int, bool] | None = None,
-    stated: Collection[tuple[int, int, int]] = (),
-) -> list[tuple[Placement, ...]]:
-    """Return the likeliest relations of each candidate to the listed objects, likeliest first.
-
-    The candidate is subject or object of the relation. Structural classes (floor, wall) are never
-    anchors. If a class has several instances, the first instance is the anchor. If an object stands
-    on top of another object, candidates are never placed under the upper object.
-
-    Args:
-        artifact: the model.
-        given: posterior of the scene.
-        candidates: (N,) indices of absent classes.
-        axes: viewer's axes, or None; see `offsets_of`.
-        at: the place in the request, as returned by `_place`. It comes first in each result, even
-            if other places are likelier. None means that the request names no place.
-        stated: triples (canonical relation, subject, object) between objects of the scene.
-    """
-    present = given.present
-    anchors = np.flatnonzero(~artifact.vocabulary.structure[present.classes])
-    if not len(anchors):
-        return [()] * len(candidates)
-    forward, backward = given.placement_log_odds(candidates, anchors)
-    A, first, asked = forward.shape[1], present.first[anchors].tolist(), -1
-    if A > ON_TOP and stated:
-        standing = {subject for relation, subject, _ in stated if relation == ON_TOP}
-        backward[:, ON_TOP, [thing in standing for thing in first]] = NO_UNIT
-    asked_p: NDArray[np.floating[Any]] | None = None
-    if at is not None:
-        relation, object_, to_it = at
-        (found,) = np.nonzero(anchors == present.row[object_])
-        if len(found):
-            asked = ((0 if to_it else A) + relation) * len(first) + int(found[0])
-            row = int(anchors[found[0]])
-            asked_p = np.exp(
-                place_log_p(artifact, given, candidates, relation, row, outgoing=to_it)
-            )
-            first[found[0]] = object_
-    which, relations, outgoing, anchor, probabilities = likeliest_places(
-        *(artifact.relation_slopes.placement, forward, backward, present.log_counts[anchors]),
-        *(len(present.classes) + 1, PLACES, asked),
-    )
-    if asked_p is not None:
-        probabilities[:: len(which) // len(candidates)] = asked_p
-    offsets: Sequence[Offset | None] = [None] * len(which)
-    if artifact.offsets is not None:
-        ends = candidates[which], present.classes[anchors[anchor]]
-        offsets = offsets_of(artifact.offsets, relations, *ends, outgoing, axes)
-    named = zip(relations.tolist(), outgoing.tolist(), strict=True)
-    listed = entries(
-        Placement,
-        [(RELATIONS if out else _SEEN_FROM_ANCHORS)[number] for number, out in named],
-        [first[number] for number in anchor.tolist()],
-        probabilities.tolist(),
-        offsets,
-    )
-    each = len(listed) // len(candidates)
-    return [tuple(listed[k : k + each]) for k in range(0, len(listed), each)]
+def _candidates(labels: list[str], reading: Reading, faults: Faults) -> list[int]:
+    """Return the class indices of the labels in the request's field `candidates`."""
+    indices: dict[int, None] = {}
+    for position, label in enumerate(labels):
+        index = reading.unknown.vocabulary.index(label)
+        if index is None:
+            index = reading.unknown.resolve(label, label, ("candidates", position), faults)
+        if index is not None:
+            indices[index] = None
+    return list(indices)
 
 
-def offsets_of(
-    known: Offsets,
-    relation: NDArray[np.int64],
-    missing: NDArray[np.int64],
-    anchor: NDArray[np.int64],
-    outgoing: NDArray[np.bool_],
-    axes: Axes | None,
-) -> Sequence[Offset | None]:
-    """Return the offset from each of n anchors to its missing object, or None if unknown.
-
-    Args:
-        known: offsets of the model.
-        relation: (n,) indices of canonical relations.
-        missing: (n,) class indices of the missing objects.
-        anchor: (n,) class indices of the anchors.
-        outgoing: (n,) bool, True if the missing object is the relation's subject.
-        axes: viewer's axes in the frame of the offsets. None means that the viewing direction is
-            unknown. The relations left and front then have no offset. The means of other offsets
-            are then vertical.
-    """
-    ends = (relation, missing, anchor, outgoing)
-    if axes is None:
-        mean, spread, scenes = _lay(known.tables, *ends, _UNTURNED, False)
-    else:
-        mean, spread, scenes = _lay(known.tables, *ends, np.array(axes), True)
-    counts = scenes.tolist()
-    found = entries(Offset, map(tuple, mean.tolist()), map(tuple, spread.tolist()), counts)
-    if NOTHING not in counts:
-        return found
-    return [offset if offset.scenes != NOTHING else None for offset in found]
+def _at(at: Anchor, artifact: Artifact, reading: Reading, faults: Faults) -> tuple[str, int] | None:
+    canonical = artifact.manifest.vocabulary.relations
+    if at.relation not in {*canonical, *map(opposite, canonical)}:
+        faults.add(Reason.INVALID, ("at", "relation"), "the model does not know this relation")
+    anchor = reading.names.find(at.object, ("at", "object"), faults)
+    return None if anchor is None else (at.relation, anchor)
 
 
-@compiled
-def _lay(
-    tables: tuple[NDArray[Any], ...],
-    relation: NDArray[np.int64],
-    missing: NDArray[np.int64],
-    anchor: NDArray[np.int64],
-    outgoing: NDArray[np.bool_],
-    axes: NDArray[np.float64],
-    looking: bool,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Compute the mean (n, 3), standard deviation (n, 3) and number of scenes (n,) of n offsets.
+def _axes(request: MissingRequest) -> Axes | None:
+    """Return the viewer's axes in `frame_id`, or None if the viewing direction is unknown."""
+    if request.frame_id is None and request.viewpoint is None:
+        return VIEWER
+    view = request.viewpoint
+    return viewer_axes(request.frame_id, None if view is None else view.yaw)
 
-    ``looking`` is False if the viewing direction is unknown. For the other arguments, see
-    `offsets_of`.
-    """
-    subject, other = np.where(outgoing, missing, anchor), np.where(outgoing, anchor, missing)
-    offset, scenes = look_up(tables, relation, subject, other)
-    n = len(relation)
-    mean, spread = np.zeros((n, 3)), np.zeros((n, 3))
-    for k in range(n):
-        if looking:
-            for axis in range(3):
-                toward, square = offset[k, axis], offset[k, 3 + axis] ** 2
-                for to in range(3):
-                    mean[k, to] += axes[axis, to] * toward
-                    spread[k, to] += axes[axis, to] ** 2 * square
-        else:
-            if relation[k] == LEFT or relation[k] == FRONT:
-                scenes[k] = NOTHING
-            mean[k, 2], spread[k, 2] = offset[k, 2], offset[k, 5] ** 2
-            for axis in range(2):
-                square = (offset[k, axis] ** 2 + offset[k, 3 + axis] ** 2) / 2
-                spread[k, 0] += square
-                spread[k, 1] += square
-        for axis in range(3):
-            value = mean[k, axis] if outgoing[k] else -mean[k, axis]
-            # Adding 0.0 turns -0.0 into 0.0.
-            mean[k, axis] = np.rint(value * _PER_METRE) / _PER_METRE + 0.0
-            spread[k, axis] = (
-                max(np.rint(math.sqrt(spread[k, axis]) * _PER_METRE), 1.0) / _PER_METRE
-            )
-    return mean, spread, scenes
+
+def _size(entries: Sequence[Fields], further: Sequence[Fields]) -> tuple[int, int]:
+    """Return the size of the lists in bytes without names, and the number of names."""
+    places = causes = 0
+    for entry in entries:
+        places += len(entry.get("placements", ()))
+        causes += len(entry.get("because", ()))
+    count = len(entries) + len(further)
+    fixed = places * (RELATION_BYTES + _OFFSET_BYTES) + causes * CAUSE_BYTES + count * OBJECT_BYTES
+    return fixed, places + causes + count
+
+
+def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+    related, bare, _ = scenes
+    for scene in scenes:
+        yield missing(artifact, scene)
+    if len(bare.objects) > 1:
+        yield missing(artifact, bare, at=("on-top", 0))
+        yield missing(artifact, related, at=("under", 0))
+
+
+_EXAMPLES: Final = {
+    **SCENES,
+    "at": Example(
+        "objects that are missing on the desk",
+        {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
+    ),
+    "coverage": Example(
+        "a complete list: unlisted classes count as absent",
+        {**LABELS, "coverage": 1.0},
+    ),
+    "candidates": Example(
+        "only these candidates",
+        {**LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3},
+    ),
+    "scores": Example(
+        "probabilities only, for a fast and short answer",
+        {**LABELS, "detail": "scores"},
+    ),
+    **REFUSED,
+    "invalid-request": Example(
+        "a place at an object that is not in the scene",
+        {**LABELS, "at": {"relation": "on-top", "object": "desk"}},
+        "invalid-request",
+    ),
+}
+_EXAMPLE_ANSWER: Final = {
+    "coverage": 0.5,
+    "missing": [
+        {
+            "label": "pillow",
+            "probability": 0.46,
+            "log_odds": 1.9,
+            "placements": [
+                {
+                    "relation": "on-top",
+                    "object": "bed",
+                    "probability": 0.91,
+                    "offset": {
+                        "mean": {"x": 0.005, "y": 0.012, "z": 0.421},
+                        "std": {"x": 0.466, "y": 0.491, "z": 0.242},
+                        "scenes": 1089,
+                    },
+                }
+            ],
+            "because": [
+                {"object": "bed", "log_odds_change": 1.7},
+                {"object": "lamp_1", "log_odds_change": -0.2},
+            ],
+        }
+    ],
+    "more": [
+        {
+            "label": "nightstand",
+            "listed_count": 1,
+            "expected_count": 1.7,
+            "low": 1,
+            "high": 2,
+            "probability": 0.6,
+        }
+    ],
+}
+
+MISSING: Final = Question(
+    missing,
+    _read,
+    _warm_up,
+    MissingRequest,
+    MissingAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+    description="""
+Rank the classes that the scene does not list, most probable first, with likely places.
+
+The list `more` contains listed classes that probably have further instances, such as a second
+nightstand. It is empty for questions about a place.
+""",
+)

@@ -21,19 +21,34 @@ half of the largest increase are ignored.
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal, NamedTuple
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
-from app.questions.calibration import false_log_odds, intruder_line
-from app.questions.posterior import Posterior, posterior
-from app.questions.ranking import EXPLAINED, Because, best, entries, strongest_reasons
+from app.questions.answer import (
+    CAUSE_BYTES,
+    EXPLAINED,
+    OBJECT_BYTES,
+    RELATION_BYTES,
+    Fields,
+    SizeLimit,
+    reasons,
+    rounded_number,
+    significant,
+)
+from app.questions.calibration import calibrated, false_log_odds
+from app.questions.posterior import Posterior, posterior_of
+from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
+from app.questions.ranking import best
+from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
 from app.registry.description import CountSlope, Thresholds
-from app.scene.relations import CANONICAL
+from app.scene.relations import CANONICAL, opposite
 from app.scene.scene import Scene
+from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
 
 Sensitivity = Literal["low", "medium", "high"]
 
@@ -48,65 +63,6 @@ COMPANIONS: Final = 3
 _LEAST_SHARE: Final = 0.5  # smallest increase of a companion, as a share of the largest
 
 
-class OutlierAnswer(NamedTuple):
-    """An object and the probability that it does not belong to the scene.
-
-    Attributes:
-        object: index of the object in `Scene.objects`.
-        label: canonical label of the object's class.
-        probability: probability that the object is an intruder, under the assumption that half of
-            all scenes contain an intruder.
-        log_odds: log-odds that the object's class is present, given the rest of the scene.
-        is_outlier: True if the probability is at least the threshold.
-        because: up to three other objects, in order of their effect on `log_odds`. For an outlier,
-            these objects lower its log-odds. For other objects, they raise the log-odds.
-        usually_with: labels of up to three companions. The tuple is empty for an object that is not
-            an outlier.
-    """
-
-    object: int
-    label: str
-    probability: float
-    log_odds: float
-    is_outlier: bool
-    because: tuple[Because, ...]
-    usually_with: tuple[str, ...] = ()
-
-
-class MisplacedAnswer(NamedTuple):
-    """A stated relation and the probability that it is false.
-
-    Attributes:
-        subject, object: indices in `Scene.objects`.
-        relation: name of the canonical relation.
-        probability: probability that the relation is false.
-        is_misplaced: True if the probability is at least the threshold.
-    """
-
-    subject: int
-    relation: str
-    object: int
-    probability: float
-    is_misplaced: bool = False
-
-
-class OutliersFound(NamedTuple):
-    """The objects and the stated relations of a scene, with their probabilities.
-
-    Attributes:
-        threshold: minimum probability of an outlier. None if the model judges no object and the
-            caller states no threshold.
-        outliers: every object of the scene, probable intruders first. The tuple is empty if the
-            model judges no object.
-        misplaced: every stated relation, probably false relations first. The tuple is empty if the
-            model judges no relation.
-    """
-
-    threshold: float | None
-    outliers: tuple[OutlierAnswer, ...]
-    misplaced: tuple[MisplacedAnswer, ...]
-
-
 def outliers(
     artifact: Artifact,
     scene: Scene,
@@ -114,7 +70,9 @@ def outliers(
     sensitivity: Sensitivity = "medium",
     threshold: float | None = None,
     details: bool = True,
-) -> OutliersFound:
+    flipped: Collection[Triple] = (),
+    size_limit: SizeLimit | None = None,
+) -> Fields:
     """Judge every object and every stated relation of a scene.
 
     Probable intruders and probably false relations come first. Objects and relations with equal
@@ -133,61 +91,100 @@ def outliers(
         scene: the objects and stated relations to judge.
         sensitivity: name of one of the model's thresholds.
         threshold: minimum probability of an outlier. None means the threshold of `sensitivity`.
-        details: whether the answers contain `because` and `usually_with`.
+        details: whether the answer contains `because` and `usually_with`.
+        flipped: relations of the scene that the request states by their opposite. The answer uses
+            the words of the request.
+        size_limit: limit on the size of the answer, or None.
+
+    Returns:
+        The fields `threshold`, `outliers` and `misplaced` of `scene_client.schemas.OutliersAnswer`.
+        A list is empty if the model gives no such judgement. Then the field `warnings` says so.
+        `threshold` is left out if the model judges no object and the caller states no threshold.
 
     Raises:
         ValueError: the threshold is outside [0, 1].
+        RequestError: the answer would exceed `size_limit`.
     """
-    entry, presets = artifact.calibration.outlier, artifact.calibration.outlier_thresholds
     if threshold is not None and not 0 <= threshold <= 1:
         raise ValueError(f"threshold must be in [0, 1], not {threshold}")
-    if not scene.objects:
-        if threshold is None and presets is not None:
-            threshold = _threshold(presets, sensitivity)
-        return OutliersFound(threshold, (), ())
-    given = posterior(artifact, scene)
-    wrong = _misplaced(artifact, given, scene, sensitivity)
-    if entry is None or presets is None:
-        return OutliersFound(threshold, (), wrong)
-    classes = given.present.classes
-    if threshold is None:
-        listed = int((~artifact.vocabulary.structure[classes]).sum())
-        short = artifact.calibration.short_list_thresholds
-        if 0 < listed <= len(short):
-            presets = short[listed - 1]
+    entry, presets = artifact.calibration.outlier, artifact.calibration.outlier_thresholds
+    judged: list[Fields] = []
+    wrong: list[Fields] = []
+    posterior = posterior_of(artifact, scene) if scene.objects else None
+    if entry is not None and presets is not None and threshold is None:
+        if posterior is not None:
+            presets = _presets(artifact, posterior, presets)
         threshold = _threshold(presets, sensitivity)
-    log_odds = given.log_odds_given_rest()
-    logits = _intruder_logits(artifact, entry, classes, log_odds)
-    # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
-    order = np.argsort(-logits[given.present.row], kind="stable")
+    if posterior is not None:
+        wrong = _misplaced(artifact, posterior, scene, sensitivity, flipped)
+        if entry is not None and presets is not None and threshold is not None:
+            judged = _judged(artifact, entry, posterior, scene, threshold, details=details)
+    if size_limit is not None:
+        size_limit.check("objects", *_size(judged, wrong))
+    fields: Fields = {"warnings": _unjudged(artifact, scene)}
+    if threshold is not None:
+        fields["threshold"] = rounded_number(threshold)
+    return fields | {"outliers": judged, "misplaced": wrong}
+
+
+def _judged(
+    artifact: Artifact,
+    entry: CountSlope,
+    posterior: Posterior,
+    scene: Scene,
+    threshold: float,
+    *,
+    details: bool,
+) -> list[Fields]:
+    """Return the fields of `scene_client.schemas.Outlier` for every object of a scene.
+
+    `because` lists up to three other objects, in order of their effect on `log_odds`. For an
+    outlier, these objects lower its log-odds. For other objects, they raise the log-odds.
+    """
+    present = posterior.present
+    log_odds = posterior.log_odds_given_rest()
+    logits = _intruder_logits(artifact, entry, present.classes, log_odds)
     p = _probability(logits)
-    row = given.present.row[order]
-    rows, labels, is_outlier = row.tolist(), artifact.vocabulary.labels, p >= threshold
-    explained = list(dict.fromkeys(rows[: _affordable(given)])) if details else []
-    reasons = _reasons(given, explained, is_outlier) if explained else {}
-    flagged = [one for one in explained if is_outlier[one]]
-    usual = _companions(artifact, classes, classes[flagged]) if flagged else []
-    company = dict(zip(flagged, usual, strict=True))
-    found = entries(
-        OutlierAnswer,
-        order.tolist(),
-        [labels[index] for index in classes[row].tolist()],
-        p[row].tolist(),
-        log_odds[row].tolist(),
-        is_outlier[row].tolist(),
-        [reasons.get(one, ()) for one in rows],
-        [company.get(one, ()) for one in rows],
+    is_outlier = p >= threshold
+    columns = (
+        [artifact.vocabulary.labels[index] for index in present.classes.tolist()],
+        *(significant(p), significant(log_odds), is_outlier.tolist()),
     )
-    return OutliersFound(threshold, tuple(found), wrong)
+    of_class: list[Fields] = [
+        {"label": label, "probability": probability, "log_odds": value, "is_outlier": flag}
+        for label, probability, value, flag in zip(*columns, strict=True)
+    ]
+    # The order follows the logits, because probabilities near 0 or 1 may round to the same number.
+    order = np.argsort(-logits[present.row], kind="stable")
+    rows = present.row[order].tolist()
+    if details:
+        for fields in of_class:
+            fields["because"], fields["usually_with"] = [], []
+        explained = np.array(list(dict.fromkeys(rows[: _affordable(posterior)])), dtype=np.int64)
+        if len(present.classes) > 1:
+            change = posterior.reasons(explained)
+            change = np.where(is_outlier[explained, None] == (change < 0), change, 0)
+            causes = reasons(scene, present, change, explained)
+            for row, because in zip(explained.tolist(), causes, strict=True):
+                of_class[row]["because"] = because
+        flagged = explained[is_outlier[explained]]
+        companions = _companions(artifact, present.classes, present.classes[flagged])
+        for row, labels in zip(flagged.tolist(), companions, strict=True):
+            of_class[row]["usually_with"] = labels
+    things = scene.objects
+    return [
+        {"object": things[number].id} | of_class[row]
+        for number, row in zip(order.tolist(), rows, strict=True)
+    ]
 
 
 def misplaced(
     artifact: Artifact, scene: Scene, *, sensitivity: Sensitivity = "medium"
-) -> tuple[MisplacedAnswer, ...]:
+) -> list[Fields]:
     """Judge every stated relation like `outliers`, but do not judge objects."""
     if not scene.objects:
-        return ()
-    return _misplaced(artifact, posterior(artifact, scene), scene, sensitivity)
+        return []
+    return _misplaced(artifact, posterior_of(artifact, scene), scene, sensitivity, ())
 
 
 def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
@@ -197,11 +194,11 @@ def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
     incomplete, do not apply.
     """
     entry, presets = artifact.calibration.outlier, artifact.calibration.outlier_thresholds
-    given = posterior(artifact, scene)
-    classes = given.present.classes
+    posterior = posterior_of(artifact, scene)
+    classes = posterior.present.classes
     if entry is None or presets is None:
         return classes[:0]
-    logits = _intruder_logits(artifact, entry, classes, given.log_odds_given_rest())
+    logits = _intruder_logits(artifact, entry, classes, posterior.log_odds_given_rest())
     return classes[_probability(logits) >= presets.medium]
 
 
@@ -213,16 +210,23 @@ def _intruder_logits(
 ) -> NDArray[np.float64]:
     """Return the logit of each class's probability of being an intruder, (n,).
 
-    The logit of a structural class is -inf.
+    The logit of a structural class is -inf. `entry` is `Calibration.outlier`.
     """
-    intercept, slope = intruder_line(entry, len(log_odds))
-    logits = intercept + slope * _adjusted(artifact, classes, log_odds).astype(np.float64)
+    adjusted = _adjusted(artifact, classes, log_odds).astype(np.float64)
+    logits = calibrated(entry, adjusted, len(log_odds)).astype(np.float64)
     logits[artifact.vocabulary.structure[classes]] = -np.inf
     return logits
 
 
 def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isinf(logits), 0.0, sigmoid(logits))
+
+
+def _presets(artifact: Artifact, posterior: Posterior, presets: Thresholds) -> Thresholds:
+    """Return the thresholds for a scene. Short lists have thresholds of their own."""
+    structure = artifact.vocabulary.structure[posterior.present.classes]
+    listed, short = int((~structure).sum()), artifact.calibration.short_list_thresholds
+    return short[listed - 1] if 0 < listed <= len(short) else presets
 
 
 def _threshold(presets: Thresholds, sensitivity: Sensitivity) -> float:
@@ -242,30 +246,14 @@ def _adjusted(
     return log_odds - artifact.calibration.popularity_weight * popularity[classes]
 
 
-def _affordable(given: Posterior) -> int:
+def _affordable(posterior: Posterior) -> int:
     """Return the maximum number of objects with reasons in the answer."""
-    per_object = len(given.present.classes) * max(1, given.unit_count)
+    per_object = len(posterior.present.classes) * max(1, posterior.unit_count)
     return min(EXPLAINED, max(1, _REASON_UNITS // per_object))
 
 
-def _reasons(
-    given: Posterior, explained: list[int], is_outlier: NDArray[np.bool_]
-) -> dict[int, tuple[Because, ...]]:
-    """Return the strongest reasons for each explained class; see `OutlierAnswer`."""
-    if len(given.present.classes) < 2:
-        return dict.fromkeys(explained, ())
-    rows = np.array(explained, dtype=np.int64)
-    change = given.reasons(rows)
-    change = np.where(is_outlier[rows, None] == (change < 0), change, 0)
-    found = strongest_reasons(given.present.first, change, rows)
-    return {
-        one: tuple([reason for reason in reasons if reason.log_odds_change])
-        for one, reasons in zip(explained, found, strict=True)
-    }
-
-
 def stated_log_odds(
-    artifact: Artifact, given: Posterior, scene: Scene
+    artifact: Artifact, posterior: Posterior, scene: Scene
 ) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]]]:
     """Return the n stated relations that the machine knows, and their log-odds.
 
@@ -277,51 +265,181 @@ def stated_log_odds(
     relation, subject, object_ = triples = np.array(stated, dtype=np.int64).reshape(-1, 3).T.copy()
     if not stated:
         return triples, np.zeros(0)
-    row = given.present.row
-    return triples, given.unit_log_odds(relation, row[subject], row[object_])
+    row = posterior.present.row
+    return triples, posterior.unit_log_odds(relation, row[subject], row[object_])
 
 
 def _misplaced(
-    artifact: Artifact, given: Posterior, scene: Scene, sensitivity: Sensitivity
-) -> tuple[MisplacedAnswer, ...]:
+    artifact: Artifact,
+    posterior: Posterior,
+    scene: Scene,
+    sensitivity: Sensitivity,
+    flipped: Collection[Triple],
+) -> list[Fields]:
     """Judge the stated relations that the machine knows, least likely first.
 
     Relations with equal log-odds keep the order of `Scene.relations`.
+
+    Returns:
+        The fields of `scene_client.schemas.MisplacedRelation`.
     """
     entry, presets = artifact.calibration.misplaced, artifact.calibration.misplaced_thresholds
-    (relation, subject, object_), log_odds = stated_log_odds(artifact, given, scene)
+    triples, log_odds = stated_log_odds(artifact, posterior, scene)
     if entry is None or presets is None or not len(log_odds):
-        return ()
+        return []
     order = np.argsort(log_odds, kind="stable")
     p = sigmoid(false_log_odds(entry, log_odds[order]))
-    return tuple(
-        entries(
-            MisplacedAnswer,
-            subject[order].tolist(),
-            [CANONICAL[number] for number in relation[order].tolist()],
-            object_[order].tolist(),
-            p.tolist(),
-            (p >= _threshold(presets, sensitivity)).tolist(),
+    is_misplaced = (p >= _threshold(presets, sensitivity)).tolist()
+    return [
+        _spelled(scene, triple, flipped) | {"probability": probability, "is_misplaced": flag}
+        for triple, probability, flag in zip(
+            map(tuple, triples.T[order].tolist()), significant(p), is_misplaced, strict=True
         )
-    )
+    ]
+
+
+def _spelled(scene: Scene, triple: Triple, flipped: Collection[Triple]) -> Fields:
+    """Convert a canonical relation to the name, subject and object that the request uses."""
+    relation, subject, object_ = triple
+    name = CANONICAL[relation]
+    if triple in flipped:
+        subject, name, object_ = object_, opposite(name), subject
+    things = scene.objects
+    return {"subject": things[subject].id, "relation": name, "object": things[object_].id}
 
 
 def _companions(
     artifact: Artifact, present: NDArray[np.int64], flagged: NDArray[np.int64]
-) -> list[tuple[str, ...]]:
+) -> list[list[str]]:
     """Return the labels of the companions of each outlier, best first; see the module.
 
     The classes in ``present``, those of the scene, and structural classes are never companions.
     """
     usable = ~artifact.vocabulary.structure
     usable[present] = False
-    if not usable.any():
-        return [()] * len(flagged)
+    if not (len(flagged) and usable.any()):
+        return [[] for _ in flagged]
     weights, labels = artifact.weights, artifact.vocabulary.labels
     beside = artifact.scorer.gain(weights["c1"] + weights["W"][flagged])
     increase = np.where(usable, beside - artifact.empty_gain, 0)
     least = np.maximum(_LEAST_SHARE * increase.max(1, keepdims=True), 1e-6)
     score = np.where(increase < least, 0, increase * sigmoid(weights["b"] + beside))
+    return [[labels[index] for index in best(row, row > 0, COMPANIONS).tolist()] for row in score]
+
+
+def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
+    """Return a warning for objects, and one for relations, if the model gives no judgement."""
+    parts = {
+        "objects": bool(scene.objects) and artifact.calibration.outlier is None,
+        "relations": bool(scene.relations) and artifact.calibration.misplaced is None,
+    }
     return [
-        tuple([labels[place] for place in best(row, row > 0, COMPANIONS).tolist()]) for row in score
+        SceneWarning(
+            code="not-judged",
+            message=f"the model does not judge {part}, because its calibration had too few scenes",
+            objects=[],
+        )
+        for part, is_unjudged in parts.items()
+        if is_unjudged
     ]
+
+
+def _size(judged: Sequence[Fields], wrong: Sequence[Fields]) -> tuple[int, int]:
+    """Return the size of the lists in bytes without names, and the number of names."""
+    causes = 0
+    for entry in judged:
+        causes += len(entry.get("because", ())) + len(entry.get("usually_with", ()))
+    count = len(judged)
+    fixed = count * OBJECT_BYTES + causes * CAUSE_BYTES + len(wrong) * RELATION_BYTES
+    return fixed, 2 * count + causes + 2 * len(wrong)
+
+
+def _read(request: OutliersRequest, _: Artifact, reading: Reading) -> Options:
+    """Return the arguments of `outliers` for a request."""
+    return {
+        "sensitivity": request.sensitivity,
+        "threshold": request.threshold,
+        "details": request.detail == "full",
+        "flipped": reading.flipped,
+    }
+
+
+def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+    # With threshold 0, every object is an outlier. So the function also computes `usually_with`.
+    yield outliers(artifact, scenes[0], threshold=0.0)
+    for scene in scenes[1:]:
+        yield outliers(artifact, scene)
+
+
+_EXAMPLES: Final = {
+    "intruder": Example("a toilet in a bedroom", WITH_TOILET),
+    **SCENES,
+    "misplaced": Example(
+        "relations that the request states, as arrays, and that may be wrong",
+        {
+            "objects": ["bed", "pillow", "nightstand"],
+            "relations": [["pillow", "on-top", "bed"], ["bed", "on-top", "nightstand"]],
+        },
+    ),
+    "sensitivity": Example(
+        "high sensitivity: a lower threshold",
+        {**WITH_TOILET, "sensitivity": "high"},
+    ),
+    "threshold": Example(
+        "a threshold set by the client",
+        {**WITH_TOILET, "threshold": 0.5},
+    ),
+    "scores": Example(
+        "probabilities only, for a fast and short answer",
+        {**WITH_TOILET, "detail": "scores"},
+    ),
+    **REFUSED,
+}
+_EXAMPLE_ANSWER: Final = {
+    "threshold": 0.7,
+    "outliers": [
+        {
+            "object": "toilet",
+            "label": "toilet",
+            "probability": 0.94,
+            "log_odds": -5.2,
+            "is_outlier": True,
+            "because": [{"object": "bed", "log_odds_change": -2.7}],
+            "usually_with": ["toilet paper", "sink", "faucet"],
+        },
+        {
+            "object": "bed",
+            "label": "bed",
+            "probability": 0.03,
+            "log_odds": 2.4,
+            "is_outlier": False,
+            "because": [{"object": "lamp_1", "log_odds_change": 0.9}],
+            "usually_with": [],
+        },
+    ],
+    "misplaced": [
+        {
+            "subject": "lamp_1",
+            "relation": "on-top",
+            "object": "nightstand_1",
+            "probability": 0.05,
+            "is_misplaced": False,
+        }
+    ],
+}
+
+OUTLIERS: Final = Question(
+    outliers,
+    _read,
+    _warm_up,
+    OutliersRequest,
+    OutliersAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+    description="""
+Return probabilities that each object is an outlier and that each observed relation is false.
+
+The list `outliers` starts with the most probable outlier. All instances of a class have the
+same probability. The list `misplaced` starts with the relation that is most probably false.
+""",
+)

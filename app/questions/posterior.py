@@ -13,8 +13,7 @@ from app.inference.posterior import Pull, ScenePosterior
 from app.inference.relations import Given
 from app.registry.artifact import Artifact
 from app.registry.description import EvidenceWeights
-from app.scene.evidence import instance_evidence, pool_classes, pooled
-from app.scene.scene import Scene
+from app.scene.scene import Scene, instance_evidence, pool_classes, pooled
 
 Floats = NDArray[np.floating[Any]]
 Places = NDArray[np.int64]
@@ -127,8 +126,8 @@ class Posterior(ScenePosterior):
         The relations of these classes are unobserved. All other absent classes count as absent.
         """
         gain = self._artifact.scorer.gain(self.context.object_y)
-        found: Floats = self._closed.b + gain
-        return found[absent]
+        log_odds: Floats = self._closed.b + gain
+        return log_odds[absent]
 
     def absent_posterior(self, absent: Places, coverage: float) -> Floats:
         """Return the log-odds that each of N unlisted classes is present, (N,).
@@ -143,10 +142,10 @@ class Posterior(ScenePosterior):
         )
 
 
-def posterior(artifact: Artifact, scene: Scene) -> Posterior:
+def posterior_of(artifact: Artifact, scene: Scene) -> Posterior:
     """Return the posterior of a scene. If the artifact has an oracle, the oracle computes it."""
-    found: Posterior = (artifact.oracle or Posterior)(artifact, scene)
-    return found
+    posterior: Posterior = (artifact.oracle or Posterior)(artifact, scene)
+    return posterior
 
 
 def with_unlisted(

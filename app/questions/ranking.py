@@ -1,4 +1,4 @@
-"""Compiled loops that rank the entries of answers and round their numbers.
+"""Compiled loops that rank the entries of answers.
 
 Entries with equal values keep the order of their indices. Several functions take tables of
 `RelationSlopes`, which contain the calibration of relations.
@@ -6,50 +6,11 @@ Entries with equal values keep the order of their indices. Several functions tak
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from functools import partial
-from typing import Any, Final, NamedTuple, TypeVar
-
 import numpy as np
-from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.inference.relations import NO_UNIT
 from app.questions.calibration import exclusive, relation_probability
-
-DIGITS: Final = 6
-"""Significant digits of probabilities, log-odds and metres."""
-
-# Doubles represent these powers of ten exactly. So an integer divided by such a power is the double
-# that is nearest to the decimal number.
-_POWERS: Final = np.array([10.0**power for power in range(23)])
-
-
-TupleT = TypeVar("TupleT", bound=tuple[Any, ...])
-
-
-REASONS: Final = 3
-"""Maximum number of reasons for one entry of an answer."""
-
-EXPLAINED: Final = 32
-"""Maximum number of entries with reasons in an answer. The first entries have reasons."""
-
-
-class Because(NamedTuple):
-    """A reason: an object of the scene that changes the log-odds of the judged class.
-
-    Attributes:
-        object: index of the object in `Scene.objects`.
-        log_odds_change: log-odds of the judged class with this object minus its log-odds without.
-    """
-
-    object: int
-    log_odds_change: float
-
-
-def entries(kind: type[TupleT], *columns: Iterable[Any]) -> list[TupleT]:
-    """Make named tuples from one column per field. This is twice as fast as calls to the class."""
-    return list(map(partial(tuple.__new__, kind), zip(*columns, strict=True)))
 
 
 @compiled
@@ -109,6 +70,27 @@ def _sink(values, heap, size, position):
         heap[at] = heap[below]
         at = below
     heap[at] = position
+
+
+@compiled
+def likeliest_classes(logits, usable, count):
+    """Return the `count` usable classes with the largest logits, likeliest first.
+
+    The order follows the logits, because probabilities near 0 or 1 may round to the same number.
+
+    Args:
+        logits: (N,) logit of the probability of each class.
+        usable: (N,) bool, True for classes that the result may contain.
+        count: maximum number k of classes.
+
+    Returns:
+        Indices of the classes, and their probabilities, each (k,).
+    """
+    first = best(logits, usable, count)
+    p = np.empty(len(first), np.float64)
+    for k in range(len(first)):
+        p[k] = 1.0 / (1.0 + np.exp(-np.float64(logits[first[k]])))
+    return first, p
 
 
 @compiled
@@ -205,8 +187,14 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
 def strongest(change, rows, count):
     """Return the indices and values of the k <= `count` largest absolute changes, each (N, k).
 
-    `strongest_reasons` describes ``change`` and ``rows``, which is empty for absent classes. The
-    result leaves out the change of a class by itself.
+    The result leaves out the change of a class by itself.
+
+    Args:
+        change: (N, n) change of each explained class's log-odds by each of the n classes of the
+            scene.
+        rows: (N,) index of each explained class among the n classes. It is empty if the explained
+            classes are absent.
+        count: maximum of k.
     """
     N, n = change.shape
     kept = min(count, n - (len(rows) > 0))
@@ -221,30 +209,6 @@ def strongest(change, rows, count):
         for k in range(kept):
             places[c, k], values[c, k] = where[k], change[c, where[k]]
     return places, values
-
-
-def strongest_reasons(
-    first: NDArray[np.int64],
-    change: NDArray[np.floating[Any]],
-    rows: NDArray[np.int64] | None = None,
-) -> list[tuple[Because, ...]]:
-    """Return the reasons for each of N explained classes.
-
-    The reasons are the changes with the largest absolute values, largest first. The object of a
-    reason is the first object of the class that causes the change.
-
-    Args:
-        first: (n,) index of the first object of each class in `Scene.objects`.
-        change: (N, n) change of each explained class's log-odds by each of the n classes of the
-            scene.
-        rows: (N,) index of each explained class among the n classes. None means that the explained
-            classes are absent.
-    """
-    rows = np.zeros(0, np.int64) if rows is None else rows
-    places, values = strongest(change, rows, REASONS)
-    found = entries(Because, first[places.reshape(-1)].tolist(), values.reshape(-1).tolist())
-    kept = places.shape[1]
-    return [tuple(found[k * kept : (k + 1) * kept]) for k in range(len(change))]
 
 
 @compiled
@@ -337,33 +301,3 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
             ratio[k] = likely[0, k] / observed
     where = best(ratio, usable, count)
     return where, expected[where], likely[0][where], likely[1][where]
-
-
-def significant(numbers: Sequence[float]) -> list[float]:
-    """Round numbers to `DIGITS` significant digits."""
-    values = np.array(numbers, dtype=np.float64)
-    exact = _round(values)
-    rounded: list[float] = values.tolist()
-    if not exact:
-        return [float(f"{value:.{DIGITS}g}") for value in rounded]
-    return rounded
-
-
-@compiled
-def _round(values: NDArray[np.float64]) -> bool:
-    """Round numbers to `DIGITS` significant digits in place.
-
-    Returns:
-        False if a number is too small or too large for exact powers of ten. Such numbers stay
-        unchanged.
-    """
-    exact = True
-    for k in range(len(values)):
-        size = np.abs(values[k])
-        if 1e-16 < size < 1e5:
-            shift = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
-            scale = _POWERS[shift]
-            values[k] = np.rint(values[k] * scale) / scale
-        elif size != 0.0:
-            exact = False
-    return exact

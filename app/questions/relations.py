@@ -14,60 +14,29 @@ another chair is to the right. Then left and right both count as observed for ea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Iterator, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.questions.posterior import Posterior, Present, posterior, relations_given
-from app.questions.ranking import disagreeing, entries, likeliest_relations, observed_pairs
+from app.errors import Location, Reason
+from app.questions.answer import RELATION_BYTES, Fields, SizeLimit, significant
+from app.questions.names import Faults
+from app.questions.posterior import Posterior, Present, posterior_of, relations_given
+from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
+from app.questions.ranking import disagreeing, likeliest_relations, observed_pairs
+from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
-from app.scene.relations import CANONICAL, OPPOSITES, canonicalise
+from app.scene.relations import CANONICAL, OPPOSITES, canonicalise, opposite
 from app.scene.scene import Scene
+from scene_client.schemas import RelationsAnswer, RelationsRequest
 
 EXPECTED = 0.5
 """Minimum probability of the expected relation of a disagreement.
 
 If all relations of a pair are unlikely, the likeliest relation is not a meaningful expectation.
 """
-
-
-class RelationAnswer(NamedTuple):
-    """A relation between two objects and its probability.
-
-    Attributes:
-        subject, object: indices in `Scene.objects`.
-        relation: name of the relation from subject to object.
-        probability: probability that the relation holds, given that both objects are present.
-        observed: True if the request states the relation, or if poses imply it.
-    """
-
-    subject: int
-    relation: str
-    object: int
-    probability: float
-    observed: bool = False
-
-
-class Disagreement(NamedTuple):
-    """A pair of objects whose observed relation the rest of the scene does not suggest.
-
-    Attributes:
-        subject, object: indices in `Scene.objects`.
-        observed: names of the observed relations from subject to object.
-        expected: name of the likeliest relation, without the observed relations of the pair as
-            evidence.
-        probability: probability of the relation `expected`.
-        observed_probability: probability of the likeliest observed relation of the pair.
-    """
-
-    subject: int
-    object: int
-    observed: tuple[str, ...]
-    expected: str
-    probability: float
-    observed_probability: float
 
 
 def relations(
@@ -78,7 +47,9 @@ def relations(
     min_probability: float = 0.0,
     pairs: Sequence[tuple[int, int]] | None = None,
     include_opposites: bool = False,
-) -> tuple[tuple[RelationAnswer, ...], tuple[Disagreement, ...]]:
+    flipped: Collection[Triple] = (),
+    size_limit: SizeLimit | None = None,
+) -> Fields:
     """Return the likeliest relations between the objects of a scene, and its disagreements.
 
     Observed relations are evidence for other relations, but an observed relation is not evidence
@@ -94,51 +65,64 @@ def relations(
             all pairs.
         include_opposites: whether the answer also lists opposite relations, such as right(y, x) for
             left(x, y).
+        flipped: relations of the scene that the request states by their opposite. Disagreements
+            use the words of the request.
+        size_limit: limit on the size of the answer, or None.
 
     Returns:
-        The relations, likeliest first. Then the disagreements, with the largest ratio of
-        `probability` to `observed_probability` first. Entries with equal values are ordered by
-        their indices.
+        The fields `relations` and `disagreements` of `scene_client.schemas.RelationsAnswer`. The
+        likeliest relation comes first. The disagreement with the largest ratio of `probability` to
+        `observed_probability` comes first. Entries with equal values are ordered by their indices.
 
     Raises:
         ValueError: top_k is below 1, the probability is outside [0, 1], or a pair does not consist
             of two different objects of the scene.
+        RequestError: the answer would exceed `size_limit`.
     """
     if top_k < 1:
         raise ValueError(f"top_k must be at least 1, not {top_k}")
     if not 0 <= min_probability <= 1:
         raise ValueError(f"min_probability must be in [0, 1], not {min_probability}")
     if not scene.objects:
-        return (), ()
-    given = posterior(artifact, scene)
-    present, slopes = given.present, artifact.relation_slopes
-    asked = _asked(artifact, present, pairs)
-    found = likeliest_relations(
+        return {"relations": [], "disagreements": []}
+    posterior = posterior_of(artifact, scene)
+    present, slopes = posterior.present, artifact.relation_slopes
+    judged = _judged(artifact, present, pairs)
+    # This limit is slightly lower than the requested minimum, because the final comparison uses
+    # rounded probabilities.
+    least = min_probability * (1 - 1e-5)
+    *columns, probabilities = likeliest_relations(
         slopes.given if relations_given(scene) else slopes.alone,
-        *(given.relation_log_odds(), present.log_counts, present.row, asked),
-        *(min_probability, include_opposites, top_k),
+        *(posterior.relation_log_odds(), present.log_counts, present.row, judged),
+        *(least, include_opposites, top_k),
     )
+    disagreements = _disagreements(
+        artifact, scene, posterior, judged, flipped, top_k=top_k, least=least
+    )
+    if size_limit is not None:
+        count = len(probabilities) + 2 * len(disagreements)
+        size_limit.check("top_k", count * RELATION_BYTES, 2 * count)
     # Relation A + a is the opposite of relation a.
     names = CANONICAL[: artifact.spec.A]
     names += tuple([OPPOSITES[name] for name in names])
-    subjects, objects, kinds, probabilities = (values.tolist() for values in found)
-    kinds = [names[kind] for kind in kinds]
-    stated = set(scene.relations or ())
-    observed = (
-        [
-            canonicalise(subject, kind, object_) in stated
-            for subject, kind, object_ in zip(subjects, kinds, objects, strict=True)
-        ]
-        if stated
-        else [False] * len(kinds)
-    )
-    answers = entries(RelationAnswer, subjects, kinds, objects, probabilities, observed)
-    return tuple(answers), _disagreements(
-        artifact, scene, given, asked, top_k=top_k, min_probability=min_probability
-    )
+    observed, things = set(scene.relations or ()), scene.objects
+    entries: list[Fields] = [
+        {
+            "subject": things[subject].id,
+            "relation": names[kind],
+            "object": things[object_].id,
+            "probability": probability,
+            "observed": bool(observed) and canonicalise(subject, names[kind], object_) in observed,
+        }
+        for subject, object_, kind, probability in zip(
+            *(values.tolist() for values in columns), significant(probabilities), strict=True
+        )
+        if probability >= min_probability
+    ]
+    return {"relations": entries, "disagreements": disagreements}
 
 
-def _asked(
+def _judged(
     artifact: Artifact, present: Present, pairs: Sequence[tuple[int, int]] | None
 ) -> NDArray[np.bool_]:
     """Return a bool mask (N subjects, N objects) of the ordered pairs to judge."""
@@ -146,63 +130,195 @@ def _asked(
     if pairs is None:
         things = ~artifact.vocabulary.structure[present.classes][present.row]
         return things[:, None] & things & ~np.eye(size, dtype=np.bool_)
-    asked = np.zeros((size, size), dtype=np.bool_)
+    judged = np.zeros((size, size), dtype=np.bool_)
     for subject, object_ in pairs:
         if subject == object_ or not (0 <= subject < size and 0 <= object_ < size):
             raise ValueError(
                 f"pair ({subject}, {object_}) must have the indices of two different objects; the "
                 f"scene has {size} objects"
             )
-        asked[subject, object_] = True
-    return asked
+        judged[subject, object_] = True
+    return judged
 
 
 def _disagreements(
     artifact: Artifact,
     scene: Scene,
-    given: Posterior,
-    asked: NDArray[np.bool_],
+    posterior: Posterior,
+    judged: NDArray[np.bool_],
+    flipped: Collection[Triple],
     *,
     top_k: int,
-    min_probability: float,
-) -> tuple[Disagreement, ...]:
-    """Return the disagreements of a scene.
+    least: float,
+) -> list[Fields]:
+    """Return the fields of `scene_client.schemas.ExpectedRelation` for each disagreement.
 
     Disagreements with the largest ratio of `probability` to `observed_probability` come first. If a
     pair has several observed relations, the first of them in `CANONICAL` defines the subject of the
-    disagreement. A relation is never expected if the machine has no unit for it. ``asked`` is
+    disagreement. A relation is never expected if the machine has no unit for it. ``judged`` is
     (N, N) bool. The function judges a pair of objects if one of its two orders is True.
     """
     A = artifact.spec.A
     stated = [triple for triple in scene.relations or () if triple[0] < A]
     if not stated:
-        return ()
-    present = given.present
+        return []
+    present = posterior.present
     subjects, objects, holds, of_classes = observed_pairs(
-        np.array(stated), present.row, asked, len(present.classes), A
+        np.array(stated), present.row, judged, len(present.classes), A
     )
     if not len(subjects):
-        return ()
+        return []
     one, other = present.row[subjects], present.row[objects]
-    where, *found = disagreeing(
-        *(artifact.relation_slopes.given, *given.log_odds_apart(one, other)),
+    where, expected, p, observed_p = disagreeing(
+        *(artifact.relation_slopes.given, *posterior.log_odds_apart(one, other)),
         *(present.log_counts[one] + present.log_counts[other], len(present.classes)),
-        *(holds, of_classes, max(min_probability, EXPECTED), top_k),
+        *(holds, of_classes, max(least, EXPECTED), top_k),
     )
-    pairs = subjects[where], objects[where], holds[where]
+    columns = subjects[where], objects[where], holds[where], expected
+    return [
+        _disagreement(scene, A, flipped, pair, held, kind)
+        | {"probability": probability, "observed_probability": observed_probability}
+        for *pair, held, kind, probability, observed_probability in zip(
+            *(values.tolist() for values in columns),
+            *(significant(p), significant(observed_p)),
+            strict=True,
+        )
+    ]
+
+
+def _disagreement(
+    scene: Scene, A: int, flipped: Collection[Triple], pair: list[int], held: int, expected: int
+) -> Fields:
+    """Return the names of a disagreement, from the subject of the relation in the request.
+
+    Args:
+        scene: the scene.
+        A: number of canonical relations that the machine knows.
+        flipped: relations that the request states by their opposite.
+        pair: indices of subject and object.
+        held: bit set of the observed relations; see `observed_pairs`.
+        expected: number of the expected relation.
+    """
     names = CANONICAL[:A] + tuple(OPPOSITES[name] for name in CANONICAL[:A])
-    return tuple(
-        [
-            Disagreement(
-                subject,
-                object_,
-                tuple([name for bit, name in enumerate(names) if held >> bit & 1]),
-                names[expected],
-                probability,
-                observed,
-            )
-            for subject, object_, held, expected, probability, observed in zip(
-                *(values.tolist() for values in (*pairs, *found)), strict=True
-            )
-        ]
-    )
+    observed = [name for bit, name in enumerate(names) if held >> bit & 1]
+    subject, object_ = pair
+    if flipped:
+        triples = {canonicalise(subject, relation, object_) for relation in observed}
+        # A relation comes from this subject if the request states it with this subject, or if the
+        # request states its opposite with the other object as subject.
+        if all((triple[1] == subject) == (triple in flipped) for triple in triples):
+            subject, object_ = object_, subject
+            names = tuple(map(opposite, names))
+            observed = list(map(opposite, observed))
+    return {
+        "subject": scene.objects[subject].id,
+        "object": scene.objects[object_].id,
+        "observed": observed,
+        "expected": names[expected],
+    }
+
+
+def _read(request: RelationsRequest, _: Artifact, reading: Reading) -> Options:
+    """Return the arguments of `relations` for a request."""
+    return {
+        "top_k": request.top_k,
+        "min_probability": request.min_probability,
+        "pairs": None if request.pairs is None else _pairs(request, reading),
+        "include_opposites": request.include_opposites,
+        "flipped": reading.flipped,
+    }
+
+
+def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]:
+    faults, names = Faults(), reading.names
+    pairs: dict[tuple[int, int], None] = {}
+    for position, pair in enumerate(request.pairs or ()):
+        location: Location = ("pairs", position)
+        if names.is_ignored(pair.subject) or names.is_ignored(pair.object):
+            continue
+        subject = names.find(pair.subject, (*location, "subject"), faults)
+        other = names.find(pair.object, (*location, "object"), faults)
+        if subject is None or other is None:
+            continue
+        if subject == other:
+            faults.add(Reason.INVALID, location, "subject and object must be two different objects")
+            continue
+        pairs[subject, other] = None
+    faults.raise_any()
+    return list(pairs)
+
+
+def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+    for scene in scenes:
+        yield relations(artifact, scene)
+
+
+_EXAMPLES: Final = {
+    **SCENES,
+    "instances": Example(
+        "two instances of one class",
+        {"objects": ["chair", "chair", "desk"], "top_k": 10},
+    ),
+    "pairs": Example(
+        "all eight relations of one ordered pair of objects",
+        {
+            **BEDROOM,
+            "pairs": [{"subject": "lamp_1", "object": "bed"}],
+            "include_opposites": True,
+        },
+    ),
+    "likely": Example(
+        "relations with p of at least 0.5; unlisted relations do not hold",
+        {**BEDROOM, "relations_complete": True, "min_probability": 0.5},
+    ),
+    **REFUSED,
+    "invalid-request": Example(
+        "a pair with an object that is not in the scene",
+        {**LABELS, "pairs": [{"subject": "lamp", "object": "desk"}]},
+        "invalid-request",
+    ),
+}
+_EXAMPLE_ANSWER: Final = {
+    "relations": [
+        {
+            "subject": "lamp_1",
+            "relation": "on-top",
+            "object": "nightstand_1",
+            "probability": 0.83,
+            "observed": True,
+        },
+        {
+            "subject": "nightstand_1",
+            "relation": "left",
+            "object": "bed",
+            "probability": 0.41,
+            "observed": False,
+        },
+    ],
+    "disagreements": [
+        {
+            "subject": "lamp_1",
+            "object": "bed",
+            "observed": ["on-top"],
+            "expected": "left",
+            "probability": 0.36,
+            "observed_probability": 0.02,
+        }
+    ],
+}
+
+RELATIONS: Final = Question(
+    relations,
+    _read,
+    _warm_up,
+    RelationsRequest,
+    RelationsAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+    description="""
+Rank the relations between the objects of a scene, most probable first.
+
+The answer also lists disagreements: pairs of objects whose observed relation differs from the
+relation that the model expects from the rest of the scene.
+""",
+)

@@ -29,16 +29,6 @@ class CountSlope(Frozen):
     slope: float = 1.0
     log_count: float = 0.0
 
-    def log_odds(self, z: Floats, n: int | NDArray[np.integer[Any]]) -> Floats:
-        """Return the calibrated log-odds of the logits z, (N,).
-
-        Args:
-            z: (N,) logits.
-            n: number n of the formula, or an array (N,) with a number for each logit.
-        """
-        found: Floats = self.intercept + self.log_count * np.log(n) + self.slope * z
-        return found
-
 
 class PairSlope(CountSlope):
     """Calibration of a relation between two objects.

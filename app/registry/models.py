@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
+from typing import Final
 
 from app.registry.artifact import Artifact
 from app.registry.errors import ArtifactCode, ArtifactError, StoreError
@@ -86,7 +87,11 @@ class ModelSet:
         return sorted(self.versions.get(name, ()), key=lambda v: (name, v) not in self.failures)
 
 
-def load_model_set(store: Store, previous: ModelSet | None = None) -> ModelSet:
+EMPTY: Final = ModelSet({}, {})
+"""The state of a store without models."""
+
+
+def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
     """Load and verify every version of a store.
 
     The function raises no exception for errors in the store, such as invalid versions, unreadable
@@ -95,8 +100,7 @@ def load_model_set(store: Store, previous: ModelSet | None = None) -> ModelSet:
     Args:
         store: the store.
         previous: earlier snapshot of the store. The function verifies all files again, but reuses
-            artifacts of this snapshot whose digest is unchanged. None means that there is no
-            earlier snapshot.
+            artifacts of this snapshot whose digest is unchanged.
     """
     failure: StoreError | None = None
     aliases: Mapping[str, AliasTarget]
@@ -115,8 +119,7 @@ def load_model_set(store: Store, previous: ModelSet | None = None) -> ModelSet:
                 failure = StoreError(error.code, error.reason)
     except StoreError as error:
         failure = StoreError(error.code, error.reason)
-    known = previous.entries if previous is not None else {}
-    entries = {key: _load(store, *key, known.get(key)) for key in keys}
+    entries = {key: _load(store, *key, previous.entries.get(key)) for key in keys}
     return ModelSet(MappingProxyType(entries), MappingProxyType(dict(aliases)), failure)
 
 

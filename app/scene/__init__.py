@@ -1,9 +1,7 @@
 """Scenes, canonical relations, vocabularies and geometry, independent of any trained model."""
 
-from app.scene.evidence import ClassEvidence, class_evidence, pool_instances
 from app.scene.geometry import PoseRelations, Viewpoint, derive_relations, to_viewer_frame
 from app.scene.labels import head_of, label_key
-from app.scene.observe import observe
 from app.scene.relations import (
     CANONICAL,
     OPPOSITES,
@@ -12,7 +10,14 @@ from app.scene.relations import (
     contradiction,
     opposite,
 )
-from app.scene.scene import Scene, SceneObject
+from app.scene.scene import (
+    ClassEvidence,
+    Scene,
+    SceneObject,
+    class_evidence,
+    observe,
+    pool_instances,
+)
 from app.scene.vocabulary import ObjectClass, Vocabulary
 
 __all__ = [

@@ -1,15 +1,36 @@
-"""A scene as observed by one viewer: objects and their relations."""
+"""A scene as observed by one viewer: objects, their relations, and their evidence about classes.
+
+`observe` derives the relations of a scene from the poses of its objects.
+
+Scenes contain instances (objects), but models only know classes. `class_evidence` converts a scene
+to evidence about classes. A relation is on if it holds, and off if it was observed not to hold.
+Relation a between classes x and y is on if at least one instance of x has relation a to an instance
+of y. Pairs of instances without an observed relation have no influence.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
-from app.scene.geometry import PoseRelations
+import numpy as np
+from numpy.typing import NDArray
+
+from app.compiling import compiled
+from app.scene.geometry import (
+    SMALLEST,
+    PoseRelations,
+    Viewpoint,
+    derive_relations,
+    is_world_fixed,
+    to_viewer_frame,
+)
 from app.scene.relations import CANONICAL, contradiction
 
+A = len(CANONICAL)
+Places = NDArray[np.int64]
 Point = tuple[float, float, float]
 
 
@@ -69,7 +90,7 @@ class Scene:
             to hold.
         room_type: index of the room type in the model's vocabulary. None means that the room type
             is unknown.
-        poses: relations derived from poses by `app.scene.observe`. They include relations observed
+        poses: relations derived from poses by `observe`. They include relations observed
             not to hold, and replace ``relations`` as evidence. ``relations`` must list the derived
             relations that hold, but the class does not check this condition. None means that no
             relations were derived from poses.
@@ -132,3 +153,222 @@ def _are_finite(point: Sequence[float]) -> bool:
     # A loop would be slower. This function runs twice for every object.
     finite = math.isfinite
     return len(point) == 3 and finite(point[0]) and finite(point[1]) and finite(point[2])
+
+
+# ------------------------------------------------------------------------- relations from poses
+
+_UNKNOWN = (math.nan, math.nan, math.nan)
+
+
+def observe(
+    scene: Scene,
+    *,
+    frame_id: str | None = None,
+    viewpoint: Viewpoint | None = None,
+    typical_sizes: NDArray[np.float64] | None = None,
+) -> Scene:
+    """Derive the relations of a scene from the poses of its objects.
+
+    Positions and yaws must be in body axes (`app.scene.geometry.body_pose`). If ``viewpoint`` is
+    given, the returned scene has positions and yaws in viewer axes. The field ``relations`` of the
+    result lists the relations that hold. The field ``poses`` also contains relations observed not
+    to hold.
+
+    The function returns a scene unchanged if the scene states relations or has no positions. In a
+    world-fixed frame (map, odom, world) without a viewpoint, left and front are undefined. The
+    function then derives only on-top and above.
+
+    Args:
+        scene: the scene.
+        frame_id: name of the frame of the positions.
+        viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
+            the origin and looks along x.
+        typical_sizes: (V, 3) typical extents of each class in metres (`Vocabulary.sizes`). They
+            replace missing sizes of objects, and sizes below `SMALLEST`. NaN means an unknown size.
+    """
+    if scene.relations is not None or all(thing.position is None for thing in scene.objects):
+        return scene
+    if viewpoint is not None:
+        scene = replace(scene, objects=_seen_from(scene.objects, viewpoint))
+    positions = np.array([thing.position or _UNKNOWN for thing in scene.objects])
+    sizes = np.array([_extent(thing, typical_sizes) for thing in scene.objects])
+    yaws = np.array([thing.yaw for thing in scene.objects])
+    nobody_looks = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
+    poses = derive_relations(positions, sizes, yaws, horizontal=not nobody_looks)
+    triples = tuple(zip(*(ends.tolist() for ends in np.nonzero(poses.holds)), strict=True))
+    return replace(scene, relations=triples, poses=poses)
+
+
+def _seen_from(objects: tuple[SceneObject, ...], viewpoint: Viewpoint) -> tuple[SceneObject, ...]:
+    positions, yaws = to_viewer_frame(
+        [thing.position or _UNKNOWN for thing in objects],
+        viewpoint,
+        [thing.yaw for thing in objects],
+    )
+    turned = [
+        thing
+        if thing.position is None
+        else SceneObject(
+            thing.id, thing.label, thing.class_index, thing.confidence, (x, y, z), thing.size, yaw
+        )
+        for thing, (x, y, z), yaw in zip(objects, positions.tolist(), yaws.tolist(), strict=True)
+    ]
+    return tuple(turned)
+
+
+def _extent(thing: SceneObject, typical_sizes: NDArray[np.float64] | None) -> Sequence[float]:
+    if thing.size is not None and max(thing.size) >= SMALLEST:
+        return thing.size
+    if typical_sizes is not None and thing.class_index is not None:
+        size: list[float] = typical_sizes[thing.class_index].tolist()
+        return size
+    return _UNKNOWN
+
+
+# -------------------------------------------------------------------------- evidence of classes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClassEvidence:
+    """The n distinct classes of a scene and their observed relations.
+
+    Attributes:
+        classes: (n,) int64, distinct indices of the classes, in ascending order.
+        counts: (n,) int64, number of instances of each class.
+        confidence: (n,) float64 in (0, 1], probability that at least one instance of the class
+            exists.
+        holds: (A, n, n) bool, True for relations that hold. ``holds[a, x, y]`` means that
+            classes[x] has relation a to classes[y].
+        observed: (A, n, n) bool, True for relations that were observed, whether they hold or not.
+            ``holds`` implies ``observed``.
+        room_type: index of the room type, or None if the room type is unknown.
+    """
+
+    classes: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    confidence: NDArray[np.float64]
+    holds: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
+    room_type: int | None
+
+
+def pool_instances(
+    classes: NDArray[np.int64],
+    confidence: NDArray[np.float64],
+    holds: NDArray[np.bool_],
+    observed: NDArray[np.bool_],
+    room_type: int | None = None,
+) -> ClassEvidence:
+    """Pool the instances of each class by a logical OR.
+
+    A relation between classes is on if the relation holds for at least one pair of instances. The
+    relation is off if it was observed for at least one pair, but holds for none. Otherwise the
+    relation is unobserved. If a class has a single instance, the relations between the class and
+    itself stay unobserved.
+
+    Args:
+        classes: (N,) index of the class of each instance.
+        confidence: (N,) probability that the instance exists. Instances count as independent
+            detections, so a class exists with probability 1 - prod(1 - confidence).
+        holds: (A, N, N) bool, True for relations between instances that hold.
+        observed: (A, N, N) bool, True for relations between instances that were observed, whether
+            they hold or not.
+        room_type: index of the room type, or None if the room type is unknown.
+
+    Raises:
+        ValueError: the shapes do not match.
+    """
+    size = len(classes)
+    for name, array in (("holds", holds), ("observed", observed)):
+        if array.shape != (A, size, size):
+            raise ValueError(f"{name} must have the shape {(A, size, size)}, not {array.shape}")
+    if confidence.shape != (size,):
+        raise ValueError(f"confidence must have the shape {(size,)}, not {confidence.shape}")
+    labels = np.asarray(classes, dtype=np.int64)
+    distinct, _, row, counts, present = pool_classes(labels, np.asarray(confidence, np.float64))
+    on, seen = pooled(row, len(distinct), holds, observed)
+    return ClassEvidence(distinct, counts, present, on, seen, room_type)
+
+
+@compiled
+def pool_classes(
+    classes: NDArray[np.int64], confidence: NDArray[np.float64]
+) -> tuple[Places, Places, Places, Places, NDArray[np.float64]]:
+    """Return the n distinct classes of N instances.
+
+    Returns:
+        Class indices in ascending order, (n,).
+        Index of the first instance of each class, (n,).
+        For each instance, index of its class in the first array, (N,).
+        Number of instances of each class, (n,).
+        Probability that at least one instance of each class exists, (n,).
+    """
+    distinct, row = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
+    counts, first = np.zeros(len(classes), np.int64), np.empty(len(classes), np.int64)
+    absent, n = np.ones(len(classes), np.float64), 0
+    for instance in np.argsort(classes, kind="mergesort"):
+        if n == 0 or distinct[n - 1] != classes[instance]:
+            distinct[n], first[n] = classes[instance], instance
+            n += 1
+        row[instance] = n - 1
+        counts[n - 1] += 1
+        absent[n - 1] *= 1.0 - confidence[instance]
+    return distinct[:n], first[:n], row, counts[:n], 1.0 - absent[:n]
+
+
+@compiled
+def pooled(
+    row: NDArray[np.int64], n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
+
+    Args:
+        row: (N,) index of each instance's class, from 0 to n - 1.
+        n: number of classes.
+        holds: (A, N, N) bool, True for relations between instances that hold.
+        observed: (A, N, N) bool, True for relations between instances that were observed.
+
+    Returns:
+        The arrays ``holds`` and ``observed`` of `ClassEvidence`, each (A, n, n).
+    """
+    size = len(row)
+    on, seen = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
+    for a in range(A):
+        for i in range(size):
+            for j in range(size):
+                if i != j and (holds[a, i, j] or observed[a, i, j]):
+                    seen[a, row[i], row[j]] = True
+                    on[a, row[i], row[j]] |= holds[a, i, j]
+    return on, seen
+
+
+def class_evidence(scene: Scene) -> ClassEvidence:
+    """Return the evidence of a scene about its classes.
+
+    Instances whose label is outside the vocabulary are left out. If the scene has poses,
+    ``scene.poses`` defines which relations hold and which are observed. Otherwise, stated relations
+    are on. Relations that are not stated are off if ``scene.relations_complete`` is True, and
+    unobserved otherwise.
+    """
+    kept = [i for i, thing in enumerate(scene.objects) if thing.class_index is not None]
+    size = len(kept)
+    classes = np.array([scene.objects[i].class_index for i in kept], dtype=np.int64)
+    confidence = np.array([scene.objects[i].confidence for i in kept], dtype=np.float64)
+    holds, observed = instance_evidence(scene)
+    if size < len(scene.objects):
+        holds, observed = holds[:, kept][:, :, kept], observed[:, kept][:, :, kept]
+    return pool_instances(classes, confidence, holds, observed, scene.room_type)
+
+
+def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which relations between the N instances of a scene hold, and which are observed.
+
+    Both bool arrays have the shape (A relations, N subjects, N objects).
+    """
+    if scene.poses is not None:
+        return scene.poses.holds, scene.poses.observed
+    size = len(scene.objects)
+    holds = np.zeros((A, size, size), dtype=np.bool_)
+    if scene.relations:
+        holds[tuple(np.array(scene.relations).T)] = True
+    return holds, np.full((A, size, size), scene.relations_complete)

@@ -30,7 +30,7 @@ from time import monotonic, thread_time
 from typing import Final, Generic, TypeVar
 from weakref import WeakSet
 
-from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFullError
+from app.errors import DeadlinePassedError, DisconnectedError, QueueFullError
 
 T = TypeVar("T")
 

@@ -84,38 +84,11 @@ def vocabulary(served: ServedModel) -> schemas.VocabularyAnswer:
 
 def contexts(served: ServedModel) -> schemas.ContextsAnswer:
     """List the hidden units of a model with the objects and relations of their largest weights."""
-    return schemas.ContextsAnswer(
-        model=served.reference,
-        layers={
-            layer: [
-                schemas.ContextUnit(
-                    unit=unit.unit,
-                    name=unit.name,
-                    objects=_weighted(unit.objects),
-                    relations=[
-                        schemas.WeightedRelation(
-                            subject=subject,
-                            relation=cast("schemas.RelationName", relation),
-                            object=other,
-                            weight=weight,
-                        )
-                        for (subject, relation, other), weight in unit.relations
-                    ],
-                    room_types=_weighted(unit.room_types),
-                )
-                for unit in units
-            ]
-            for layer, units in served.contexts.items()
-        },
-    )
+    return schemas.ContextsAnswer(model=served.reference, layers=dict(served.contexts))
 
 
 def _size(extents: Sequence[float] | None) -> schemas.Size | None:
     return None if extents is None else schemas.Size(**dict(zip("xyz", extents, strict=True)))
-
-
-def _weighted(pairs: Sequence[tuple[str, float]]) -> list[schemas.WeightedLabel]:
-    return [schemas.WeightedLabel(label=label, weight=weight) for label, weight in pairs]
 
 
 def _name(models: ServedModels, reference: str) -> str:

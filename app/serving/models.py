@@ -15,20 +15,22 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
+from typing import Final
 
-from app import questions
-from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
-from app.scene.nearest import spelt_alike
-from app.scene.vocabulary import Vocabulary
-from app.serving.admission import WorkQueue
-from app.serving.errors import (
+from app.errors import (
     ModelUnavailableError,
     NotReadyError,
     ServingError,
     UnknownModelError,
     some_of,
 )
-from scene_client.schemas import Failure, ModelReference
+from app.questions.contexts import contexts
+from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
+from app.registry.models import EMPTY
+from app.scene.nearest import spelt_alike
+from app.scene.vocabulary import Vocabulary
+from app.serving.admission import WorkQueue
+from scene_client.schemas import ContextUnit, Failure, ModelReference
 
 DEFAULT = "default"
 Key = tuple[str, str]
@@ -71,18 +73,12 @@ class ServedModel:
         return self.artifact.vocabulary
 
     @cached_property
-    def context_sizes(self) -> Mapping[str, int]:
-        """Maps the name of each hidden layer to its number of units."""
-        spec = self.artifact.spec
-        return {"h1": spec.H1, "h2": spec.H2} if spec.H2 else {"h1": spec.H1}
-
-    @cached_property
-    def contexts(self) -> Mapping[str, tuple[questions.ContextUnit, ...]]:
+    def contexts(self) -> Mapping[str, list[ContextUnit]]:
         """Maps each hidden layer to its units, with the objects and relations of largest weight.
 
         The first access computes the value, which takes 0.2 s.
         """
-        return questions.contexts(self.artifact)
+        return contexts(self.artifact)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,3 +191,7 @@ class ServedModels:
                 subject="store", reason=self.store.failure.code, detail=self.store.failure.reason
             )
         return found
+
+
+NOTHING: Final = ServedModels(EMPTY, MappingProxyType({}))
+"""The snapshot before the service has loaded its models."""

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Iterator, Mapping, Sequence, Sized
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
-from typing import Concatenate, Final, ParamSpec, TypeVar
+from typing import Any, Final, TypeVar
 
-from app.registry import Artifact
+from app.errors import ServingError
+from app.questions.answer import Fields, SizeLimit, envelope
+from app.questions.names import LookUps
+from app.questions.question import Question
+from app.questions.reading import Limits, Reading, read_scene
 from app.scene.scene import Scene
 from app.serving.admission import Done, Ticket
-from app.serving.errors import ServingError
 from app.serving.metrics import Metrics
 from app.serving.models import Key, ServedModel, ServedModels
-from app.serving.reading import Limits, LookUps, Reading, read_scene
 from scene_client.schemas import SceneRequest
 
-P = ParamSpec("P")
-T = TypeVar("T")
+RequestT = TypeVar("RequestT", bound=SceneRequest)
 
 SUCCESS: Final = "success"
 
@@ -101,21 +102,50 @@ class Request(Ticket):
     holding: bool = False
     look_ups: LookUps = field(default_factory=LookUps)
 
-    async def read(
-        self, scene: SceneRequest, *, may_be_empty: bool = False
-    ) -> tuple[ServedModel, Reading]:
-        """Return the model in the field `model` of a scene, and the scene converted for this model.
+    async def answer(self, question: Question[RequestT], scene: RequestT) -> Fields:
+        """Ask the model in the field `model` of a scene one question.
 
-        The queue of the model reads large scenes.
+        Args:
+            question: the question.
+            scene: the validated scene.
+
+        Returns:
+            The fields of `scene_client.schemas.Answer` and of the question.
 
         Raises:
             UnknownModelError: the model does not exist.
             ModelUnavailableError: the service refused to load the model.
-            RequestError: the scene is invalid; see `read_scene`.
-            DeadlinePassedError, DisconnectedError: see `WorkQueue`.
+            RequestError: the scene is invalid, or the answer would be too large.
+            QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
         """
         model = self.models.resolve(scene.model)
         self.record.models.add(model.key)
+        reading = await self._read(model, scene, may_be_empty=question.samples)
+        options = question.read(scene, model.artifact, reading)
+        limit = SizeLimit(reading, self.limits.answer_bytes)
+        ask = partial(question.answer, model.artifact, reading.scene, **options, size_limit=limit)
+        rows = options["count"] if question.samples else 1
+        held = 0 if self.holding else rows
+        model.queue.take(held)
+        try:
+            if question.samples:
+                done = await model.queue.draw(lambda stop: ask(stop=stop), self)
+            else:
+                kind = _kind_of_cost(question.name, reading.scene, options)
+                # The time for relations grows with the number of pairs of objects.
+                size = (1 + len(reading.scene.objects)) ** 2
+                done = await model.queue.run(ask, self, kind=kind, size=size)
+        finally:
+            model.queue.give_back(held)
+        self._note(model, question.name, rows, done)
+        answer = envelope(scene, self.id, model.reference, reading)
+        warnings = [*reading.warnings, *done.result.pop("warnings", ())]
+        return answer | done.result | {"warnings": warnings}
+
+    async def _read(
+        self, model: ServedModel, scene: SceneRequest, *, may_be_empty: bool
+    ) -> Reading:
+        """Return a scene converted for a model. The queue of the model reads large scenes."""
         read = partial(
             read_scene,
             scene,
@@ -126,7 +156,7 @@ class Request(Ticket):
         )
         relations = len(scene.relations or ())
         if len(scene.objects) <= MANY_OBJECTS and relations <= MANY_RELATIONS:
-            return model, read()
+            return read()
         posed = sum(
             not isinstance(thing, str) and thing.position is not None for thing in scene.objects
         )
@@ -137,74 +167,15 @@ class Request(Ticket):
             kind=f"read {posed.bit_length()}",
             size=len(scene.objects) + relations + posed**2,
         )
-        return model, done.result
+        return done.result
 
-    async def ask(
-        self,
-        model: ServedModel,
-        name: str,
-        question: Callable[Concatenate[Artifact, Scene, P], T],
-        scene: Scene,
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> T:
-        """Ask a model one question about one scene.
-
-        Args:
-            model: the model that computes the answer.
-            name: name of the question, for log and metrics.
-            question: function that computes the answer.
-            scene: the scene with the class indices of the model.
-            *args, **kwargs: further arguments of ``question``.
-
-        Raises:
-            QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
-        """
-        call = partial(question, model.artifact, scene, *args, **kwargs)
-        rows = 0 if self.holding else 1
-        model.queue.take(rows)
-        try:
-            done = await model.queue.run(
-                call,
-                self,
-                kind=_kind_of_cost(name, scene, kwargs),
-                # The time for relations grows with the number of pairs of objects.
-                size=(1 + len(scene.objects)) ** 2,
-            )
-        finally:
-            model.queue.give_back(rows)
-        return self._noted(model, name, 1, done)
-
-    async def draw(
-        self, rows: int, model: ServedModel, name: str, draw: Callable[[Callable[[], bool]], T]
-    ) -> T:
-        """Sample scenes from a model.
-
-        Args:
-            rows: number of scenes to sample.
-            model: the model to sample from.
-            name: name of the question, for log and metrics.
-            draw: function that samples the scenes. Its argument is a function that returns whether
-                the request has ended, because the sampling can then stop.
-
-        Raises:
-            QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
-        """
-        taken = 0 if self.holding else rows
-        model.queue.take(taken)
-        try:
-            done = await model.queue.draw(draw, self)
-        finally:
-            model.queue.give_back(taken)
-        return self._noted(model, name, rows, done)
-
-    def _noted(self, model: ServedModel, name: str, rows: int, done: Done[T]) -> T:
+    def _note(self, model: ServedModel, name: str, rows: int, done: Done[Any]) -> None:
+        """Record the times of a computation, for log and metrics."""
         record = self.record
         record.queue_seconds = (record.queue_seconds or 0.0) + done.waited
         record.compute_seconds = (record.compute_seconds or 0.0) + done.computed
         record.answered_at = perf_counter()
         self.metrics.computed(model.key, name, rows, done.waited, done.computed)
-        return done.result
 
     def with_answer_bytes(self, left: int) -> Request:
         """Return a copy of the request that limits the next answer to ``left`` bytes."""

@@ -7,18 +7,17 @@ import ctypes
 import gc
 import logging
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from typing import Literal
 
+from app import errors
 from app.compiling import check_cache, progress
+from app.questions.reading import Limits
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
-from app.serving import errors
 from app.serving.admission import Backlog, Threads, WorkQueue
 from app.serving.metrics import Change, Metrics
-from app.serving.models import DEFAULT, Key, ServedModels
-from app.serving.reading import Limits
-from app.serving.request import Record, Request
+from app.serving.models import DEFAULT, NOTHING, Key, ServedModels
 from app.serving.warm_up import prepare
 from app.settings import Settings
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
@@ -41,7 +40,9 @@ class Runtime:
 
     Attributes:
         backlog: queue of requests that wait for admission.
+        limits: limits on scenes and answers.
         metrics: metrics of the service.
+        models: current snapshot of the models.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -52,7 +53,7 @@ class Runtime:
             lock_timeout=_LOCK_TIMEOUT,
             max_weights_bytes=settings.max_weights_bytes,
         )
-        self._limits = Limits(
+        self.limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
         self._queue_rows = settings.queue_rows
@@ -60,46 +61,8 @@ class Runtime:
         self._poll = settings.store_poll
         self._polling: asyncio.Task[None] | None = None
         self._changing = asyncio.Lock()
-        self._models: ServedModels | None = None
+        self.models = NOTHING
         self._seen: StoreState | None = None
-
-    @property
-    def models(self) -> ServedModels:
-        """The current snapshot of the models.
-
-        Raises:
-            NotReadyError: the service has not loaded the models yet.
-        """
-        if self._models is None:
-            raise errors.NotReadyError("The service is starting.")
-        return self._models
-
-    def request(
-        self,
-        deadline: float,
-        request_id: str,
-        record: Record | None = None,
-        is_gone: Callable[[], Awaitable[bool]] | None = None,
-    ) -> Request:
-        """Create a request that uses the current snapshot of the models until its end.
-
-        Args:
-            deadline, is_gone: deadline and connection check of the request, as in `Ticket`.
-            request_id: id of the request. Every answer contains the id.
-            record: values of the request for the log and the metrics.
-
-        Raises:
-            NotReadyError: the models are not loaded yet.
-        """
-        return Request(
-            deadline,
-            is_gone,
-            request_id,
-            record or Record(),
-            models=self.models,
-            limits=self._limits,
-            metrics=self.metrics,
-        )
 
     @property
     def draining(self) -> bool:
@@ -131,7 +94,7 @@ class Runtime:
         check_cache()
         # The models load on this thread, because the service has no requests yet. Another thread
         # would cost time and memory.
-        self._serve(self._load(None))
+        self._serve(self._load())
         for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
         if self._poll:
@@ -151,7 +114,6 @@ class Runtime:
 
         Raises:
             RefreshRefusedError: the service refused the new state. The served models are unchanged.
-            NotReadyError: the service has not loaded the models yet.
         """
         async with self._change("refresh"):
             # These sets contain only names, so Python can free the memory of the old snapshot.
@@ -176,7 +138,6 @@ class Runtime:
                 of the alias.
             StoreNotWritableError: this process cannot write to the store.
             StoreBusyError: another process is writing to the store.
-            NotReadyError: the models are not loaded yet.
         """
         async with self._change("alias"):
             target = self._target(request.model)
@@ -246,7 +207,7 @@ class Runtime:
             RefreshRefusedError: the service refused the new state.
         """
         # `_load` runs in a thread, so that the event loop can answer from the old snapshot.
-        new = await asyncio.to_thread(self._load, self.models)
+        new = await asyncio.to_thread(self._load)
         worse = [failure for subject, failure in new.failures.items() if matters(subject)]
         if worse:
             raise errors.RefreshRefusedError(worse)
@@ -254,24 +215,21 @@ class Runtime:
         return new
 
     def _serve(self, models: ServedModels) -> None:
-        unchanged = self._models is not None and self._models.served == models.served
-        if self._models is not None:
-            before = self._models.store.aliases
-            for alias, target in models.store.aliases.items():
-                if before.get(alias) != target:
-                    _logger.info("the alias %s names %s now", alias, target)
-        self._models = models
+        before, self.models = self.models, models
+        for alias, target in models.store.aliases.items():
+            if before is not NOTHING and before.store.aliases.get(alias) != target:
+                _logger.info("the alias %s names %s now", alias, target)
         self.metrics.serving(models)
-        if not unchanged:
+        if before is NOTHING or before.served != models.served:
             _settle_memory()
 
-    def _load(self, previous: ServedModels | None) -> ServedModels:
+    def _load(self) -> ServedModels:
         # Read the state before the files. So the next check of the store finds changes that other
         # processes make during the load.
         self._seen = self._store.state()
-        known = None if previous is None else previous.store
+        models = self.models
         with progress():
-            return prepare(load_model_set(self._store, known), self._new_queue, previous)
+            return prepare(load_model_set(self._store, models.store), self._new_queue, models)
 
     def _new_queue(self) -> WorkQueue:
         return WorkQueue(self._queue_rows, self._threads, self.backlog)

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from types import MappingProxyType
 
-from app.questions.ranking import significant
+from app.questions import QUESTIONS
+from app.questions.answer import written
 from app.registry import Artifact, ArtifactFailure, ModelSet
-from app.scene.observe import observe
-from app.scene.scene import Scene, SceneObject
+from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import WorkQueue
 from app.serving.models import Key, ServedModel, ServedModels
-from app.serving.questions import QUESTIONS
 
 _logger = logging.getLogger("app.serving")
 
 
 def prepare(
-    store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels | None = None
+    store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels
 ) -> ServedModels:
     """Warm up every verified model. Return the models that can be served, and all failures.
 
@@ -33,9 +31,9 @@ def prepare(
     for key, artifact in store.entries.items():
         if not isinstance(artifact, Artifact):
             continue
-        known = previous.served.get(key) if previous is not None else None
-        if known is not None and known.artifact is artifact:
-            served[key] = known
+        before = previous.served.get(key)
+        if before is not None and before.artifact is artifact:
+            served[key] = before
             continue
         try:
             warm_up(artifact)
@@ -61,9 +59,9 @@ def warm_up(artifact: Artifact) -> None:
     bare = replace(related, relations=None)
     posed = observe(bare, typical_sizes=artifact.vocabulary.sizes)
     scenes = related, bare, posed
-    numbers = [number for question in QUESTIONS for number in question.warm_up(artifact, scenes)]
-    if not all(map(math.isfinite, significant(numbers))):
-        raise ValueError("the model's answers contain numbers that are not finite")
+    for question in QUESTIONS:
+        for answer in question.warm_up(artifact, scenes):
+            written(answer)
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:

@@ -13,7 +13,7 @@ import pytest
 from app import questions
 from app.registry import Store
 from app.scene import Scene, SceneObject
-from app.scene.frames import viewer_axes
+from app.scene.geometry import viewer_axes
 from tests.http.stores import V, publish
 from tests.http.test_questions import ask
 from tests.questions.test_offsets import known

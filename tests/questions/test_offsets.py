@@ -14,7 +14,7 @@ from app.questions import missing
 from app.questions.missing import offsets_of
 from app.registry import Offsets
 from app.scene import CANONICAL, Scene, SceneObject
-from app.scene.frames import viewer_axes
+from app.scene.geometry import viewer_axes
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP, canonicalise
 from tests.questions.artifacts import LARGER, larger_artifact
 

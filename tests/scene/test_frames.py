@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.scene.frames import body_pose, is_optical, is_world_fixed, viewer_axes
+from app.scene.geometry import body_pose, is_optical, is_world_fixed, viewer_axes
 from app.scene.geometry import Viewpoint, to_viewer_frame
 from tests.scene.turns import about, after
 

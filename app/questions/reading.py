@@ -1,7 +1,7 @@
 """Conversion of a request to a scene with ids, class indices and relations from poses.
 
 The functions collect all errors of a request before they raise an exception. So a client can
-correct all errors at once.
+correct all errors at once. A scene with probable mistakes gets warnings.
 """
 
 from __future__ import annotations
@@ -9,43 +9,35 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final
+from statistics import median
+from typing import Final, Literal
 
 from pydantic_core import to_json
 
-from app.scene.frames import body_pose, is_optical
-from app.scene.geometry import Viewpoint
-from app.scene.labels import label_key
-from app.scene.nearest import Guess, Match, spelt_alike
-from app.scene.observe import observe
+from app.errors import Location, Reason
+from app.questions.names import Faults, LookUps, Names, Unknown
+from app.scene.geometry import (
+    LARGEST,
+    MOST_DISTANT,
+    SMALLEST,
+    Viewpoint,
+    body_pose,
+    is_optical,
+    is_world_fixed,
+)
 from app.scene.relations import CANONICAL, canonicalise
-from app.scene.scene import Scene, SceneObject
+from app.scene.scene import Point, Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
-from app.serving.errors import Fault, Location, Reason, RequestError, some_of
-from app.serving.warnings import scene_warnings
 from scene_client.schemas import (
     Detection,
-    Mapped,
     ObservedRelation,
     Quaternion,
     RelationName,
     SceneRequest,
     SceneWarning,
-    UnknownLabels,
 )
-from scene_client.validation import MAX_ERRORS, PLAIN
-
-MAX_SUGGESTED: Final = 32
-"""Maximum number of searches for classes similar to an unknown label, per scene.
-
-The same number limits the errors with suggestions per request.
-"""
-MAX_MAPPED: Final = 256
-"""Maximum number of unknown labels per request that the service maps to the nearest class."""
-
 
 Triple = tuple[int, int, int]
 
@@ -63,167 +55,6 @@ class Limits:
     objects: int = 256
     relations: int = 4096
     answer_bytes: int = 16 * 2**20
-
-
-@dataclass(slots=True)
-class Faults:
-    """The errors of a request found so far.
-
-    Attributes:
-        found: dictionary from each kind of error to the list of errors of this kind.
-    """
-
-    found: dict[Reason, list[Fault]] = field(default_factory=dict)
-
-    def add(
-        self, reason: Reason, location: Location, message: str, suggestions: Sequence[str] = ()
-    ) -> None:
-        """Add an error without raising it."""
-        self.found.setdefault(reason, []).append(Fault(location, message, tuple(suggestions)))
-
-    @property
-    def are_many(self) -> bool:
-        """Whether an answer cannot list further errors."""
-        return sum(map(len, self.found.values())) >= MAX_ERRORS
-
-    def raise_any(self) -> None:
-        """Raise an exception if the request has errors.
-
-        Raises:
-            RequestError: the request has errors. The exception contains all errors of one kind, the
-                first kind in `Reason` with errors.
-        """
-        for reason in Reason if self.found else ():
-            if reason in self.found:
-                raise RequestError(reason, self.found[reason])
-
-
-@dataclass(slots=True)
-class LookUps:
-    """Searches for classes similar to unknown labels, shared by all scenes of one request.
-
-    This class limits the number of searches, because a search takes 0.2 ms, and a batch may contain
-    10,000 unknown labels.
-
-    Attributes:
-        suggestions: number of errors of the request that already have suggestions, or for which the
-            service has looked for similar ids.
-    """
-
-    suggestions: int = 0
-    _guesses: dict[tuple[int, str, bool], Guess | None] = field(default_factory=dict)
-    _similar: dict[tuple[int, str, bool], tuple[Match, ...]] = field(default_factory=dict)
-
-    # id() of a vocabulary stays unique, because the request keeps its models in memory.
-
-    def guess(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> Guess | None:
-        """Return what an unknown label probably stands for.
-
-        Raises:
-            OverflowError: the request has had `MAX_MAPPED` guesses.
-        """
-        key = id(vocabulary), label, is_room
-        if key not in self._guesses:
-            if len(self._guesses) >= MAX_MAPPED:
-                raise OverflowError
-            self._guesses[key] = vocabulary.guess(label, is_room=is_room)
-        return self._guesses[key]
-
-    def similar(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> tuple[Match, ...]:
-        """Return the names most similar to a label, or none after `MAX_SUGGESTED` searches."""
-        key = id(vocabulary), label, is_room
-        if key not in self._similar:
-            if len(self._similar) >= MAX_SUGGESTED:
-                return ()
-            self._similar[key] = vocabulary.nearest(label, is_room=is_room)
-        return self._similar[key]
-
-
-@dataclass(slots=True)
-class Unknown:
-    """The labels of one scene that the vocabulary does not list, and their treatment.
-
-    Attributes:
-        vocabulary: classes and room types of the model.
-        treatment: value of the field `unknown_labels` of the request.
-        look_ups: searches for similar classes, shared by all scenes of the request.
-        ignored: names of the ignored objects.
-        mapped: the class that replaces each label. A key consists of the label and whether it is a
-            room type.
-    """
-
-    vocabulary: Vocabulary
-    treatment: UnknownLabels
-    look_ups: LookUps
-    ignored: list[str] = field(default_factory=list)
-    mapped: dict[tuple[str, bool], Mapped] = field(default_factory=dict)
-    _guesses: dict[tuple[str, bool], Guess | None] = field(default_factory=dict)
-
-    def resolve(
-        self, label: str, name: str, location: Location, faults: Faults, *, is_room: bool = False
-    ) -> int | None:
-        """Return the class or room type that replaces an unlisted label.
-
-        Each treatment accepts the syntax of detectors, such as "chair_12".
-
-        Args:
-            label: the label.
-            name: name of the object with this label. The list of ignored names contains it if the
-                label is ignored.
-            location: location of the label in the request, for an error message.
-            faults: list of errors. If the method refuses the label, it adds an error to this list.
-            is_room: whether the label is the name of a room type.
-
-        Returns:
-            Index of the class or room type. None means that the label is ignored or refused.
-        """
-        found = self.vocabulary.read(label, is_room=is_room)
-        if found is None and self.treatment.startswith("nearest"):
-            found = self._guess(label, is_room=is_room)
-        if found is not None:
-            entry, similarity, rule = found
-            name = (self.vocabulary.room_types if is_room else self.vocabulary.labels)[entry]
-            mapped = Mapped(label=label, class_=name, similarity=similarity, rule=rule)
-            self.mapped[label, is_room] = mapped
-            return entry
-        if self.treatment.endswith("ignore"):
-            self.ignored.append(name)
-        else:
-            self._refuse(label, location, faults, is_room=is_room)
-        return None
-
-    def copy(self) -> Unknown:
-        """Return a copy. A question with further labels changes only its own copy."""
-        return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
-
-    def _guess(self, label: str, *, is_room: bool) -> Guess | None:
-        key = label, is_room
-        if key in self._guesses or len(self._guesses) < MAX_SUGGESTED:
-            with suppress(OverflowError):
-                guess = self.look_ups.guess(self.vocabulary, label, is_room=is_room)
-                return self._guesses.setdefault(key, guess)
-        return None
-
-    def _refuse(self, label: str, location: Location, faults: Faults, *, is_room: bool) -> None:
-        known = self.vocabulary.room_types if is_room else self.vocabulary.labels
-        message = "the model does not know this label"
-        if not is_room and self.vocabulary.room_index(label) is not None:
-            message += "; it is a room type: send it as `room_type`"
-        if is_room:
-            message = "this model does not have room types"
-            if known:
-                message = f"the model does not know this room type; it knows {some_of(known)}"
-        if self.treatment == "nearest" and (label, is_room) not in self._guesses:
-            message += (
-                f"; the service maps at most {MAX_SUGGESTED} unknown labels per scene and "
-                f"{MAX_MAPPED} per batch to the nearest class"
-            )
-        suggestions: list[str] = []
-        if self.look_ups.suggestions < MAX_SUGGESTED:
-            matches = self.look_ups.similar(self.vocabulary, label, is_room=is_room)
-            suggestions = [known[match.entry] for match in matches]
-        self.look_ups.suggestions += bool(suggestions)
-        faults.add(Reason.UNKNOWN_LABELS, location, message, suggestions)
 
 
 @dataclass
@@ -252,7 +83,7 @@ class Reading:
     @cached_property
     def names(self) -> Names:
         """Look-up of objects by id or label. The first access builds the look-up tables."""
-        return Names(self)
+        return Names(self.scene.objects, self.unknown, self.left_out)
 
     def longest_name(self) -> int:
         """Return the maximum size in bytes of an id or label in the JSON text of the answer."""
@@ -262,81 +93,6 @@ class Reading:
         else:
             longest = max(len(to_json(name)) for name in self.ids)
         return max(longest, self.unknown.vocabulary.longest_label) + 1
-
-
-class Names:
-    """Look-up of the objects of a scene by id, or by label if only one object has the label."""
-
-    def __init__(self, reading: Reading) -> None:
-        self._unknown = reading.unknown
-        self._objects = reading.scene.objects
-        self._ignored_ids = {name for name, _ in reading.left_out}
-        self._ignored_labels = {label_key(label) for _, label in reading.left_out}
-
-    # The first access builds each table. Most requests never need the tables, because most requests
-    # do not refer to objects by name.
-
-    @cached_property
-    def _by_id(self) -> dict[str, int]:
-        return {thing.id: place for place, thing in enumerate(self._objects)}
-
-    @cached_property
-    def _by_label(self) -> dict[str, list[int]]:
-        places: dict[str, list[int]] = {}
-        for place, thing in enumerate(self._objects):
-            places.setdefault(thing.label, []).append(place)
-        return places
-
-    @cached_property
-    def _by_class(self) -> dict[int, list[int]]:
-        places: dict[int, list[int]] = {}
-        for place, thing in enumerate(self._objects):
-            if thing.class_index is not None:
-                places.setdefault(thing.class_index, []).append(place)
-        return places
-
-    @cached_property
-    def _plain_ids(self) -> list[str]:
-        # A request cannot put arbitrary text into an error through its ids.
-        return [thing.id for thing in self._objects if PLAIN.fullmatch(thing.id.replace(" ", "_"))]
-
-    def find(self, name: str, location: Location, faults: Faults) -> int | None:
-        """Return the index of the object with a name. On failure, add an error and return None.
-
-        The name is an id or a label. Ids take precedence over labels. A label may have any spelling
-        that the vocabulary accepts for its class.
-        """
-        if (place := self._by_id.get(name)) is not None:
-            return place
-        places = self._by_label.get(name)
-        if places is None:
-            index = self._unknown.vocabulary.index(name)
-            places = [] if index is None else self._by_class.get(index, [])
-        if len(places) == 1:
-            return places[0]
-        if places:
-            message = (
-                f"{len(places)} objects have this label; use the id of one of them. The service "
-                "numbers objects without an id, such as chair_1 and chair_2"
-            )
-            faults.add(Reason.INVALID, location, message)
-        else:
-            message = "no entry of `objects` has this id or label"
-            faults.add(Reason.INVALID, location, message, self._similar(name))
-        return None
-
-    def _similar(self, name: str) -> list[str]:
-        """Return similar ids for the first `MAX_SUGGESTED` unknown names of a request."""
-        if self._unknown.look_ups.suggestions >= MAX_SUGGESTED:
-            return []
-        self._unknown.look_ups.suggestions += 1
-        return spelt_alike(name, self._plain_ids)
-
-    def is_ignored(self, name: str) -> bool:
-        """Return whether an ignored object has this id or label."""
-        if name in self._by_id:
-            return False
-        return name in self._ignored_ids or label_key(name) in self._ignored_labels
 
 
 def read_scene(
@@ -553,3 +309,90 @@ def _triples(
             faults.add(Reason.CONTRADICTION, location, message)
         triples.setdefault((index, i, j), i != subject)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])
+
+
+# ------------------------------------------------------------------------------------ warnings
+
+_SAME_DEPTH: Final = 1e-3  # maximum difference in m of depths that count as equal
+_LEAST_FLAT: Final = 3  # minimum number of objects for the warning flat-scene
+
+_TOO_FAR: Final = (
+    f"the object is more than {MOST_DISTANT:g} m from the viewer; positions must be in metres"
+)
+_ODD_SIZE: Final = (
+    f"all sides of the object are below {SMALLEST * 1e3:g} mm, so its size is unknown, or a side "
+    f"is above {LARGEST:g} m; sizes must be in metres"
+)
+_FLAT: Final = "all objects have the same depth along the optical axis; the depth may be missing"
+_UNSIZED: Final = (
+    "the service cannot derive vertical relations of this object: the object has no size, and its "
+    "class has no typical size"
+)
+
+Code = Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"]
+
+
+def scene_warnings(
+    given: Scene, scene: Scene, vocabulary: Vocabulary, request: SceneRequest
+) -> list[SceneWarning]:
+    """Return the warnings about a scene.
+
+    Args:
+        given: the scene in the request's frame, in axes of REP-103 (x forward, y left, z up).
+        scene: the same scene after `observe`, in the axes of the viewer if the request has a
+            viewpoint.
+        vocabulary: classes of the model, with their typical sizes.
+        request: the request that contains the scene.
+    """
+    # Python loops are fast enough, because most scenes have no poses or pass all checks.
+    placed = [thing for thing in scene.objects if thing.position is not None]
+    odd = [thing for thing in scene.objects if not _is_plausible(thing.size)]
+    is_seen_flat = request.frame_id is not None and is_optical(request.frame_id) and _is_flat(given)
+    has_poses = scene.poses is not None and len(placed) > 1
+    found: list[tuple[Code, str, Sequence[SceneObject]]] = [
+        ("implausible-position", _TOO_FAR, _distant(given, request) if placed else ()),
+        ("implausible-size", _ODD_SIZE, odd),
+        ("flat-scene", _FLAT, placed if is_seen_flat else ()),
+        ("unknown-sizes", _UNSIZED, _unsized(placed, vocabulary) if has_poses else ()),
+    ]
+    return [
+        SceneWarning(code=code, message=message, objects=[thing.id for thing in objects])
+        for code, message, objects in found
+        if objects
+    ]
+
+
+def _distant(given: Scene, request: SceneRequest) -> list[SceneObject]:
+    """Return the objects that are too far from the viewer.
+
+    In a world-fixed frame without a viewpoint, the position of the viewer is unknown. The median
+    position of the objects then replaces the position of the viewer.
+    """
+    placed = [(thing, thing.position) for thing in given.objects if thing.position is not None]
+    centre: Point = (0.0, 0.0, 0.0)
+    if request.viewpoint is not None:
+        centre = (request.viewpoint.x, request.viewpoint.y, 0.0)
+    elif request.frame_id is not None and is_world_fixed(request.frame_id):
+        xs, ys, zs = zip(*[position for _, position in placed], strict=True)
+        centre = (median(xs), median(ys), median(zs))
+    return [thing for thing, place in placed if math.dist(place, centre) > MOST_DISTANT]
+
+
+def _is_plausible(size: Point | None) -> bool:
+    return size is None or SMALLEST <= max(size) <= LARGEST
+
+
+def _is_flat(given: Scene) -> bool:
+    """Return whether all objects have the same depth, the distance along the optical axis."""
+    depths = [thing.position[0] for thing in given.objects if thing.position is not None]
+    return len(depths) >= _LEAST_FLAT and max(depths) - min(depths) <= _SAME_DEPTH
+
+
+def _unsized(placed: Sequence[SceneObject], vocabulary: Vocabulary) -> list[SceneObject]:
+    sizes = vocabulary.sizes
+    return [
+        thing
+        for thing in placed
+        if thing.size is None
+        and (thing.class_index is None or math.isnan(sizes[thing.class_index, 0]))
+    ]

@@ -1,19 +1,22 @@
-"""The class `Question`: the function, the schemas and the examples of one question."""
+"""The class `Question`: a function, its schemas and its examples."""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from inspect import getdoc
-from typing import Any, Final, Generic, TypeVar
+from inspect import cleandoc, getdoc
+from typing import Any, Final, Generic, TypeAlias, TypeVar
 
-from app.registry import Artifact
+from app.questions.answer import Fields
+from app.questions.reading import Reading
+from app.registry.artifact import Artifact
 from app.scene.scene import Scene
-from app.serving.answers import Answer
-from app.serving.request import Request
 from scene_client import schemas
 
 RequestT = TypeVar("RequestT", bound=schemas.SceneRequest)
+
+Options: TypeAlias = dict[str, Any]
+"""Keyword arguments of the function of a question."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,47 +35,42 @@ class Example:
     problem: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Question(Generic[RequestT]):
     """One question about a scene. Routes, documentation, warm-up and metrics use this record.
 
     Attributes:
-        answer: function that answers a request. The name of this function is the name of the
-            question, and its docstring is the description of the route. The function raises the
-            errors of `Request.read` and `Request.ask`, and `RequestError` if the answer would be
-            too large.
-        warm_up: function that asks a model about scenes and returns all numbers of the answers. The
-            function must call every compiled kernel of the question, because the first call
-            compiles the kernel.
+        answer: function of a model, a scene and keyword arguments. It returns the fields of the
+            answer that are not common to all answers. The name of this function is the name of the
+            question. If the answer could be too large, the argument ``size_limit`` raises an error.
+        read: function that returns the keyword arguments of ``answer`` for a request. It raises
+            `RequestError` if a field of the request is wrong.
+        warm_up: function that asks a model about scenes and yields the answers. The function must
+            call every compiled kernel of the question, because the first call compiles the kernel.
         request, response: schemas of the request and of the answer.
         examples: dictionary from names to example requests. The default model knows all labels of
             the examples.
         example_answer: an answer with illustrative figures, without the common fields of answers.
-        has_batch: whether one request can ask the question about many scenes.
+        description: description of the route, for the API documentation.
+        samples: whether the question samples scenes. Then the scene of a request may be empty, the
+            request has a field ``count``, and ``answer`` has an argument ``stop``, a function that
+            returns True after the end of the request. There is no route for batches.
     """
 
-    answer: Callable[[Request, RequestT], Awaitable[Answer]]
-    warm_up: Callable[[Artifact, tuple[Scene, ...]], list[float]]
+    answer: Callable[..., Fields]
+    read: Callable[[RequestT, Artifact, Reading], Options]
+    warm_up: Callable[[Artifact, tuple[Scene, ...]], Iterator[Fields]]
     request: type[RequestT]
     response: type[schemas.Answer]
     examples: Mapping[str, Example]
-    example_answer: Mapping[str, Any]
-    has_batch: bool = True
+    example_answer: Fields
+    description: str
+    samples: bool = False
 
-    @property
-    def name(self) -> str:
-        """Name of the question. The path of the route is the same name."""
-        return self.answer.__name__
-
-    @property
-    def summary(self) -> str:
-        """Summary of the route, for the API documentation."""
-        return getdoc(self.request) or ""
-
-    @property
-    def description(self) -> str:
-        """Description of the route, for the API documentation."""
-        return getdoc(self.answer) or ""
+    def __post_init__(self) -> None:
+        self.name = self.answer.__name__
+        self.summary = getdoc(self.request) or ""
+        self.description = cleandoc(self.description)
 
 
 LABELS: Final[dict[str, Any]] = {"objects": ["bed", "nightstand", "lamp"]}

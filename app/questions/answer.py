@@ -1,0 +1,204 @@
+"""Parts of all answers: common fields, rounded numbers, reasons, the size limit, and JSON.
+
+The schemas of `scene_client.schemas` describe the answers. An answer contains its fields in the
+order of the schema, without null fields. Answers are dictionaries, because pydantic objects would
+take twice the time (docs/decisions/http.md).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+from pydantic_core import from_json, to_json, to_jsonable_python
+
+from app.compiling import compiled
+from app.errors import Fault, Reason, RequestError
+from app.questions.posterior import Present
+from app.questions.ranking import strongest
+from app.questions.reading import Reading
+from app.scene.scene import Scene
+from scene_client.schemas import ModelReference, SceneRequest
+
+Fields: TypeAlias = dict[str, Any]
+"""Fields of an answer, or of a part of an answer."""
+
+DIGITS: Final = 6
+"""Significant digits of probabilities, log-odds and metres."""
+
+REASONS: Final = 3
+"""Maximum number of reasons for one entry of an answer."""
+
+EXPLAINED: Final = 32
+"""Maximum number of entries with reasons in an answer. The first entries have reasons."""
+
+# Upper bounds in bytes on the sizes of parts of an answer. Ids and labels are not included.
+RELATION_BYTES: Final = 120
+CAUSE_BYTES: Final = 60
+OBJECT_BYTES: Final = 200  # one entry about one object
+_ENVELOPE_BYTES: Final = 4096
+_WARNING_BYTES: Final = 400
+# Size in bytes of the longest id: 128 characters of at most four bytes, two quotes and a comma.
+_LONGEST_NAME: Final = 4 * 128 + 3
+
+# Doubles represent these powers of ten exactly. So an integer divided by such a power is the double
+# that is nearest to the decimal number.
+_POWERS: Final = np.array([10.0**power for power in range(23)])
+
+
+def envelope(
+    request: SceneRequest, request_id: str, model: ModelReference, reading: Reading
+) -> Fields:
+    """Return the fields that all answers share. `scene_client.schemas.Answer` describes them."""
+    fields: Fields = {"model": model, "request_id": request_id}
+    if request.frame_id is not None:
+        fields["frame_id"] = request.frame_id
+    if request.stamp is not None:
+        fields["stamp"] = request.stamp
+    fields["ignored"] = list(reading.unknown.ignored)
+    fields["mapped"] = list(reading.unknown.mapped.values())
+    fields["warnings"] = reading.warnings
+    if reading.observed is not None:
+        fields["observed_relations"] = reading.observed
+    return fields
+
+
+def reasons(
+    scene: Scene,
+    present: Present,
+    change: NDArray[np.floating[Any]],
+    rows: NDArray[np.int64] | None = None,
+    *,
+    least: float = 0.0,
+) -> list[list[Fields]]:
+    """Return the strongest reasons for each of N explained classes.
+
+    The reasons are the changes with the largest absolute values, largest first. The object of a
+    reason is the first object of the class that causes the change.
+
+    Args:
+        scene: the scene.
+        present: classes of the scene.
+        change: (N, n) change of each explained class's log-odds by each of the n classes of the
+            scene.
+        rows: (N,) index of each explained class among the n classes. None means that the explained
+            classes are absent.
+        least: minimum absolute value of a change. Changes of 0 are left out.
+
+    Returns:
+        For each class, the fields of `scene_client.schemas.Because`.
+    """
+    columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
+    strong = (np.abs(values) >= least) & (values != 0)
+    entries: list[list[Fields]] = [[] for _ in change]
+    for one, number, value in zip(
+        np.nonzero(strong)[0].tolist(),
+        present.first[columns[strong]].tolist(),
+        significant(values[strong]),
+        strict=True,
+    ):
+        entries[one].append({"object": scene.objects[number].id, "log_odds_change": value})
+    return entries
+
+
+def significant(numbers: NDArray[np.floating[Any]]) -> list[float]:
+    """Round numbers (n,) to `DIGITS` significant digits."""
+    values = numbers.astype(np.float64)
+    exact = _round(values)
+    rounded: list[float] = values.tolist()
+    return rounded if exact else [rounded_number(value) for value in rounded]
+
+
+def rounded_number(number: float) -> float:
+    """Round one number to `DIGITS` significant digits. Use `significant` for many numbers."""
+    return float(f"{number:.{DIGITS}g}")
+
+
+@compiled
+def _round(values: NDArray[np.float64]) -> bool:
+    """Round numbers to `DIGITS` significant digits in place.
+
+    Returns:
+        False if a number is too small or too large for exact powers of ten. Such numbers stay
+        unchanged.
+    """
+    exact = True
+    for k in range(len(values)):
+        size = np.abs(values[k])
+        if 1e-16 < size < 1e5:
+            shift = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
+            scale = _POWERS[shift]
+            values[k] = np.rint(values[k] * scale) / scale
+        elif size != 0.0:
+            exact = False
+    return exact
+
+
+class SizeLimit:
+    """Limit on the size of the answer to one request.
+
+    Args:
+        reading: the scene of the request.
+        most: maximum size of the answer in bytes.
+    """
+
+    def __init__(self, reading: Reading, most: int) -> None:
+        self._reading, self._most = reading, most
+
+    def check(self, field: str, fixed: int, names: int) -> None:
+        """Check that the answer is not too large.
+
+        Args:
+            field: name of the request's field that the client can lower for a smaller answer.
+            fixed: size in bytes of the question's own fields, without ids and labels.
+            names: number of ids and labels in these fields.
+
+        Raises:
+            RequestError: the answer is too large.
+        """
+        longest = max(_LONGEST_NAME, self._reading.unknown.vocabulary.longest_label + 1)
+        if self._size(fixed, names, longest) <= self._most:
+            return
+        exact = self._size(fixed, names, self._reading.longest_name())
+        if exact > self._most:
+            message = (
+                f"the answer could have {exact} bytes, but SCENE_MAX_ANSWER_BYTES allows only "
+                f"{self._most} bytes here. Lower `{field}`, send fewer objects, relations or "
+                "scenes, or use shorter ids"
+            )
+            raise RequestError(Reason.ANSWER_TOO_LARGE, [Fault((field,), message)])
+
+    def _size(self, fixed: int, names: int, name: int) -> int:
+        """Return the size in bytes of the answer if the longest id or label has `name` bytes."""
+        reading, unknown = self._reading, self._reading.unknown
+        size = _ENVELOPE_BYTES + fixed + names * name
+        if not (unknown.ignored or unknown.mapped or reading.observed or reading.warnings):
+            return size
+        size += len(to_json(unknown.ignored)) + len(unknown.mapped) * _WARNING_BYTES
+        size += len(reading.observed or ()) * (RELATION_BYTES + 2 * name)
+        return size + len(reading.warnings) * (_WARNING_BYTES + len(reading.ids) * name)
+
+
+def written(answer: Any) -> bytes:
+    """Write an answer, or a container of answers, as JSON.
+
+    Raises:
+        ValueError: a number in the answer is not finite.
+    """
+    body = orjson.dumps(answer, default=_fields)
+    if b"null" not in body:
+        return body
+    # orjson writes NaN, infinity and fields without a value as `null`. A name may also contain the
+    # text "null". So convert the answer again, with a stricter function.
+    body = to_json(answer, inf_nan_mode="constants", exclude_none=True)
+    try:
+        from_json(body, allow_inf_nan=False)
+    except ValueError:
+        raise ValueError("an answer contains a number that is not finite") from None
+    return body
+
+
+def _fields(part: Any) -> Any:
+    return to_jsonable_python(part, exclude_none=True)

@@ -1,0 +1,275 @@
+"""Names in a request: labels and room types outside the vocabulary, and references to objects.
+
+The functions collect all errors of a request before they raise an exception. So a client can
+correct all errors at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Final
+
+from app.errors import Fault, Location, Reason, RequestError, some_of
+from app.scene.labels import label_key
+from app.scene.nearest import Guess, Match, spelt_alike
+from app.scene.scene import SceneObject
+from app.scene.vocabulary import Vocabulary
+from scene_client.schemas import Mapped, UnknownLabels
+from scene_client.validation import MAX_ERRORS, PLAIN
+
+MAX_SUGGESTED: Final = 32
+"""Maximum number of searches for classes similar to an unknown label, per scene.
+
+The same number limits the errors with suggestions per request.
+"""
+MAX_MAPPED: Final = 256
+"""Maximum number of unknown labels per request that the service maps to the nearest class."""
+
+
+@dataclass(slots=True)
+class Faults:
+    """The errors of a request found so far.
+
+    Attributes:
+        found: dictionary from each kind of error to the list of errors of this kind.
+    """
+
+    found: dict[Reason, list[Fault]] = field(default_factory=dict)
+
+    def add(
+        self, reason: Reason, location: Location, message: str, suggestions: Sequence[str] = ()
+    ) -> None:
+        """Add an error without raising it."""
+        self.found.setdefault(reason, []).append(Fault(location, message, tuple(suggestions)))
+
+    @property
+    def are_many(self) -> bool:
+        """Whether an answer cannot list further errors."""
+        return sum(map(len, self.found.values())) >= MAX_ERRORS
+
+    def raise_any(self) -> None:
+        """Raise an exception if the request has errors.
+
+        Raises:
+            RequestError: the request has errors. The exception contains all errors of one kind, the
+                first kind in `Reason` with errors.
+        """
+        for reason in Reason if self.found else ():
+            if reason in self.found:
+                raise RequestError(reason, self.found[reason])
+
+
+@dataclass(slots=True)
+class LookUps:
+    """Searches for classes similar to unknown labels, shared by all scenes of one request.
+
+    This class limits the number of searches, because a search takes 0.2 ms, and a batch may contain
+    10,000 unknown labels.
+
+    Attributes:
+        suggestions: number of errors of the request that already have suggestions, or for which the
+            service has looked for similar ids.
+    """
+
+    suggestions: int = 0
+    _guesses: dict[tuple[int, str, bool], Guess | None] = field(default_factory=dict)
+    _similar: dict[tuple[int, str, bool], tuple[Match, ...]] = field(default_factory=dict)
+
+    # id() of a vocabulary stays unique, because the request keeps its models in memory.
+
+    def guess(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> Guess | None:
+        """Return what an unknown label probably stands for.
+
+        Raises:
+            OverflowError: the request has had `MAX_MAPPED` guesses.
+        """
+        key = id(vocabulary), label, is_room
+        if key not in self._guesses:
+            if len(self._guesses) >= MAX_MAPPED:
+                raise OverflowError
+            self._guesses[key] = vocabulary.guess(label, is_room=is_room)
+        return self._guesses[key]
+
+    def similar(self, vocabulary: Vocabulary, label: str, *, is_room: bool) -> tuple[Match, ...]:
+        """Return the names most similar to a label, or none after `MAX_SUGGESTED` searches."""
+        key = id(vocabulary), label, is_room
+        if key not in self._similar:
+            if len(self._similar) >= MAX_SUGGESTED:
+                return ()
+            self._similar[key] = vocabulary.nearest(label, is_room=is_room)
+        return self._similar[key]
+
+
+@dataclass(slots=True)
+class Unknown:
+    """The labels of one scene that the vocabulary does not list, and their treatment.
+
+    Attributes:
+        vocabulary: classes and room types of the model.
+        treatment: value of the field `unknown_labels` of the request.
+        look_ups: searches for similar classes, shared by all scenes of the request.
+        ignored: names of the ignored objects.
+        mapped: the class that replaces each label. A key consists of the label and whether it is a
+            room type.
+    """
+
+    vocabulary: Vocabulary
+    treatment: UnknownLabels
+    look_ups: LookUps
+    ignored: list[str] = field(default_factory=list)
+    mapped: dict[tuple[str, bool], Mapped] = field(default_factory=dict)
+    _guesses: dict[tuple[str, bool], Guess | None] = field(default_factory=dict)
+
+    def resolve(
+        self, label: str, name: str, location: Location, faults: Faults, *, is_room: bool = False
+    ) -> int | None:
+        """Return the class or room type that replaces an unlisted label.
+
+        Each treatment accepts the syntax of detectors, such as "chair_12".
+
+        Args:
+            label: the label.
+            name: name of the object with this label. The list of ignored names contains it if the
+                label is ignored.
+            location: location of the label in the request, for an error message.
+            faults: list of errors. If the method refuses the label, it adds an error to this list.
+            is_room: whether the label is the name of a room type.
+
+        Returns:
+            Index of the class or room type. None means that the label is ignored or refused.
+        """
+        found = self.vocabulary.read(label, is_room=is_room)
+        if found is None and self.treatment.startswith("nearest"):
+            found = self._guess(label, is_room=is_room)
+        if found is not None:
+            entry, similarity, rule = found
+            name = (self.vocabulary.room_types if is_room else self.vocabulary.labels)[entry]
+            mapped = Mapped(label=label, class_=name, similarity=similarity, rule=rule)
+            self.mapped[label, is_room] = mapped
+            return entry
+        if self.treatment.endswith("ignore"):
+            self.ignored.append(name)
+        else:
+            self._refuse(label, location, faults, is_room=is_room)
+        return None
+
+    def copy(self) -> Unknown:
+        """Return a copy. A question with further labels changes only its own copy."""
+        return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
+
+    def _guess(self, label: str, *, is_room: bool) -> Guess | None:
+        key = label, is_room
+        if key in self._guesses or len(self._guesses) < MAX_SUGGESTED:
+            with suppress(OverflowError):
+                guess = self.look_ups.guess(self.vocabulary, label, is_room=is_room)
+                return self._guesses.setdefault(key, guess)
+        return None
+
+    def _refuse(self, label: str, location: Location, faults: Faults, *, is_room: bool) -> None:
+        known = self.vocabulary.room_types if is_room else self.vocabulary.labels
+        message = "the model does not know this label"
+        if not is_room and self.vocabulary.room_index(label) is not None:
+            message += "; it is a room type: send it as `room_type`"
+        if is_room:
+            message = "this model does not have room types"
+            if known:
+                message = f"the model does not know this room type; it knows {some_of(known)}"
+        if self.treatment == "nearest" and (label, is_room) not in self._guesses:
+            message += (
+                f"; the service maps at most {MAX_SUGGESTED} unknown labels per scene and "
+                f"{MAX_MAPPED} per batch to the nearest class"
+            )
+        suggestions: list[str] = []
+        if self.look_ups.suggestions < MAX_SUGGESTED:
+            matches = self.look_ups.similar(self.vocabulary, label, is_room=is_room)
+            suggestions = [known[match.entry] for match in matches]
+        self.look_ups.suggestions += bool(suggestions)
+        faults.add(Reason.UNKNOWN_LABELS, location, message, suggestions)
+
+
+class Names:
+    """Look-up of the objects of a scene by id, or by label if only one object has the label.
+
+    Args:
+        objects: objects of the scene.
+        unknown: unknown labels of the request and their treatment.
+        left_out: pairs (id, label) of the ignored objects.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[SceneObject],
+        unknown: Unknown,
+        left_out: Sequence[tuple[str, str]],
+    ) -> None:
+        self._objects, self._unknown = objects, unknown
+        self._ignored_ids = {name for name, _ in left_out}
+        self._ignored_labels = {label_key(label) for _, label in left_out}
+
+    # The first access builds each table. Most requests never need the tables, because most requests
+    # do not refer to objects by name.
+
+    @cached_property
+    def _by_id(self) -> dict[str, int]:
+        return {thing.id: place for place, thing in enumerate(self._objects)}
+
+    @cached_property
+    def _by_label(self) -> dict[str, list[int]]:
+        places: dict[str, list[int]] = {}
+        for place, thing in enumerate(self._objects):
+            places.setdefault(thing.label, []).append(place)
+        return places
+
+    @cached_property
+    def _by_class(self) -> dict[int, list[int]]:
+        places: dict[int, list[int]] = {}
+        for place, thing in enumerate(self._objects):
+            if thing.class_index is not None:
+                places.setdefault(thing.class_index, []).append(place)
+        return places
+
+    @cached_property
+    def _plain_ids(self) -> list[str]:
+        # A request cannot put arbitrary text into an error through its ids.
+        return [thing.id for thing in self._objects if PLAIN.fullmatch(thing.id.replace(" ", "_"))]
+
+    def find(self, name: str, location: Location, faults: Faults) -> int | None:
+        """Return the index of the object with a name. On failure, add an error and return None.
+
+        The name is an id or a label. Ids take precedence over labels. A label may have any spelling
+        that the vocabulary accepts for its class.
+        """
+        if (place := self._by_id.get(name)) is not None:
+            return place
+        places = self._by_label.get(name)
+        if places is None:
+            index = self._unknown.vocabulary.index(name)
+            places = [] if index is None else self._by_class.get(index, [])
+        if len(places) == 1:
+            return places[0]
+        if places:
+            message = (
+                f"{len(places)} objects have this label; use the id of one of them. The service "
+                "numbers objects without an id, such as chair_1 and chair_2"
+            )
+            faults.add(Reason.INVALID, location, message)
+        else:
+            message = "no entry of `objects` has this id or label"
+            faults.add(Reason.INVALID, location, message, self._similar(name))
+        return None
+
+    def _similar(self, name: str) -> list[str]:
+        """Return similar ids for the first `MAX_SUGGESTED` unknown names of a request."""
+        if self._unknown.look_ups.suggestions >= MAX_SUGGESTED:
+            return []
+        self._unknown.look_ups.suggestions += 1
+        return spelt_alike(name, self._plain_ids)
+
+    def is_ignored(self, name: str) -> bool:
+        """Return whether an ignored object has this id or label."""
+        if name in self._by_id:
+            return False
+        return name in self._ignored_ids or label_key(name) in self._ignored_labels
