@@ -15,7 +15,7 @@ import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from app.main import create_app
-from app.serving.errors import ServingError
+from app.serving.errors import ServiceError
 from app.serving.logs import log_config
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -95,7 +95,7 @@ class Server(uvicorn.Server):
         details = f"{pages} ({models}, {monotonic() - self._began:.1f} s)"
         try:
             self._runtime.check_ready()
-        except ServingError as error:
+        except ServiceError as error:
             _logger.warning("not ready: %s: %s", details, error)
         else:
             _logger.info("ready: %s", details)

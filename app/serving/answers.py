@@ -15,7 +15,7 @@ from pydantic_core import from_json, to_json, to_jsonable_python
 
 from app import questions
 from app.questions.ranking import DIGITS
-from app.serving.errors import Fault, Reason, RequestError
+from app.serving.errors import AnswerTooLargeError, Fault
 from app.serving.reading import Reading
 from scene_client.schemas import ModelReference, SceneRequest
 
@@ -78,7 +78,7 @@ def require_size(size: Callable[[int], int], reading: Reading, limit: int, param
         parameter: name of the request's field that the client can lower for a smaller answer.
 
     Raises:
-        RequestError: the answer would be larger than `limit`.
+        AnswerTooLargeError: the answer would be larger than `limit`.
     """
     longest = max(_LONGEST_NAME, reading.unknown.vocabulary.longest_label + 1)
     if estimated_size(size, reading, longest) <= limit:
@@ -90,7 +90,7 @@ def require_size(size: Callable[[int], int], reading: Reading, limit: int, param
             f"bytes here. Lower `{parameter}`, send fewer objects, relations or scenes, or use "
             "shorter ids"
         )
-        raise RequestError(Reason.ANSWER_TOO_LARGE, [Fault((parameter,), message)])
+        raise AnswerTooLargeError([Fault((parameter,), message)])
 
 
 def estimated_size(size: Callable[[int], int], reading: Reading, name: int) -> int:

@@ -24,7 +24,15 @@ from app.scene.observe import observe
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
-from app.serving.errors import Fault, Location, Reason, RequestError, some_of
+from app.serving.errors import (
+    ContradictionError,
+    Fault,
+    InvalidRequestError,
+    Location,
+    RequestError,
+    UnknownLabelsError,
+    some_of,
+)
 from app.serving.warnings import scene_warnings
 from scene_client.schemas import (
     Detection,
@@ -70,16 +78,20 @@ class Faults:
     """The errors of a request found so far.
 
     Attributes:
-        found: dictionary from each kind of error to the list of errors of this kind.
+        found: dictionary from each class of exception to its errors.
     """
 
-    found: dict[Reason, list[Fault]] = field(default_factory=dict)
+    found: dict[type[RequestError], list[Fault]] = field(default_factory=dict)
 
     def add(
-        self, reason: Reason, location: Location, message: str, suggestions: Sequence[str] = ()
+        self,
+        kind: type[RequestError],
+        location: Location,
+        message: str,
+        suggestions: Sequence[str] = (),
     ) -> None:
         """Add an error without raising it."""
-        self.found.setdefault(reason, []).append(Fault(location, message, tuple(suggestions)))
+        self.found.setdefault(kind, []).append(Fault(location, message, tuple(suggestions)))
 
     @property
     def are_many(self) -> bool:
@@ -90,12 +102,12 @@ class Faults:
         """Raise an exception if the request has errors.
 
         Raises:
-            RequestError: the request has errors. The exception contains all errors of one kind, the
-                first kind in `Reason` with errors.
+            RequestError: the request has errors. The exception contains all errors of one class,
+                the first class in `app.serving.errors` with errors.
         """
-        for reason in Reason if self.found else ():
-            if reason in self.found:
-                raise RequestError(reason, self.found[reason])
+        for kind in RequestError.__subclasses__() if self.found else ():
+            if kind in self.found:
+                raise kind(self.found[kind])
 
 
 @dataclass(slots=True)
@@ -223,7 +235,7 @@ class Unknown:
             matches = self.look_ups.similar(self.vocabulary, label, is_room=is_room)
             suggestions = [known[match.entry] for match in matches]
         self.look_ups.suggestions += bool(suggestions)
-        faults.add(Reason.UNKNOWN_LABELS, location, message, suggestions)
+        faults.add(UnknownLabelsError, location, message, suggestions)
 
 
 @dataclass
@@ -319,10 +331,10 @@ class Names:
                 f"{len(places)} objects have this label; use the id of one of them. The service "
                 "numbers objects without an id, such as chair_1 and chair_2"
             )
-            faults.add(Reason.INVALID, location, message)
+            faults.add(InvalidRequestError, location, message)
         else:
             message = "no entry of `objects` has this id or label"
-            faults.add(Reason.INVALID, location, message, self._similar(name))
+            faults.add(InvalidRequestError, location, message, self._similar(name))
         return None
 
     def _similar(self, name: str) -> list[str]:
@@ -390,7 +402,9 @@ def read_scene(
     if name is not None and (room := vocabulary.room_index(name)) is None:
         room = unknown.resolve(name, name, ("room_type",), faults, is_room=True)
     if not objects and not may_be_empty and not faults.found:
-        faults.add(Reason.INVALID, ("objects",), "the model does not know any of these objects")
+        faults.add(
+            InvalidRequestError, ("objects",), "the model does not know any of these objects"
+        )
     faults.raise_any()
 
     reading.scene = Scene(tuple(objects), None, False, room)
@@ -410,10 +424,10 @@ def read_scene(
 def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
     for name, most in (("objects", limits.objects), ("relations", limits.relations)):
         if len(getattr(request, name) or ()) > most:
-            faults.add(Reason.INVALID, (name,), f"the scene must have at most {most} {name}")
+            faults.add(InvalidRequestError, (name,), f"the scene must have at most {most} {name}")
     if request.relations is None and request.relations_complete:
         message = "`relations_complete` requires the field `relations`"
-        faults.add(Reason.INVALID, ("relations_complete",), message)
+        faults.add(InvalidRequestError, ("relations_complete",), message)
     faults.raise_any()
 
 
@@ -456,7 +470,9 @@ def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
             labels.append(entry.label)
         else:
             if entry.id in taken:
-                faults.add(Reason.INVALID, ("objects", place, "id"), "another object has this id")
+                faults.add(
+                    InvalidRequestError, ("objects", place, "id"), "another object has this id"
+                )
             taken[entry.id] = None
     if len(taken) == len(entries):
         return list(taken)
@@ -545,11 +561,11 @@ def _triples(
             continue
         if subject == other:
             message = "an object cannot have a relation to itself"
-            faults.add(Reason.CONTRADICTION, location, message)
+            faults.add(ContradictionError, location, message)
             continue
         index, i, j = canonicalise(subject, relation, other)
         if (index, j, i) in triples:
             message = "this relation contradicts an earlier relation of the same two objects"
-            faults.add(Reason.CONTRADICTION, location, message)
+            faults.add(ContradictionError, location, message)
         triples.setdefault((index, i, j), i != subject)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])

@@ -13,7 +13,7 @@ from typing import Concatenate, Final, ParamSpec, TypeVar
 from app.registry import Artifact
 from app.scene.scene import Scene
 from app.serving.admission import Done, Ticket
-from app.serving.errors import ServingError
+from app.serving.errors import ServiceError
 from app.serving.metrics import Metrics
 from app.serving.models import Key, ServedModel, ServedModels
 from app.serving.reading import Limits, LookUps, Reading, read_scene
@@ -228,7 +228,7 @@ class Request(Ticket):
             for reference, rows in Counter(references).items():
                 try:
                     model = self.models.resolve(reference)
-                except ServingError:
+                except ServiceError:
                     continue
                 model.queue.take(rows)
                 held.callback(model.queue.give_back, rows)

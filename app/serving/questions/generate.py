@@ -10,7 +10,7 @@ from app import questions
 from app.registry import Artifact
 from app.scene.scene import Scene
 from app.serving import answers
-from app.serving.errors import Reason
+from app.serving.errors import InvalidRequestError
 from app.serving.models import ServedModel
 from app.serving.questions.question import BEDROOM, POSES, REFUSED, Example, Question
 from app.serving.reading import Faults
@@ -71,7 +71,7 @@ def _check_context(asked: GenerateRequest, model: ServedModel) -> None:
         if size is None:
             layers = tuple(model.context_sizes)
             faults.add(
-                Reason.INVALID,
+                InvalidRequestError,
                 ("context", layer),
                 "the model lacks this hidden layer",
                 layers,
@@ -80,7 +80,7 @@ def _check_context(asked: GenerateRequest, model: ServedModel) -> None:
         for place, unit in enumerate(units):
             if unit >= size:
                 message = f"the hidden layer has only the units 0 to {size - 1}"
-                faults.add(Reason.INVALID, ("context", layer, place), message)
+                faults.add(InvalidRequestError, ("context", layer, place), message)
     faults.raise_any()
 
 

@@ -14,7 +14,7 @@ from app.scene.frames import Axes, viewer_axes
 from app.scene.relations import opposite
 from app.scene.scene import Scene
 from app.serving import answers
-from app.serving.errors import Reason
+from app.serving.errors import InvalidRequestError
 from app.serving.models import ServedModel
 from app.serving.questions.question import LABELS, REFUSED, SCENES, Example, Question
 from app.serving.reading import Faults, Reading
@@ -37,7 +37,7 @@ async def missing(request: Request, asked: MissingRequest) -> answers.Answer:
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:
         message = f"`top_k` must be at most {len(model.vocabulary)}, the size of the vocabulary"
-        faults.add(Reason.INVALID, ("top_k",), message)
+        faults.add(InvalidRequestError, ("top_k",), message)
     candidates = at = None
     if asked.candidates is not None:
         candidates = _candidates(asked.candidates, model, reading, faults)
@@ -138,7 +138,7 @@ def _place(
 ) -> tuple[str, int] | None:
     canonical = model.artifact.manifest.vocabulary.relations
     if at.relation not in {*canonical, *map(opposite, canonical)}:
-        faults.add(Reason.INVALID, ("at", "relation"), "the model does not know this relation")
+        faults.add(InvalidRequestError, ("at", "relation"), "the model does not know this relation")
     anchor = reading.names.find(at.object, ("at", "object"), faults)
     return None if anchor is None else (at.relation, anchor)
 

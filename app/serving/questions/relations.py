@@ -11,7 +11,7 @@ from app.registry import Artifact
 from app.scene.relations import canonicalise, opposite
 from app.scene.scene import Scene
 from app.serving.answers import RELATION_BYTES, Answer, envelope, require_size, rounded
-from app.serving.errors import Location, Reason
+from app.serving.errors import InvalidRequestError, Location
 from app.serving.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Question
 from app.serving.reading import Faults, Reading
 from app.serving.request import Request
@@ -69,7 +69,9 @@ def _pairs(asked: RelationsRequest, reading: Reading) -> list[tuple[int, int]]:
         if subject is None or other is None:
             continue
         if subject == other:
-            faults.add(Reason.INVALID, location, "subject and object must be two different objects")
+            faults.add(
+                InvalidRequestError, location, "subject and object must be two different objects"
+            )
             continue
         pairs[subject, other] = None
     faults.raise_any()
