@@ -1,19 +1,45 @@
-"""Errors of the serving layer. They do not depend on HTTP."""
+"""All errors that the service answers with. One class defines one problem type (RFC 9457).
+
+The docstring of a class is the page of the problem type: its first line is the title. Everything
+else derives from `ERRORS`: the pages, the error responses in the OpenAPI document, and the tests.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum
-from typing import Final
+from typing import Any, ClassVar, Final, Literal
 
-from scene_client.schemas import Failure
+from starlette.exceptions import HTTPException
+
+from scene_client.schemas import Failure, FieldError, Problem
+from scene_client.validation import MAX_ERRORS, pointer
 
 Location = tuple[str | int, ...]
 """Path to a value in a request: field names and list indices, from the root of the request."""
 
+Step = Literal[
+    "admin",  # administration routes: the admin key and the new state of the store
+    "admission",  # all routes except health checks and metrics
+    "alias",  # a change of an alias
+    "body",  # routes that read a JSON body
+    "host",  # the check of the Host header, if SCENE_ALLOWED_HOSTS is not *
+    "key",  # the check of the API key, if SCENE_API_KEY is set
+    "model",  # routes that use a loaded model
+    "models",  # routes that list or use the models
+    "name",  # routes that find a model by its name
+    "readiness",  # readiness checks
+    "route",  # all routes
+    "scene",  # routes that answer a question about one scene
+    "http",  # errors of Starlette: `HTTPException` with the same status
+]
+"""A step of a request. The steps of a route determine the errors in its documentation."""
+
 MOST_NAMED: Final = 50
 """Maximum number of known names in the message of an error."""
+
+ERRORS: Final[dict[str, type[ServiceError]]] = {}
+"""All problem types by slug, in the order of this module."""
 
 
 def some_of(names: Iterable[str]) -> str:
@@ -38,79 +64,364 @@ class Fault:
     suggestions: tuple[str, ...] = ()
 
 
-class Reason(Enum):
-    """The kind of a `RequestError`. Each kind has its own problem type."""
+class ServiceError(HTTPException):
+    """Base class of all errors that the service answers with.
 
-    INVALID = "invalid"
-    UNKNOWN_LABELS = "unknown labels"
-    CONTRADICTION = "contradiction"
-    ANSWER_TOO_LARGE = "answer too large"
+    This class extends `HTTPException`, because Starlette wraps all other exceptions that occur
+    while Starlette reads a body. A subclass without a slug has the problem type of its base class.
+
+    Args:
+        detail: cause of this error. Clients receive it. The default is the title.
+        errors: the errors in the request. The first `MAX_ERRORS` are kept.
+        failures: unusable versions and aliases, with the reasons.
+        headers: further headers of the response.
+
+    Attributes:
+        slug: stable name and last path segment of the ``type`` member. Clients can compare it.
+        status: HTTP status code.
+        title: short summary. All problems of this type have the same title.
+        explanation: cause and remedy. The page of the problem type shows this text.
+        uri: the ``type`` member of the problem document (RFC 9457, section 3.1.1).
+        steps: the steps that may raise the error.
+        example: errors in the example of the OpenAPI document.
+    """
+
+    slug: ClassVar[str]
+    status: ClassVar[int]
+    title: ClassVar[str]
+    explanation: ClassVar[str]
+    uri: ClassVar[str]
+    steps: ClassVar[tuple[Step, ...]]
+    example: ClassVar[tuple[FieldError, ...]] = ()
+
+    def __init_subclass__(
+        cls, *, slug: str = "", status: int = 500, steps: tuple[Step, ...] = ()
+    ) -> None:
+        super().__init_subclass__()
+        if slug:
+            title, _, explanation = (cls.__doc__ or slug).partition("\n")
+            cls.title, cls.explanation = title.removesuffix("."), " ".join(explanation.split())
+            cls.slug, cls.status, cls.steps, cls.uri = slug, status, steps, f"/problems/{slug}"
+            ERRORS[slug] = cls
+
+    def __init__(
+        self,
+        detail: str = "",
+        *,
+        errors: Sequence[FieldError] = (),
+        failures: Sequence[Failure] = (),
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(self.status, detail or f"{self.title}.", headers)
+        self.errors = list(errors[:MAX_ERRORS])
+        self.failures = list(failures)
+
+    def __str__(self) -> str:
+        return self.detail
+
+    def describe(self, request_id: str) -> Problem:
+        """Return the problem document that the client receives."""
+        return Problem(
+            type=self.uri,
+            title=self.title,
+            status=self.status,
+            detail=self.detail,
+            instance=f"{self.uri}#{request_id}",
+            request_id=request_id,
+            errors=self.errors or None,
+            failures=self.failures or None,
+        )
 
 
-class ServingError(Exception):
-    """Base class of the errors of the serving layer. Clients may receive the message."""
+class RequestError(ServiceError):
+    """The request does not match the schema or the model, or is contradictory.
+
+    Args:
+        faults: errors in the request. `locate` converts them to `errors`.
+        errors: further errors in the request, with pointers.
+        detail: cause of this error. The default is the number of errors.
+    """
+
+    _hint: ClassVar[str] = ""
+
+    def __init__(
+        self, faults: Sequence[Fault] = (), *, errors: Sequence[FieldError] = (), detail: str = ""
+    ) -> None:
+        self.faults = faults[:MAX_ERRORS]
+        count = len(self.faults) + len(errors)
+        most = "at least " * (count >= MAX_ERRORS)
+        counted = f"The request has {most}{count} error{'' if count == 1 else 's'}"
+        super().__init__(detail or f"{counted}, listed in `errors`.{self._hint}", errors=errors)
+
+    def locate(self, body: Any, at: Location = ()) -> None:
+        """Convert the faults to errors with JSON pointers. A second call has no effect.
+
+        Args:
+            body: the scene as the client sent it, for the pointers; see `pointer`.
+            at: location of the scene in a batch request. It is empty for other requests.
+        """
+        self.errors += [
+            FieldError(
+                pointer=pointer(at) + pointer(fault.location, body)[1:],
+                message=fault.message,
+                suggestions=list(fault.suggestions),
+            )
+            for fault in self.faults
+        ]
+        self.faults = ()
 
 
-class RequestError(ServingError):
-    """The request matches the schema, but is contradictory or does not match the model."""
+class NotJSONError(ServiceError, slug="not-json", status=400, steps=("body",)):
+    """The body is not acceptable JSON.
 
-    def __init__(self, reason: Reason, faults: Sequence[Fault]) -> None:
-        super().__init__(reason.value)
-        self.reason = reason
-        self.faults = tuple(faults)
-
-
-class UnknownModelError(ServingError):
-    """The requested alias, model or version does not exist."""
+    The body must be one JSON value in UTF-8 without a byte order mark. The service refuses NaN,
+    Infinity, lone surrogates, duplicate member names in an object and nesting deeper than 200. JSON
+    parsers read such texts in different ways. In a body of at most 64 KiB, `errors` points at each
+    NaN and Infinity.
+    """
 
 
-class ModelUnavailableError(ServingError):
-    """The version is in the store, but the service refused to load it."""
+class BadRequestError(ServiceError, slug="bad-request", status=400, steps=("admission", "http")):
+    """The request could not be read.
+
+    Either the connection closed before the body was complete, or X-Request-Timeout-Ms is invalid.
+    This header must be a whole number of milliseconds, from 1 to SCENE_MAX_REQUEST_TIMEOUT_MS.
+    """
 
 
-class NotReadyError(ServingError):
-    """The service is still starting, or the default model is not usable."""
-
-
-class QueueFullError(ServingError):
-    """The queue of requests or the queue of the model's scenes is full."""
-
-
-class DeadlinePassedError(ServingError):
-    """The deadline of the request passed before the answer was complete."""
-
-
-class DisconnectedError(ServingError):
+class DisconnectedError(BadRequestError):
     """The client has closed its connection."""
 
 
-class DrainingError(ServingError):
-    """The service is shutting down, so it is not ready."""
+class UnauthorizedError(ServiceError, slug="unauthorized", status=401, steps=("key", "admin")):
+    """A valid key is required.
 
-
-class AliasConflictError(ServingError):
-    """The alias does not point to the expected version, or a model has the name of the alias."""
-
-
-class ModelUnusableError(ServingError):
-    """The alias would point to a version that the service refused to load."""
-
-
-class StoreNotWritableError(ServingError):
-    """This process cannot write the aliases of the store."""
-
-
-class StoreBusyError(ServingError):
-    """Another process is writing to the store."""
-
-
-class RefreshRefusedError(ServingError):
-    """The new state of the store would make a working version or alias unusable.
-
-    Attributes:
-        failures: for each refused version or alias, its name and the reason.
+    Administration routes need the admin key in the header X-Admin-Key or Authorization: Bearer. If
+    SCENE_ADMIN_KEY is not set, the service refuses every administration request. If SCENE_API_KEY
+    is set, all other routes need that key in the header X-API-Key or Authorization: Bearer. Health
+    checks and HTML pages need no key.
     """
 
-    def __init__(self, failures: Sequence[Failure]) -> None:
-        super().__init__("refused")
-        self.failures = tuple(failures)
+
+class OriginRefusedError(ServiceError, slug="origin-refused", status=403):
+    """Pages of this origin may not send this request.
+
+    A browser asked whether a page of another origin may send a request. SCENE_CORS_ORIGINS lists
+    the allowed origins. Pages of these origins may ask questions and read the models. They may not
+    administer the service.
+    """
+
+
+class NotFoundError(ServiceError, slug="not-found", status=404, steps=("http",)):
+    """The service has no route at this path.
+
+    /openapi.json lists the routes, unless SCENE_DOCS is off.
+    """
+
+
+class UnknownModelError(ServiceError, slug="model-not-found", status=404, steps=("name",)):
+    """The model or version does not exist.
+
+    Name a model by an alias, by its name or as name@version. A name selects the newest usable
+    version. GET /models lists all models, versions and aliases.
+    """
+
+
+class MethodNotAllowedError(ServiceError, slug="method-not-allowed", status=405, steps=("http",)):
+    """This route does not accept this method.
+
+    The Allow header lists the methods of the route.
+    """
+
+
+class RequestTimeoutError(ServiceError, slug="request-timeout", status=408, steps=("body",)):
+    """The request did not arrive in time.
+
+    The body of a request must arrive within SCENE_CLIENT_TIMEOUT seconds after its headers. The
+    service closes the connection. Send the request again on a new connection.
+    """
+
+
+class AliasConflictError(ServiceError, slug="alias-conflict", status=409, steps=("alias",)):
+    """The alias does not point to the expected version.
+
+    Another client has moved the alias. GET /models shows its new target. Send the request again
+    with this target as `expected`. An alias cannot have the name of a model either.
+    """
+
+
+class ModelUnusableError(ServiceError, slug="model-unusable", status=409, steps=("alias",)):
+    """An alias cannot point to this version.
+
+    The version is in the store, but the service refused to load it. GET /models gives the reason.
+    """
+
+
+class RefreshRefusedError(ServiceError, slug="refresh-refused", status=409, steps=("admin",)):
+    """The new state of the store was refused.
+
+    A version in the store failed its verification or its warm-up, or the target of an alias is not
+    usable. The service still serves the previous versions. `failures` lists each refused version or
+    alias with the reason.
+    """
+
+
+class StoreNotWritableError(ServiceError, slug="store-not-writable", status=409, steps=("alias",)):
+    """The store cannot be written.
+
+    Either this service has no write access to the store, which holds the aliases, or the table of
+    aliases is full. Without write access, change the alias on a computer that has it. Then send
+    POST /models/refresh to this service.
+    """
+
+
+class StoreBusyError(ServiceError, slug="store-busy", status=503, steps=("alias",)):
+    """Another process is writing to the store.
+
+    That process holds the lock of the store, for example while it publishes a version. Send the
+    request again after the time in Retry-After.
+    """
+
+
+class BodyTooLargeError(ServiceError, slug="body-too-large", status=413, steps=("body", "http")):
+    """The body is too large.
+
+    Send fewer scenes in one request. SCENE_MAX_SCENE_BYTES limits the body of a question about one
+    scene, and SCENE_MAX_BODY_BYTES all bodies. Both limits also apply to chunked bodies.
+    """
+
+
+class UnsupportedMediaTypeError(
+    ServiceError, slug="unsupported-media-type", status=415, steps=("body",)
+):
+    """The body is not declared as JSON.
+
+    Send Content-Type: application/json, without a charset other than utf-8 and without
+    Content-Encoding.
+    """
+
+
+class InvalidRequestError(RequestError, slug="invalid-request", status=422, steps=("body",)):
+    """The request is not valid for this route.
+
+    The body is JSON, but does not match the schema of this route. `errors` lists the errors. The
+    `pointer` of an error is a JSON pointer into the body. `suggestions` lists the nearest valid
+    names.
+    """
+
+    example = (FieldError(pointer="#/objects/1/confidence", message="must be greater than 0"),)
+
+
+class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=("scene",)):
+    """The model does not know some labels or room types.
+
+    `errors` points at each unknown name and suggests the nearest known ones. With `unknown_labels`
+    set to `ignore`, the service ignores unknown labels and lists them in `ignored`. With `nearest`,
+    it maps misspelt labels and phrases to a class and lists them in `mapped`. It refuses a label
+    that could be several classes. With `nearest-or-ignore`, it ignores such a label. GET
+    /models/{name}/vocabulary lists every known label.
+    """
+
+    example = (
+        FieldError(
+            pointer="#/objects/1",
+            message="the model does not know this label",
+            suggestions=["nightstand"],
+        ),
+    )
+    _hint = (
+        " GET /models/{name}/vocabulary lists the known names. With `unknown_labels` set to "
+        "`ignore`, the service leaves unknown names out."
+    )
+
+
+class ContradictionError(RequestError, slug="contradictory-evidence", status=422, steps=("scene",)):
+    """The scene contradicts itself.
+
+    Either an object has a relation to itself, or a pair has both a relation and its opposite (left
+    and right, on-top and under).
+    """
+
+    example = (
+        FieldError(
+            pointer="#/relations/1",
+            message="this relation contradicts an earlier relation of the same two objects",
+        ),
+    )
+
+
+class AnswerTooLargeError(RequestError, slug="answer-too-large", status=422, steps=("scene",)):
+    """The answer would be too large.
+
+    The answer would exceed SCENE_MAX_ANSWER_BYTES. `errors` points at the parameter to lower:
+    `top_k`, `count` or the number of `objects`. Shorter ids also make the answer smaller. All
+    scenes of a batch share one limit. Send the refused scenes in another request.
+    """
+
+
+class HostRefusedError(ServiceError, slug="host-refused", status=421, steps=("host",)):
+    """The service does not answer to this host name.
+
+    The Host header must be one of the names in SCENE_ALLOWED_HOSTS. The service ignores the port in
+    this header. The default names are 127.0.0.1, localhost, [::1] and the address in SCENE_HOST.
+    Add the name that your clients use. Health checks answer to every host name.
+    """
+
+
+class BodiesFullError(ServiceError, slug="bodies-full", status=503, steps=("body",)):
+    """The service holds too many bytes of request bodies.
+
+    All requests in progress share SCENE_HELD_BODY_BYTES for their bodies. The service always
+    accepts a body of at most 64 KiB that has arrived whole. Send the request again after the time
+    in Retry-After.
+    """
+
+
+class InternalError(ServiceError, slug="internal-error", status=500, steps=("route",)):
+    """The service failed.
+
+    This is a defect of the service. Search the log of the service for the request id to find the
+    details.
+    """
+
+
+class NotReadyError(ServiceError, slug="not-ready", status=503, steps=("models", "readiness")):
+    """The service is not ready.
+
+    Either the service is still starting, or its default model is not usable. GET /models gives the
+    reason. Send the request again after the time in Retry-After.
+    """
+
+
+class ModelUnavailableError(ServiceError, slug="model-unavailable", status=503, steps=("model",)):
+    """This model is not usable.
+
+    The version is in the store, but the service refused to load it. GET /models gives the reason.
+    Other models may still be usable.
+    """
+
+
+class DrainingError(ServiceError, slug="draining", status=503, steps=("readiness",)):
+    """The service is shutting down.
+
+    The service soon closes its socket. Use another instance, or send the request again after the
+    time in Retry-After.
+    """
+
+
+class QueueFullError(ServiceError, slug="queue-full", status=429, steps=("admission",)):
+    """Too many requests are waiting.
+
+    The queue of requests (SCENE_QUEUE_REQUESTS) or the queue of this model's scenes
+    (SCENE_QUEUE_ROWS) is full. The service also refuses a request that would wait in the queue for
+    too much of its time limit. The service did not start the computation. Send the request again
+    after the time in Retry-After.
+    """
+
+
+class DeadlinePassedError(ServiceError, slug="deadline-passed", status=504, steps=("admission",)):
+    """The deadline passed.
+
+    The answer was not complete within the time limit of the request. X-Request-Timeout-Ms sets this
+    limit. The default is SCENE_REQUEST_TIMEOUT_MS. The service has stopped the computation.
+    """

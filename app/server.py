@@ -14,7 +14,7 @@ from typing import Final
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from app.errors import ServingError
+from app.errors import ServiceError
 from app.main import create_app
 from app.serving.logs import log_config
 from app.serving.runtime import Runtime
@@ -95,7 +95,7 @@ class Server(uvicorn.Server):
         details = f"{pages} ({models}, {monotonic() - self._began:.1f} s)"
         try:
             self._runtime.check_ready()
-        except ServingError as error:
+        except ServiceError as error:
             _logger.warning("not ready: %s: %s", details, error)
         else:
             _logger.info("ready: %s", details)

@@ -18,10 +18,18 @@ from pydantic_core import from_json
 from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
-from app.api import catalogue
-from app.api.gateway import ADMIN_KEY, carries, too_large, unauthorized
-from app.api.problems import ProblemError, from_exception, invalid
-from app.errors import Location, RequestError
+from app.api.gateway import ADMIN_KEY, carries, too_large
+from app.errors import (
+    BadRequestError,
+    BodiesFullError,
+    InvalidRequestError,
+    Location,
+    NotJSONError,
+    RequestError,
+    RequestTimeoutError,
+    UnauthorizedError,
+    UnsupportedMediaTypeError,
+)
 from app.settings import Settings
 from scene_client.schemas import FieldError
 from scene_client.schemas import Request as Form
@@ -66,7 +74,7 @@ class Bodies:
         After the answer, the caller must subtract the length of the body from `held`.
 
         Raises:
-            ProblemError: the body is too large, too slow or incomplete, or the total size of the
+            ServiceError: the body is too large, too slow or incomplete, or the total size of the
                 bodies of all requests in progress exceeds the limit.
         """
         body: bytes | bytearray = b""
@@ -76,10 +84,8 @@ class Bodies:
                 while more:
                     message = await receive()
                     if message["type"] != "http.request":
-                        raise ProblemError(
-                            catalogue.BAD_REQUEST,
-                            "The connection closed before the body was complete.",
-                        )
+                        detail = "The connection closed before the body was complete."
+                        raise BadRequestError(detail)
                     part, more = message.get("body", b""), message.get("more_body", False)
                     is_whole = not (more or body)
                     self.held += len(part)
@@ -92,14 +98,11 @@ class Bodies:
                         raise too_large(limit)
                     if self.held > self.budget and not (is_whole and len(body) <= SMALL):
                         detail = f"All bodies in progress exceed {self.budget} bytes together."
-                        raise ProblemError(catalogue.BODIES_FULL, detail)
+                        raise BodiesFullError(detail)
         except TimeoutError:
             self.held -= len(body)
-            raise ProblemError(
-                catalogue.REQUEST_TIMEOUT,
-                f"The body did not arrive within {self.patience:g} seconds.",
-                headers={"Connection": "close"},
-            ) from None
+            detail = f"The body did not arrive within {self.patience:g} seconds."
+            raise RequestTimeoutError(detail) from None
         except BaseException:
             self.held -= len(body)
             raise
@@ -109,7 +112,7 @@ class Bodies:
         """Return the JSON value of a body, and the same value as a ``form``.
 
         Raises:
-            ProblemError: see `parse` and `validated`.
+            NotJSONError, InvalidRequestError: see `parse` and `validated`.
         """
         if len(body) <= SMALL:
             return _read(body, form)
@@ -130,7 +133,7 @@ def validated(value: Any, form: type[FormT], *, at: Location = ()) -> FormT:
         at: location of ``value`` in a batch request. It is empty for other requests.
 
     Raises:
-        ProblemError: `catalogue.INVALID_REQUEST`.
+        InvalidRequestError: the value does not match the schema.
     """
     errors = [
         FieldError(pointer=pointer((*at, name)), message=f"must have at most {most} entries")
@@ -138,12 +141,12 @@ def validated(value: Any, form: type[FormT], *, at: Location = ()) -> FormT:
         if isinstance(value, dict) and isinstance(value.get(name), list) and len(value[name]) > most
     ]
     if errors:
-        raise invalid(catalogue.INVALID_REQUEST, errors)
+        raise InvalidRequestError(errors=errors)
     try:
         return form.model_validate(value)
     except ValidationError as error:
         errors = field_errors(error, value, form, at=at)
-        raise invalid(catalogue.INVALID_REQUEST, errors) from None
+        raise InvalidRequestError(errors=errors) from None
 
 
 @cache
@@ -165,8 +168,8 @@ def parse(body: bytes) -> Any:
     names in an object.
 
     Raises:
-        ProblemError: `catalogue.NOT_JSON` for a refused text, or `catalogue.INVALID_REQUEST` for an
-            object with more than `MAX_MEMBERS` members.
+        NotJSONError: the function refuses the text.
+        InvalidRequestError: an object has more than `MAX_MEMBERS` members.
     """
     try:
         # from_json() is strict, but only the decoder of the standard library finds duplicate names.
@@ -175,10 +178,10 @@ def parse(body: bytes) -> Any:
     except _TooManyMembersError:
         detail = f"A JSON object has more than {MAX_MEMBERS} members."
         errors = [FieldError(pointer="#", message=detail)]
-        raise ProblemError(catalogue.INVALID_REQUEST, detail, errors=errors) from None
+        raise InvalidRequestError(errors=errors, detail=detail) from None
     except _RepeatedNameError as error:
         detail = f"A JSON object has two members with the same name{error}."
-        raise ProblemError(catalogue.NOT_JSON, detail) from None
+        raise NotJSONError(detail) from None
     except ValueError as error:
         errors = _not_finite(body)
         detail = "NaN and Infinity are not JSON. `errors` lists their places."
@@ -188,7 +191,7 @@ def parse(body: bytes) -> Any:
                 f"The body is not valid JSON: {error}. Strings and names need double quotes. "
                 "Comments, trailing commas, NaN, None and True are not JSON."
             )
-        raise ProblemError(catalogue.NOT_JSON, detail, errors=errors) from None
+        raise NotJSONError(detail, errors=errors) from None
 
 
 def _not_finite(body: bytes) -> list[FieldError]:
@@ -256,7 +259,7 @@ def _check_media(http: Request) -> None:
     """Check that the headers declare plain JSON in UTF-8.
 
     Raises:
-        ProblemError: `catalogue.UNSUPPORTED_MEDIA_TYPE`.
+        UnsupportedMediaTypeError: the headers declare something else.
     """
     headers = http.headers
     content_type, detail = headers.get("content-type", ""), ""
@@ -271,7 +274,7 @@ def _check_media(http: Request) -> None:
     if any(coding.lower() != "identity" for coding in headers.getlist("content-encoding")):
         detail = "The body must not be compressed: leave the header Content-Encoding out."
     if detail:
-        raise ProblemError(catalogue.UNSUPPORTED_MEDIA_TYPE, detail)
+        raise UnsupportedMediaTypeError(detail)
 
 
 class JSONRoute(APIRoute):
@@ -286,7 +289,7 @@ class JSONRoute(APIRoute):
         """Answer one request.
 
         Raises:
-            ProblemError, ServingError: the service cannot answer the request.
+            ServiceError: the service cannot answer the request.
         """
         if scope["method"] not in (self.methods or ()):
             await super().handle(scope, receive, send)
@@ -295,19 +298,20 @@ class JSONRoute(APIRoute):
         self.check(http)
         if scope["query_string"]:
             detail = "This route has no query parameters. Send all fields in the JSON body."
-            raise ProblemError(catalogue.BAD_REQUEST, detail)
+            raise BadRequestError(detail)
         _check_media(http)
         bodies: Bodies = scope["app"].state.bodies
         body = await bodies.read(receive, self.limit(scope["app"].state.settings))
         try:
             if not body:
-                raise ProblemError(catalogue.NOT_JSON, "The body is empty.")
+                raise NotJSONError("The body is empty.")
             form: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
             value, asked = await bodies.parse(body, form)
             try:
                 answer: bytes = await self.endpoint(asked=asked, http=http, **scope["path_params"])
             except RequestError as error:
-                raise from_exception(error, body=value) from None
+                error.locate(value)
+                raise
             headers = [
                 (b"content-length", b"%d" % len(answer)),
                 (b"content-type", b"application/json"),
@@ -318,7 +322,7 @@ class JSONRoute(APIRoute):
             bodies.held -= len(body)
 
     def check(self, http: Request) -> None:
-        """Check a request before its body is read. Subclasses may raise `ProblemError`."""
+        """Check a request before its body is read. Subclasses may raise `ServiceError`."""
 
     def limit(self, settings: Settings) -> int:
         """Return the maximum size of a body in bytes."""
@@ -345,8 +349,7 @@ def check_admin(http: Request) -> None:
     """Check that the request carries the admin key.
 
     Raises:
-        ProblemError: `catalogue.UNAUTHORIZED` if the request lacks the key, or if the service has
-            no admin key.
+        UnauthorizedError: the request lacks the key, or the service has no admin key.
     """
     if not carries(http.headers, ADMIN_KEY, http.app.state.settings.admin_key):
-        raise unauthorized("This route needs the admin key of the service.")
+        raise UnauthorizedError("This route needs the admin key of the service.")

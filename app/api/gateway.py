@@ -16,8 +16,8 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api import catalogue
-from app.api.problems import ProblemError, answer, from_exception, report_defect
+from app import errors
+from app.api.problems import answer, from_exception, report_defect
 from app.serving.request import SUCCESS, Record
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -129,9 +129,8 @@ class Gateway:
                 await self._admitted(scope, receive, send_completed)
             else:
                 detail = "SCENE_ALLOWED_HOSTS does not list the name in the Host header."
-                problem = ProblemError(catalogue.HOST_REFUSED, detail)
-                await answer(problem, scope, receive, send_completed)
-        except ProblemError as refused:  # refused preflight request of another origin
+                await answer(errors.HostRefusedError(detail), scope, receive, send_completed)
+        except errors.OriginRefusedError as refused:
             await answer(refused, scope, receive, send_completed)
         except Exception:
             raise
@@ -152,7 +151,7 @@ class Gateway:
         try:
             if self._settings.api_key is not None and not self._may_enter(scope):
                 detail = "This service needs its API key, or the admin key for administration."
-                raise unauthorized(detail)
+                raise errors.UnauthorizedError(detail)
             allowed = size = None
             for name, value in scope["headers"]:
                 if name == b"x-request-timeout-ms":
@@ -173,12 +172,12 @@ class Gateway:
         """Answer a failure, or close the connection if a response has started already."""
         problem = from_exception(error)
         record: Record = scope["state"]["record"]
-        if problem.status_code == 500:
+        if problem.status == 500:
             report_defect(error, scope["state"]["request_id"])
         if not record.status:
             await answer(problem, scope, receive, send)
             return
-        record.outcome = problem.kind.slug
+        record.outcome = problem.slug
         # A part of the response has been sent already. The raised error makes the server close the
         # connection.
         record.status = 500
@@ -197,7 +196,7 @@ class Gateway:
         longest = self._settings.max_request_timeout_ms
         if not _TIMEOUT.fullmatch(value) or int(value) > longest:
             detail = f"{TIMEOUT_HEADER} must be a whole number from 1 to {longest} (milliseconds)."
-            raise ProblemError(catalogue.BAD_REQUEST, detail)
+            raise errors.BadRequestError(detail)
         return int(value) / 1e3
 
     def _check_size(self, value: bytes) -> None:
@@ -238,16 +237,9 @@ def _completed(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) -> lis
     return found
 
 
-def unauthorized(detail: str) -> ProblemError:
-    """Return the problem for a request without the required key."""
-    headers = {"WWW-Authenticate": "Bearer"}
-    return ProblemError(catalogue.UNAUTHORIZED, detail, headers=headers)
-
-
-def too_large(limit: int) -> ProblemError:
-    """Return the problem for a body of more than ``limit`` bytes."""
-    detail = f"The body must not be larger than {limit} bytes."
-    return ProblemError(catalogue.BODY_TOO_LARGE, detail)
+def too_large(limit: int) -> errors.BodyTooLargeError:
+    """Return the error for a body of more than ``limit`` bytes."""
+    return errors.BodyTooLargeError(f"The body must not be larger than {limit} bytes.")
 
 
 def carries(headers: Headers, name: str, expected: SecretStr | None) -> bool:
@@ -298,12 +290,11 @@ class CrossOrigin(CORSMiddleware):
         """Answer a preflight request (CORS).
 
         Raises:
-            ProblemError: `catalogue.ORIGIN_REFUSED` if the service does not allow the request.
+            OriginRefusedError: the service does not allow the request.
         """
         response = super().preflight_response(request_headers)
         if response.status_code != 200:
-            raise ProblemError(
-                catalogue.ORIGIN_REFUSED,
+            raise errors.OriginRefusedError(
                 "The service does not allow the origin, the method or a header of this request.",
                 headers={"Vary": response.headers["vary"]},
             )

@@ -12,9 +12,8 @@ from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse
 
 from app import __version__
-from app.api import catalogue
 from app.api.models import Reference, RuntimeDep
-from app.api.openapi import problems, queued
+from app.api.openapi import error_responses
 from app.serving.metrics import CONTENT_TYPE
 from scene_client import schemas
 
@@ -25,8 +24,8 @@ monitoring = APIRouter(tags=["monitoring"])
 # Maximum number of failures in an answer, because load balancers ask often and without a key.
 _FAILURES = 10
 
-_NOT_READY = problems(catalogue.NOT_READY, catalogue.DRAINING)
-_NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
+_READINESS_ERRORS = error_responses("readiness")
+_LOADED_ERRORS = error_responses("admission", "models", "name", "model")
 
 
 # Load balancers may check health with HEAD. OpenAPI describes only GET.
@@ -34,7 +33,7 @@ _NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MOD
 @router.get(
     "/health/live",
     summary="Is the process alive?",
-    responses=problems(),
+    responses=error_responses(),
     response_model_exclude_none=True,
 )
 async def health_live() -> schemas.Health:
@@ -46,7 +45,7 @@ async def health_live() -> schemas.Health:
 @router.get(
     "/health/ready",
     summary="Is the default model usable?",
-    responses=_NOT_READY,
+    responses=_READINESS_ERRORS,
     response_model_exclude_none=True,
 )
 async def health_ready(runtime: RuntimeDep) -> schemas.Health:
@@ -59,28 +58,28 @@ async def health_ready(runtime: RuntimeDep) -> schemas.Health:
     return schemas.Health(status="ready", failures=failures or None)
 
 
-@protocol.get("", summary="Server metadata", responses=queued())
+@protocol.get("", summary="Server metadata", responses=error_responses("admission"))
 async def server_metadata() -> schemas.ServerMetadata:
     """Return the name and the version of the server."""
     return schemas.ServerMetadata(name="scene-boltzmann", version=__version__, extensions=[])
 
 
 @protocol.head("/health/live", include_in_schema=False)
-@protocol.get("/health/live", summary="Is the process alive?", responses=problems())
+@protocol.get("/health/live", summary="Is the process alive?", responses=error_responses())
 async def server_live() -> schemas.ServerLive:
     """Run the same check as `GET /health/live`."""
     return schemas.ServerLive(live=True)
 
 
 @protocol.head("/health/ready", include_in_schema=False)
-@protocol.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
+@protocol.get("/health/ready", summary="Is the default model usable?", responses=_READINESS_ERRORS)
 async def server_ready(runtime: RuntimeDep) -> schemas.ServerReady:
     """Run the same check as `GET /health/ready`."""
     runtime.check_ready()
     return schemas.ServerReady(ready=True)
 
 
-@protocol.get("/models/{name}", summary="Model metadata", responses=_NO_MODEL)
+@protocol.get("/models/{name}", summary="Model metadata", responses=_LOADED_ERRORS)
 async def model_metadata(name: Reference, runtime: RuntimeDep) -> schemas.ModelMetadata:
     """Return versions and variant of a model, named by an alias, `name` or `name@version`."""
     models = runtime.models
@@ -93,7 +92,7 @@ async def model_metadata(name: Reference, runtime: RuntimeDep) -> schemas.ModelM
 
 
 @protocol.head("/models/{name}/ready", include_in_schema=False)
-@protocol.get("/models/{name}/ready", summary="Is this model usable?", responses=_NO_MODEL)
+@protocol.get("/models/{name}/ready", summary="Is this model usable?", responses=_LOADED_ERRORS)
 async def model_ready(name: Reference, runtime: RuntimeDep) -> schemas.ModelReady:
     """Return status 200 if the model is usable, 404 if it does not exist, or else 503."""
     model = runtime.models.resolve(name)
@@ -104,7 +103,7 @@ async def model_ready(name: Reference, runtime: RuntimeDep) -> schemas.ModelRead
     "/metrics",
     summary="Metrics for Prometheus",
     response_class=PlainTextResponse,
-    responses=problems(),
+    responses=error_responses(),
 )
 async def show_metrics(runtime: RuntimeDep) -> PlainTextResponse:
     """Return counters, gauges and histograms in the text format of Prometheus.

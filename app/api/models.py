@@ -9,16 +9,15 @@ from fastapi import APIRouter, Depends, Path, Security
 from fastapi.security import APIKeyHeader, HTTPBearer
 from starlette.requests import Request
 
-from app.api import catalogue
 from app.api.body import AdminJSONRoute, check_admin
 from app.api.gateway import ADMIN_KEY
-from app.api.openapi import BODY, queued
+from app.api.openapi import error_responses
 from app.serving import describe
 from app.serving.runtime import Runtime
 from scene_client import schemas
 
-_PROBLEMS: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY)
-_USABLE: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
+_ERRORS: Final = error_responses("admission", "models", "name")
+_LOADED_ERRORS: Final = error_responses("admission", "models", "name", "model")
 
 Reference = Annotated[
     str,
@@ -58,7 +57,7 @@ changes = APIRouter(
 @router.get(
     "",
     summary="Models, versions and aliases",
-    responses=queued(catalogue.NOT_READY),
+    responses=error_responses("admission", "models"),
     response_model_exclude_none=True,
 )
 async def list_models(runtime: RuntimeDep) -> schemas.ModelList:
@@ -66,7 +65,7 @@ async def list_models(runtime: RuntimeDep) -> schemas.ModelList:
     return describe.everything(runtime.models)
 
 
-@router.get("/{name}", summary="One model", responses=_PROBLEMS, response_model_exclude_none=True)
+@router.get("/{name}", summary="One model", responses=_ERRORS, response_model_exclude_none=True)
 async def show_model(name: Reference, runtime: RuntimeDep) -> schemas.ModelSummary:
     """List the versions of a model, newest version first."""
     return describe.model(runtime.models, name)
@@ -75,7 +74,7 @@ async def show_model(name: Reference, runtime: RuntimeDep) -> schemas.ModelSumma
 @router.get(
     "/{name}/versions/{version}",
     summary="One version of a model",
-    responses=_PROBLEMS,
+    responses=_ERRORS,
     response_model_exclude_none=True,
 )
 async def show_version(
@@ -85,13 +84,13 @@ async def show_version(
     return describe.version(runtime.models, name, version)
 
 
-@router.get("/{name}/vocabulary", summary="The vocabulary of a model", responses=_USABLE)
+@router.get("/{name}/vocabulary", summary="The vocabulary of a model", responses=_LOADED_ERRORS)
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> schemas.VocabularyAnswer:
     """List the object classes with their aliases, the relations and the room types of a model."""
     return describe.vocabulary(runtime.models.resolve(name))
 
 
-@router.get("/{name}/contexts", summary="The hidden units of a model", responses=_USABLE)
+@router.get("/{name}/contexts", summary="The hidden units of a model", responses=_LOADED_ERRORS)
 async def show_contexts(name: Reference, runtime: RuntimeDep) -> schemas.ContextsAnswer:
     """List the hidden units of a model with the classes of their largest weights.
 
@@ -104,7 +103,7 @@ async def show_contexts(name: Reference, runtime: RuntimeDep) -> schemas.Context
 @administration.post(
     "/refresh",
     summary="Load the current state of the store",
-    responses=queued(catalogue.UNAUTHORIZED, catalogue.REFRESH_REFUSED),
+    responses=error_responses("admission", "admin"),
     response_model_exclude_none=True,
 )
 async def refresh_models(http: Request) -> schemas.RefreshAnswer:
@@ -121,16 +120,7 @@ async def refresh_models(http: Request) -> schemas.RefreshAnswer:
 @changes.put(
     "/aliases/{alias}",
     summary="Point an alias at another version",
-    responses=queued(
-        catalogue.UNAUTHORIZED,
-        catalogue.MODEL_NOT_FOUND,
-        catalogue.ALIAS_CONFLICT,
-        catalogue.MODEL_UNUSABLE,
-        catalogue.REFRESH_REFUSED,
-        catalogue.STORE_NOT_WRITABLE,
-        catalogue.STORE_BUSY,
-        *BODY,
-    ),
+    responses=error_responses("admission", "admin", "alias", "body", "models", "name"),
     response_model=schemas.AliasAnswer,
 )
 async def move_alias(

@@ -7,49 +7,21 @@ from typing import Any, Final
 from fastapi import FastAPI
 from fastapi.routing import APIRoute
 
-from app.api import catalogue, examples
-from app.api.catalogue import ProblemType
+from app.api import examples
 from app.api.gateway import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
-from app.api.problems import MEDIA_TYPE, ProblemError
+from app.api.problems import MEDIA_TYPE
+from app.errors import ERRORS, Step
 from app.questions.question import Example
-from scene_client.schemas import MAX_SEED, FieldError, Problem
+from scene_client.schemas import MAX_SEED, Problem
 
 Responses = dict[int | str, dict[str, Any]]
 
 _REFERENCE: Final = "#/components/schemas/{model}"
 _REQUEST_ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
-_ERRORS: Final = {
-    catalogue.INVALID_REQUEST: [
-        FieldError(pointer="#/objects/1/confidence", message="must be greater than 0")
-    ],
-    catalogue.UNKNOWN_LABELS: [
-        FieldError(
-            pointer="#/objects/1",
-            message="the model does not know this label",
-            suggestions=["nightstand"],
-        )
-    ],
-    catalogue.CONTRADICTORY_EVIDENCE: [
-        FieldError(
-            pointer="#/relations/1",
-            message="this relation contradicts an earlier relation of the same two objects",
-        )
-    ],
-}
 _KEY_SCHEMES: Final = {
     "api-key": {"type": "apiKey", "in": "header", "name": API_KEY},
     "api-key-as-bearer-token": {"type": "http", "scheme": "bearer"},
 }
-BODY: Final = (
-    catalogue.NOT_JSON,
-    catalogue.REQUEST_TIMEOUT,
-    catalogue.BODY_TOO_LARGE,
-    catalogue.BODIES_FULL,
-    catalogue.UNSUPPORTED_MEDIA_TYPE,
-    catalogue.INVALID_REQUEST,
-    catalogue.NOT_READY,
-)
-"""Problems of every `JSONRoute`."""
 TAGS: Final = [
     {"name": "questions", "description": "The four questions about one scene."},
     {"name": "batches", "description": "The same questions about many scenes in one request."},
@@ -61,43 +33,34 @@ TAGS: Final = [
 ]
 
 
-def problems(*kinds: ProblemType) -> Responses:
-    """Return the error responses of a route: the given problems and an internal error."""
+def error_responses(*steps: Step) -> Responses:
+    """Return the error responses of a route whose requests take these steps."""
     responses: Responses = {}
-    for kind in (*kinds, catalogue.INTERNAL_ERROR):
-        response = responses.setdefault(
-            kind.status,
-            {
-                "description": kind.title,
-                "content": {
-                    MEDIA_TYPE: {
-                        "schema": {"$ref": _REFERENCE.format(model="Problem")},
-                        "examples": {},
-                    }
-                },
-            },
-        )
-        example = ProblemError(kind, kind.title + ".", errors=_ERRORS.get(kind, ()))
+    for kind in ERRORS.values():
+        if not {"route", *steps}.intersection(kind.steps):
+            continue
+        schema = {"$ref": _REFERENCE.format(model="Problem")}
+        empty = {
+            "description": kind.title,
+            "content": {MEDIA_TYPE: {"schema": schema, "examples": {}}},
+        }
+        response = responses.setdefault(kind.status, empty)
+        problem = kind(detail=f"{kind.title}.", errors=kind.example).describe(_REQUEST_ID)
         response["content"][MEDIA_TYPE]["examples"][kind.slug] = {
             "summary": kind.title,
-            "value": example.describe(_REQUEST_ID).model_dump(mode="json", exclude_none=True),
+            "value": problem.model_dump(mode="json", exclude_none=True),
         }
     return responses
-
-
-def queued(*kinds: ProblemType) -> Responses:
-    """Return the error responses of a route, including the problems of admission control."""
-    return problems(*kinds, catalogue.BAD_REQUEST, catalogue.QUEUE_FULL, catalogue.DEADLINE_PASSED)
 
 
 def described(example: Example) -> dict[str, Any]:
     """Return an example request as an Example Object of OpenAPI."""
     if example.problem is None:
         return {"summary": example.summary, "value": example.value}
-    problem = catalogue.PROBLEM_TYPES[example.problem]
+    kind = ERRORS[example.problem]
     return {
-        "summary": f"{example.summary}: {problem.status}",
-        "description": f"Refused: {problem.title} (`{problem.uri}`).",
+        "summary": f"{example.summary}: {kind.status}",
+        "description": f"Refused: {kind.title} (`{kind.uri}`).",
         "value": example.value,
     }
 
@@ -169,10 +132,10 @@ def _timeout_parameter(most: int) -> dict[str, Any]:
 
 def _refuse_other_hosts(document: dict[str, Any]) -> None:
     """Add the problem `host-refused` to each operation except health checks."""
-    kind = catalogue.HOST_REFUSED
+    refused = error_responses("host")[421]
     for path, operations in document["paths"].items():
         for operation in () if path.endswith(HEALTH) else operations.values():
-            operation["responses"][str(kind.status)] = problems(kind)[kind.status]
+            operation["responses"]["421"] = refused
 
 
 def _ask_for_keys(document: dict[str, Any]) -> None:
@@ -182,5 +145,4 @@ def _ask_for_keys(document: dict[str, Any]) -> None:
         for operation in operations.values():
             if path not in OPEN_ROUTES and "security" not in operation:
                 operation["security"] = [{name: []} for name in _KEY_SCHEMES]
-                unauthorized = problems(catalogue.UNAUTHORIZED)[catalogue.UNAUTHORIZED.status]
-                operation["responses"][str(catalogue.UNAUTHORIZED.status)] = unauthorized
+                operation["responses"]["401"] = error_responses("key")[401]

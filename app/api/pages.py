@@ -17,8 +17,7 @@ from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
-from app.api import catalogue
-from app.api.problems import ProblemError
+from app.errors import ERRORS, NotFoundError
 
 STATIC: Final = Path(__file__).parents[1] / "static"
 _BOARD: Final = "board.html"
@@ -69,7 +68,7 @@ async def list_problem_types() -> HTMLResponse:
     entries = "\n".join(
         f'<dt><a href="problems/{kind.slug}"><code>{kind.slug}</code></a> ({kind.status})</dt>'
         f"<dd>{escape(kind.title)}</dd>"
-        for kind in catalogue.PROBLEM_TYPES.values()
+        for kind in ERRORS.values()
     )
     return _page("Problems", f"<dl>{entries}</dl>", root="")
 
@@ -77,9 +76,9 @@ async def list_problem_types() -> HTMLResponse:
 @problems.get("/problems/{slug}")
 async def show_problem_type(slug: str) -> HTMLResponse:
     """Return the HTML page with the cause and the remedy of a problem type."""
-    kind = catalogue.PROBLEM_TYPES.get(slug)
+    kind = ERRORS.get(slug)
     if kind is None:
-        raise ProblemError(catalogue.NOT_FOUND, "No problem type has this name.")
+        raise NotFoundError("No problem type has this name.")
     body = (
         f"<p><code>{kind.uri}</code>, status {kind.status}</p><p>{escape(kind.explanation)}</p>"
         '<p><a href="../problems">All problems</a></p>'

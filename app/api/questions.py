@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 from fastapi import APIRouter
 from pydantic_core import to_json
 from starlette.requests import Request
 
-from app.api import catalogue
 from app.api.body import BatchRoute, JSONRoute, validated
-from app.api.openapi import BODY, operation_id, queued
+from app.api.openapi import error_responses, operation_id
 from app.api.problems import from_exception, report_defect
+from app.errors import RequestError
 from app.questions import QUESTIONS, Question
 from app.questions.answer import written
 from app.serving import request as serving
@@ -26,25 +26,16 @@ from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequ
 RequestT = TypeVar("RequestT", bound=SceneRequest)
 _Endpoint = Callable[..., Awaitable[bytes]]
 
-_PROBLEMS: Final = queued(
-    *BODY,
-    catalogue.MODEL_NOT_FOUND,
-    catalogue.UNKNOWN_LABELS,
-    catalogue.CONTRADICTORY_EVIDENCE,
-    catalogue.ANSWER_TOO_LARGE,
-    catalogue.MODEL_UNAVAILABLE,
-)
-
 router = APIRouter(
     tags=["questions"],
     route_class=JSONRoute,
-    responses=_PROBLEMS,
+    responses=error_responses("admission", "body", "models", "name", "model", "scene"),
     generate_unique_id_function=operation_id,
 )
 batches = APIRouter(
     tags=["batches"],
     route_class=BatchRoute,
-    responses=queued(*BODY),
+    responses=error_responses("admission", "body", "models"),
     generate_unique_id_function=operation_id,
 )
 
@@ -103,12 +94,13 @@ def _failed(error: Exception, place: int, scene: Any, request_id: str) -> tuple[
     This is a separate function, because an error refers to the frame of `_answer_each`. A local
     variable of that frame must not refer to the error, to avoid a reference cycle.
     """
-    failure = from_exception(error, at=("scenes", place), body=scene)
-    problem = failure.describe(request_id)
-    if problem.status == 500:
+    if isinstance(error, RequestError):
+        error.locate(scene, ("scenes", place))
+    failure = from_exception(error)
+    if failure.status == 500:
         report_defect(error, request_id)
-    body = problem.model_dump_json(exclude_none=True).encode()
-    return failure.kind.slug, b'{"status":%d,"problem":%b}' % (problem.status, body)
+    body = failure.describe(request_id).model_dump_json(exclude_none=True).encode()
+    return failure.slug, b'{"status":%d,"problem":%b}' % (failure.status, body)
 
 
 def _reference(scene: Any) -> str:

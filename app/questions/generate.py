@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.errors import Reason
+from app.errors import InvalidRequestError
 from app.inference import MachineSpec, Weights
 from app.inference.chains import ConditionedChains, Conditions, Drawn, random_stream
 from app.inference.elementary import softplus
@@ -361,13 +361,14 @@ def _read(request: GenerateRequest, artifact: Artifact, _: Reading) -> Options:
         size = sizes.get(layer)
         if size is None:
             message = "the model lacks this hidden layer"
-            faults.add(Reason.INVALID, ("context", layer), message, tuple(sizes))
+            faults.add(InvalidRequestError, ("context", layer), message, tuple(sizes))
             continue
         for position, unit in enumerate(units):
             if unit >= size:
                 message = f"the hidden layer has only the units 0 to {size - 1}"
-                faults.add(Reason.INVALID, ("context", layer, position), message)
-    faults.raise_any()
+                faults.add(InvalidRequestError, ("context", layer, position), message)
+    if faults.found:
+        faults.raise_any()
     return {
         "count": request.count,
         "seed": secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed,

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import Reason
+from app.errors import InvalidRequestError
 from app.questions.answer import (
     CAUSE_BYTES,
     EXPLAINED,
@@ -200,13 +200,14 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if request.top_k > size and "top_k" in request.model_fields_set:
         message = f"`top_k` must be at most {size}, the size of the vocabulary"
-        faults.add(Reason.INVALID, ("top_k",), message)
+        faults.add(InvalidRequestError, ("top_k",), message)
     candidates = at = None
     if request.candidates is not None:
         candidates = _candidates(request.candidates, reading, faults)
     if request.at is not None:
         at = _at(request.at, artifact, reading, faults)
-    faults.raise_any()
+    if faults.found:
+        faults.raise_any()
     return {
         "top_k": request.top_k,
         "candidates": candidates,
@@ -232,7 +233,7 @@ def _candidates(labels: list[str], reading: Reading, faults: Faults) -> list[int
 def _at(at: Anchor, artifact: Artifact, reading: Reading, faults: Faults) -> tuple[str, int] | None:
     canonical = artifact.manifest.vocabulary.relations
     if at.relation not in {*canonical, *map(opposite, canonical)}:
-        faults.add(Reason.INVALID, ("at", "relation"), "the model does not know this relation")
+        faults.add(InvalidRequestError, ("at", "relation"), "the model does not know this relation")
     anchor = reading.names.find(at.object, ("at", "object"), faults)
     return None if anchor is None else (at.relation, anchor)
 

@@ -12,7 +12,14 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
-from app.errors import Fault, Location, Reason, RequestError, some_of
+from app.errors import (
+    Fault,
+    InvalidRequestError,
+    Location,
+    RequestError,
+    UnknownLabelsError,
+    some_of,
+)
 from app.scene.labels import label_key
 from app.scene.nearest import Guess, Match, spelt_alike
 from app.scene.scene import SceneObject
@@ -34,16 +41,20 @@ class Faults:
     """The errors of a request found so far.
 
     Attributes:
-        found: dictionary from each kind of error to the list of errors of this kind.
+        found: dictionary from each class of exception to its errors.
     """
 
-    found: dict[Reason, list[Fault]] = field(default_factory=dict)
+    found: dict[type[RequestError], list[Fault]] = field(default_factory=dict)
 
     def add(
-        self, reason: Reason, location: Location, message: str, suggestions: Sequence[str] = ()
+        self,
+        kind: type[RequestError],
+        location: Location,
+        message: str,
+        suggestions: Sequence[str] = (),
     ) -> None:
         """Add an error without raising it."""
-        self.found.setdefault(reason, []).append(Fault(location, message, tuple(suggestions)))
+        self.found.setdefault(kind, []).append(Fault(location, message, tuple(suggestions)))
 
     @property
     def are_many(self) -> bool:
@@ -54,12 +65,12 @@ class Faults:
         """Raise an exception if the request has errors.
 
         Raises:
-            RequestError: the request has errors. The exception contains all errors of one kind, the
-                first kind in `Reason` with errors.
+            RequestError: the request has errors. The exception contains all errors of one class,
+                the first class in `app.errors` with errors.
         """
-        for reason in Reason if self.found else ():
-            if reason in self.found:
-                raise RequestError(reason, self.found[reason])
+        for kind in RequestError.__subclasses__() if self.found else ():
+            if kind in self.found:
+                raise kind(self.found[kind])
 
 
 @dataclass(slots=True)
@@ -187,7 +198,7 @@ class Unknown:
             matches = self.look_ups.similar(self.vocabulary, label, is_room=is_room)
             suggestions = [known[match.entry] for match in matches]
         self.look_ups.suggestions += bool(suggestions)
-        faults.add(Reason.UNKNOWN_LABELS, location, message, suggestions)
+        faults.add(UnknownLabelsError, location, message, suggestions)
 
 
 class Names:
@@ -255,10 +266,10 @@ class Names:
                 f"{len(places)} objects have this label; use the id of one of them. The service "
                 "numbers objects without an id, such as chair_1 and chair_2"
             )
-            faults.add(Reason.INVALID, location, message)
+            faults.add(InvalidRequestError, location, message)
         else:
             message = "no entry of `objects` has this id or label"
-            faults.add(Reason.INVALID, location, message, self._similar(name))
+            faults.add(InvalidRequestError, location, message, self._similar(name))
         return None
 
     def _similar(self, name: str) -> list[str]:

@@ -16,7 +16,7 @@ from typing import Final, Literal
 
 from pydantic_core import to_json
 
-from app.errors import Location, Reason
+from app.errors import ContradictionError, InvalidRequestError, Location
 from app.questions.names import Faults, LookUps, Names, Unknown
 from app.scene.geometry import (
     LARGEST,
@@ -146,8 +146,11 @@ def read_scene(
     if name is not None and (room := vocabulary.room_index(name)) is None:
         room = unknown.resolve(name, name, ("room_type",), faults, is_room=True)
     if not objects and not may_be_empty and not faults.found:
-        faults.add(Reason.INVALID, ("objects",), "the model does not know any of these objects")
-    faults.raise_any()
+        faults.add(
+            InvalidRequestError, ("objects",), "the model does not know any of these objects"
+        )
+    if faults.found:
+        faults.raise_any()
 
     reading.scene = Scene(tuple(objects), None, False, room)
     if reading.left_out:
@@ -166,11 +169,12 @@ def read_scene(
 def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
     for name, most in (("objects", limits.objects), ("relations", limits.relations)):
         if len(getattr(request, name) or ()) > most:
-            faults.add(Reason.INVALID, (name,), f"the scene must have at most {most} {name}")
+            faults.add(InvalidRequestError, (name,), f"the scene must have at most {most} {name}")
     if request.relations is None and request.relations_complete:
         message = "`relations_complete` requires the field `relations`"
-        faults.add(Reason.INVALID, ("relations_complete",), message)
-    faults.raise_any()
+        faults.add(InvalidRequestError, ("relations_complete",), message)
+    if faults.found:
+        faults.raise_any()
 
 
 def _derive(
@@ -212,7 +216,9 @@ def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
             labels.append(entry.label)
         else:
             if entry.id in taken:
-                faults.add(Reason.INVALID, ("objects", place, "id"), "another object has this id")
+                faults.add(
+                    InvalidRequestError, ("objects", place, "id"), "another object has this id"
+                )
             taken[entry.id] = None
     if len(taken) == len(entries):
         return list(taken)
@@ -301,12 +307,12 @@ def _triples(
             continue
         if subject == other:
             message = "an object cannot have a relation to itself"
-            faults.add(Reason.CONTRADICTION, location, message)
+            faults.add(ContradictionError, location, message)
             continue
         index, i, j = canonicalise(subject, relation, other)
         if (index, j, i) in triples:
             message = "this relation contradicts an earlier relation of the same two objects"
-            faults.add(Reason.CONTRADICTION, location, message)
+            faults.add(ContradictionError, location, message)
         triples.setdefault((index, i, j), i != subject)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])
 

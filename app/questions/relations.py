@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import Location, Reason
+from app.errors import InvalidRequestError, Location
 from app.questions.answer import RELATION_BYTES, Fields, SizeLimit, significant
 from app.questions.names import Faults
 from app.questions.posterior import Posterior, Present, posterior_of, relations_given
@@ -241,10 +241,13 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
         if subject is None or other is None:
             continue
         if subject == other:
-            faults.add(Reason.INVALID, location, "subject and object must be two different objects")
+            faults.add(
+                InvalidRequestError, location, "subject and object must be two different objects"
+            )
             continue
         pairs[subject, other] = None
-    faults.raise_any()
+    if faults.found:
+        faults.raise_any()
     return list(pairs)
 
 

@@ -20,7 +20,7 @@ from typing import Final
 from app.errors import (
     ModelUnavailableError,
     NotReadyError,
-    ServingError,
+    ServiceError,
     UnknownModelError,
     some_of,
 )
@@ -150,7 +150,7 @@ class ServedModels:
         """Maps each served model to the sorted aliases that point at it."""
         found: dict[Key, list[str]] = {key: [] for key in self.served}
         for alias in sorted(self.store.aliases):
-            with suppress(ServingError):
+            with suppress(ServiceError):
                 found[self.resolve(alias).key].append(alias)
         return found
 

@@ -10,7 +10,7 @@ from functools import partial
 from time import perf_counter
 from typing import Any, Final, TypeVar
 
-from app.errors import ServingError
+from app.errors import ServiceError
 from app.questions.answer import Fields, SizeLimit, envelope
 from app.questions.names import LookUps
 from app.questions.question import Question
@@ -199,7 +199,7 @@ class Request(Ticket):
             for reference, rows in Counter(references).items():
                 try:
                     model = self.models.resolve(reference)
-                except ServingError:
+                except ServiceError:
                     continue
                 model.queue.take(rows)
                 held.callback(model.queue.give_back, rows)

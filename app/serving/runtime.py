@@ -77,7 +77,7 @@ class Runtime:
             DrainingError: the service is shutting down.
         """
         if self.draining:
-            raise errors.DrainingError("The service is shutting down.")
+            raise errors.DrainingError
         self.models.resolve(DEFAULT)
 
     def drain(self) -> None:
@@ -131,7 +131,7 @@ class Runtime:
         """Point an alias at a served version, in the store and in this process.
 
         Raises:
-            RequestError: the name is not valid for an alias.
+            InvalidRequestError: the name is not valid for an alias.
             UnknownModelError: the service does not serve the model or version.
             ModelUnusableError: the service refused the version.
             AliasConflictError: the alias has another target than expected, or a model has the name
@@ -188,7 +188,7 @@ class Runtime:
         try:
             async with self._changing:
                 yield
-        except errors.ServingError:
+        except errors.ServiceError:
             self.metrics.reloaded(change, "refused")
             raise
         except Exception:
@@ -210,7 +210,8 @@ class Runtime:
         new = await asyncio.to_thread(self._load)
         worse = [failure for subject, failure in new.failures.items() if matters(subject)]
         if worse:
-            raise errors.RefreshRefusedError(worse)
+            detail = "The service still serves the previous versions. `failures` gives the reasons."
+            raise errors.RefreshRefusedError(detail, failures=worse)
         self._serve(new)
         return new
 
@@ -266,7 +267,7 @@ def _refusal(error: StoreError) -> Exception:
         case "name_conflict":
             return errors.AliasConflictError("A model already has the name of this alias.")
         case "invalid_reference":
-            return errors.RequestError(errors.Reason.INVALID, [errors.Fault((), error.reason)])
+            return errors.InvalidRequestError([errors.Fault((), error.reason)])
         case "unknown_model" | "unknown_version":
             return errors.UnknownModelError("The store no longer contains this version.")
         case "locked":

@@ -15,7 +15,7 @@ import pytest
 from pydantic import ValidationError
 
 from app.questions import more
-from app.serving.reading import read_scene
+from app.questions.reading import read_scene
 from scene_client.schemas import MissingRequest
 from tests.http.test_problems import problem
 from tests.services import LiveService, Replace, launch, serve

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from app.api.catalogue import PROBLEM_TYPES
+from app.errors import ERRORS
 from scene_client.schemas import Problem
 from tests.chaos.corpus import JSON, MARKER, NUMBER, Hostile
 from tests.services import ADMIN_KEY
@@ -52,7 +52,7 @@ def faults_of_problem(document: Any, status: int) -> list[str]:
     except ValueError as error:
         return [f"does not fit the schema: {error}"]
     faults = []
-    kind = PROBLEM_TYPES.get(document["type"].removeprefix("/problems/"))
+    kind = ERRORS.get(document["type"].removeprefix("/problems/"))
     if kind is None or not kind.status == document["status"] == status:
         faults.append(f"status {status} with type {document['type']}, {document['status']}")
     # A request id of the right form is the one thing that is repeated.

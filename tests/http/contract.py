@@ -10,7 +10,7 @@ import schemathesis
 from pydantic import BaseModel, ValidationError
 
 from app.main import create_app
-from app.serving.questions import QUESTIONS
+from app.questions import QUESTIONS
 from app.settings import Settings
 from scene_client import schemas
 from tests.conftest import REPOSITORY

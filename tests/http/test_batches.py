@@ -8,7 +8,7 @@ from typing import Any
 import httpx
 import pytest
 
-from app.serving.questions import QUESTIONS
+from app.questions import QUESTIONS
 from tests.services import Replace, defect
 
 pytestmark = pytest.mark.anyio

@@ -13,9 +13,9 @@ from urllib.parse import urljoin, urlsplit
 import httpx
 import pytest
 
-from app.api.catalogue import PROBLEM_TYPES
 from app.api.examples import REQUESTS
 from app.api.openapi import described
+from app.errors import ERRORS
 from scene_client import schemas
 from scene_client.schemas import Problem
 from tests.http.test_problems import problem
@@ -226,7 +226,7 @@ async def test_an_example_is_answered_or_refused_as_it_says(
         validated = model.model_validate_json(response.content, extra="forbid")
         assert validated.model_dump_json(exclude_unset=True) == response.text
         return
-    found = problem(response, PROBLEM_TYPES[case.problem].status, case.problem)
+    found = problem(response, ERRORS[case.problem].status, case.problem)
     documented = responses[str(response.status_code)]
     shown = documented["content"]["application/problem+json"]["examples"][case.problem]
     if name in {"unknown-labels", "contradictory-evidence"}:
@@ -246,7 +246,7 @@ async def test_an_example_of_moving_an_alias_does_as_it_says(
         assert response.status_code == 200
         assert response.json()["model"] == case.value["model"]
     else:
-        problem(response, PROBLEM_TYPES[case.problem].status, case.problem)
+        problem(response, ERRORS[case.problem].status, case.problem)
 
 
 async def test_example_answers_have_the_fields_of_real_ones(document: dict[str, Any]) -> None:

@@ -73,7 +73,7 @@ def test_requests_below_http_break_nothing(service: LiveService) -> None:
 
 
 def test_every_field_of_every_request_is_attacked() -> None:
-    from app.serving.questions import QUESTIONS
+    from app.questions import QUESTIONS
     from scene_client import schemas
 
     forms = {f"/{question.name}": question.request for question in QUESTIONS}

@@ -16,8 +16,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from app.api.catalogue import PROBLEM_TYPES
-from app.serving.questions import QUESTIONS
+from app.errors import ERRORS
+from app.questions import QUESTIONS
 from scene_client.schemas import (
     Detection,
     Position,
@@ -45,8 +45,8 @@ def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
     document: dict[str, Any] = response.json()
     Problem.model_validate(document, extra="forbid")
     assert document["type"] == f"/problems/{slug}"
-    assert document["status"] == status == PROBLEM_TYPES[slug].status
-    assert document["title"] == PROBLEM_TYPES[slug].title
+    assert document["status"] == status == ERRORS[slug].status
+    assert document["title"] == ERRORS[slug].title
     assert document["request_id"] == response.headers["x-request-id"]
     assert document["instance"] == f"/problems/{slug}#{document['request_id']}"
     assert ("retry-after" in response.headers) == (status in (429, 503))
@@ -555,7 +555,7 @@ async def test_an_answer_that_is_not_finite_is_a_defect(
 
 async def test_every_problem_type_has_a_page(client: httpx.AsyncClient) -> None:
     index = (await client.get("/problems")).text
-    for slug, kind in PROBLEM_TYPES.items():
+    for slug, kind in ERRORS.items():
         page = await client.get(f"/problems/{slug}")
         assert page.status_code == 200
         assert page.headers["content-type"].startswith("text/html")
@@ -570,7 +570,7 @@ def test_every_problem_type_is_provoked_by_a_test() -> None:
         for file in Path(__file__).parents[1].glob("*/test_*.py")
         for status, slug in re.findall(r'\b(\d{3}),\s*"([a-z-]+)"\)', file.read_text("utf-8"))
     }
-    assert {(slug, kind.status) for slug, kind in PROBLEM_TYPES.items()} <= checked
+    assert {(slug, kind.status) for slug, kind in ERRORS.items()} <= checked
 
 
 # --------------------------------------------------------------------------------- any input

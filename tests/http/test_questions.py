@@ -13,7 +13,7 @@ from app import questions
 from app.registry import Store
 from app.scene import Scene, SceneObject
 from app.scene.relations import CANONICAL, opposite
-from app.serving.questions import QUESTIONS
+from app.questions import QUESTIONS
 from tests.http.stores import VOCABULARY, publish
 from tests.services import Replace, serve
 

@@ -26,7 +26,7 @@ from app.serving.admission import (
     Ticket,
     WorkQueue,
 )
-from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFullError
+from app.errors import DeadlinePassedError, DisconnectedError, QueueFullError
 
 pytestmark = pytest.mark.anyio
 

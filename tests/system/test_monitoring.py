@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from app.api import catalogue
+from app.errors import ERRORS
 from tests.http.test_monitoring import documented_metrics
 
 pytestmark = pytest.mark.system
@@ -85,7 +85,7 @@ def check(query: str) -> set[str]:
             assert label in known[name] | ADDED, (name, label)
             if label == "outcome" and name != "scene_reloads_total":
                 for outcome in value.split("|"):
-                    assert outcome in {"success", *catalogue.PROBLEM_TYPES}, outcome
+                    assert outcome in {"success", *ERRORS}, outcome
             elif label == "outcome":
                 assert value in {"success", "refused", "failed"}
     assert names
