@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from app.questions import missing, outliers, relations
 from app.scene import CANONICAL, OPPOSITES
 from tests.enumeration.implied import relation_by_definition
 from tests.enumeration.small_machines import Joint, enumerate_joint
+from tests.questions.answers import missing, outliers, relations
 from tests.questions.artifacts import EXACT, LABELS, exact_artifact, scene_of
 from training.machines.arrays import machine_of
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from app.questions import generate
 from app.scene import CANONICAL
 from tests.enumeration.small_machines import enumerate_joint
+from tests.questions.answers import generate
 from tests.questions.artifacts import LABELS, artifact_of, exact_artifact, larger_artifact, scene_of
 from tests.questions.log_score import log_score
 from training.machines.arrays import machine_of

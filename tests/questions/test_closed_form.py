@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from app.inference.posterior import ClosedForm
-from app.questions import missing, outliers, relations
 from app.registry import Artifact
 from app.registry.description import EvidenceWeights
 from app.scene import RELATIONS, Scene, SceneObject, derive_relations
+from tests.questions.answers import missing, outliers, relations
 from tests.questions.artifacts import LABELS, LARGER, larger_artifact, scene_of
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from app.questions import contexts
+from app.questions.contexts import contexts
 from app.scene import CANONICAL
 from tests.questions.artifacts import LABELS, LARGER, ROOMS, STRUCTURE, larger_artifact
 from training.machines.arrays import machine_of

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.questions import more
 from app.questions.counts import LIKELY, distribution
 from app.registry import Counts
 from app.scene import Scene
+from tests.questions.answers import more
 from tests.questions.artifacts import LABELS, LARGER, calibration, larger_artifact, scene_of
 
 SPEC = LARGER["triway-local"]

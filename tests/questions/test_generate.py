@@ -10,10 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.questions import generate
 from app.scene import CANONICAL, contradiction, derive_relations
 from app.scene.scene import Scene
 from tests.enumeration.small_machines import enumerate_joint, small_machine
+from tests.questions.answers import generate
 from tests.questions.artifacts import (
     EXACT,
     LABELS,

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.questions import missing
-from app.questions.missing import offsets_of
+from app.questions.placements import offsets_of
 from app.registry import Offsets
+from app.registry.offsets import NOTHING
 from app.scene import CANONICAL, Scene, SceneObject
 from app.scene.geometry import viewer_axes
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP, canonicalise
+from tests.questions.answers import missing
 from tests.questions.artifacts import LARGER, larger_artifact
 
 V = LARGER["triway-local"].V
@@ -38,13 +40,23 @@ def known(V: int = V) -> Offsets:
     )
 
 
+class Offset(NamedTuple):
+    """Mean and standard deviation in metres, and the number of training scenes."""
+
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    scenes: int
+
+
 OFFSETS = known()
 VIEWER = viewer_axes()
 
 
 def one(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFFSETS):
+    """The offset of one placement, or None if it is unknown."""
     ends = (np.array([value]) for value in (relation, missing, anchor, outgoing))
-    return offsets_of(offsets, *ends, axes)[0]
+    mean, std, scenes = (values[0].tolist() for values in offsets_of(offsets, *ends, axes))
+    return None if scenes == NOTHING else Offset(tuple(mean), tuple(std), scenes)
 
 
 @given(st.integers(0, A - 1), st.integers(0, V - 1), st.integers(0, V - 1))
@@ -110,7 +122,11 @@ def test_a_relation_without_poses_has_no_offset():
 @pytest.mark.parametrize("name", ["rbm", "triway-wide", "triway-local"])
 def test_placements_have_the_offsets_of_their_classes(name):
     artifact = larger_artifact(name)
-    things = tuple(SceneObject(str(k), "", index) for k, index in enumerate((2, 0, 8, 2, 4)))
+    centre = (0.0, 0.0, 0.0)
+    things = tuple(
+        SceneObject(str(k), "", index, position=centre)
+        for k, index in enumerate((2, 0, 8, 2, 4))
+    )
     scene = Scene(things)
     bare = missing(artifact, scene)
     answers = missing(replace(artifact, offsets=OFFSETS), scene)
@@ -123,7 +139,10 @@ def test_placements_have_the_offsets_of_their_classes(name):
         for place in entry.placements:
             relation, subject, _ = canonicalise("missing", place.relation, "anchor")
             anchor = things[place.object].class_index
-            assert place.offset == one(relation, label, anchor, subject == "missing")
+            expected = one(relation, label, anchor, subject == "missing")
+            assert tuple(place.offset.mean) == expected.mean
+            assert tuple(place.offset.std) == expected.std
+            assert place.offset.scenes == expected.scenes
             places += 1
     assert places >= 3
 

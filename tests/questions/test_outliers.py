@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from app.questions import misplaced, outliers
 from app.registry.description import CountSlope, Thresholds
+from tests.questions.answers import misplaced, outliers
 from tests.questions.artifacts import LABELS, STRUCTURE, larger_artifact, scene_of
 from training.machines.arrays import machine_of
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from app.questions import missing
 from app.registry import PairSlope
 from app.scene.relations import ON_TOP
+from tests.questions.answers import missing
 from tests.questions.artifacts import larger_artifact, scene_of
 
 # On-top is likelier than all other relations.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from app.questions import generate, outliers
 from app.registry.description import CountSlope, Thresholds
+from tests.questions.answers import generate, outliers
 from tests.questions.artifacts import LARGER, larger_artifact, scene_of
 
 LOCAL = [name for name, spec in LARGER.items() if spec.form == "local"]

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.questions import misplaced, missing, outliers, relations
 from app.scene import CANONICAL, OPPOSITES, RELATIONS, Scene, canonicalise, contradiction
+from tests.questions.answers import misplaced, missing, outliers, relations
 from tests.questions.artifacts import LABELS, LARGER, STRUCTURE, larger_artifact, scene_of
 
 pytestmark = pytest.mark.usefixtures("the_likeliest_is_expected")

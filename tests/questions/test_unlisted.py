@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.questions import missing
+from tests.questions.answers import missing
 from tests.questions.artifacts import LABELS, artifact_of, larger_artifact, scene_of
 from training.machines import MachineSpec, build
 from training.machines.chain_samples import pack_scenes
