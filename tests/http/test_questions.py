@@ -10,10 +10,10 @@ import httpx
 import pytest
 
 from app import questions
+from app.questions import QUESTIONS
 from app.registry import Store
 from app.scene import Scene, SceneObject
 from app.scene.relations import CANONICAL, opposite
-from app.questions import QUESTIONS
 from tests.http.stores import VOCABULARY, publish
 from tests.services import Replace, serve
 

@@ -124,8 +124,7 @@ def test_placements_have_the_offsets_of_their_classes(name):
     artifact = larger_artifact(name)
     centre = (0.0, 0.0, 0.0)
     things = tuple(
-        SceneObject(str(k), "", index, position=centre)
-        for k, index in enumerate((2, 0, 8, 2, 4))
+        SceneObject(str(k), "", index, position=centre) for k, index in enumerate((2, 0, 8, 2, 4))
     )
     scene = Scene(things)
     bare = missing(artifact, scene)

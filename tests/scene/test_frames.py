@@ -6,8 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.scene.geometry import body_pose, is_optical, is_world_fixed, viewer_axes
-from app.scene.geometry import Viewpoint, to_viewer_frame
+from app.scene.geometry import (
+    Viewpoint,
+    body_pose,
+    is_optical,
+    is_world_fixed,
+    to_viewer_frame,
+    viewer_axes,
+)
 from tests.scene.turns import about, after
 
 

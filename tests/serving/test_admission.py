@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from app.errors import DeadlinePassedError, DisconnectedError, QueueFullError
 from app.serving.admission import (
     CHEAP,
     PACE,
@@ -26,7 +27,6 @@ from app.serving.admission import (
     Ticket,
     WorkQueue,
 )
-from app.errors import DeadlinePassedError, DisconnectedError, QueueFullError
 
 pytestmark = pytest.mark.anyio
 

@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 
 from app.questions.posterior import Present, present
-from app.scene.scene import class_evidence
-from app.scene.scene import Scene
+from app.scene.scene import Scene, class_evidence
 from training.machines import BoltzmannMachine
 from training.machines.draws import HiddenDraws, draw_hidden
 from training.machines.mean_field import Evidence
