@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated, Final
+import math
+from collections.abc import Sequence
+from typing import Annotated, Final, cast
 
 from fastapi import APIRouter, Depends, Path, Security
 from fastapi.security import APIKeyHeader, HTTPBearer
@@ -12,7 +14,9 @@ from starlette.requests import Request
 from app.api.body import AdminJSONRoute, check_admin
 from app.api.gateway import ADMIN_KEY
 from app.api.openapi import error_responses
-from app.serving import describe
+from app.registry import AliasTarget
+from app.scene.relations import opposite
+from app.serving.models import ServedModels
 from app.serving.runtime import Runtime
 from scene_client import schemas
 
@@ -62,13 +66,19 @@ changes = APIRouter(
 )
 async def list_models(runtime: RuntimeDep) -> schemas.ModelList:
     """List the models, versions and aliases of the store. Each refused version has a reason."""
-    return describe.everything(runtime.models)
+    models = runtime.models
+    return schemas.ModelList(
+        generation=models.generation,
+        models=[_summary(models, name) for name in models.store.versions],
+        aliases={alias: str(target) for alias, target in sorted(models.store.aliases.items())},
+        failures=list(models.failures.values()),
+    )
 
 
 @router.get("/{name}", summary="One model", responses=_ERRORS, response_model_exclude_none=True)
 async def show_model(name: Reference, runtime: RuntimeDep) -> schemas.ModelSummary:
     """List the versions of a model, newest version first."""
-    return describe.model(runtime.models, name)
+    return _summary(runtime.models, _name(runtime.models, name))
 
 
 @router.get(
@@ -81,13 +91,51 @@ async def show_version(
     name: Reference, version: Version, runtime: RuntimeDep
 ) -> schemas.VersionDetails:
     """Return metrics, training data, terms and model card of a version, or why it is refused."""
-    return describe.version(runtime.models, name, version)
+    models = runtime.models
+    name = _name(models, name)
+    if version not in models.store.versions[name]:
+        raise models.unknown(f"{name}@{version}")
+    summary = _version_summary(models, name, version)
+    served = models.served.get((name, version))
+    if served is None:
+        return schemas.VersionDetails(name=name, **dict(summary))
+    manifest = served.artifact.manifest
+    return schemas.VersionDetails(
+        name=name,
+        **dict(summary),
+        created=manifest.created,
+        parameters=sum(math.prod(tensor.shape) for tensor in manifest.weights.values()),
+        metrics=[schemas.Metric(**metric.model_dump()) for metric in manifest.metrics],
+        data=[schemas.TrainingSource(**source.model_dump()) for source in manifest.data],
+        terms=manifest.terms,
+        card=served.artifact.card,
+    )
 
 
 @router.get("/{name}/vocabulary", summary="The vocabulary of a model", responses=_LOADED_ERRORS)
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> schemas.VocabularyAnswer:
     """List the object classes with their aliases, the relations and the room types of a model."""
-    return describe.vocabulary(runtime.models.resolve(name))
+    served = runtime.models.resolve(name)
+    canonical = served.artifact.manifest.vocabulary.relations
+    names = (*canonical, *map(opposite, canonical))
+    return schemas.VocabularyAnswer(
+        model=served.reference,
+        objects=[
+            schemas.VocabularyEntry(
+                label=entry.label,
+                aliases=list(entry.aliases),
+                structure=entry.structure,
+                size=_size(entry.size),
+            )
+            for entry in served.vocabulary.objects
+        ],
+        relations=[cast("schemas.RelationName", name) for name in names],
+        room_types=list(served.vocabulary.room_types),
+        examples=[
+            schemas.ExampleScene(name=example.name, scene=example.request())
+            for example in served.artifact.manifest.examples
+        ],
+    )
 
 
 @router.get("/{name}/contexts", summary="The hidden units of a model", responses=_LOADED_ERRORS)
@@ -96,8 +144,10 @@ async def show_contexts(name: Reference, runtime: RuntimeDep) -> schemas.Context
 
     The field `context` of `POST /generate` accepts the numbers of these units.
     """
-    # `describe.contexts` runs in a thread, because the first call for a model takes 0.2 s.
-    return await asyncio.to_thread(describe.contexts, runtime.models.resolve(name))
+    served = runtime.models.resolve(name)
+    # The first access to the contexts of a model takes 0.2 s, so it runs in a thread.
+    layers = await asyncio.to_thread(lambda: served.contexts)
+    return schemas.ContextsAnswer(model=served.reference, layers=dict(layers))
 
 
 @administration.post(
@@ -138,3 +188,48 @@ async def move_alias(
     runtime: Runtime = http.app.state.runtime
     answer = await runtime.move_alias(alias, asked, http.state.request_id)
     return answer.model_dump_json(exclude_none=True).encode()
+
+
+def _size(extents: Sequence[float] | None) -> schemas.Size | None:
+    return None if extents is None else schemas.Size(**dict(zip("xyz", extents, strict=True)))
+
+
+def _name(models: ServedModels, reference: str) -> str:
+    """Return the model name of a reference, even if the service refused the version."""
+    name = reference.partition("@")[0]
+    target: AliasTarget | None = models.store.aliases.get(name)
+    if target is not None:
+        name = target.name
+    if name not in models.store.versions:
+        raise models.unknown(reference)
+    return name
+
+
+def _summary(models: ServedModels, name: str) -> schemas.ModelSummary:
+    return schemas.ModelSummary(
+        name=name,
+        versions=[
+            _version_summary(models, name, number)
+            for number in reversed(models.store.versions[name])
+        ],
+    )
+
+
+def _version_summary(models: ServedModels, name: str, number: str) -> schemas.VersionSummary:
+    served = models.served.get((name, number))
+    if served is None:
+        failure = models.failures[f"{name}@{number}"]
+        return schemas.VersionSummary(
+            version=number,
+            status="refused",
+            aliases=[],
+            reason=failure.reason,
+            detail=failure.detail,
+        )
+    return schemas.VersionSummary(
+        version=number,
+        status="ready",
+        aliases=models.aliases[name, number],
+        variant=served.reference.variant,
+        digest=served.reference.digest,
+    )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, Final, Self
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.registry.errors import ArtifactError
-from app.registry.fields import require_shapes
+from app.registry.fields import Tables
 
 Table = NDArray[np.float32]
 
@@ -30,7 +30,7 @@ _MOST: Final = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Counts:
+class Counts(Tables):
     """Counts of K of a model's V classes. `app.questions.counts` has the formula.
 
     Attributes:
@@ -43,14 +43,12 @@ class Counts:
             on itself.
     """
 
+    prefix: ClassVar[str] = PREFIX
+
     classes: NDArray[np.integer[Any]]
     most: NDArray[np.integer[Any]]
     log_share: Table
     weights: Table
-
-    def tensors(self) -> dict[str, NDArray[Any]]:
-        """Return a mapping of tensor names in an artifact to the arrays."""
-        return {f"{PREFIX}{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], V: int, C: int) -> Self:
@@ -71,8 +69,7 @@ class Counts:
             "log_share": (K, M),
             "weights": (K, EXPONENTS, ROOM + C + V),
         }
-        require_shapes(tensors, PREFIX, shapes)
-        counts = cls(**{name: tensors[f"{PREFIX}{name}"] for name in shapes})
+        counts = cls.read(tensors, shapes)
         if complaint := counts._complaint(V, C):
             raise ArtifactError("invalid_tensor", f"the count tensors are invalid: {complaint}")
         return counts

@@ -1,11 +1,12 @@
-"""Base class and field types of stored JSON, and the check of stored tensors."""
+"""Base class and field types of stored JSON, and of groups of stored tensors."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from numpy.typing import NDArray
 from pydantic import (
@@ -51,24 +52,40 @@ class Frozen(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-def require_shapes(
-    tensors: Mapping[str, NDArray[Any]], prefix: str, shapes: Mapping[str, tuple[int, ...]]
-) -> None:
-    """Check the names and shapes of a group of tensors.
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """Base class of groups of arrays that an artifact stores beside the tensors of the machine.
 
-    Args:
-        tensors: all tensors whose names begin with the prefix.
-        shapes: maps each name without the prefix to the required shape.
-
-    Raises:
-        ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape.
+    A subclass is a dataclass whose fields are the arrays. The names of the stored tensors begin
+    with `prefix`.
     """
-    for name in sorted(tensors.keys() | {f"{prefix}{name}" for name in shapes}):
-        shape = shapes.get(name.removeprefix(prefix))
-        found = tensors[name].shape if name in tensors else None
-        if found != shape:
-            raise ArtifactError(
-                "wrong_shape",
-                f"tensor '{name}' has the shape {found}, but the shape must be {shape} (None means "
-                "that the tensor does not exist)",
-            )
+
+    prefix: ClassVar[str]
+
+    def tensors(self) -> dict[str, NDArray[Any]]:
+        """Return a mapping of tensor names in an artifact to the arrays."""
+        return {f"{self.prefix}{field.name}": getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def read(
+        cls, tensors: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]
+    ) -> Self:
+        """Build the group from all stored tensors whose names begin with the prefix.
+
+        Args:
+            tensors: result of `tensors()`, read from an artifact.
+            shapes: maps the name of each field to its required shape.
+
+        Raises:
+            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape.
+        """
+        for name in sorted(tensors.keys() | {f"{cls.prefix}{name}" for name in shapes}):
+            required = shapes.get(name.removeprefix(cls.prefix))
+            shape = tensors[name].shape if name in tensors else None
+            if shape != required:
+                raise ArtifactError(
+                    "wrong_shape",
+                    f"tensor '{name}' has the shape {shape}, but the shape must be {required} "
+                    "(None means that the tensor does not exist)",
+                )
+        return cls(**{name: tensors[f"{cls.prefix}{name}"] for name in shapes})

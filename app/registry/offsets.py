@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Self
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.registry.errors import ArtifactError
-from app.registry.fields import require_shapes
+from app.registry.fields import Tables
 
 Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
@@ -31,7 +31,7 @@ NOTHING: Final = -1
 
 
 @dataclass(frozen=True, eq=False)
-class Offsets:
+class Offsets(Tables):
     """Normal distributions of offsets, for A canonical relations, V classes and P observed pairs.
 
     Attributes:
@@ -46,6 +46,8 @@ class Offsets:
         pair_scenes: (P,) number of training scenes with each pair in its relation.
     """
 
+    prefix: ClassVar[str] = PREFIX
+
     relation: Table
     relation_scenes: Ints
     subject: Table
@@ -53,10 +55,6 @@ class Offsets:
     pair: Ints
     pair_offset: Table
     pair_scenes: Ints
-
-    def tensors(self) -> dict[str, NDArray[Any]]:
-        """Return a mapping of tensor names in an artifact to the arrays."""
-        return {f"{PREFIX}{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
@@ -80,8 +78,7 @@ class Offsets:
             "pair_offset": (P, 6),
             "pair_scenes": (P,),
         }
-        require_shapes(tensors, PREFIX, shapes)
-        offsets = cls(**{name: tensors[f"{PREFIX}{name}"] for name in shapes})
+        offsets = cls.read(tensors, shapes)
         if complaint := offsets._complaint(A * V * V):
             raise ArtifactError("invalid_tensor", f"the offset tensors are invalid: {complaint}")
         return offsets

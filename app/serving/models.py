@@ -2,7 +2,7 @@
 
 A snapshot of the models never changes, so a request uses the same models from beginning to end. The
 snapshot lists each refused version with the reason. A name without a version means the newest
-usable version.
+usable version. During its warm-up, a model answers every question.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,10 +24,13 @@ from app.errors import (
     UnknownModelError,
     some_of,
 )
+from app.questions import QUESTIONS
+from app.questions.answer import written
 from app.questions.contexts import contexts
-from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
+from app.registry import AliasTarget, Artifact, ArtifactError, ArtifactFailure, ModelSet, StoreError
 from app.registry.models import EMPTY
 from app.scene.nearest import spelt_alike
+from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import WorkQueue
 from scene_client.schemas import ContextUnit, Failure, ModelReference
@@ -195,3 +198,62 @@ class ServedModels:
 
 NOTHING: Final = ServedModels(EMPTY, MappingProxyType({}))
 """The snapshot before the service has loaded its models."""
+
+
+# ------------------------------------------------------------------------------------- warm-up
+
+
+def prepare(
+    store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels
+) -> ServedModels:
+    """Warm up every verified model. Return the models that can be served, and all failures.
+
+    If ``previous`` already serves a model from the same artifact, the function skips the warm-up of
+    this model and keeps its queue.
+    """
+    served: dict[Key, ServedModel] = {}
+    entries = dict(store.entries)
+    for key, artifact in store.entries.items():
+        if not isinstance(artifact, Artifact):
+            continue
+        before = previous.served.get(key)
+        if before is not None and before.artifact is artifact:
+            served[key] = before
+            continue
+        try:
+            warm_up(artifact)
+        except Exception:
+            # A broken model may raise any exception. The service must still serve other models.
+            _logger.exception("the warm-up of model %s failed", "@".join(key))
+            entries[key] = ArtifactFailure(
+                "warm_up_failed", "the files are valid, but the model could not answer a question"
+            )
+        else:
+            served[key] = ServedModel(artifact, new_queue())
+    return ServedModels(replace(store, entries=MappingProxyType(entries)), MappingProxyType(served))
+
+
+def warm_up(artifact: Artifact) -> None:
+    """Ask each question about three scenes: with relations, without relations, and with poses.
+
+    Raises:
+        ValueError: an answer contains a number that is not finite.
+        Exception: any other error of the model.
+    """
+    related = _scene(artifact.vocabulary)
+    bare = replace(related, relations=None)
+    posed = observe(bare, typical_sizes=artifact.vocabulary.sizes)
+    scenes = related, bare, posed
+    for question in QUESTIONS:
+        for answer in question.warm_up(artifact, scenes):
+            written(answer)
+
+
+def _scene(vocabulary: Vocabulary) -> Scene:
+    """Return a scene of up to three objects in a row. The third object is on top of the second."""
+    proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
+    objects = tuple(
+        SceneObject(str(place), vocabulary.labels[index], index, position=(1.0, 0.5 * place, 0.5))
+        for place, index in enumerate((proposable or [0])[:3])
+    )
+    return Scene(objects, ((2, 1, 0),) if len(objects) > 1 else None)

@@ -17,8 +17,7 @@ from app.questions.reading import Limits
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.serving.admission import Backlog, Threads, WorkQueue
 from app.serving.metrics import Change, Metrics
-from app.serving.models import DEFAULT, NOTHING, Key, ServedModels
-from app.serving.warm_up import prepare
+from app.serving.models import DEFAULT, NOTHING, Key, ServedModels, prepare
 from app.settings import Settings
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 
