@@ -15,10 +15,10 @@ import torch
 from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import frequencies, presence, random_scenes
-from training.batches import Batch
-from training.config import ObjectiveConfig
+from training.datasets.batches import Batch
+from training.fit.objectives import ContrastiveDivergence
+from training.fit.settings import ObjectiveConfig
 from training.machines import MachineSpec, build
-from training.objectives import ContrastiveDivergence
 
 OURS, LOCAL, DENSE = "ours, seed form", "ours, local form", "dense Triway"
 

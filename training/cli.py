@@ -21,43 +21,30 @@ from rich.table import Table
 
 from app.registry import Artifact, Metric, RegistryError, Store, load_model_set
 from app.registry.references import AliasTarget
-from training.batches import subset
-from training.config import (
-    DATA,
-    Config,
-    ConfigError,
-    data_folder,
-    is_file,
-    load_config,
-    shipped_configs,
-    source_name,
-    with_settings,
-)
 from training.datasets import DatasetError
-from training.distributed import is_first, process_group
-from training.domain.command import example, fail, init
+from training.datasets.batches import subset
+from training.datasets.files import DATA
+from training.domain.compare import compare_command, show
+from training.domain.gate import MARGIN, compare_with_served, losses, measure_usefulness, seat
+from training.domain.init_command import example, fail, init
 from training.domain.labels import outside_vocabulary
-from training.evaluation.everyday import EVERYDAY
+from training.evaluation.everyday_task import EVERYDAY
 from training.evaluation.metrics import Figure
 from training.evaluation.report import evaluate
 from training.evaluation.tasks import in_words
-from training.example_scenes import known_examples, read_examples
-from training.experiments.ablate import ablate
-from training.experiments.benchmark import benchmark
-from training.experiments.compare import compare_command, show
-from training.experiments.gate import (
-    MARGIN,
-    compare_with_served,
-    losses,
-    measure_usefulness,
-    seat,
-)
-from training.experiments.tune import tune
-from training.live import Display, next_steps, summarise
-from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
-from training.publish import RefusedError, publish_run, refit
-from training.runs import FinishedRun, RunError, load_run, save_run
-from training.trainer import Trainer
+from training.fit.checkpoint import RunError
+from training.fit.settings import Config, ConfigError, is_file, source_name
+from training.fit.trainer import Trainer
+from training.machines.distributed import is_first, process_group
+from training.research.ablate import ablate
+from training.research.benchmark import benchmark
+from training.research.tune import tune
+from training.runs.config import data_folder, load_config, shipped_configs, with_settings
+from training.runs.example_scenes import known_examples, read_examples
+from training.runs.folder import FinishedRun, load_run, save_run
+from training.runs.live import Display, next_steps, summarise
+from training.runs.pipeline import SplitScenes, prepare, read_sources, split_and_encode
+from training.runs.publish import RefusedError, publish_run, refit
 
 app = typer.Typer(
     rich_markup_mode="markdown", add_completion=False, no_args_is_help=True, help=__doc__

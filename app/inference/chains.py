@@ -27,7 +27,14 @@ from numpy.typing import NDArray
 from app.inference import chain_kernels as kernels
 from app.inference.elementary import sigmoid, softplus
 from app.inference.relation_kernels import draw_in_groups
-from app.inference.relations import NEVER, Ends, Given, RelationUnits, all_pairs
+from app.inference.relations import (
+    NEVER,
+    Ends,
+    Given,
+    RelationUnits,
+    all_pairs,
+    relation_units,
+)
 from app.inference.weights import Weights, unpack_scenes
 
 Floats = NDArray[np.float32]
@@ -144,7 +151,7 @@ class SceneChains:
                 "compiled chains need a machine in the local form with float32 weights"
             )
         self.machine = weights
-        self.units = units or weights.spec.kind.units(weights)
+        self.units = units or relation_units(weights)
         W, J, H1 = weights["W"], weights["J"], weights.spec.H1
         shared = self.units.G.reshape(-1, H1) if len(self.units.G) else np.eye(H1)
         self.arrays = Arrays(

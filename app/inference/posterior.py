@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from app.inference import objects
 from app.inference.objects import group_size
-from app.inference.relations import Between, Context, Ends, Given
+from app.inference.relations import Between, Context, Ends, Given, relation_units
 from app.inference.weights import Weights
 
 Floats = NDArray[np.float32]
@@ -78,7 +78,7 @@ class ClosedForm:
         self._weights = weights
         self.W, self.b = weights["W"], weights["b"]
         self._c1, self._Q = weights["c1"], weights["Q"]
-        self.units = weights.spec.kind.units(weights)
+        self.units = relation_units(weights)
         self.group = group_size(self.W)
 
     @staticmethod

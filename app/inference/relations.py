@@ -17,24 +17,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import relation_kernels as kernels
 from app.inference.elementary import sigmoid
-
-if TYPE_CHECKING:
-    from app.inference.weights import Weights
+from app.inference.weights import SWEEPS, Weights
 
 Floats = NDArray[np.float32]
 Places = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-SWEEPS: Final = 10
-"""Number of iterations of a mean field. The shipped machines converge within these iterations. The
-number is constant, so that answers are reproducible."""
 
 NO_UNIT: Final = np.float32(-30.0)
 """Lower limit of the log-odds of a relation."""
@@ -645,6 +639,13 @@ class SharedUnits(RelationUnits):
             mean += between.apart[:, start, end]
         found = to_log_odds(mean, spread).reshape(A, 2, P)
         return np.ascontiguousarray(found.swapaxes(0, 1))
+
+
+def relation_units(weights: Weights) -> RelationUnits:
+    """Return the relation units of a machine."""
+    if weights.spec.kind.factorised:
+        return SharedUnits(weights)
+    return FreeUnits(weights, weights["U"], weights.arrays.get("g"))
 
 
 @lru_cache(maxsize=128)

@@ -1,19 +1,14 @@
 """The variants of the machine, and the specification of its sizes.
 
-Each variant is a class that defines the arrays and the relation units of the machine. The service
-needs no other information about a variant. To add a variant, write a class and add it to
-`VARIANTS`. docs/models.md defines the symbols in the formulas.
+Each variant is a class that defines the arrays of the machine. `relations.relation_units` computes
+its relation units from these arrays. To add a variant, write a class and add it to `VARIANTS`.
+docs/models.md defines the symbols in the formulas.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
-
-from app.inference.relations import FreeUnits, RelationUnits, SharedUnits
-
-if TYPE_CHECKING:
-    from app.inference.weights import Weights
+from typing import Any, ClassVar, Final, Literal, get_args
 
 Variant = Literal["rbm", "gbm", "triway"]
 Form = Literal["seed", "local"]
@@ -40,11 +35,6 @@ class RBM:
         """Return the names and shapes of the arrays that this variant adds to `layout`."""
         return {"d": (spec.T,), "U": (spec.T, spec.H1)}
 
-    @staticmethod
-    def units(weights: Weights) -> RelationUnits:
-        """Return the relation units."""
-        return FreeUnits(weights, weights["U"])
-
 
 class GBM(RBM):
     """GBM: a machine with two hidden layers and one relation unit for each training triple.
@@ -58,11 +48,6 @@ class GBM(RBM):
     def shapes(spec: MachineSpec) -> Shapes:
         """See `RBM`."""
         return {**RBM.shapes(spec), "g": (spec.T, 2)}
-
-    @staticmethod
-    def units(weights: Weights) -> RelationUnits:
-        """Return the relation units."""
-        return FreeUnits(weights, weights["U"], weights["g"])
 
 
 class Triway:
@@ -91,11 +76,6 @@ class Triway:
         if spec.G:
             found |= {"gamma": (1 + spec.G, A, feature_count(A)), "B": (spec.G, H1)}
         return found
-
-    @staticmethod
-    def units(weights: Weights) -> RelationUnits:
-        """Return the relation units."""
-        return SharedUnits(weights)
 
 
 VARIANTS: Final[dict[str, type[RBM | Triway]]] = {

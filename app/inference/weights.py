@@ -13,14 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
-from app.inference.relations import SWEEPS
 from app.inference.variants import MachineSpec
+
+SWEEPS: Final = 10
+"""Number of iterations of a mean field. The shipped machines converge within these iterations. The
+number is constant, so that answers are reproducible."""
 
 WORD = 32
 """Number of bits in a word of the packed stored scenes."""

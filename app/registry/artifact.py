@@ -23,6 +23,7 @@ from app.inference.chains import SceneChains
 from app.inference.completions import Completions
 from app.inference.objects import ContextScorer
 from app.inference.posterior import ClosedForm
+from app.inference.relations import relation_units
 from app.inference.weights import layout
 from app.registry.card import render_card
 from app.registry.counts import PREFIX as COUNTS
@@ -125,7 +126,7 @@ class Artifact:
     def context_rows(self) -> NDArray[np.float32]:
         """Return the weights between h1 and each of the T triples of the weights, (T, H1)."""
         relation, subject, object_ = self.weights["triples"].astype(np.int64).T.copy()
-        return self.spec.kind.units(self.weights).rows_of(relation, subject, object_)
+        return relation_units(self.weights).rows_of(relation, subject, object_)
 
     @cached_property
     def scene_chains(self) -> SceneChains:

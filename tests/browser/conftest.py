@@ -32,7 +32,9 @@ DESK = {
 }
 
 EXAMPLES = json.loads(
-    (Path(__file__).parents[2] / "training" / "examples" / "indoor.json").read_text("utf-8")
+    (Path(__file__).parents[2] / "training" / "runs" / "examples" / "indoor.json").read_text(
+        "utf-8"
+    )
 )
 """Example scenes of the shipped vocabulary."""
 

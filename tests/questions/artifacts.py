@@ -11,9 +11,9 @@ from app.registry.artifact import Artifact
 from app.registry.description import NEVER, Calibration, CountSlope, Slope
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL
+from training.fit.oracle.drawn import DrawnPosterior
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.arrays import weights_of
-from training.oracle.drawn import DrawnPosterior
 
 # Three classes, so that a present one leaves two to choose from; few enough states to enumerate.
 EXACT: dict[str, MachineSpec] = {

@@ -26,7 +26,7 @@ LOG_ODDS_TOLERANCE = 0.05
 
 @pytest.fixture(autouse=True)
 def _many_draws(monkeypatch):
-    monkeypatch.setattr("training.oracle.evidence.DRAWS", DRAWS)
+    monkeypatch.setattr("training.fit.oracle.evidence.DRAWS", DRAWS)
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from app.registry.description import EvidenceWeights
 from app.scene import RELATIONS, Scene, SceneObject, derive_relations
 from tests.questions.answers import missing, outliers, relations
 from tests.questions.artifacts import LABELS, LARGER, larger_artifact, scene_of
+from training.fit.oracle.drawn import DrawnPosterior
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
-from training.oracle.drawn import DrawnPosterior
 
 pytestmark = pytest.mark.usefixtures("the_likeliest_is_expected")
 
@@ -129,7 +129,7 @@ def test_answers_are_those_of_very_many_draws(
     bounds: tuple[float, ...],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("training.oracle.evidence.DRAWS", 1 << 13)
+    monkeypatch.setattr("training.fit.oracle.evidence.DRAWS", 1 << 13)
     scene, closed = SCENES[of], larger_artifact(name, scale=scale)
     assert closed.oracle is None
     drawn = dataclasses.replace(closed, oracle=DrawnPosterior)
@@ -200,7 +200,7 @@ def test_weighted_answers_are_those_of_draws(
     kind: str, weight: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The closed form scales the pull of its mean field, draws the likelihood of relations."""
-    monkeypatch.setattr("training.oracle.evidence.DRAWS", 1 << 13)
+    monkeypatch.setattr("training.fit.oracle.evidence.DRAWS", 1 << 13)
     weights = {f"{kind}_on_objects": weight, f"{kind}_on_relations": weight}
     closed = larger_artifact("triway-wide", scale=0.12, evidence=EvidenceWeights(**weights))
     drawn = dataclasses.replace(closed, oracle=DrawnPosterior)

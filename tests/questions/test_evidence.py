@@ -7,9 +7,9 @@ import torch
 
 from app.scene import Scene, SceneObject, derive_relations
 from tests.questions.artifacts import LARGER, larger_artifact, scene_of
+from training.fit.oracle.evidence import draw_context, observe
+from training.fit.oracle.units import mean_log_p, units_between
 from training.machines.arrays import machine_of
-from training.oracle.evidence import draw_context, observe
-from training.oracle.units import mean_log_p, units_between
 
 
 def triples_of(edges, values):
@@ -113,7 +113,7 @@ def test_many_relations_get_fewer_draws(monkeypatch):
     machine = machine_of(larger_artifact("triway-local").weights)
     small = observe(machine, scene_of([0, 1], [(0, 0, 1)])).evidence
     assert len(draw_context(machine, small).h1) == 64
-    monkeypatch.setattr("training.oracle.evidence._RELATION_DRAWS", 16 * 16)
+    monkeypatch.setattr("training.fit.oracle.evidence._RELATION_DRAWS", 16 * 16)
     assert len(draw_context(machine, small).h1) == 16
     assert len(draw_context(machine, small, rows=1000).h1) == 8
 

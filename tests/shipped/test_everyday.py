@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from app.registry import Store, load_model_set
-from training.evaluation.everyday import EVERYDAY, LINES, ask_everyday, facts_file
+from training.evaluation.everyday_task import EVERYDAY, LINES, ask_everyday, facts_file
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDER = REPOSITORY / EVERYDAY

@@ -19,11 +19,11 @@ from app.registry.references import AliasTarget
 from app.scene import Scene, SceneObject
 from tests.registry.small_artifacts import description, state
 from tests.training.commands import invoke, small_config, write_config
-from training.config import load_config, with_settings
-from training.offsets import fit_offsets
-from training.pipeline import prepare
-from training.publish import refit
-from training.runs import RunError
+from training.fit.checkpoint import RunError
+from training.fit.offset_statistics import fit_offsets
+from training.runs.config import load_config, with_settings
+from training.runs.pipeline import prepare
+from training.runs.publish import refit
 
 ROOT = Path(__file__).parents[2]
 

@@ -26,7 +26,7 @@ from app.scene import (
     to_viewer_frame,
 )
 from scene_client.image_plane import are_neighbours, relation_between
-from training.array_types import Flags, Floats, Ints
+from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.names import Names, curated_names
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 from training.datasets.sources import SOURCES, Meaning, meaning_of

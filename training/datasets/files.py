@@ -109,3 +109,7 @@ def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type
         names = kind.__name__ if isinstance(kind, type) else " or ".join(k.__name__ for k in kind)
         raise DatasetError(path, where, f"{name!r} must be of type {names}, not {value!r}")
     return value
+
+
+DATA = Path("../shared/data")
+"""Default folder of the shipped data sources."""

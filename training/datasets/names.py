@@ -10,7 +10,7 @@ from typing import Any
 
 from app.scene import head_of, label_key
 
-NAMES_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "names.toml"
+NAMES_FILE = Path(__file__).resolve().parent / "vocabularies" / "names.toml"
 
 
 @dataclass(frozen=True)

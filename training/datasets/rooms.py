@@ -19,7 +19,7 @@ import numpy as np
 
 from app.scene import Viewpoint, Vocabulary, to_viewer_frame
 from app.scene.footprints import overlap_and_gap
-from training.array_types import Rng
+from training.datasets.array_types import Rng
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 from training.datasets.vocabulary import source_vocabulary
 
@@ -128,7 +128,7 @@ class _Tables:
         return Piece(**entry | parts)
 
 
-_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "rooms.toml"
+_FILE = Path(__file__).resolve().parent / "vocabularies" / "rooms.toml"
 DOMAINS: Final = _Tables(tomllib.loads(_FILE.read_text(encoding="utf-8"))).rooms
 """Rooms of each domain: ``homes``, or ``workplaces`` (laboratories, workshops, storerooms)."""
 

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from app.scene import ClassEvidence
-from training.array_types import Flags, Ints, Rng
+from training.datasets.array_types import Flags, Ints, Rng
 from training.datasets.encoding import EncodedScene
 
 # Number of attempted exchanges, divided by the number of slots. An exchange draws two slots, so

@@ -15,7 +15,7 @@ from app.scene import ObjectClass, Vocabulary, label_key
 from training.datasets.names import Names, curated_names
 from training.datasets.records import AnnotatedScene
 
-INDOOR_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "indoor.json"
+INDOOR_FILE = Path(__file__).resolve().parent / "vocabularies" / "indoor.json"
 
 # Minimum number of objects of a class in the scenes. Classes of indoor vocabularies also have word
 # vectors, so a smaller minimum is enough for these vocabularies.

@@ -19,7 +19,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from app.scene import Vocabulary
-from training.array_types import Flags
+from training.datasets.array_types import Flags
 from training.datasets.records import DatasetError
 
 MAX_WORDS: Final = 1_000_000

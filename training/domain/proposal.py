@@ -15,7 +15,6 @@ from typing import Any, Final
 
 from app.registry import Example
 from app.scene import Vocabulary, label_key
-from training.config import Config, ConfigError, sections_toml
 from training.datasets import (
     FRACTIONS,
     AnnotatedScene,
@@ -28,7 +27,9 @@ from training.datasets import (
 from training.domain.labels import Label, Lookalike, count_labels, lookalikes
 from training.domain.look import Facts, look
 from training.evaluation.metrics import FEWEST_GROUPS
-from training.example_scenes import choose_examples
+from training.fit.settings import Config, ConfigError
+from training.runs.config import sections_toml
+from training.runs.example_scenes import choose_examples
 
 # Possible minimum numbers of objects of a class, in order of preference. A class with few objects
 # is hardly trained. A small data set needs a small minimum, so that the vocabulary covers enough

@@ -22,8 +22,8 @@ from app import questions
 from app.questions.outliers import Sensitivity
 from app.registry import Artifact
 from app.scene import Scene
-from training.cases import scene_of, stated_relations
 from training.datasets import EncodedScene
+from training.datasets.cases import scene_of, stated_relations
 
 ALARMS: dict[Sensitivity, float] = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Maximum shares of unaltered scenes with an alarm, on the large source with the most alarms."""

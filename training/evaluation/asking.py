@@ -19,9 +19,9 @@ from app import questions
 from app.questions import Sensitivity
 from app.registry import Artifact
 from app.scene import CANONICAL, Scene, SceneObject
-from training.array_types import Flags, Floats
-from training.cases import scene_of
 from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Floats
+from training.datasets.cases import scene_of
 
 Case = TypeVar("Case")
 

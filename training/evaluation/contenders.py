@@ -14,19 +14,19 @@ from torch import Tensor
 from app.questions.posterior import posterior
 from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES, Scene
-from training.batches import Batch, SceneTensors
+from training.datasets.batches import Batch, SceneTensors
 from training.evaluation.asking import missing_probabilities, of_classes
-from training.evaluation.density import DensitySettings, independent_density, machine_density
-from training.evaluation.generation import (
+from training.evaluation.density_task import DensitySettings, independent_density, machine_density
+from training.evaluation.generation_task import (
     held_out_halves,
     independent_sampler,
     machine_sampler,
     scene_sampler,
 )
-from training.evaluation.missing import MachineScore, PlacedScore, Places
-from training.evaluation.outliers import calibrated_alarm
-from training.evaluation.relations import RelationScore
-from training.evaluation.setting import Contender, Setting
+from training.evaluation.missing_tasks import MachineScore
+from training.evaluation.model import Contender, PlacedScore, Places, RelationScore
+from training.evaluation.outlier_tasks import calibrated_alarm
+from training.evaluation.setting import Setting
 from training.machines.arrays import machine_of
 
 

@@ -31,9 +31,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.array_types import Flags, Floats, Ints
-from training.batches import SceneTensors
-from training.cases import scene_rng
+from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.batches import SceneTensors
+from training.datasets.cases import scene_rng
 from training.evaluation.metrics import Items, Ratio
 
 SIGNATURE = 10

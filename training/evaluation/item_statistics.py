@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from training.array_types import Flags, Floats, Ints
+from training.datasets.array_types import Flags, Floats, Ints
 
 Prepared = Callable[[Floats], float]
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
-from training.array_types import Flags, Floats, Ints
+from training.datasets.array_types import Flags, Floats, Ints
 from training.evaluation.item_statistics import STATISTICS
 
 RESAMPLES = 1000

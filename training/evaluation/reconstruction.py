@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import torch
 
-from training.batches import Batch, SceneTensors, relation_units
+from training.datasets.batches import Batch, SceneTensors, relation_units
 from training.machines import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
 

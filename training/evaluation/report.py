@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
@@ -22,12 +22,13 @@ from torch import Tensor
 
 from app.registry import Artifact
 from app.registry import Metric as CardMetric
-from training.batches import SceneTensors, subset
+from training.datasets.batches import SceneTensors, subset
 from training.evaluation.contenders import artifact_contender
-from training.evaluation.everyday import SOURCE, facts_digest
+from training.evaluation.everyday_task import SOURCE, facts_digest
 from training.evaluation.metrics import Macro, Metric, Ratio, Resampled, Scored
-from training.evaluation.setting import Contender, Outcome, Setting
-from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
+from training.evaluation.model import Contender
+from training.evaluation.setting import Outcome, Setting
+from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET, Task
 
 # Maximum number of scenes per data source in slow tasks. The second limit is for machines that
 # compute their answers by sampling.
@@ -124,9 +125,13 @@ def run(
     report: SourceReport,
     *,
     tasks: Iterable[str] = tuple(TASKS),
+    known: Mapping[str, Task] = EVERY_TASK,
     progress: Progress = silent,
 ) -> Iterator[str]:
     """Measure the tasks that the report lacks. Yield the name of each task after measuring it.
+
+    Args:
+        tasks: names of the tasks, which are keys of `known`.
 
     Raises:
         ValueError: a task is unknown, or the report belongs to other scenes or questions.
@@ -136,14 +141,14 @@ def run(
             f"the file of the report on {report.source} is from other scenes or tasks: delete it"
         )
     wanted = list(tasks)
-    if unknown := sorted(set(wanted) - set(EVERY_TASK)):
-        raise ValueError(f"unknown tasks {unknown}: choose from {list(EVERY_TASK)}")
+    if unknown := sorted(set(wanted) - set(known)):
+        raise ValueError(f"unknown tasks {unknown}: choose from {list(known)}")
     for task in wanted:
         if task in report.outcomes:
             continue
         progress(f"{report.source}: {task}")
         began = time.perf_counter()
-        report.outcomes[task] = EVERY_TASK[task](contender, setting)
+        report.outcomes[task] = known[task](contender, setting)
         report.seconds[task] = time.perf_counter() - began
         yield task
 
@@ -155,13 +160,14 @@ def measure(
     source: str,
     *,
     tasks: Iterable[str] = tuple(TASKS),
+    known: Mapping[str, Task] = EVERY_TASK,
     progress: Progress = silent,
 ) -> SourceReport:
     """Measure the tasks that the file at `path` lacks, and write it after every task."""
     report = SourceReport(source, digest(setting))
     if path.exists():
         report = SourceReport.read(path)
-    for _ in run(contender, setting, report, tasks=tasks, progress=progress):
+    for _ in run(contender, setting, report, tasks=tasks, known=known, progress=progress):
         write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
     return report
 

@@ -2,62 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from training.batches import SceneTensors, subset
-from training.cases import some_scenes
+from training.datasets.batches import SceneTensors, subset
+from training.datasets.cases import some_scenes
 from training.evaluation.metrics import Metric
-
-if TYPE_CHECKING:
-    from app.registry import Artifact
-    from training.evaluation.density import ObjectDensity
-    from training.evaluation.generation import Sampler
-    from training.evaluation.missing import ObjectScore, PlacedScore, RoomScore
-    from training.evaluation.outliers import Alarm
-    from training.evaluation.relations import RelationScore
-    from training.machines import BoltzmannMachine
-
-
-@dataclass(frozen=True, eq=False)
-class Contender:
-    """A model or baseline that the evaluation compares; it fills one row of the result tables.
-
-    The attribute of a task is None if the model or baseline does not support the task.
-
-    Attributes:
-        objects: score of T2 and T3.
-        relations: score of T1a.
-        completion: score of T1b; the batch observes the given triples.
-        placed: score of T2-at.
-        placement: score of T3b; the batch observes all triples, one of them false.
-        sampler: sampler of T4.
-        density: density, computed at its first use.
-        alarm: alarm of T3.
-        artifact: model for Calibration and for all questions to the service.
-        objects_in_rooms: score of T2 with the room type as evidence.
-        machine: machine for the seed protocol.
-        parameters: number of trained weights, or None if this number is not meaningful.
-    """
-
-    objects: ObjectScore | None = None
-    relations: RelationScore | None = None
-    completion: RelationScore | None = None
-    placed: PlacedScore | None = None
-    placement: RelationScore | None = None
-    sampler: Sampler | None = None
-    density: Callable[[], ObjectDensity] | None = None
-    alarm: Alarm | None = None
-    artifact: Artifact | None = None
-    objects_in_rooms: RoomScore | None = None
-    machine: BoltzmannMachine | None = None
-    parameters: int | None = None
 
 
 @dataclass(frozen=True, eq=False)

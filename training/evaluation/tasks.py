@@ -9,35 +9,32 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-from training.evaluation import counts, offsets
-from training.evaluation.answers import QUESTIONS, calibration_task
+from training.evaluation import count_task as counts
+from training.evaluation import offset_task as offsets
 from training.evaluation.asking import SENSITIVITIES
-from training.evaluation.density import density_task
-from training.evaluation.everyday import LINES, everyday_task
-from training.evaluation.evidence import (
+from training.evaluation.calibration_task import QUESTIONS, calibration_task
+from training.evaluation.density_task import density_task
+from training.evaluation.everyday_task import LINES, everyday_task
+from training.evaluation.evidence_tasks import (
     KINDS,
     missing_evidence_task,
     outliers_evidence_task,
     relations_evidence_task,
 )
-from training.evaluation.generation import generation_task
+from training.evaluation.generation_task import generation_task
 from training.evaluation.intruders import by_popularity, by_room
-from training.evaluation.missing import (
+from training.evaluation.missing_tasks import (
     SHARES,
     missing_in_room_task,
     missing_task,
     partial_task,
     placed_task,
 )
-from training.evaluation.outliers import outliers_task, sensitivity_task, signature_task
-from training.evaluation.pairs import pairs_task
-from training.evaluation.relations import completion_task, placement_task, relations_task
-from training.evaluation.seed_protocol import (
-    reconstruction_after_addition,
-    relations_switched_on,
-    removed_switched_on,
-)
-from training.evaluation.setting import Contender, Outcome, Setting
+from training.evaluation.model import Contender
+from training.evaluation.outlier_tasks import outliers_task, sensitivity_task, signature_task
+from training.evaluation.pair_task import pairs_task
+from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
+from training.evaluation.setting import Outcome, Setting
 
 Ask = Callable[[Contender, Setting], Outcome | None]
 
@@ -181,31 +178,6 @@ TASKS: dict[str, Task] = {
     "Everyday": _carded("everyday facts", everyday_task, LINES, of_objects=False),
 }
 
-SEED_TASKS: dict[str, Task] = {
-    "Seed T1": Task(
-        "relations, seed protocol",
-        relations_switched_on,
-        shown=(
-            "labelled relations switched on",
-            "relations switched on per scene",
-            "labelled relations per scene",
-        ),
-    ),
-    "Seed T2": Task(
-        "missing object, seed protocol",
-        removed_switched_on,
-        shown=(
-            "removed objects switched on, relations left on",
-            "removed objects switched on, relations deleted",
-        ),
-    ),
-    "Seed T3": Task(
-        "intruder, seed protocol",
-        reconstruction_after_addition,
-        shown=("error measure", "error measure, doing nothing"),
-    ),
-}
-"""Tasks of the seed protocol (Bozcan et al., 2018). Their results have separate tables."""
 
 # The statistics depend only on the training scenes, not on the machine. They appear in model cards,
 # but not in tables that compare machines.
@@ -214,7 +186,7 @@ STATISTICS: dict[str, Task] = {
     "Counts": _objects("numbers of instances", counts.counts_task, (), counts.METRICS),
 }
 
-EVERY_TASK = TASKS | SEED_TASKS | STATISTICS
+EVERY_TASK = TASKS | STATISTICS
 
 
 def in_words(task: str) -> str:

@@ -1,4 +1,4 @@
-"""Random draws for rows of scenes, which several processes may share (`training.distributed`).
+"""Random draws for rows of scenes, which several processes may share (`machines.distributed`).
 
 A Bernoulli draw uses 8 random bits, and 53 more bits in a tie.
 
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.distributed import own_rows
+from training.machines.distributed import own_rows
 
 
 def bernoulli(p: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -65,3 +65,8 @@ def categorical(weight: Tensor, generator: torch.Generator | None) -> Tensor:
     every[first : first + len(weight)] = weight.cpu()
     drawn = torch.multinomial(every, 1, generator=generator).squeeze(1)
     return drawn[first : first + len(weight)].to(weight.device)
+
+
+def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
+    """Return the log-odds of `count` events in `total` trials, with 1/2 added to both counts."""
+    return ((count + 0.5) / (total - count + 0.5)).log()

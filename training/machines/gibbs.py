@@ -28,8 +28,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from training.distributed import widest
 from training.machines.bernoulli import bernoulli, integers, uniform
+from training.machines.distributed import widest
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field

@@ -40,7 +40,7 @@ class BoltzmannMachine(nn.Module, ABC):
     """
 
     # True if single triples have residual weights besides the shared weights. The objective
-    # `objectives.relations` can fit the residual weights.
+    # `relation_likelihood` can fit the residual weights.
     has_residuals = False
 
     def __init__(self, spec: MachineSpec) -> None:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from app.inference.relations import SWEEPS
+from app.inference.weights import SWEEPS
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
 

@@ -17,7 +17,6 @@ import pytest
 from scipy.io import savemat
 
 from app.scene import CANONICAL
-from training.config import ConfigError, DataConfig
 from training.datasets import (
     READERS,
     AnnotatedObject,
@@ -30,7 +29,8 @@ from training.datasets import (
     read_scenes,
 )
 from training.datasets.readers import guess_format
-from training.pipeline import read_sources
+from training.fit.settings import ConfigError, DataConfig
+from training.runs.pipeline import read_sources
 
 Write = Callable[[Path], Path]
 

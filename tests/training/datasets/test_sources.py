@@ -8,7 +8,6 @@ import torch
 
 from app.scene import ObjectClass, Vocabulary
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
-from training.batches import scene_tensors
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
@@ -16,6 +15,7 @@ from training.datasets import (
     annotated_classes,
     encode,
 )
+from training.datasets.batches import scene_tensors
 from training.datasets.sources import BOXES, LISTS, SOURCES, meaning_of
 
 VOCABULARY = Vocabulary([ObjectClass("desk"), ObjectClass("monitor"), ObjectClass("pencil")])

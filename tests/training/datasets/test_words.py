@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from app.scene import ObjectClass, Vocabulary
-from training.config import DataConfig
 from training.datasets import DatasetError, indoor_vocabulary, words
 from training.datasets.words import class_vectors, read_word_vectors
-from training.pipeline import read_sources, split_and_encode
+from training.fit.settings import DataConfig
+from training.runs.pipeline import read_sources, split_and_encode
 
 WORDS = np.array(["coffee", "table", "zero", "the", "sofa"])
 VECTORS = np.array([[4, 0], [0, 2], [0, 0], [3, 3], [3, -4]], dtype=np.int8)

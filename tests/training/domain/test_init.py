@@ -10,12 +10,13 @@ import pytest
 
 from tests.training.commands import invoke
 from tests.training.domain.scenes import scene
-from training.config import ConfigError, data_folder, load_config
 from training.datasets import generate_rooms
 from training.datasets.jsonl import write_jsonl
 from training.datasets.rooms import DOMAINS
 from training.domain.proposal import propose
-from training.pipeline import prepare
+from training.fit.settings import ConfigError
+from training.runs.config import data_folder, load_config
+from training.runs.pipeline import prepare
 
 SCENES = generate_rooms(80, 0, DOMAINS["workplaces"])
 

@@ -7,10 +7,10 @@ from functools import cache
 import torch
 
 from app.registry import Artifact, Calibration, CountSlope, Thresholds
-from training.batches import SceneTensors, scene_tensors
 from training.datasets import annotated_classes, encode, generate_rooms, rooms_vocabulary
+from training.datasets.batches import SceneTensors, scene_tensors
 from training.machines import MachineSpec, build
-from training.publish import draft_artifact
+from training.runs.publish import draft_artifact
 
 VOCABULARY = rooms_vocabulary()
 STRUCTURE = torch.from_numpy(VOCABULARY.structure.copy())

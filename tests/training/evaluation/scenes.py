@@ -11,8 +11,8 @@ import torch
 
 from app.scene import pool_instances
 from tests.questions.artifacts import LARGER
-from training.batches import SceneTensors, scene_tensors
 from training.datasets import EncodedScene
+from training.datasets.batches import SceneTensors, scene_tensors
 from training.machines import build
 
 V = 5

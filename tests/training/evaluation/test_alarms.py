@@ -8,8 +8,8 @@ from math import comb
 import pytest
 
 from tests.training.evaluation.furnished_rooms import room_model, rooms
-from training.calibrate_objects import recalibrated
 from training.evaluation.alarms import ALARMS, EXCESS, Alarms, untouched_alarms
+from training.fit.calibrate_objects import recalibrated
 
 
 @pytest.mark.parametrize(("alarms", "scenes"), [(0, 9), (3, 9), (9, 9), (30, 200)])

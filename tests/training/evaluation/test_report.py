@@ -19,16 +19,17 @@ from tests.training.evaluation.scenes import (
     scene,
     tensors,
 )
-from training.batches import seen_triples
-from training.cases import some_scenes
-from training.evaluation.answers import QUESTIONS
+from training.datasets.batches import seen_triples
+from training.datasets.cases import some_scenes
+from training.evaluation.calibration_task import QUESTIONS
 from training.evaluation.contenders import (
     artifact_contender,
     floor_contender,
     independent_contender,
 )
-from training.evaluation.density import DensitySettings
-from training.evaluation.generation import held_out_halves
+from training.evaluation.density_task import DensitySettings
+from training.evaluation.generation_task import held_out_halves
+from training.evaluation.model import Contender
 from training.evaluation.report import (
     SourceReport,
     digest,
@@ -38,7 +39,7 @@ from training.evaluation.report import (
     run,
     settings_by_source,
 )
-from training.evaluation.setting import Contender, Setting
+from training.evaluation.setting import Setting
 from training.evaluation.tasks import EVERY_TASK, TASKS, WHOLE_SET
 
 V = LARGER["triway-local"].V

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from app.scene import Vocabulary
+from tests.training.research.baselines.furnished import STRUCTURE, furnished, tensors
+from training.domain.compare import COMPARED, compare, show, side_by_side
+from training.domain.sides import Side, held_out
+from training.evaluation.model import Contender
+from training.evaluation.tasks import in_words
+from training.fit.settings import Config, ConfigError
+from training.fit.trainer import new_machine
+from training.research.baselines import BASELINES
+from training.runs.config import with_settings
+from training.runs.pipeline import prepare, read_sources
+from training.runs.publish import as_stored, draft_artifact
+
+CONFIG = Config.model_validate(
+    {
+        "name": "small",
+        "data": {"sources": ["rooms"], "rooms": 120, "vocabulary": "rooms", "split": "stable"},
+        "machine": {"variant": "rbm", "form": "local", "H1": 4, "H2": 0, "K": 0},
+        "objective": {"name": "composite"},
+    }
+)
+
+
+def test_scenes_with_incomplete_lists_are_compared_on_relations_alone() -> None:
+    """Photographs list a few objects each: questions about objects leave these scenes out."""
+    train, validation, test = (furnished(60, seed=seed) for seed in range(3))
+    scenes = tensors([replace(scene, complete=k % 2 == 0) for k, scene in enumerate(test.scenes)])
+    fitted = [
+        Contender(
+            objects=BASELINES[objects].fit(train, validation, STRUCTURE).score,
+            relations=BASELINES["frequency table"].fit(train, validation, STRUCTURE).score,
+        )
+        for objects in ("EASE", "popularity")
+    ]
+    results = side_by_side(
+        ("a", "b"), (lambda _: fitted[0], lambda _: fitted[1]), scenes, STRUCTURE
+    )
+    scenes_of = {asked.task: asked.scenes for asked in results.asked if asked.row == "a"}
+    assert scenes_of["T1a relations"] == 60
+    assert scenes_of["T2 missing"] == 30
+    assert {row.task for row in results.differences} >= {"T1a relations", "T2 missing"}
+
+
+@pytest.mark.parametrize("lacking", [0, 1])
+def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacking) -> None:
+    """The second model has the classes in another order, all of them or all but one."""
+    scenes = prepare(CONFIG, Path())
+    classes = list(reversed(scenes.vocabulary.objects))
+    if lacking:
+        classes[0] = replace(classes[0], label="unheard of", aliases=())
+    machine = new_machine(CONFIG, scenes.training_data(), torch.Generator().manual_seed(0))
+    other = Vocabulary(classes, scenes.vocabulary.room_types)
+    a, b = (
+        Side(title, CONFIG, scenes.digests, draft_artifact(as_stored(machine), vocabulary))
+        for title, vocabulary in (("new", scenes.vocabulary), ("old", other))
+    )
+    found = compare(a, b, Path(), limit=None, examples=0, say=lambda _: None)
+    assert ["old lacks 1 of these classes" in note for note in found.notes] == [True] * lacking
+    assert {row.task for row in found.results.differences} == set(COMPARED)
+    console = Console(file=io.StringIO(), width=80)
+    show(found, console)
+    lines = [line.strip() for line in console.file.getvalue().splitlines()]
+    for row in found.results.differences:
+        assert in_words(row.task) in lines
+        # The name of a metric, its values and the verdict are on one line.
+        assert any(
+            line.startswith(f"{row.metric} ") and line.endswith(f"] {row.verdict}")
+            for line in lines
+        )
+
+
+def test_a_model_of_all_scenes_has_no_test_scenes() -> None:
+    side = Side("new", with_settings(CONFIG, {"data.split": "final"}), {}, None)
+    with pytest.raises(ConfigError, match="trained with --final"):
+        held_out(side, side, read_sources(side.config.data, Path()), Path())

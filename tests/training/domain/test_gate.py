@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from app.registry import Store
+from tests.http.stores import corrupt, make_store
+from training.datasets.batches import subset
+from training.domain.compare import RELATIONAL, Comparison, unmeasured
+from training.domain.gate import Usefulness, losses, measure_usefulness, seat
+from training.domain.sides import Side
+from training.evaluation.metrics import Figure
+from training.evaluation.results import Difference, Results
+from training.fit.settings import Config
+from training.fit.trainer import Trainer
+from training.runs.pipeline import SplitScenes, prepare
+from training.runs.publish import as_stored, draft_artifact
+
+
+def difference(task: str, metric: str, low: float, high: float) -> Difference:
+    return Difference("old", task, "held out", metric, Figure((low + high) / 2, low, high, 9))
+
+
+def comparison(*rows: tuple[str, str, float, float]) -> Comparison:
+    """Of rows (task, metric, low, high)."""
+    results = Results("new", (), tuple(difference(*row) for row in rows))
+    return Comparison(results, "old", 40, 20, True, (), ())
+
+
+@pytest.mark.parametrize(
+    ("metric", "low", "high", "margin", "worse"),
+    [
+        ("MRR", -0.20, -0.03, 0.02, True),
+        ("MRR", -0.20, -0.03, 0.05, False),  # within the margin
+        ("MRR", -0.20, 0.01, 0.02, False),  # may be chance
+        ("MRR", -0.20, -0.01, 0.02, False),  # worse for sure, beyond the margin not for sure
+        ("top-10", -0.20, -0.10, 0.02, False),  # not the primary metric
+        ("MRR", -0.20, -0.01, 0.0, True),
+    ],
+)
+def test_worse_is_what_lies_beyond_the_margin_entirely(metric, low, high, margin, worse) -> None:
+    found = comparison(("T2 missing", metric, low, high), ("T2 missing", "top-1", 0.1, 0.2))
+    assert [row.metric for row in found.worse_by(margin)] == (["MRR"] if worse else [])
+
+
+def test_a_refusal_names_every_metric_that_is_worse() -> None:
+    found = comparison(
+        ("T2 missing", "MRR", -0.3, -0.2),
+        ("T3 outliers, uniform", "hit@1", -0.3, -0.1),
+        ("T1b completion", "R-precision", 0, 1),
+    )
+    (text,) = losses(found, 0.02)
+    assert "missing object, MRR -0.250" in text
+    assert "hit@1" in text
+    assert "R-precision" not in text
+    assert found.to_dict()["differences"][0]["verdict"] == "worse"
+    assert losses(comparison(), 0) == []
+
+
+@pytest.mark.parametrize(
+    ("measured", "task", "expected"),
+    [
+        (("T2 missing", "T3b placement", "T1a relations"), "T2 missing", 2),
+        (("T2 missing", "T1a relations"), "T1a relations", 0),  # some scenes tell of relations
+        (("T2 missing",), "T2 missing", 0),  # nor does what is served know of any
+    ],
+)
+def test_a_model_without_relation_metrics_replaces_no_model_with_them(
+    measured, task, expected
+) -> None:
+    manifest = SimpleNamespace(metrics=[SimpleNamespace(task=name) for name in measured])
+    holder = Side("old", None, {}, SimpleNamespace(manifest=manifest))  # type: ignore[arg-type]
+    names = unmeasured([difference(task, "MRR", -0.1, 0.1)], holder)
+    assert len(names) == expected
+    assert set(names) < set(RELATIONAL)
+    reasons = losses(replace(comparison(("T2 missing", "MRR", -0.1, 0.1)), unmeasured=names), 0.02)
+    assert len(reasons) == bool(names)
+    for text in reasons:
+        assert "old was measured in relations of a scene, false relation, but new was not" in text
+        assert "worse" not in text
+
+
+# ---------------------------------------------------------------------- against the baselines
+
+
+def small(**training: float) -> Config:
+    return Config.model_validate(
+        {
+            "name": "small",
+            "data": {"sources": ["rooms"], "rooms": 240, "vocabulary": "rooms", "split": "stable"},
+            "machine": {"variant": "rbm", "form": "local", "H1": 16, "H2": 0, "K": 0},
+            "objective": {"name": "composite"},
+            "training": {"epochs": 12, "batch_size": 16, "learning_rate": 0.05} | training,
+        }
+    )
+
+
+@cache
+def rooms() -> SplitScenes:
+    return prepare(small(), Path())
+
+
+def usefulness(scenes: SplitScenes, config: Config) -> Usefulness:
+    """Of a model that learnt from these scenes, on the real ones."""
+    machine = as_stored(Trainer(config, scenes.training_data()).run().machine)
+    artifact = draft_artifact(machine, scenes.vocabulary)
+    return measure_usefulness(artifact, rooms().training_data(), limit=300, say=lambda _: None)
+
+
+def test_a_trained_model_is_better_than_popularity() -> None:
+    found = usefulness(rooms(), small())
+    assert found.objections() == []
+    assert found.differences["popularity"].low > 0.1
+    assert all(len(line) <= 80 for line in found.lines())
+
+
+@pytest.mark.parametrize("how", ["hardly trained", "labels shuffled between scenes"])
+def test_a_useless_model_is_refused_with_its_figures(how: str) -> None:
+    if how == "hardly trained":
+        found = usefulness(rooms(), small(epochs=1, learning_rate=1e-6))
+    else:
+        found = usefulness(rooms().shuffled(0), small())
+    popularity, ease = found.objections()
+    assert "not clearly better than popularity" in popularity
+    assert "worse than EASE" in ease
+    assert f"{found.differences['popularity'].value:+.3f}" in popularity
+    assert f"{found.scenes} test scenes" in popularity
+
+
+@pytest.mark.parametrize(
+    ("popularity", "reasons"),
+    [
+        (Figure(0.006, 0.001, 0.011, 90), 1),  # a model of shuffled labels, from few groups
+        (Figure(0.030, -0.001, 0.061, 90), 1),  # may be chance
+        (Figure(0.020, 0.001, 0.039, 90), 0),
+    ],
+)
+def test_a_useful_model_leads_popularity_for_sure_and_by_enough(popularity, reasons) -> None:
+    differences = {"popularity": popularity, "EASE": Figure(0.0, -0.1, 0.1, 90)}
+    found = Usefulness(30, 9, 0.417, {"popularity": 0.4, "EASE": 0.417}, differences)
+    required = "at least +0.020, whole interval above zero"
+    assert [required in text for text in found.objections()] == [True] * reasons
+    assert any(required in line for line in found.lines())
+
+
+def test_photographs_with_incomplete_lists_are_used_where_there_are_no_others() -> None:
+    data = rooms().training_data()
+    flags = [replace(scene, complete=False) for scene in data.test.scenes]
+    machine = as_stored(Trainer(small(epochs=1), data).run().machine)
+    artifact = draft_artifact(machine, rooms().vocabulary)
+    incomplete = replace(data, test=replace(data.test, scenes=flags))
+    found = measure_usefulness(artifact, incomplete, limit=300, say=lambda _: None)
+    assert found.ours is not None
+    assert found.scenes == len(flags)
+
+
+@pytest.mark.parametrize("which", ["few scenes", "few scenes with two classes"])
+def test_too_few_test_scenes_decide_nothing_and_are_refused(which) -> None:
+    data = rooms().training_data()
+    if which == "few scenes":
+        few = replace(data, test=subset(data.test, torch.arange(4)))
+    else:
+        v = torch.zeros_like(data.test.v)
+        v[:4] = data.test.v[:4]
+        few = replace(data, test=replace(data.test, v=v))
+    artifact = draft_artifact(
+        as_stored(Trainer(small(epochs=1), data).run().machine), rooms().vocabulary
+    )
+    found = measure_usefulness(artifact, few, limit=300, say=lambda _: None)
+    assert list(found.lines()) == []
+    assert "at least 6 groups" in found.objections()[0]
+
+
+# ------------------------------------------------------------------------------- what is served
+
+
+def test_an_alias_serves_a_model_or_nothing_that_can_be_compared_with(tmp_path) -> None:
+    store = Store(make_store(tmp_path / "store"))
+    found = seat(store, "default")
+    assert found.holder is not None
+    assert (found.holder.title, found.note) == ("home@1.0.0", "")
+    assert found.holder.config is None  # random weights do not say how they were trained
+    new = seat(store, "fresh")
+    assert (new.target, new.holder) == (None, None)
+    assert "fresh is a new alias" in new.note
+    corrupt(store.root, "home", "1.0.0")
+    broken = seat(store, "default")
+    assert str(broken.target) == "home@1.0.0"
+    assert broken.holder is None
+    assert "cannot be read" in broken.note

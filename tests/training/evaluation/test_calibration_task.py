@@ -1,0 +1,134 @@
+"""Calibration: the right answers are collected, with the right truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from app.questions import missing, relations
+from app.registry import CountSlope
+from tests.questions.artifacts import LARGER, artifact_of, calibration
+from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
+from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
+from training.datasets.cases import scene_of
+from training.evaluation.calibration_task import QUESTIONS, ask_outliers, collect, uncalibrated
+from training.evaluation.intruders import kinds_of_intruders
+
+ARTIFACT = artifact_of(larger_machine("triway-local"))
+V = LARGER["triway-local"].V
+DATA = tensors(random_scenes(30, V - 1), V)
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_every_question_is_asked_and_some_answers_are_true(question):
+    found = collect(ARTIFACT, DATA, QUESTIONS[question])
+    assert found.scenes == 30
+    assert 0 < found.truth.sum() < len(found.truth)
+    assert found.score.min() >= 0
+    assert found.score.max() <= 1
+    assert np.isfinite(found.metric("ECE").value)
+    assert found.metric("Brier skill").value <= 1
+
+
+def test_relations_are_compared_with_what_was_listed():
+    found = collect(ARTIFACT, DATA, QUESTIONS["relations"])
+    entry = DATA.scenes[4]
+    asked = replace(scene_of(entry, range(len(entry.instance_classes)), ()), room_type=None)
+    answers, _ = relations(ARTIFACT, asked)
+    names = ("left", "front", "on-top", "above")
+    listed = [
+        bool(entry.instance_holds[names.index(a.relation), a.subject, a.object]) for a in answers
+    ]
+    ours = found.scene == 4
+    assert found.score[ours].tolist() == [answer.probability for answer in answers]
+    assert found.truth[ours].tolist() == listed
+
+
+def test_unknown_relations_are_not_judged():
+    """A source of sentences lists what holds: of no unlisted relation is anything known."""
+    vague = [replace(entry, source="coco_captions", complete=False) for entry in DATA.scenes]
+    vague = [replace(entry, instance_observed=entry.instance_holds) for entry in vague]
+    for question in ("relations", "relations, others given", "placements"):
+        found = collect(ARTIFACT, tensors(vague, V), QUESTIONS[question])
+        assert (len(found.score), found.skipped) == (0, 30)
+
+
+def test_a_denied_relation_makes_its_kind_known():
+    """Of sentences: left(0, 1) is listed, which alone says nothing of how often left is off."""
+    entry = scene([0, 1], [(0, 0, 1)], source="coco_captions")
+
+    def judged(*denied):
+        observed = entry.instance_holds.copy()
+        for triple in denied:
+            observed[triple] = True
+        told = replace(entry, instance_observed=observed)
+        return collect(ARTIFACT, tensors([told], V), QUESTIONS["relations"]).truth.tolist()
+
+    assert judged() == []
+    assert judged((1, 1, 0)) == [False]
+    assert sorted(judged((0, 1, 0))) == [False, True]
+
+
+def test_places_are_asked_whether_something_is_hidden_there_or_not():
+    found = collect(ARTIFACT, DATA, QUESTIONS["missing at a place"])
+    hidden = np.bincount(found.scene, weights=found.truth)
+    asked = np.bincount(found.scene) > 0
+    assert 0 < (hidden[asked] > 0).mean() < 1
+
+
+def test_hidden_classes_are_true_and_nothing_else():
+    """All absent classes are answered here; of n classes 1 to n - 1 are hidden."""
+    found = collect(ARTIFACT, DATA, QUESTIONS["missing"])
+    hidden = np.bincount(found.scene, weights=found.truth)
+    sizes = np.array([(entry.evidence.classes < V - 1).sum() for entry in DATA.scenes])
+    assert bool(((hidden >= 1) & (hidden < sizes)).all())
+    assert len(set(hidden.tolist())) > 1
+    answered = np.bincount(found.scene)
+    assert answered.tolist() == (V - 1 - sizes + hidden).tolist()
+    again = collect(ARTIFACT, DATA, QUESTIONS["missing"])
+    assert again.truth.tolist() == found.truth.tolist()
+
+
+@pytest.mark.parametrize("question", ["missing", "missing at a place", "outliers"])
+def test_scenes_with_incomplete_object_lists_are_not_asked_about_objects(question):
+    """An unlisted class may be there all the same."""
+    some = tensors([replace(entry, complete=False) for entry in DATA.scenes], V)
+    found = collect(ARTIFACT, some, QUESTIONS[question])
+    assert (len(found.score), found.skipped) == (0, 30)
+
+
+def test_half_of_the_scenes_have_an_intruder():
+    """Of 30 fair draws fewer than 5 or more than 25 happen with probability below 1e-4."""
+    found = collect(ARTIFACT, DATA, QUESTIONS["outliers"])
+    intruders = np.bincount(found.scene, weights=found.truth, minlength=30)
+    assert set(intruders.tolist()) == {0.0, 1.0}
+    assert 5 <= intruders.sum() <= 25
+
+
+def test_intruders_are_of_every_kind():
+    """Uniform, popular, and typical of another room type; each absent and no structure."""
+    data, train = rooms(40, 1), rooms(400, 2)
+    found = kinds_of_intruders(data, STRUCTURE, train)
+    assert set(found) == {(entry.source, entry.scene_id) for entry in data.scenes}
+    for entry in data.scenes:
+        drawn = found[entry.source, entry.scene_id]
+        assert not np.isin(drawn, entry.evidence.classes).any()
+        assert not STRUCTURE.numpy()[drawn].any()
+    assert max(map(len, found.values())) == 3
+    alone = kinds_of_intruders(data, STRUCTURE, None)
+    assert {len(drawn) for drawn in alone.values()} <= {0, 1}
+    ask = partial(ask_outliers, intruders=found)
+    answers = collect(room_model(), data, ask)
+    assert set(np.bincount(answers.scene, weights=answers.truth).tolist()) == {0.0, 1.0}
+
+
+def test_the_uncalibrated_model_answers_with_its_log_odds():
+    plain = uncalibrated(
+        replace(ARTIFACT, calibration=calibration(4, missing=CountSlope(slope=3.0)))
+    )
+    asked = replace(scene_of(DATA.scenes[0], range(2), ()), room_type=None)
+    for answer in missing(plain, asked):
+        assert answer.probability == pytest.approx(1 / (1 + np.exp(-answer.log_odds)), rel=1e-4)

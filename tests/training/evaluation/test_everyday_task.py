@@ -1,0 +1,190 @@
+"""Everyday facts: asked as a client of the service asks them, by one module, for acceptance."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+from app.questions import relations
+from app.registry import Store, load_model_set
+from app.scene import Scene, SceneObject, opposite
+from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
+from training.evaluation import everyday_task as everyday
+from training.evaluation.everyday_task import (
+    EVERYDAY,
+    LINES,
+    everyday_task,
+    facts_digest,
+    facts_file,
+)
+from training.evaluation.model import Contender
+from training.evaluation.report import SourceReport, digest, evaluate, run
+from training.evaluation.setting import Setting
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+FOLDER = REPOSITORY / EVERYDAY
+STORE = REPOSITORY / "model_store"
+ROOM = "bedroom"
+FACTS = {
+    "relations": [
+        {"subject": "lamp", "relation": "on-top", "object": "nightstand"},
+        {"subject": "lamp", "relation": "under", "object": "zeppelin"},
+        {"subject": "zeppelin", "relation": "under", "object": "airship"},
+    ],
+    "missing": [
+        {"objects": ["bed", "zeppelin"], "expected": ["pillow", "lamp"]},
+        {"objects": ["zeppelin"], "expected": ["pillow"]},
+    ],
+    "missing_at": [
+        {
+            "objects": ["bed", "nightstand"],
+            "at": {"relation": "on-top", "object": "nightstand"},
+            "expected": ["lamp", "book"],
+        },
+        {"objects": ["bed"], "at": {"relation": "on-top", "object": "desk"}, "expected": ["lamp"]},
+        {
+            "objects": ["bed", "nightstand"],
+            "at": {"relation": "on-top", "object": "night stand"},
+            "expected": ["lamp", "book"],
+        },
+    ],
+    "plain": [{"room": ROOM, "objects": ["bed", "pillow", "lamp"]}],
+    "intruders": [
+        {"room": ROOM, "objects": ["bed", "pillow", "lamp", "lamp"], "intruder": "toilet"}
+    ],
+    "rooms": [{"room": ROOM, "one_of": ["bed"], "never": ["toilet"]}],
+    "seeds": [5, 6],
+}
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    (tmp_path / "facts.json").write_text(json.dumps(FACTS))
+    return tmp_path
+
+
+def score(monkeypatch, capsys, *arguments: str) -> dict[str, tuple[int, int]]:
+    """What the script that came with the facts prints."""
+    monkeypatch.setattr(sys, "argv", ["score.py", *arguments])
+    runpy.run_path(str(FOLDER / "score.py"), run_name="__main__")
+    lines: dict[str, str] = json.loads(capsys.readouterr().out)
+    return {name: tuple(map(int, value.split("/"))) for name, value in lines.items()}
+
+
+def ask_everyday(artifact, folder: Path) -> dict[str, tuple[int, int]]:
+    found = everyday.ask_everyday(artifact, folder)
+    return {line: tuple(map(sum, zip(*each, strict=True))) for line, each in found.items()}
+
+
+needs_facts = pytest.mark.skipif(facts_file(FOLDER) is None, reason="the facts are not here")
+
+
+@needs_facts
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "made"), [("indoor-triway", False), ("indoor-rbm", True)])
+def test_the_service_gives_the_same_eleven_lines(shipped, model, made, folder, monkeypatch, capsys):
+    place = folder if made else FOLDER
+    artifact = load_model_set(Store(STORE)).resolve(model)
+    expected = score(monkeypatch, capsys, shipped.url, str(place / "facts.json"), "--model", model)
+    found = ask_everyday(artifact, place)
+    assert found == expected
+    assert tuple(found) == LINES
+
+
+def test_unknown_labels_count_as_missed(folder):
+    found = ask_everyday(room_model(), folder)
+    assert [found[line][1] for line in LINES] == [3, 3, 3, 2, 3, 1, 1, 1, 16, 16, 16]
+    assert found["missing: an expected object is among five"][0] <= 1
+
+
+def test_a_fact_and_its_mirror_image_are_the_same_fact(tmp_path):
+    """The likeliest relation of two objects is so too from the other object, as its opposite."""
+    model, names = room_model(), ("lamp", "nightstand")
+    things = (SceneObject(name, name, model.vocabulary.index(name)) for name in names)
+    found, _ = relations(model, Scene(tuple(things)), top_k=50)
+    first = max(found, key=lambda answer: answer.probability)
+    subject, object_ = names[first.subject], names[first.object]
+    mirrored = opposite(first.relation)
+    facts = [
+        {"subject": subject, "relation": first.relation, "object": object_},
+        {"subject": object_, "relation": mirrored, "object": subject},
+        {"subject": subject, "relation": mirrored, "object": object_},
+    ]
+    (tmp_path / "facts.json").write_text(json.dumps(FACTS | {"relations": facts}))
+    assert ask_everyday(model, tmp_path)["relations: the fact is the likeliest of eight"] == (2, 3)
+
+
+def test_the_task_has_a_metric_for_each_line(folder):
+    setting = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
+    contender = Contender(artifact=room_model())
+    outcome = everyday_task(contender, setting)
+    assert tuple(outcome.metrics) == LINES
+    for line, (hits, asked) in ask_everyday(room_model(), folder).items():
+        assert outcome.metrics[line].value == pytest.approx(hits / asked)
+        assert outcome.metrics[line].n == asked
+    assert everyday_task(Contender(), setting) is None
+
+
+def test_an_absent_folder_leaves_the_task_out(tmp_path):
+    contender = Contender(artifact=room_model())
+    for place in (None, tmp_path / "nowhere"):
+        assert everyday_task(contender, Setting(rooms(5, 1), STRUCTURE, everyday=place)) is None
+    with pytest.raises(FileNotFoundError, match=r"no facts\.json"):
+        ask_everyday(room_model(), tmp_path)
+    assert facts_digest(tmp_path) == ""
+
+
+def test_other_facts_are_other_questions(folder):
+    before = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
+    report = SourceReport("pooled", digest(before))
+    assert list(run(Contender(), before, report, tasks=("Everyday",))) == ["Everyday"]
+    (folder / "facts.json").write_text(json.dumps(FACTS | {"seeds": [7]}))
+    with pytest.raises(ValueError, match="other scenes or tasks"):
+        list(run(Contender(), before, report, tasks=("T2 missing",)))
+
+
+def test_a_card_has_the_lines_once(folder):
+    rows = evaluate(room_model(), rooms(8, 1), STRUCTURE, rooms(9, 2), limit=2, everyday=folder)
+    found = [(row.source, row.metric) for row in rows if row.task == "Everyday"]
+    assert found == [("facts", line) for line in LINES]
+
+
+def test_no_other_module_reads_the_facts():
+    """Neither the file nor its folder is named elsewhere."""
+    named = re.compile(r"facts\.json|shared/everyday|/\s*[\"']everyday\b|[\"']\S*/everyday\b")
+    own = REPOSITORY / "training/evaluation/everyday_task.py"
+    sources = [*(REPOSITORY / "training").rglob("*"), *(REPOSITORY / "app").rglob("*.py")]
+    for path in sources:
+        if path.suffix in (".py", ".toml", ".json") and path != own:
+            text = path.read_text(encoding="utf-8")
+            assert not named.search(text), f"{path} names the everyday facts"
+
+
+def test_no_training_or_tuning_asks_the_facts():
+    """What imports the module publishes or compares finished models."""
+    used = re.compile(r"evaluation(?:\.everyday| import everyday)|ask_everyday")
+    users = {
+        str(path.relative_to(REPOSITORY))
+        for path in (REPOSITORY / "training").rglob("*.py")
+        if used.search(path.read_text(encoding="utf-8"))
+    }
+    users.discard("training/evaluation/everyday_task.py")
+    assert users == {
+        "training/cli.py",
+        "training/evaluation/report.py",
+        "training/evaluation/tasks.py",
+        "training/research/benchmark.py",
+        "training/runs/publish.py",
+    }
+
+
+def test_publishing_asks_after_everything_is_fitted():
+    """The facts are opened by `evaluate` alone, which takes a calibrated model."""
+    text = (REPOSITORY / "training/runs/publish.py").read_text(encoding="utf-8")
+    assert text.count("EVERYDAY") == 2
+    assert text.index("everyday=EVERYDAY") > text.index("judge(calibrated)")

@@ -1,0 +1,150 @@
+"""With and without evidence: what is told, what is asked, and that these never meet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.scene import Scene
+from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
+from tests.training.evaluation.scenes import scene, tensors
+from training.evaluation import evidence_tasks as evidence
+from training.evaluation.asking import LeakError
+from training.evaluation.evidence_tasks import (
+    halves,
+    intrusions,
+    missing_evidence_task,
+    outliers_evidence_task,
+    reciprocal_rank,
+    relations_evidence_task,
+    removals,
+    told,
+)
+from training.evaluation.model import Contender
+from training.evaluation.setting import Setting
+
+DATA = rooms(20, 3)
+PLAIN = STRUCTURE.numpy()
+TASKS = {
+    "MRR": missing_evidence_task,
+    "hit@1": outliers_evidence_task,
+    "R-precision": relations_evidence_task,
+}
+
+
+@pytest.mark.parametrize("kind", ["relations", "poses", "room type"])
+def test_a_removed_class_is_nowhere(kind):
+    cases = list(removals(DATA, PLAIN, kind))
+    assert len(cases) > 20
+    for case in cases:
+        for asked in case.scenes:
+            assert case.target not in {thing.class_index for thing in asked.objects}
+        bare, more = case.scenes
+        assert (bare.relations, bare.poses, bare.room_type) == (None, None, None)
+        assert bare.objects == more.objects
+        assert (more.room_type is not None) == (kind == "room type")
+        assert (more.poses is not None) == (kind == "poses")
+        assert bool(more.relations) == (kind != "room type")
+
+
+def test_all_relations_among_what_stays_are_told():
+    encoded = DATA.scenes[0]
+    kept = np.flatnonzero(encoded.instance_classes != encoded.instance_classes[0]).tolist()
+    _, more = told(encoded, kept, "relations")
+    listed = {
+        (int(a), kept.index(i), kept.index(j))
+        for a, i, j in np.argwhere(encoded.instance_holds)
+        if i in kept and j in kept
+    }
+    assert set(more.relations) == listed
+
+
+@pytest.mark.parametrize("kind", ["relations", "poses"])
+def test_no_asked_pair_is_told(kind):
+    cases = list(halves(DATA, PLAIN, kind))
+    assert cases
+    for case in cases:
+        _, more = case.scenes
+        for a, i, j in more.relations:
+            assert not case.asked[a, i, j]
+        if more.poses is not None:
+            assert not (more.poses.observed & case.asked).any()
+        assert not (case.truth & ~case.asked).any()
+        own = DATA.scenes[case.place].instance_classes
+        assert not case.asked[:, PLAIN[own]].any()
+
+
+@pytest.mark.parametrize("kind", ["relations", "poses"])
+def test_nothing_is_known_of_an_intruder_but_its_label(kind):
+    intruders = np.array(
+        [np.flatnonzero((one == 0) & ~PLAIN)[0] for one in DATA.v.numpy()], dtype=np.int64
+    )
+    intruders[0] = -1
+    cases = list(intrusions(room_model(), DATA, intruders, kind))
+    assert 0 not in {case.place for case in cases}
+    for case in cases:
+        _, more = case.scenes
+        assert case.target == len(more.objects) - 1
+        assert more.objects[-1].class_index == intruders[case.place]
+        assert not any(case.target in (i, j) for _, i, j in more.relations)
+        if kind == "poses":
+            assert not more.poses.observed[:, case.target].any()
+
+
+def test_reciprocal_ranks_by_hand(monkeypatch):
+    p = np.array([0.1, 0.4, 0.4, -np.inf, 0.4])
+    monkeypatch.setattr(evidence, "missing_probabilities", lambda *_: p)
+    assert reciprocal_rank(None, Scene(()), 0) == pytest.approx(1 / 4)
+    assert reciprocal_rank(None, Scene(()), 2) == pytest.approx((1 + 1 / 2 + 1 / 3) / 3)
+
+
+@pytest.mark.parametrize("metric", TASKS)
+def test_a_change_is_the_difference_of_both_sides(metric):
+    outcome = TASKS[metric](Contender(artifact=room_model()), Setting(DATA, STRUCTURE, limit=8))
+    kinds = ("relations", "poses") if metric == "R-precision" else evidence.KINDS
+    for kind in kinds:
+        change, given, without = (
+            outcome.metrics[name]
+            for name in (
+                f"change of {metric}, {kind}",
+                f"{metric}, {kind}",
+                f"{metric}, {kind} withheld",
+            )
+        )
+        assert change.value == pytest.approx(given.value - without.value)
+        assert 0 <= without.value <= 1
+        assert change.scenes == outcome.scenes
+    assert next(iter(outcome.metrics)) == f"change of {metric}, relations"
+
+
+@pytest.mark.parametrize("metric", TASKS)
+def test_scenes_without_relations_ask_nothing(metric):
+    silent = tensors([scene([0, 1, 2], room=0) for _ in range(3)], len(VOCABULARY))
+    assert TASKS[metric](Contender(artifact=room_model()), Setting(silent, STRUCTURE)) is None
+    assert TASKS[metric](Contender(), Setting(DATA, STRUCTURE)) is None
+
+
+def test_a_source_without_positions_has_no_poses():
+    flat = [replace(one, instance_positions=None, room_type=-1) for one in DATA.scenes]
+    data = replace(DATA, scenes=flat)
+    outcome = missing_evidence_task(
+        Contender(artifact=room_model()), Setting(data, STRUCTURE, limit=5)
+    )
+    assert {name.split(", ")[1].split()[0] for name in outcome.metrics} == {"relations"}
+
+
+def test_a_planted_cheater_is_caught(monkeypatch):
+    """A model that counts the questions, and so knows what was removed."""
+    targets = iter([case.target for case in removals(DATA, PLAIN, "relations") for _ in "ab"] * 3)
+
+    def cheat(artifact, asked):
+        p = np.full(len(VOCABULARY), 0.1)
+        p[next(targets)] = 0.9
+        return p
+
+    monkeypatch.setattr(evidence, "missing_probabilities", cheat)
+    setting = Setting(DATA, STRUCTURE, limit=None)
+    with pytest.raises(LeakError, match="leaks information"):
+        missing_evidence_task(Contender(artifact=room_model()), setting)

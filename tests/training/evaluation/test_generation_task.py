@@ -1,0 +1,210 @@
+"""T4: each figure by hand, the floor, and samples of small machines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
+from training.evaluation.contradictions import Contradictions
+from training.evaluation.generation_task import (
+    copies,
+    discrepancy,
+    drawn_of,
+    generation_metrics,
+    hamming,
+    held_out_halves,
+    independent_sampler,
+    machine_sampler,
+    marginal_error,
+    median_distance,
+    pair_correlation,
+    scene_sampler,
+)
+from training.evaluation.model import Drawn
+from training.evaluation.setting import Setting
+
+X = torch.tensor([[1.0, 0, 0], [1, 1, 0]])
+Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 1]])
+
+
+def test_distances_and_copies_by_hand():
+    assert hamming(X, Y).tolist() == [[0, 2, 3], [1, 3, 2]]
+    # 2, 3 and 1 between the rows of Y.
+    assert median_distance(Y) == 2.0
+    assert copies(X, Y).tolist() == [1.0, 0.0]
+
+
+def test_discrepancy_and_marginal_error_by_hand():
+    k = lambda d: np.exp(-np.asarray(d) / 2.0)  # noqa: E731
+    expected = k(1) + k([2, 3, 1]).mean() - 2 * k([[0, 2, 3], [1, 3, 2]]).mean()
+    at = discrepancy(Y, X, 2.0)
+    assert at(np.ones(3)) == pytest.approx(expected)
+    # A scene drawn twice is no pair of its own.
+    twice = k(1) + k(2) - 2 * (2 * k([0, 1]).mean() + k([2, 3]).mean()) / 3
+    assert at(np.array([2.0, 1, 0])) == pytest.approx(twice)
+    marginal = marginal_error(Y.numpy().astype(float), X.numpy().astype(float))
+    assert marginal(np.ones(3)) == pytest.approx((2 / 3 + 1 / 6 + 2 / 3) / (4 / 3))
+
+
+def test_discrepancy_of_one_distribution_is_zero_on_average():
+    """300 pairs of samples from the same law; the mean is within 5 standard errors of zero."""
+    rng = torch.Generator().manual_seed(0)
+    p = torch.tensor([0.1, 0.5, 0.3, 0.8])
+    values = []
+    for _ in range(300):
+        x, y = (torch.rand(20, 4, generator=rng) < p for _ in range(2))
+        values.append(discrepancy(x.float(), y.float(), 2.0)(np.ones(20)))
+    assert abs(np.mean(values)) < 5 * np.std(values) / np.sqrt(300)
+    other = (torch.rand(20, 4, generator=rng) < 1 - p).float()
+    assert discrepancy(x.float(), other, 2.0)(np.ones(20)) > 0.1
+
+
+def test_pair_correlation_by_hand():
+    """Covariances of (0,1), (0,2), (1,2) against those of another sample."""
+    rng = np.random.default_rng(0)
+    x, y = (rng.random((30, 3)) < 0.5 for _ in range(2))
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    cov = [[np.cov(v.T.astype(float), bias=True)[p] for p in pairs] for v in (x, y)]
+    expected = np.corrcoef(*cov)[0, 1]
+    assert pair_correlation(y.astype(float), x.astype(float))(np.ones(30)) == pytest.approx(
+        expected
+    )
+    same = pair_correlation(y.astype(float), y.astype(float))
+    assert same(np.ones(30)) == pytest.approx(1.0)
+
+
+def test_contradictions_by_hand():
+    """Mirrored pairs are counted by pair; cycles of on-top are found whatever their length.
+
+    left(0,1), left(1,0), left(0,2), front(2,2): two related pairs, one of them both ways. Then a
+    tower of three; the same with its foot on its top; nothing but left, in a circle.
+    """
+    holds = torch.zeros(4, 4, 3, 3)
+    for a, i, j in [(0, 0, 1), (0, 1, 0), (0, 0, 2), (1, 2, 2)]:
+        holds[3, a, i, j] = 1
+    for k, i, j in [(0, 0, 1), (0, 1, 2), (1, 0, 1), (1, 1, 2), (1, 2, 0)]:
+        holds[k, 2, i, j] = 1
+    holds[2, 0] = torch.eye(3).roll(1, 1)
+    holds[:, 2, 1, 1] = 1  # of itself: two books, one on the other
+    found = Contradictions.of(holds)
+    assert (int(found.related[3]), int(found.mirrored[3])) == (2, 1)
+    assert found.stacked.tolist() == [True, True, False, False]
+    assert found.cyclic.tolist() == [False, True, False, False]
+    assert set(found.metrics()) == {"mirrored relations", "on-top cycles"}
+
+
+def test_halves_keep_groups_together():
+    scenes = tensors([scene([0, 1], group=f"g{k // 2}") for k in range(40)])
+    first, second = held_out_halves(Setting(scenes, torch.zeros(5, dtype=torch.bool)))
+    assert len(first) + len(second) == 40
+    assert len(first) >= 5
+    assert len(second) >= 5
+    assert not {s.group for s in first.scenes} & {s.group for s in second.scenes}
+
+
+def test_held_out_scenes_are_their_own_floor():
+    """Scenes drawn from the same source beat independent classes that were never together."""
+    kinds = ([0, 1, 2], [3, 4, 5], [6, 7, 8])
+    train, held_out, floor = (
+        tensors([scene(kinds[k % 3]) for k in range(60)], WIDE) for _ in range(3)
+    )
+    asked = torch.ones(WIDE, dtype=torch.bool)
+
+    def figures(drawn: Drawn):
+        metrics = generation_metrics(drawn, held_out.v, train.v, asked, 2.0)
+        return {name: metric.value for name, metric in metrics.items()}
+
+    nothing = torch.zeros(60, WIDE, dtype=torch.bool)
+    best = figures(drawn_of(floor))
+    plain = figures(independent_sampler(train)(nothing, torch.full((60,), -1), 0))
+    assert best["pair correlation"] == pytest.approx(1.0)
+    assert best["marginal error"] == pytest.approx(0.0, abs=1e-6)
+    assert best["copies of training scenes"] == 1.0
+    assert plain["MMD²"] > best["MMD²"] + 0.1
+    assert plain["pair correlation"] < 0.9
+    assert plain["marginal error"] < 0.5
+
+
+def test_scenes_that_fit_are_their_own_sampler():
+    scenes = tensors([scene([0, 1], room=0), scene([1, 2], room=1), scene([3], room=1)], WIDE)
+    sample = scene_sampler(scenes)
+    nothing, nowhere = torch.zeros(3, WIDE, dtype=torch.bool), torch.full((3,), -1)
+    assert bool((sample(nothing, nowhere, 0).v == scenes.v).all())
+    assert bool((sample(nothing, scenes.room, 0).v == scenes.v).all())
+    given = nothing.clone()
+    given[:, 2] = True
+    assert bool((sample(given, nowhere, 0).v == scenes.v[1]).all())
+    with pytest.raises(ValueError, match="test scene 0"):
+        sample(given, torch.zeros(3, dtype=torch.int64), 0)
+
+
+def test_given_one_class_scenes_count_by_their_size():
+    """Enumerated: draw a class among all mentions, then a scene that has it; large ones come up
+    more often, and held-out scenes that count by size have the same marginals."""
+    held_out = torch.tensor([[1.0, 1, 1, 0], [1, 0, 0, 0], [0, 0, 1, 1]])
+    drawn = [
+        held_out[k]
+        for i in held_out.nonzero()[:, 1].tolist()
+        for k in held_out[:, i].nonzero().squeeze(1).tolist()
+        for _ in range(2 // int(held_out[:, i].sum()))
+    ]
+    asked = torch.ones(4, dtype=torch.bool)
+    size = held_out.sum(1)
+    for emphasis, expected in ((size, 0.0), (None, 1 / 6)):
+        metrics = generation_metrics(
+            Drawn(torch.stack(drawn)), held_out, held_out, asked, 2.0, emphasis
+        )
+        assert metrics["marginal error"].value == pytest.approx(expected, abs=1e-9)
+
+
+def test_independent_classes_have_the_frequencies_of_training():
+    """2,000 draws: each frequency within 5 standard errors."""
+    train = tensors(random_scenes(50), WIDE)
+    given = torch.zeros(2000, WIDE, dtype=torch.bool)
+    given[:, 3] = True
+    v = independent_sampler(train)(given, torch.full((2000,), -1), 0).v
+    p = train.v.mean(0)
+    error = (v.mean(0) - p).abs()
+    error[3] = 0
+    assert bool((error <= 5 * (p * (1 - p) / 2000).sqrt()).all())
+    assert bool((v[:, 3] == 1).all())
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_machines_are_sampled_from_their_distribution(name):
+    """Marginals of 2,000 chains of 20 sweeps, within 5 standard errors of the exact ones."""
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    given = torch.zeros(2000, machine.spec.V, dtype=torch.bool)
+    room = torch.full((2000,), -1)
+    drawn = machine_sampler(machine, steps=20)(given, room, 0)
+    p = joint.p @ joint.v
+    deviation = (p * (1 - p) / 2000).sqrt()
+    assert bool(((drawn.v.mean(0) - p).abs() < 5 * deviation).all())
+    if machine.spec.G:
+        return  # Relations that imply each other have no joint: tests/machines/test_implications.
+    grid = torch.zeros(len(joint.v), machine.spec.A, machine.spec.V, machine.spec.V)
+    edges = joint.edges
+    present = joint.r * edges.ends_present(joint.v)
+    row, unit = present.nonzero(as_tuple=True)
+    ends = (getattr(edges, end)[0][unit] for end in ("relation", "subject", "object"))
+    grid[row, *ends] = 1.0
+    exact_pairs, ours_pairs = Contradictions.of(grid), drawn.contradictions
+    for exact, ours in (
+        (exact_pairs.related, ours_pairs.related),
+        (exact_pairs.mirrored, ours_pairs.mirrored),
+    ):
+        mean = joint.p @ exact.double()
+        spread = (joint.p @ (exact.double() - mean) ** 2 / 2000).sqrt()
+        assert abs(ours.double().mean() - mean) <= 5 * spread + 1e-9
+
+
+def test_given_classes_stay():
+    machine = small_machine("triway-local-two-layers")
+    given = torch.tensor([[True, False]]).expand(50, -1)
+    drawn = machine_sampler(machine, steps=5)(given, torch.full((50,), -1), 1)
+    assert bool((drawn.v[:, 0] == 1).all())
+    assert 0 < float(drawn.v[:, 1].mean()) < 1

@@ -1,0 +1,180 @@
+"""T1 pairs by hand: what is asked, what is right, and what is new."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
+from tests.training.evaluation.scenes import (
+    NO_STRUCTURE,
+    WIDE,
+    WIDE_STRUCTURE,
+    flat,
+    knowing,
+    random_scenes,
+    scene,
+    tensors,
+)
+from training.datasets.batches import seen_triples
+from training.evaluation import pair_task as pairs
+from training.evaluation.asking import LeakError, labels_alone, relation_probabilities
+from training.evaluation.model import Contender
+from training.evaluation.pair_task import RARE, pairs_task, service_score, vertical_pairs
+from training.evaluation.setting import Setting
+
+LEFT, ON, ABOVE = 0, 2, 3
+DATA = tensors(random_scenes(20), WIDE)
+
+
+def log_odds(p):
+    """A relation score of the same values everywhere, by relation and direction of the places."""
+
+    def score(batch):
+        n = batch.classes.shape[1]
+        values = torch.full(batch.holds.shape, -20.0)
+        for (a, back), value in p.items():
+            mask = torch.ones(n, n).triu(1).T if back else torch.ones(n, n).triu(1)
+            values[:, a] += mask * (torch.tensor(value).logit() + 20)
+        return values
+
+    return score
+
+
+def test_only_vertical_relations_between_two_things_are_asked():
+    structure = NO_STRUCTURE.clone()
+    structure[3] = True
+    data = tensors(
+        [
+            scene([0, 1, 2, 3], [(ON, 1, 0), (LEFT, 0, 1), (LEFT, 1, 2), (ON, 2, 3)]),
+            scene([0, 1], [(LEFT, 0, 1)]),
+        ]
+    )
+    (asked,) = vertical_pairs(data, structure)
+    assert asked.classes.tolist() == [[0, 1]]
+    # left(0, 1) and on-top(1, 0): the first to the second, then back.
+    assert np.flatnonzero(asked.listed[0]).tolist() == [LEFT, 4 + ON]
+
+
+EITHER = [scene([0, 1], [(ON, 1, 0)]), scene([0, 1], [(ON, 0, 1)])]
+SEVERAL = [scene([0, 1], [(ON, 1, 0), (LEFT, 0, 1)])]
+
+
+@pytest.mark.parametrize(
+    ("scenes", "p", "accuracy", "log_loss"),
+    [
+        # on-top back has .6 of a total of 1: it is the likeliest, and its share is .6.
+        (
+            EITHER,
+            {(ON, True): 0.6, (ON, False): 0.3, (LEFT, False): 0.1},
+            1 / 2,
+            -(np.log(0.6) + np.log(0.3)) / 2,
+        ),
+        # Any listed relation is right.
+        (SEVERAL, {(ON, True): 0.3, (LEFT, False): 0.6, (ABOVE, True): 0.1}, 1.0, -np.log(0.9)),
+    ],
+)
+def test_accuracy_and_log_loss_by_hand(scenes, p, accuracy, log_loss):
+    setting = Setting(tensors(scenes), NO_STRUCTURE)
+    metrics = pairs_task(Contender(relations=log_odds(p)), setting).metrics
+    assert metrics["accuracy"].value == metrics["accuracy, vertical"].value == accuracy
+    assert metrics["log-loss"].value == pytest.approx(log_loss, rel=1e-4)
+
+
+def test_perfect_and_ignorant_scores():
+    setting = Setting(DATA, WIDE_STRUCTURE)
+    assert pairs_task(Contender(relations=knowing(DATA)), setting).metrics["accuracy"].value == 1
+    ignorant = pairs_task(Contender(relations=flat), setting).metrics
+    listed = np.concatenate([one.listed for one in vertical_pairs(DATA, WIDE_STRUCTURE)])
+    assert ignorant["accuracy"].value == pytest.approx(listed.mean())
+    assert ignorant["log-loss"].value == pytest.approx(-np.log(listed.mean(1)).mean())
+
+
+def test_pairs_without_a_possible_relation_count_as_a_guess():
+    data = tensors([scene([0, 1], [(ON, 1, 0)])])
+
+    def never(batch):
+        return torch.full(batch.holds.shape, -torch.inf)
+
+    metrics = pairs_task(Contender(relations=never), Setting(data, NO_STRUCTURE)).metrics
+    assert metrics["log-loss"].value == pytest.approx(np.log(8))
+    assert metrics["accuracy"].value == pytest.approx(1 / 8)
+
+
+def test_unseen_pairs_are_those_that_no_training_relation_joins():
+    data = tensors([scene([0, 1, 2], [(ON, 1, 0), (ON, 2, 1)])])
+    # left(1, 0) is listed in training: the pair is seen, whatever the relation.
+    train = tensors([scene([0, 1, 2], [(LEFT, 1, 0)])])
+    for seen in (None, seen_triples(train.scenes, 5)):
+        setting = Setting(data, NO_STRUCTURE, train, seen)
+        metrics = pairs_task(Contender(relations=flat), setting).metrics
+        assert (metrics["accuracy"].n, metrics["accuracy, unseen pairs"].n) == (2, 1)
+    unknown = pairs_task(Contender(relations=flat), Setting(data, NO_STRUCTURE)).metrics
+    assert "accuracy, unseen pairs" not in unknown
+
+
+def test_rare_classes_are_those_that_training_relates_to_few():
+    """Class 0 is related to RARE + 1 others, all others to it alone: (0, 1) has a rare end."""
+    V = RARE + 3
+    train = tensors([scene([0, k], [(ON, k, 0)]) for k in range(1, V - 1)], V)
+    none = torch.zeros(V, dtype=torch.bool)
+    for classes, rare in (([0, 1], 1), ([0, V - 1], 1)):
+        data = tensors([scene(classes, [(ON, classes[1], 0)])], V)
+        metrics = pairs_task(Contender(relations=flat), Setting(data, none, train)).metrics
+        assert metrics["accuracy, rare classes"].n == rare
+    often = [scene([a, b], [(ON, a, b)]) for a in range(V) for b in range(a)]
+    train = tensors(often, V)
+    metrics = pairs_task(Contender(relations=flat), Setting(data, none, train)).metrics
+    assert "accuracy, rare classes" not in metrics
+
+
+def test_no_relation_is_shown():
+    shown = []
+
+    def spy(batch):
+        shown.append(bool(batch.observed.any() or batch.holds.any()))
+        return torch.zeros(batch.holds.shape)
+
+    pairs_task(Contender(relations=spy), Setting(DATA, WIDE_STRUCTURE))
+    assert shown
+    assert not any(shown)
+
+
+def test_a_score_that_follows_the_order_is_caught():
+    turns = iter(vertical_pairs(DATA, WIDE_STRUCTURE) * 3)
+
+    def cheat(batch):
+        asked = next(turns)
+        values = torch.full(batch.holds.shape, -5.0)
+        for (x, y), listed in zip(asked.ends.tolist(), asked.listed, strict=True):
+            values[0, :, min(x, values.shape[2] - 1), min(y, values.shape[2] - 1)] = (
+                10.0 * torch.from_numpy(listed[:4].astype(np.float32))
+            )
+        return values
+
+    with pytest.raises(LeakError, match="leaks information"):
+        pairs_task(Contender(relations=cheat), Setting(DATA, WIDE_STRUCTURE))
+
+
+def test_the_service_is_asked_about_its_first_instances():
+    asked = next(one for one in vertical_pairs(rooms(20, 2), STRUCTURE) if len(one.ends) > 2)
+    p = service_score(room_model())(asked)
+    every = relation_probabilities(room_model(), labels_alone(asked.scene))
+    own = asked.scene.instance_classes
+    for (i, j), row in zip(asked.classes.tolist(), p, strict=True):
+        x, y = (int(np.flatnonzero(own == c)[0]) for c in (i, j))
+        assert row == pytest.approx([*every[:, x, y], *every[:, y, x]])
+    assert p.max() <= 1
+
+
+def test_the_limit_counts_scenes_with_such_a_pair():
+    silent = [scene([0, 1], [(LEFT, 0, 1)], name=f"s{k}") for k in range(20)]
+    data = tensors([*silent, *(scene([0, 1], [(ON, 1, 0)], name=f"t{k}") for k in range(3))])
+    setting = Setting(data, NO_STRUCTURE, limit=2)
+    assert pairs_task(Contender(relations=flat), setting).scenes == 2
+    assert pairs_task(Contender(relations=flat), replace(setting, scenes=tensors(silent))) is None
+    assert pairs_task(Contender(), setting) is None
+    assert pairs.VERTICAL == (ON, ABOVE)

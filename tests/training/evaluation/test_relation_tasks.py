@@ -1,0 +1,237 @@
+"""T1a, T1b and T3b by hand: what is given, what is asked, who finds it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from app.scene import ObjectClass, Vocabulary
+from tests.questions.artifacts import artifact_of
+from tests.training.evaluation.scenes import (
+    NO_STRUCTURE,
+    WIDE,
+    WIDE_STRUCTURE,
+    V,
+    flat,
+    knowing,
+    larger_machine,
+    random_scenes,
+    scene,
+    tensors,
+    toy,
+)
+from training.datasets import AnnotatedObject, AnnotatedScene, encode
+from training.datasets.batches import seen_triples
+from training.evaluation.contenders import relation_score
+from training.evaluation.relation_tasks import (
+    alter,
+    complete_scenes,
+    expected_hits,
+    placement_scores,
+    rank,
+    rank_relations,
+    score_scenes,
+    telling,
+    unseen,
+)
+
+DATA = tensors(random_scenes(30), WIDE)
+FLOOR = torch.tensor([False, True, False, False, False])
+
+
+def by_hand(batch):
+    """left(0,1) before left(1,0) before front(1,0); equal classes are no candidates."""
+    values = torch.zeros(len(batch), 2, 2, 2)
+    values[:, 0, 0, 1] = 3
+    values[:, 0, 1, 0] = 2
+    values[:, 1, 1, 0] = 1
+    values[:, :, [0, 1], [0, 1]] = 9
+    return values
+
+
+class Spy:
+    """A score that knows nothing and keeps the rows that it was asked about."""
+
+    def __init__(self):
+        self.rows = []
+
+    def __call__(self, batch):
+        self.rows += [batch.rows(torch.tensor([k])) for k in range(len(batch))]
+        return torch.zeros(batch.holds.shape)
+
+
+def related(triples):
+    return [one.evidence for one in DATA.scenes if one.evidence.holds.sum() >= triples]
+
+
+def test_r_precision_by_hand():
+    """Two annotated triples; the two best scores hit one of them."""
+    data = tensors([toy([0, 1], [(0, 0, 1), (1, 1, 0)]), toy([0, 1], [(0, 0, 1)]), toy([0, 1])])
+    ranking = rank_relations(data, NO_STRUCTURE, by_hand)
+    assert (ranking.annotated.tolist(), ranking.skipped) == ([2, 1, 0], 1)
+    assert ranking.pooled().value == pytest.approx(2 / 3)
+    assert ranking.per_scene().value == pytest.approx((1 / 2 + 1) / 2)
+    scored = score_scenes(data, NO_STRUCTURE, by_hand)[:1]
+    assert rank([scored[0].where(scored[0].relation == 0)], 1).pooled().value == 1.0
+    assert [rank(scored, 1, first=k).pooled().value for k in (1, 3, 20)] == [0.5, 1.0, 1.0]
+    # left(0, 1) was seen; of the others left(1, 0) comes first and front(1, 0) is the true one.
+    new = rank(unseen(scored, torch.tensor([[0, 0, 1]]), V), 1)
+    assert (new.annotated.tolist(), new.pooled().value) == ([1], 0.0)
+    both = torch.tensor([[0, 0, 1], [0, 1, 0]])
+    assert rank(unseen(scored, both, V), 1).pooled().value == 1.0
+
+
+def test_scores_that_know_everything_or_nothing():
+    """A flat score hits R of R out of k candidates: R² / k in expectation."""
+    assert rank_relations(DATA, WIDE_STRUCTURE, knowing(DATA)).pooled().value == 1.0
+    ranking = rank_relations(DATA, WIDE_STRUCTURE, flat)
+    n = np.array([len(evidence.classes) for evidence in related(1)])
+    R = ranking.annotated[ranking.annotated > 0]
+    assert ranking.hits[ranking.annotated > 0] == pytest.approx(R**2 / (4 * n * (n - 1)))
+    half = complete_scenes(DATA, WIDE_STRUCTURE, knowing(DATA))
+    assert rank(half, len(DATA)).pooled().value == 1.0
+    for asked in complete_scenes(DATA, WIDE_STRUCTURE, flat):
+        if held := asked.truth.sum():
+            hits = rank([dataclasses.replace(asked, scene=0)], 1).hits[0]
+            assert hits == pytest.approx(held**2 / len(asked.score))
+    scores = placement_scores(DATA, WIDE_STRUCTURE, knowing(DATA))
+    assert scores.hit_at_1().value == scores.metric("AUROC").value == 1.0
+    scores = placement_scores(DATA, WIDE_STRUCTURE, flat)
+    triples = np.bincount(scores.scene)
+    assert scores.hit_at_1().value == pytest.approx((1 / triples[triples > 0]).mean())
+    assert scores.metric("AUROC").value == pytest.approx(0.5)
+
+
+def test_expected_hits_shares_ties():
+    values, truth = np.array([2.0, 1, 1, 1]), np.array([False, True, False, False])
+    assert expected_hits(values, truth, 2) == pytest.approx(1 / 3)
+    assert expected_hits(values, truth, 9) == 1.0
+    assert expected_hits(np.full(4, -np.inf), truth, 1) == pytest.approx(1 / 4)
+
+
+def test_structure_is_no_end_of_a_relation():
+    data = tensors([scene([0, 1, 2], [(0, 0, 1), (0, 0, 2), (1, 0, 2)])])
+    (scored,) = score_scenes(data, FLOOR, flat)
+    assert (len(scored.score), scored.truth.sum()) == (4 * 2, 2)
+    assert placement_scores(data, FLOOR, flat).scene.tolist() == [0, 0]
+
+
+def test_relation_scores_are_asked_without_relations():
+    """T1a asks with all relations hidden, and with nobody having counted if so wished."""
+    spy = Spy()
+    data = tensors([scene([0, 1, 1], [(0, 0, 1)])])
+    score_scenes(data, NO_STRUCTURE, spy)
+    score_scenes(data, NO_STRUCTURE, spy, counts=False)
+    assert not any(bool(one.holds.any()) or bool(one.observed.any()) for one in spy.rows)
+    assert [one.counts.tolist() for one in spy.rows] == [[[1, 2]], [[0, 0]]]
+
+
+def test_a_score_that_is_no_number_is_an_error():
+    data = tensors([scene([0, 1], [(0, 0, 1)])])
+    with pytest.raises(FloatingPointError, match="NaN"):
+        rank_relations(data, NO_STRUCTURE, lambda batch: flat(batch) * float("nan"))
+
+
+def test_seen_triples_are_counted_by_scene():
+    scenes = [scene([0, 1], [(0, 0, 1)]), scene([0, 1], [(0, 0, 1), (1, 1, 0)])]
+    assert seen_triples(scenes, V).tolist() == [[0, 0, 1], [1, 1, 0]]
+    assert seen_triples(scenes, V, minimum=2).tolist() == [[0, 0, 1]]
+
+
+# -------------------------------------------------------------------------------------------- T1b
+
+
+def test_halves_are_disjoint_and_together_the_truth():
+    """Given plus asked is all; nothing given, nor its mirror image, is asked."""
+    spy = Spy()
+    asked = complete_scenes(DATA, WIDE_STRUCTURE, spy)
+    for one, own, evidence in zip(spy.rows, asked, related(2), strict=True):
+        n = len(evidence.classes)
+        truth, given = torch.from_numpy(evidence.holds), one.holds[0, :, :n, :n] > 0
+        assert bool((given <= truth).all())
+        assert int(one.holds.sum()) == int(truth.sum()) // 2
+        assert bool((one.observed == (one.holds > 0)).all())
+        mirrored = given.mT & ~given
+        assert len(own.score) == 4 * n * (n - 1) - int((given | mirrored).sum())
+        assert own.truth.sum() == int((truth & ~given & ~mirrored).sum())
+
+
+def test_repeating_what_was_given_gains_nothing():
+    """Neither a given triple nor its mirror image can be scored by copying."""
+    mutual = [scene([0, 1, 2], [(0, 0, 1), (0, 1, 0), (1, 1, 2), (1, 2, 1)]) for _ in range(8)]
+    for data, structure in ((DATA, WIDE_STRUCTURE), (tensors(mutual), NO_STRUCTURE)):
+        copied, blind = (
+            rank(complete_scenes(data, structure, score), len(data)).hits.tolist()
+            for score in (lambda batch: batch.holds + batch.holds.mT, flat)
+        )
+        assert copied == blind
+
+
+def test_a_relation_in_both_spellings_is_one_triple():
+    """left(a, b) and right(b, a): not given in one spelling and asked in the other."""
+    objects = tuple(AnnotatedObject(id=k, label=label) for k, label in enumerate(("bed", "lamp")))
+    twice = AnnotatedScene("s", "toy", "g", None, objects, ((0, "left", 1), (1, "right", 0)))
+    vocabulary = Vocabulary([ObjectClass("bed"), ObjectClass("lamp")])
+    data = tensors(encode([twice], vocabulary), len(vocabulary))
+    assert rank(complete_scenes(data, torch.zeros(2, dtype=torch.bool), flat), 1).skipped == 1
+
+
+def test_the_split_depends_on_the_scene_alone():
+    def keys(data, seed=0):
+        found = complete_scenes(data, WIDE_STRUCTURE, flat, seed=seed)
+        return [entry.key.tolist() for entry in found]
+
+    alone = [key for entry in DATA.scenes for key in keys(tensors([entry], WIDE))]
+    assert keys(DATA) == alone
+    assert keys(DATA) != keys(DATA, seed=1)
+
+
+def test_classes_related_both_ways_are_stated_of_different_instances():
+    """Two lamps on either side of a bed: left(lamp, bed) and left(bed, lamp) hold of classes."""
+    artifact = artifact_of(larger_machine("triway-local"))
+    both = scene([0, 1, 1], [(0, 0, 1), (0, 1, 0)])
+    data = tensors([both, scene([0, 1, 1], [(0, 0, 1)])], artifact.spec.V)
+    batch = data.batch(torch.arange(2))
+    told = telling(batch, batch.holds > 0)
+    values = relation_score(artifact, given=True)(told)
+    blind = relation_score(artifact, given=False)(told)
+    assert torch.isfinite(values).all()
+    assert not torch.allclose(values[0], values[1])
+    torch.testing.assert_close(blind[0], blind[1])
+
+
+# -------------------------------------------------------------------------------------------- T3b
+
+
+def test_one_triple_is_replaced_by_a_false_one():
+    """All others stay; what replaces it shares two of relation, subject, object with it."""
+    spy = Spy()
+    placement_scores(DATA, WIDE_STRUCTURE, spy)
+    kinds = set()
+    for one, evidence in zip(spy.rows, related(2), strict=True):
+        n = len(evidence.classes)
+        stated = one.holds[0, :, :n, :n].numpy() > 0
+        assert bool((one.observed == (one.holds > 0)).all())
+        (gone,) = np.argwhere(evidence.holds & ~stated)
+        ((a, i, j),) = np.argwhere(stated & ~evidence.holds)
+        (other,) = np.flatnonzero(gone != (a, i, j))
+        kinds.add(int(other))
+        assert not evidence.holds[a, j, i]
+        assert i != j
+    assert kinds == {0, 1, 2}
+
+
+def test_without_a_false_triple_there_is_no_case():
+    rng = np.random.default_rng(0)
+    holds, off = np.ones((1, 2, 2), np.bool_), ~np.eye(2, dtype=np.bool_)
+    assert alter(holds & off, np.broadcast_to(off, holds.shape), rng) is None
+    one = np.zeros((1, 2, 2), np.bool_)
+    one[0, 0, 1] = True
+    assert alter(one, np.broadcast_to(off, one.shape), rng) is None
+    data = tensors([scene([0, 1], [(0, 0, 1)]), scene([0, 1], [(0, 0, 1), (1, 0, 1)])])
+    scores = placement_scores(data, NO_STRUCTURE, flat)
+    assert (scores.scenes, scores.skipped, scores.scene.tolist()) == (2, 1, [1, 1])
+    assert len(placement_scores(tensors([scene([0, 1])]), NO_STRUCTURE, flat).scene) == 0

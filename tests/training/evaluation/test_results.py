@@ -1,0 +1,162 @@
+"""Tables and their remarks; splits that fill no table."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tests.training.commands import invoke, small_config, write_config
+from training.evaluation.metrics import Figure, Ratio
+from training.evaluation.report import SourceReport
+from training.evaluation.results import Asked, Cell, Difference, Results, remarks, summarise
+from training.evaluation.setting import Outcome
+
+
+def arguments(folder, *others):
+    config = small_config("rooms-rbm", "rbm", split="random")
+    path = write_config(folder / "random.toml", config, {"training.epochs": 1})
+    where = ("--folder", folder / "reports", "--quick", "--workers", "1")
+    return "benchmark", path, *where, "--task", "T2 missing", "--baseline", "popularity", *others
+
+
+def test_a_random_split_fills_no_table(tmp_path):
+    for others in ((), ("--shuffled",), ("--shuffled", "--seed-protocol")):
+        output = invoke(*arguments(tmp_path, *others), code=1)
+        assert "rooms-rbm: data.split" in output
+        assert "--seed-protocol" in output
+    assert not (tmp_path / "reports").exists()
+
+
+def test_a_random_split_is_asked_as_the_seed_paper_asks(tmp_path):
+    invoke(*arguments(tmp_path, "--seed-protocol"))
+    folder = tmp_path / "reports/rooms"
+    assert not (folder / "results.json").exists()
+    assert json.loads((folder / "seed-protocol/results.json").read_text())["cells"]
+
+
+def figure(value):
+    return Figure(value, value, value, 1)
+
+
+@pytest.mark.parametrize(
+    ("task", "metric", "said"),
+    [
+        ("T1a relations", "R-precision, distinct classes", True),
+        ("T1b completion", "R-precision", True),
+        ("T2 missing", "MRR", False),
+    ],
+)
+def test_precision_of_relations_says_what_counts_as_wrong(task, metric, said):
+    text = Results("a", (Cell("a", task, "x", metric, figure(0.5), (0.5,)),), ()).markdown()
+    assert ("An unlisted relation counts as wrong" in text) is said
+
+
+@pytest.mark.parametrize(
+    ("metric", "low", "high", "verdict"),
+    [
+        ("MRR", 0.1, 0.2, "better"),
+        ("MRR", -0.1, 0.2, "undecided"),
+        ("MRR", -0.2, -0.1, "worse"),
+        ("MMD², free", -0.2, -0.1, "better"),
+        ("ECE, missing", 0.1, 0.2, "worse"),
+        ("mirrored relations, free", -0.2, -0.1, "better"),
+        ("on-top cycles, free", 0.1, 0.2, "worse"),
+    ],
+)
+def test_a_verdict_needs_the_whole_interval_on_the_better_side(metric, low, high, verdict):
+    figure = Figure((low + high) / 2, low, high, 1)
+    assert Difference("a", "T", "x", metric, figure).verdict == verdict
+
+
+def test_results_list_the_questions():
+    metrics = {"MMD²": Ratio(np.array([0.5]), np.ones(1))}
+    outcome = Outcome(metrics, 7, 2, {"bandwidth": 4.0})
+    report = SourceReport("x", "", {"T4 generate": outcome, "Density": None})
+    (asked,) = summarise({("a", 0): {"x": report}}, "a").to_dict()["asked"]
+    assert asked == {
+        "row": "a", "seed": 0, "task": "T4 generate", "source": "x", "scenes": 7, "skipped": 2,
+        "notes": {"bandwidth": 4.0},
+    }  # fmt: skip
+
+
+def test_remarks_stand_below_the_tables_of_their_task():
+    cells = (Cell("a", "T4 generate", "x", "MMD², free", figure(0.1), (0.1,)),)
+    asked = (
+        Asked("a", 0, "T4 generate", "x", 7, 0, {"bandwidth": 4.5, "drawn scenes": 1200}),
+        Asked("a", 0, "T2 missing", "x", 90, 8, {}),
+    )
+    text = Results("a", cells, (), asked=asked).markdown()
+    assert text.endswith(
+        "\n\n|  | bandwidth | drawn scenes |\n|---|---|---|\n| x | 4.500 | 1,200 |\n"
+    )
+    assert "could not be scored" not in text
+
+
+def test_notes_go_by_source_or_by_row_or_by_both():
+    def asked(row, source, value):
+        return Asked(row, 0, "Density", source, 5, 0, {"log Z, AIS": value})
+
+    def keys(*some):
+        (table,) = remarks(some)
+        return [line.split(" | ")[0].strip("| ") for line in table.splitlines()[2:]]
+
+    rows = asked("a", "x", 1.5), asked("a", "y", 1.5), asked("b", "x", 2.5), asked("b", "y", 2.5)
+    assert keys(*rows) == ["a, seed 0", "b, seed 0"]
+    assert keys(asked("a", "x", 1.5), asked("b", "x", 1.5), asked("b", "y", 2.5)) == ["x", "y"]
+    assert keys(*rows, asked("b", "z", 3.5)) == [
+        "a, seed 0, x", "a, seed 0, y", "b, seed 0, x", "b, seed 0, y", "b, seed 0, z",
+    ]  # fmt: skip
+
+
+def test_skipped_scenes_are_told_by_source():
+    asked = [Asked(r, 0, "T2", s, 90, k, {}) for r, s, k in [("a", "x", 8), ("b", "x", 9)]]
+    asked.append(Asked("a", 0, "T2", "y", 1200, 0, {}))
+    assert remarks(asked) == ["Scenes that could not be scored: x 8–9 of 90."]
+
+
+def test_a_row_is_compared_by_scene_where_the_reference_row_has_the_metric():
+    """Differences (.5, .5, -.25) of three scenes; the metric of one row alone is not compared."""
+
+    def report(**metrics):
+        outcome = Outcome({n: Ratio.of_scenes(np.array(v)) for n, v in metrics.items()}, 3, 0)
+        return {"x": SourceReport("x", "", {"T2 missing": outcome})}
+
+    reports = {
+        ("ours", 0): report(MRR=[1.0, 0.5, 0.25]),
+        ("other", 0): report(MRR=[0.5, 0.0, 0.5], extra=[1.0, 1.0, 1.0]),
+    }
+    results = summarise(reports, "ours")
+    assert {(cell.row, cell.metric) for cell in results.cells} == {
+        ("ours", "MRR"), ("other", "MRR"), ("other", "extra"),
+    }  # fmt: skip
+    (gap,) = results.differences
+    assert (gap.row, gap.task, gap.source, gap.metric) == ("other", "T2 missing", "x", "MRR")
+    assert gap.figure.value == pytest.approx(0.25)
+    assert gap.figure.low == pytest.approx(-0.25)
+    assert gap.figure.high == pytest.approx(0.5)
+
+
+def test_tables_for_terminals_name_tasks_in_words_and_fit_80_columns():
+    cells = tuple(
+        Cell(row, "T1a relations", source, metric, figure(0.5), (0.5,))
+        for row in ("indoor-triway-deep", "frequency table, completing")
+        for source in ("validation pooled", "test pooled", "sunrgbd")
+        for metric in ("R-precision, distinct classes", "R-precision, instance counts")
+    )
+    gaps = (
+        Difference("indoor-triway-deep", "T1a relations", "test pooled", cells[0].metric,
+                   figure(0.1)),
+    )  # fmt: skip
+    console = Console(width=80, file=io.StringIO())
+    console.print(*Results("ours", cells, gaps).tables())
+    shown = console.file.getvalue()
+    assert "relations of a scene" in shown
+    assert "T1a" not in shown
+    assert "sunrgbd" not in shown  # where there are pooled figures, the file has the others
+    assert shown.count("0.500 [0.500, 0.500]") == 8
+    assert shown.count("*") == 1
+    assert "…" not in shown

@@ -1,0 +1,181 @@
+"""Statistics of counts on scenes with known laws, and classes without statistics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.questions.counts import distribution
+from app.registry import Counts
+from app.scene import ObjectClass, Vocabulary
+from tests.training.evaluation.furnished_rooms import VOCABULARY, room_model, rooms
+from tests.training.evaluation.scenes import scene
+from training.datasets.cases import MOST, counted_classes, scene_rng, some_instances
+from training.datasets.sources import SOURCES
+from training.evaluation.count_task import counts_task
+from training.evaluation.model import Contender
+from training.evaluation.setting import Setting
+from training.fit.count_statistics import fit_counts, folds
+
+CHAIR, DESK, TABLE, WALL = range(4)
+WORDS = Vocabulary(
+    [
+        ObjectClass("chair"),
+        ObjectClass("desk"),
+        ObjectClass("table"),
+        ObjectClass("wall", (), True),
+    ],
+    ("office", "kitchen"),
+)
+FEW, MANY = (0.62, 0.24, 0.10, 0.04), (0.2, 0.3, 0.3, 0.2)
+
+
+def furnished(number: int, seed: int, source: str = "toy"):
+    """Few chairs at a desk, more at a table; walls in every scene."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for k in range(number):
+        anchor, law = (DESK, FEW) if k % 2 else (TABLE, MANY)
+        chairs = int(rng.choice(4, p=law)) + 1
+        name = f"{source} {seed} {k}"
+        found.append(scene([CHAIR] * chairs + [anchor, WALL], source=source, group=name, name=name))
+    return found
+
+
+def expected(counts: Counts, anchor: int, listed: int) -> float:
+    _, p = distribution(counts, len(WORDS), np.array([CHAIR, anchor]), np.array([listed, 1]))
+    return float(p[0] @ np.arange(1, MOST + 1))
+
+
+def exact(law: tuple[float, ...], listed: int) -> float:
+    """The posterior mean in scenes that list chairs and anchor: half list one chair, and half any
+    number of chairs."""
+    weight = [
+        p * (0.5 * (listed == 1) + 0.5 / n) if n >= listed else 0.0 for n, p in enumerate(law, 1)
+    ]
+    return sum(n * w for n, w in enumerate(weight, 1)) / sum(weight)
+
+
+def test_the_scene_moves_the_expected_number():
+    """2,000 scenes. With four other seeds, the largest error is 0.08."""
+    counts = fit_counts(furnished(2000, 0), WORDS)
+    assert counts.classes.tolist() == [CHAIR]
+    for anchor, law in ((DESK, FEW), (TABLE, MANY)):
+        for listed in (1, 2):
+            assert expected(counts, anchor, listed) == pytest.approx(
+                exact(law, listed), abs=0.15
+            ), (anchor, listed)
+    again = Counts.from_tensors(counts.tensors(), len(WORDS), 2)
+    for name, tensor in counts.tensors().items():
+        assert np.array_equal(again.tensors()[name], tensor)
+        if tensor.ndim > 1:
+            assert np.array_equal(tensor.astype(np.float16), tensor), "half precision changes it"
+
+
+@pytest.mark.parametrize(("groups", "most"), [(19, 4), (20, 7)])
+def test_a_listed_number_needs_twenty_groups_that_have_it(groups, most):
+    # A group has two scenes, one of them with fewer chairs.
+    many = [
+        scene([CHAIR] * chairs + [TABLE], group=f"many {k}", name=f"many {k} {chairs}")
+        for k in range(groups)
+        for chairs in (2, 7 + k)
+    ]
+    counts = fit_counts([*furnished(400, 0), *many], WORDS)
+    assert counts.most.tolist() == [most]
+
+
+def test_a_part_lists_what_its_docstring_says():
+    whole = scene([CHAIR] * 30 + [DESK, DESK, TABLE, WALL], room=1)
+    parts = [some_instances(whole, WORDS.structure, scene_rng(whole, seed)) for seed in range(2000)]
+    assert {len(part.classes) for part in parts} == {1, 2, 3}
+    listed = [int(part.listed[0]) for part in parts if part.classes[0] == CHAIR]
+    assert {int(part.number[0]) for part in parts if part.classes[0] == CHAIR} == {MOST}
+    share = np.bincount(listed, minlength=MOST + 1)[1:] / len(listed)
+    law = np.full(MOST, 0.5 / MOST)
+    law[0] += 0.5
+    # The standard error of a share of 1,250 draws is at most .014.
+    assert share == pytest.approx(law, abs=0.06)
+    assert np.mean([part.room == 1 for part in parts]) == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_source_counts_only_if_labels_repeat_and_lists_are_complete():
+    once = [scene([CHAIR, DESK], source="once") for _ in range(40)]
+    partial = [replace(entry, complete=False) for entry in furnished(40, 0, "partial")]
+    counting = counted_classes([*once, *partial, *furnished(40, 0)], WORDS)
+    assert counting.keys() == {"toy"}
+    assert counting["toy"].tolist() == [True, True, True, False]
+    assert fit_counts([*once, *partial], WORDS) is None
+
+
+def test_alfred_counts_only_movable_objects(monkeypatch):
+    monkeypatch.setitem(SOURCES, "toy", SOURCES["alfred"])
+    counting = counted_classes(furnished(40, 0), WORDS)
+    assert counting["toy"].tolist() == [True, False, False, False]
+
+
+def test_no_statistics_where_the_data_cannot_tell():
+    assert fit_counts(furnished(12, 0), WORDS) is None
+    # Of two groups with the same other class, one has one chair in each scene, and one has four.
+    words = Vocabulary([ObjectClass(name) for name in ("chair", *"abcdefghijklmnopqrst")])
+    misleading = [
+        scene([CHAIR] * chairs + [other], group=f"{other} {chairs}", name=f"{other} {chairs} {k}")
+        for other in range(1, 21)
+        for chairs in (1, 4)
+        for k in range(8)
+    ]
+    assert fit_counts(misleading, words) is None
+    # With the groups of half of the classes, nothing misleads.
+    fair = [one for one in misleading if (int(one.group.split()[0]) % 2) == (one.group[-1] == "4")]
+    assert fit_counts(fair, words) is not None
+
+
+def test_every_source_weighs_as_much_as_the_others():
+    """Each share has a standard deviation of 2 %, from the parts that list no chair."""
+
+    def rooms_of(source: str, number: int, chairs: int):
+        classes = [CHAIR] * chairs + [DESK]
+        names = [f"{source}{k}" for k in range(number)]
+        return [scene(classes, source=source, group=name, name=name) for name in names]
+
+    counts = fit_counts([*rooms_of("many", 1200, 2), *rooms_of("few", 300, 4)], WORDS)
+    share = np.exp(counts.log_share[0])
+    assert share[1] == pytest.approx(share[3], rel=0.1)
+    assert math.isclose(share.sum(), 1, rel_tol=1e-2)
+
+
+def test_generated_rooms_beat_the_class_mean():
+    """400 rooms to learn from, 200 others to test; the seeds are fixed."""
+    train, test = rooms(400, 0), rooms(200, 2)
+    counts = fit_counts(train.scenes, VOCABULARY)
+    artifact = replace(room_model(), counts=counts)
+    found = counts_task(Contender(artifact=artifact), Setting(test, None, train)).metrics
+    change = found["change of error, class mean"].figure()
+    assert change.high < 0
+    error, mean = found["error of the expected count"], found["error of the class mean"]
+    assert change.value == pytest.approx(error.value - mean.value)
+    assert found["count in the interval"].value > 0.75
+    assert found["proposals that are right"].value > 0.5
+
+
+def test_cross_validation_tests_each_room_once():
+    scenes = rooms(400, 0).scenes
+    tested = []
+    for train, test in folds(scenes):
+        assert not {scene.group for scene in train} & {scene.group for scene in test}
+        assert len(train) + len(test) == len(scenes)
+        tested += [scene.scene_id for scene in test]
+    assert sorted(tested) == sorted(scene.scene_id for scene in scenes)
+
+
+def test_the_task_needs_counts_and_a_source_that_counts():
+    test, once = rooms(200, 2), [scene([0, 1]) for _ in range(20)]
+    setting = Setting(test, None, test)
+    assert counts_task(Contender(artifact=room_model()), setting) is None
+    counts = fit_counts(rooms(400, 0).scenes, VOCABULARY)
+    artifact = replace(room_model(), counts=counts)
+    bare = replace(test, scenes=once)
+    assert counts_task(Contender(artifact=artifact), Setting(bare, None, bare)) is None
+    assert counts_task(Contender(), setting) is None

@@ -1,0 +1,191 @@
+"""Offsets: their shrinkage is Bayes' rule, and draws are covered as promised."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, invgamma, norm
+
+from app.registry import Offsets
+from app.scene.relations import LEFT, ON_TOP
+from tests.training.evaluation.scenes import scene
+from training.datasets import encode, generate_rooms, rooms_vocabulary
+from training.datasets.offsets import seen_offsets
+from training.fit.offset_statistics import fit_offsets, log_likelihood, posterior
+
+V = 6
+
+
+def apart(offset, i=0, j=1, *, relation=LEFT, source="toy"):
+    """A scene of two things, i in the relation to j, so far from it."""
+    found = scene([i, j], [(relation, i, j)], source=source)
+    return replace(found, instance_positions=np.array([offset, (0.0, 0.0, 0.0)]))
+
+
+def draws(mean, std, number, seed, **pair):
+    rng = np.random.default_rng(seed)
+    return [apart(tuple(rng.normal(mean, std)), **pair) for _ in range(number)]
+
+
+def of_pair(offsets, i=0, j=1, relation=LEFT):
+    values, scenes = offsets.find(np.array([relation]), np.array([i]), np.array([j]))
+    return values[0, :3], values[0, 3:], int(scenes[0])
+
+
+def moments(values):
+    values = np.array(values)
+    return len(values), values.mean(), np.square(values - values.mean()).sum()
+
+
+# -- Bayes' rule --------------------------------------------------------------------------------
+
+PRIOR = (0.3, 2.0, 2.5, 0.4)  # expected, kappa, alpha, beta
+VALUES = (0.1, 0.5, 1.1)
+
+
+def joint(m, s):
+    """Density of prior and draws."""
+    expected, kappa, alpha, beta = PRIOR
+    prior = invgamma.pdf(s, alpha, scale=beta) * norm.pdf(m, expected, np.sqrt(s / kappa))
+    return prior * np.prod([norm.pdf(value, m, np.sqrt(s)) for value in VALUES], axis=0)
+
+
+MEANS, VARIANCES = np.meshgrid(np.linspace(-6, 7, 1301), np.geomspace(1e-3, 200, 1500))
+
+
+def integral(values):
+    """Of values (on the grid) over every mean and variance that matters; steps grow with s."""
+    return (values * joint(MEANS, VARIANCES) * VARIANCES).sum() * 0.01 * np.log(2e5) / 1499
+
+
+def test_the_posterior_and_the_likelihood_are_the_integrals():
+    evidence = integral(np.ones_like(MEANS))
+    mean = integral(MEANS) / evidence
+    second = integral(VARIANCES + np.square(MEANS)) / evidence
+    found, variance = posterior(*PRIOR, *moments(VALUES))
+    assert log_likelihood(*PRIOR, *moments(VALUES)) == pytest.approx(np.log(evidence), abs=1e-4)
+    assert found == pytest.approx(mean, abs=1e-4)
+    assert variance == pytest.approx(second - mean**2, rel=2e-3)
+
+
+# -- what is learnt -----------------------------------------------------------------------------
+
+MEAN, STD = np.array([0.1, 1.2, -0.3]), np.array([0.4, 0.2, 0.05])
+
+
+def many_pairs(number=30, seed=2):
+    """Pairs of many classes, each around a mean of its own; every fifth pair seen once."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for i in range(number):
+        for j in range(i + 1, number):
+            mean = MEAN + rng.normal(0, 0.3, 3)
+            times = 1 if (i + j) % 5 == 0 else 6
+            found += [apart(tuple(rng.normal(mean, STD)), i, j) for _ in range(times)]
+    return found, number
+
+
+def test_pairs_that_are_seldom_or_never_seen_are_covered_too():
+    """Fresh draws of pairs seen once, and of unseen ones: 70 to 90 % of 1,000 each inside, as the
+    spread of the pairs' means has to be learnt as well. The seeds are fixed."""
+    scenes, number = many_pairs()
+    offsets = fit_offsets(scenes, number)
+    rng = np.random.default_rng(3)
+    seldom = [s for s in scenes if s.instance_classes.sum() % 5 == 0]
+    inside = {"seldom": [], "never": []}
+    for entry in seldom:
+        i, j = entry.instance_classes
+        mean, spread, scenes_of = of_pair(offsets, i, j)
+        assert scenes_of == 1
+        # The pair's mean given its one draw, and a new draw around it.
+        shrunk = np.square(0.3) / (np.square(0.3) + np.square(STD))
+        given_one = MEAN + shrunk * (entry.instance_positions[0] - MEAN)
+        truth = rng.normal(given_one, 0.3 * np.sqrt(1 - shrunk), (12, 3))
+        new = rng.normal(truth, STD)
+        inside["seldom"] += list(np.square((new - mean) / spread).sum(axis=1))
+    mean, spread, scenes_of = of_pair(offsets, 5, 3)
+    assert scenes_of == 0
+    new = rng.normal(MEAN + rng.normal(0, 0.3, (1000, 3)), STD)
+    inside["never"] = list(np.square((new - mean) / spread).sum(axis=1))
+    for kind, distances in inside.items():
+        share = (np.array(distances) <= chi2.ppf(0.8, 3)).mean()
+        assert 0.7 <= share <= 0.9, kind
+
+
+def test_a_pair_never_seen_has_what_its_classes_have_elsewhere():
+    """A tall thing stands high beside whatever; the offsets of pairs are sums over classes here."""
+    height = np.array([0.2, 0.4, 0.6, 0.8, 1.0, 1.2])
+    rng = np.random.default_rng(4)
+    scenes = [
+        apart(tuple(rng.normal((0, 1, height[i] - height[j]), 0.05)), i, j)
+        for i in range(V)
+        for j in range(V)
+        if i != j and (i, j) != (5, 0)
+        for _ in range(20)
+    ]
+    mean, _, seen = of_pair(fit_offsets(scenes, V), 5, 0)
+    assert seen == 0
+    assert mean[2] > 0.4
+
+
+def test_the_things_of_a_scene_weigh_one_together():
+    crowd = scene([0] * 50 + [1], [(LEFT, 0, 1)])
+    holds = np.zeros_like(crowd.instance_holds)
+    holds[LEFT, :50, 50] = True
+    positions = np.tile([0.0, 3.0, 0.0], (51, 1))
+    positions[50] = 0.0
+    crowd = replace(crowd, instance_holds=holds, instance_positions=positions)
+    offsets = fit_offsets([*draws((0, 1, 0), 0.1, 49, 5), crowd], V)
+    mean, _, scenes = of_pair(offsets)
+    assert scenes == 50
+    assert mean[1] == pytest.approx((49 * 1 + 3) / 50, abs=0.06)
+
+
+def test_every_source_weighs_as_much_as_the_others():
+    many = draws((0, 1, 0), 0.1, 1000, 6, source="many")
+    few = draws((0, 2, 0), 0.1, 100, 7, source="few")
+    mean, spread, scenes = of_pair(fit_offsets([*many, *few], V))
+    assert scenes == 1100
+    assert mean[1] == pytest.approx(1.5, abs=0.05)
+    assert spread[1] == pytest.approx(np.hypot(0.5, 0.1), abs=0.05)
+
+
+def test_a_small_source_does_not_weigh_the_others_down():
+    many = draws((0, 1, 0), 0.1, 1000, 6, source="many")
+    mean, _, _ = of_pair(fit_offsets([*many, *draws((0, 2, 0), 0.1, 5, 7, source="few")], V))
+    assert mean[1] == pytest.approx(1.0, abs=0.03)
+
+
+def test_relations_without_poses_mean_nothing():
+    offsets = fit_offsets(draws(MEAN, STD, 20, 8), V)
+    assert of_pair(offsets)[2] == 20
+    assert of_pair(offsets, relation=ON_TOP)[2] == -1
+    assert fit_offsets([scene([0, 1], [(LEFT, 0, 1)])], V) is None
+
+
+def test_things_without_a_position_are_passed_over():
+    known, unknown = draws(MEAN, STD, 2, 9)
+    unknown.instance_positions[0] = np.nan
+    assert len(seen_offsets([known, unknown]).offset) == 1
+    assert fit_offsets([unknown], V) is None
+
+
+# -- generated rooms ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    vocabulary = rooms_vocabulary()
+    return encode(generate_rooms(150, seed=0), vocabulary), vocabulary
+
+
+def test_an_artifact_can_hold_what_was_learnt(rooms):
+    scenes, vocabulary = rooms
+    offsets = fit_offsets(scenes, len(vocabulary))
+    again = Offsets.from_tensors(offsets.tensors(), 4, len(vocabulary))
+    for name, tensor in offsets.tensors().items():
+        assert np.array_equal(again.tensors()[name], tensor)
+        if tensor.ndim > 1:
+            assert np.array_equal(tensor.astype(np.float16), tensor), "half precision changes it"

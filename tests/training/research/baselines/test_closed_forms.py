@@ -1,0 +1,263 @@
+"""Closed forms and counts against slow, independent ways of computing them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from sklearn.neighbors import NearestNeighbors
+from sklearn.neural_network import BernoulliRBM
+
+from tests.training.research.baselines.furnished import (
+    LEFT,
+    ON_TOP,
+    STRUCTURE,
+    A,
+    V,
+    scene,
+    tensors,
+)
+from training.evaluation.baselines.classes import LinearScore, fit_ease, frequency
+from training.evaluation.baselines.triples import (
+    PlacedTable,
+    TripleTable,
+    count_triples,
+    smoothed_log_odds,
+    smoothed_log_p,
+)
+from training.evaluation.contradictions import transitive_closure
+from training.evaluation.model import Places
+from training.evaluation.relation_tasks import telling
+from training.research.baselines.networks import removal_loss
+from training.research.baselines.object_models import (
+    bernoulli_rbm,
+    evidence,
+    fit_pairwise,
+    nearest_score,
+)
+from training.research.baselines.relation_models import ClosureScore, complex_logits, fit_complex
+
+
+@pytest.fixture(scope="module")
+def v() -> torch.Tensor:
+    """(200, 6) presence: pairs of classes that go together, and one on its own."""
+    rng = np.random.default_rng(0)
+    base = rng.random((200, 3)) < 0.4
+    pairs = [base[:, k // 2] ^ (rng.random(200) < 0.15) for k in range(5)]
+    return torch.from_numpy(np.stack([*pairs, rng.random(200) < 0.3], 1)).float()
+
+
+def test_ease_is_a_ridge_regression_of_each_class_on_the_others(v):
+    score = fit_ease(v, 7.0)
+    x = v.double().numpy()
+    mean = x.mean(0)
+    for i in range(x.shape[1]):
+        others = [j for j in range(x.shape[1]) if j != i]
+        design = x[:, others] - mean[others]
+        gram = design.T @ design + 7.0 * np.eye(len(others))
+        weights = np.linalg.solve(gram, design.T @ (x[:, i] - mean[i]))
+        assert score.weights[others, i].numpy() == pytest.approx(weights, abs=1e-5)
+        assert float(score.bias[i]) == pytest.approx(mean[i] - mean[others] @ weights, abs=1e-5)
+
+
+def test_naive_bayes_by_counting(v):
+    weights = evidence(v, smoothing=2.0)
+    x = v.numpy() > 0
+    average = (x.sum(0) + 0.5) / (len(x) + 1)
+    for i, j in ((0, 1), (1, 0), (4, 2), (5, 3)):
+        given, without = x[x[:, i], j], x[~x[:, i], j]
+        p = (given.sum() + 2 * average[j]) / (len(given) + 2)
+        q = (without.sum() + 2 * average[j]) / (len(without) + 2)
+        assert float(weights[j, i]) == pytest.approx(np.log(p / q), abs=1e-5)
+    assert not weights.diagonal().any()
+
+
+@pytest.mark.parametrize("sharpness", [1.0, 3.0])
+def test_nearest_scenes_are_scikit_learns(v, sharpness):
+    train, query = v[:150], v[150:170]
+    query = query[query.any(1)]
+    score = nearest_score(train, neighbours=150, sharpness=sharpness)
+    rows = train.any(1)  # scikit-learn knows no cosine of an empty scene; such scenes have no vote
+    search = NearestNeighbors(n_neighbors=int(rows.sum()), metric="cosine").fit(train[rows])
+    distance, place = search.kneighbors(query)
+    vote = ((1 - distance) / (1 - distance[:, :1])) ** sharpness
+    popularity = frequency(train).numpy()
+    share = (vote[:, :, None] * train[rows].numpy()[place]).sum(1) + popularity
+    expected = share / (vote.sum(1, keepdims=True) + 1)
+    assert score(query).sigmoid().numpy() == pytest.approx(expected, abs=1e-5)
+
+
+def test_only_the_nearest_vote(v):
+    """With one neighbour, equal to the query, its classes come first."""
+    train = torch.eye(4)[:, [0, 1, 2, 3]] + torch.eye(4)[:, [1, 2, 3, 0]]
+    values = nearest_score(train, neighbours=1, sharpness=1.0)(train[:1])
+    assert set(values[0].topk(2).indices.tolist()) == set(train[0].nonzero().flatten().tolist())
+
+
+def test_pairwise_weights_are_a_stationary_point(v):
+    """The gradient of the penalised pseudo-likelihood, written out, vanishes."""
+    l2 = 5.0
+    score = fit_pairwise(v, l2, iterations=200)
+    W, x = score.weights.double(), v.double()
+    assert torch.equal(score.weights, score.weights.T)
+    residual = torch.sigmoid(score.bias.double() + x @ W) - x
+    assert residual.sum(0).abs().max() < 1e-2
+    slope = residual.T @ x + x.T @ residual + l2 * W
+    slope.fill_diagonal_(0.0)
+    assert slope.abs().max() < 2e-2
+    assert W[0, 1] > 1.0, "classes that go together attract"
+
+
+def test_a_strong_penalty_leaves_popularity(v):
+    score = fit_pairwise(v, 1e6)
+    assert score.weights.abs().max() < 1e-3
+    assert score.bias.sigmoid().numpy() == pytest.approx(v.mean(0).numpy(), abs=1e-3)
+
+
+def test_the_rbms_log_odds_are_scikit_learns_free_energies(v):
+    """F(v without i) - F(v with i), by scikit-learn's own function."""
+    scenes = tensors([scene([k for k in range(6) if row[k]]) for row in v[:60]])
+    *_, (_, score) = bernoulli_rbm(scenes, STRUCTURE, 0)
+    machine = score.machine
+    rbm = BernoulliRBM(n_components=machine.spec.H1)
+    rbm.components_ = machine.W.detach().T.numpy()
+    rbm.intercept_hidden_ = machine.c1.detach().numpy()
+    rbm.intercept_visible_ = machine.b.detach().numpy()
+    for i in range(V):
+        on, off = scenes.v[:5].clone(), scenes.v[:5].clone()
+        on[:, i], off[:, i] = 1.0, 0.0
+        expected = rbm._free_energy(off.numpy()) - rbm._free_energy(on.numpy())
+        values = score(off)[:, i].detach().numpy()
+        assert values == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_class_must_say_nothing_of_itself():
+    with pytest.raises(ValueError, match="diagonal"):
+        LinearScore(torch.zeros(2), torch.eye(2))
+    with pytest.raises(ValueError, match=r"must be \(2, 2\), not \(3, 3\)"):
+        LinearScore(torch.zeros(2), torch.zeros(3, 3))
+
+
+def test_removal_loss_of_a_flat_network_is_the_log_of_the_candidates():
+    """{0, 1} with structure 2 of 5 classes: one is removed, 3 of the 5 remain candidates."""
+    v = torch.tensor([[1.0, 1, 1, 0, 0]]).expand(8, -1)
+    structure = torch.tensor([False, False, True, False, False])
+    loss = removal_loss(lambda x: torch.zeros_like(x), v, structure, noise=0.5)
+    assert float(loss) == pytest.approx(np.log(3), abs=1e-5)
+
+
+def test_the_network_never_sees_what_it_must_find():
+    seen = []
+    v = torch.tensor([[1.0, 1, 0]]).expand(50, -1)
+
+    def spy(x):
+        seen.append(x)
+        return torch.zeros_like(x)
+
+    removal_loss(spy, v, torch.zeros(3, dtype=torch.bool), noise=0.0)
+    assert seen[0].sum(1).tolist() == [1.0] * 50
+
+
+@pytest.fixture(scope="module")
+def related():
+    """0 on 1 in two of three scenes, 0 left of 2 once; a scene that nobody annotated."""
+    return tensors(
+        [
+            scene([0, 1, 2], [(ON_TOP, 0, 1), (LEFT, 0, 2)]),
+            scene([0, 1, 1, 1], [(ON_TOP, 0, 1)]),
+            scene([0, 1, 9], [(ON_TOP, 0, 9)]),
+            scene([0, 1], annotated=False),
+        ]
+    )
+
+
+def test_triples_by_hand(related):
+    counts = count_triples(related, STRUCTURE)
+    assert counts.held.nonzero().tolist() == [[LEFT, 0, 2], [ON_TOP, 0, 1]]
+    assert counts.held[ON_TOP, 0, 1] == 2
+    assert counts.together[0, 1] == counts.together[1, 0] == 3
+    assert counts.together[0, 2] == 1
+    assert counts.together[0, 9] == 0, "structure is no end"
+    assert counts.together.diagonal().sum() == 0
+
+
+def test_the_frequency_table_by_hand(related):
+    counts = count_triples(related, STRUCTURE)
+    p = smoothed_log_odds(counts, pair=4.0, end=2.0).sigmoid()
+    # Ordered pairs together: 3 + 3 of (0, 1), 1 + 1 each of (0, 2) and (1, 2).
+    overall = (2 + 1) / (10 + 2)
+    subject = (2 + 2 * overall) / (4 + 2)
+    object_ = (2 + 2 * overall) / (4 + 2)
+    expected = (2 + 4 * (subject + object_) / 2) / (3 + 4)
+    assert float(p[ON_TOP, 0, 1]) == pytest.approx(expected, abs=1e-5)
+    never = (0 + 4 * (2 * overall / (0 + 2) * 2) / 2) / (0 + 4)
+    assert float(p[ON_TOP, 5, 6]) == pytest.approx(never, abs=1e-5)
+
+
+def test_tables_are_looked_up_for_the_classes_of_a_scene(related):
+    table = torch.randn(A, V, V, generator=torch.Generator().manual_seed(0))
+    batch = related.batch(torch.tensor([1, 0]))
+    values = TripleTable(table)(batch)
+    assert values[1, LEFT, 2, 0] == table[LEFT, 2, 0]
+    assert values[0, ON_TOP, 0, 1] == table[ON_TOP, 0, 1]
+    more = TripleTable(table, multiplicity=0.5)(batch) - values
+    assert float(more[0, LEFT, 0, 1]) == pytest.approx(0.5 * np.log(3), abs=1e-6)
+    assert float(more[0, LEFT, 1, 1]) == pytest.approx(np.log(3), abs=1e-6)
+    assert not more[1].any()
+
+
+def test_closure_is_warshalls():
+    generator = torch.Generator().manual_seed(0)
+    given = torch.rand(20, 7, 7, generator=generator) < 0.15
+    expected = given.clone()
+    for k in range(7):
+        expected |= expected[:, :, k : k + 1] & expected[:, k : k + 1, :]
+    assert torch.equal(transitive_closure(given), expected)
+
+
+def test_closure_moves_what_follows_and_its_mirror_image_alone():
+    batch = tensors([scene([0, 1, 2, 3], [(LEFT, 0, 1), (LEFT, 1, 2)])]).batch(torch.tensor([0]))
+    given = telling(batch, batch.holds > 0)
+    moved = ClosureScore(TripleTable(torch.zeros(A, V, V)), bonus=2.0, penalty=3.0)(given)
+    expected = torch.zeros(1, A, 4, 4)
+    expected[0, LEFT, 0, 2] = 2.0
+    for i, j in ((1, 0), (2, 1), (2, 0)):
+        expected[0, LEFT, i, j] = -3.0
+    assert torch.equal(moved, expected)
+
+
+def test_complex_logits_by_einsum():
+    generator = torch.Generator().manual_seed(0)
+    bias = torch.randn(2, generator=generator)
+    r = torch.randn(2, 3, dtype=torch.cfloat, generator=generator)
+    s = torch.randn(5, 3, dtype=torch.cfloat, generator=generator)
+    expected = torch.einsum("ik,ak,jk->aij", s, r, s.conj()).real + bias[:, None, None]
+    torch.testing.assert_close(complex_logits(bias, r, s), expected)
+
+
+def test_complex_learns_that_left_is_not_right(related):
+    counts = count_triples(related, STRUCTURE)
+    p = fit_complex(counts, rank=4, penalty=0.01, seed=0).sigmoid()
+    assert p[ON_TOP, 0, 1] == pytest.approx(2 / 3, abs=0.1)
+    assert p[ON_TOP, 1, 0] < 0.1
+
+
+def test_places_by_hand(related):
+    counts = count_triples(related, STRUCTURE)
+    popularity = torch.full((V,), 0.5)
+    log_p = smoothed_log_p(counts, popularity, place=2.0, relation=1.0)
+    assert log_p.exp().sum(-1) == pytest.approx(torch.ones(2, A, V), abs=1e-5)
+    # Something on 1: 0 twice. Whatever is on something: 0 twice, and one case of 1/11 each.
+    back_off = (2 + 1 / 11) / (2 + 1)
+    place = Places(
+        v=torch.zeros(1, V),
+        counts=torch.zeros(1, V),
+        relation=torch.tensor([ON_TOP]),
+        anchor=torch.tensor([1]),
+        outgoing=torch.tensor([True]),
+    )
+    value = PlacedTable(log_p)(place)[0, 0].exp()
+    assert float(value) == pytest.approx((2 + 2 * back_off) / (2 + 2), abs=1e-5)
+    # Something under 0: 1 twice.
+    turned = Places(place.v, place.counts, place.relation, torch.tensor([0]), ~place.outgoing)
+    assert PlacedTable(log_p)(turned)[0].argmax() == 1

@@ -1,0 +1,213 @@
+"""What every baseline of the registry promises, on scenes whose structure is known."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+import torch
+
+from tests.training.research.baselines.furnished import (
+    BEDROOM,
+    FLOOR,
+    KITCHEN,
+    LEFT,
+    STRUCTURE,
+    V,
+    furnished,
+    scene,
+    tensors,
+)
+from training.evaluation.baselines import PLACED, RELATIONS, placed_product
+from training.evaluation.baselines.fitting import Baseline, log_likelihood
+from training.evaluation.density_task import independent_density
+from training.evaluation.missing_tasks import removed_places
+from training.evaluation.relation_tasks import telling
+from training.research.baselines import BASELINES
+
+EVERY = tuple(BASELINES.values())
+OBJECTS = [one for one in EVERY if one.scores == ("objects",)]
+OF_RELATIONS = [one for one in EVERY if one.scores == RELATIONS]
+COMPLETIONS = [one for one in EVERY if one.scores == ("completion",)]
+(DENSITY,) = (one for one in EVERY if one.scores == ("density",))
+
+
+def named(baselines):
+    return pytest.mark.parametrize("baseline", baselines, ids=lambda baseline: baseline.name)
+
+
+@cache
+def fitted(baseline: Baseline):
+    """One fit of each, shared by the tests."""
+    return baseline.fit(furnished(300, seed=1), furnished(60, seed=2), STRUCTURE, seed=0)
+
+
+def best(baseline: Baseline):
+    """The best trial of `fitted`."""
+    return max(fitted(baseline).trials, key=lambda trial: trial.validation)
+
+
+def answers(baseline: Baseline, score, scenes):
+    """What a score says of some scenes."""
+    if baseline in OBJECTS:
+        return score(scenes.v)
+    if baseline is PLACED:
+        return score(removed_places(scenes, STRUCTURE)[2])
+    if baseline is DENSITY:
+        return score.log_unnormalised(scenes.v)
+    return score(scenes.batch(torch.arange(20)))
+
+
+@named(EVERY)
+def test_every_trial_is_recorded_and_the_best_is_chosen(baseline, validation):
+    result = fitted(baseline)
+    assert len({str(trial.parameters) for trial in result.trials}) == len(result.trials)
+    assert all(trial.seconds > 0 for trial in result.trials)
+    again = baseline.judge(validation, STRUCTURE, result.score)
+    assert again == pytest.approx(best(baseline).validation)
+
+
+@named(OBJECTS[1:])
+def test_objects_beat_popularity(baseline):
+    """Popularity cannot tell a kitchen from a bedroom: of 8 classes alike it finds 1 in 4 or so."""
+    assert best(baseline).validation > best(OBJECTS[0]).validation + 0.1
+
+
+@named(OBJECTS)
+def test_objects_belong_to_their_room(baseline):
+    """Of a kitchen's last class and a bedroom's, popular alike, the kitchen's is missed in it."""
+    v = torch.zeros(1, V)
+    v[0, [*KITCHEN[:3], FLOOR]] = 1.0
+    score = fitted(baseline).score(v)[0]
+    if baseline is OBJECTS[0]:
+        assert (score[KITCHEN[3]] - score[BEDROOM[3]]).abs() < 0.5
+    else:
+        assert score[KITCHEN[3]] > score[BEDROOM[3]]
+
+
+@named(OBJECTS)
+def test_object_scores_are_numbers_and_scenes_do_not_mix(baseline, validation):
+    score = fitted(baseline).score
+    values = score(validation.v[:20])
+    assert values.shape == (20, V)
+    candidates = (validation.v[:20] == 0) & ~STRUCTURE
+    assert torch.isfinite(values[candidates]).all()
+    alone = torch.cat([score(row.unsqueeze(0)) for row in validation.v[:20]])
+    torch.testing.assert_close(alone[candidates], values[candidates], rtol=1e-4, atol=1e-4)
+
+
+@named(OBJECTS)
+def test_an_empty_scene_has_a_score(baseline):
+    values = fitted(baseline).score(torch.zeros(2, V))
+    assert torch.isfinite(values[:, ~STRUCTURE]).all()
+
+
+REPEATED = ("masked transformer", "denoising autoencoder", "ComplEx", "scikit-learn BernoulliRBM")
+
+
+@named([BASELINES[name] for name in REPEATED])
+def test_the_same_seed_gives_the_same_fit(baseline, validation):
+    torch.manual_seed(123)
+    state = torch.get_rng_state()
+    figures = [
+        [trial.validation for trial in baseline.fit(validation, validation, STRUCTURE).trials]
+        for _ in range(2)
+    ]
+    assert torch.equal(torch.get_rng_state(), state), "the global generator was disturbed"
+    assert figures[0] == figures[1]
+
+
+@pytest.mark.slow
+@named(EVERY)
+def test_stochastic_fits_depend_on_the_seed(baseline, validation):
+    ours, theirs = (
+        answers(
+            baseline, baseline.fit(validation, validation, STRUCTURE, seed=seed).score, validation
+        )
+        for seed in (0, 1)
+    )
+    assert torch.equal(ours, theirs) is not baseline.stochastic
+
+
+@named(OF_RELATIONS[1:])
+def test_relations_beat_popularity(baseline):
+    assert best(baseline).validation > best(OF_RELATIONS[0]).validation + 0.2
+
+
+@named(OF_RELATIONS)
+def test_relations_are_judged_without_looking_at_them(baseline, validation):
+    """The truth in a batch changes nothing."""
+    batch = validation.batch(torch.arange(10))
+    blank = telling(batch)
+    score = fitted(baseline).score
+    assert score(batch).shape == batch.holds.shape
+    assert torch.equal(score(batch), score(blank))
+
+
+def test_closure_completes_what_the_table_cannot():
+    """Where left is drawn at random, only what is given tells how the chain goes on."""
+    generator = torch.Generator().manual_seed(0)
+
+    def shuffled(count):
+        scenes = []
+        for k in range(count):
+            row = torch.randperm(6, generator=generator).tolist()
+            chain = [(LEFT, i, j) for place, i in enumerate(row) for j in row[place + 1 :]]
+            scenes.append(scene(range(6), chain, name=str(k)))
+        return tensors(scenes)
+
+    train, held_out = shuffled(100), shuffled(100)
+    fits = (b.fit(train, held_out, STRUCTURE) for b in COMPLETIONS)
+    table, closure = (max(f.trials, key=lambda trial: trial.validation) for f in fits)
+    # Half of the ordered pairs hold, so the table is right by chance alone.
+    assert table.validation < 0.7
+    assert closure.validation > table.validation + 0.1
+    assert closure.parameters["bonus"] > 0
+
+
+def test_a_place_tells_what_is_missing(train, validation):
+    """On the second class lies the first of its room; the product with EASE is no worse."""
+    assert best(PLACED).validation > 0.8
+    ease, table = (fitted(b).score for b in (BASELINES["EASE"], PLACED))
+    product = placed_product("EASE", ease, table)
+    assert "× EASE" in product.name
+    result = product.fit(train, validation, STRUCTURE)
+    highest = max(trial.validation for trial in result.trials)
+    assert highest >= best(PLACED).validation - 0.02
+
+
+@named(EVERY)
+def test_nothing_to_learn_from_is_an_error(baseline, validation):
+    empty = tensors([scene([], annotated=False)])
+    with pytest.raises(ValueError, match="the 1 training scenes contain no objects"):
+        baseline.fit(empty, validation, STRUCTURE)
+
+
+@named([one for one in EVERY if one.learns_relations])
+def test_no_relation_to_learn_from_is_an_error(baseline, validation):
+    bare = tensors([scene([0, 1], annotated=False)])
+    with pytest.raises(ValueError, match="the 1 training scenes contain no observed relation"):
+        baseline.fit(bare, validation, STRUCTURE)
+
+
+def test_densities_beat_independent_classes(train, validation):
+    """Which knows nothing of rooms: one bit a scene, .69 nats, and what follows from it."""
+    independent = log_likelihood(validation, STRUCTURE, independent_density(train))
+    assert best(DENSITY).validation > independent + 0.69
+
+
+@named([one for one in EVERY if one is not DENSITY])
+def test_nothing_to_choose_by_is_an_error(baseline, train):
+    with pytest.raises(ValueError, match=r"no scene|all scenes|two classes"):
+        baseline.fit(train, tensors([scene([0])]), STRUCTURE)
+
+
+def test_disagreeing_shapes_are_an_error(train, validation):
+    with pytest.raises(ValueError, match=r"training scenes have 11 classes.*shape \(3,\)"):
+        OBJECTS[0].fit(train, validation, torch.zeros(3, dtype=torch.bool))
+
+
+def test_a_score_that_is_no_number_is_an_error(train, validation):
+    broken = Baseline("broken", lambda *_: iter([({}, None)]), lambda *_: float("nan"))
+    with pytest.raises(FloatingPointError, match="broken"):
+        broken.fit(train, validation, STRUCTURE)

@@ -1,0 +1,346 @@
+"""The benchmark command end to end on generated rooms, what it resumes, and its arithmetic."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.training.commands import invoke, small_config, write_config
+from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
+from training.evaluation.metrics import Figure, Ratio
+from training.evaluation.model import Contender
+from training.evaluation.report import SourceReport
+from training.evaluation.results import Cell, Difference, Results, summarise
+from training.evaluation.setting import Outcome, Setting
+from training.evaluation.tasks import TASKS
+from training.fit.settings import ConfigError
+from training.fit.trainer import Trainer
+from training.research.benchmark import (
+    DEFAULT,
+    QUICK_BASELINES,
+    YARDSTICKS,
+    chosen_tasks,
+    read_domains,
+    shuffled_text,
+)
+from training.research.measure import BenchmarkError, Plan, measure_rows
+from training.research.plots import read_curve, recall_points
+from training.research.rows import Material, Row, baseline_rows
+from training.runs.folder import load_run
+
+pytestmark = pytest.mark.slow
+
+BASELINES = ("--baseline", "popularity", "--baseline", "EASE")
+# In this process, where tests can look on; workers have a test of their own.
+HERE = ("--workers", "1")
+MACHINES = {"rooms-triway", "rooms-rbm"}
+REFERENCES = {"independent classes", "held-out scenes (floor)"}
+
+
+def write(folder, *, variant="triway", rooms=60, epochs=2):
+    settings = {"training.epochs": epochs, "machine.H1": 8, "machine.K": 4}
+    config = small_config(f"rooms-{variant}", variant, rooms=rooms)
+    return write_config(folder / f"{variant}-{rooms}-{epochs}.toml", config, settings)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished small benchmark: (its arguments, the folder of its domain)."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    where = folder / "reports"
+    arguments = (
+        *(write(folder, variant=variant) for variant in ("triway", "rbm")),
+        "--folder", where, "--quick",
+        "--seed-protocol", "--shuffled", *HERE,
+    )  # fmt: skip
+    invoke("benchmark", *arguments)
+    return arguments, where / "rooms"
+
+
+@pytest.fixture(scope="module")
+def results(finished):
+    return json.loads((finished[1] / "results.json").read_text())
+
+
+def test_every_row_is_measured_and_compared(finished, results):
+    assert results["ours"] == "rooms-triway"
+    cells = {(c["row"], c["source"], c["task"], c["metric"]): c["figure"] for c in results["cells"]}
+    assert {row for row, *_ in cells} == MACHINES | set(QUICK_BASELINES) | REFERENCES
+    assert {key[0] for key in cells if key[2] == "T4 generate"} == MACHINES | REFERENCES
+    for difference in results["differences"]:
+        key = (difference["source"], difference["task"], difference["metric"])
+        gap = cells["rooms-triway", *key]["value"] - cells[difference["row"], *key]["value"]
+        assert difference["figure"]["value"] == pytest.approx(gap)
+    compared = {(d["row"], d["task"]) for d in results["differences"]}
+    assert {("EASE", "T2 missing"), ("rooms-rbm", "T1b completion")} <= compared
+    assert "### T2 missing: MRR" in (finished[1] / "results.md").read_text()
+    # One source is also the pool.
+    for row in ("EASE", "rooms-triway"):
+        alone, both = (cells[row, x, "T2 missing", "MRR"]["value"] for x in ("rooms", "pooled"))
+        assert alone == pytest.approx(both)
+    # Machines are measured as they are published: calibrated, with the default alarm.
+    for row in MACHINES:
+        names = {(task, metric) for name, _, task, metric in cells if name == row}
+        assert ("T3 outliers, uniform", "alarms in untouched scenes") in names
+        assert ("T2 missing, room type given", "MRR, room type withheld") in names
+        for question in ("relations", "missing", "outliers"):
+            assert ("Calibration", f"Brier skill, {question}") in names
+        # So few validation scenes allow no judgement of relations.
+        assert ("Calibration", "Brier skill, misplaced") not in names
+
+
+def test_weights_are_counted(finished, results):
+    machine = load_run(finished[1] / "rooms-rbm/seed-0/run").machine
+    assert results["parameters"]["rooms-rbm"] == machine.parameter_count
+    assert results["parameters"]["popularity"] == machine.spec.V
+    assert f"{machine.parameter_count:,}" in (finished[1] / "results.md").read_text()
+
+
+def test_the_seed_protocol_has_a_page_of_its_own(finished):
+    folder = finished[1] / "seed-protocol"
+    protocol = json.loads((folder / "results.json").read_text())
+    assert {cell["task"] for cell in protocol["cells"]} == {"Seed T1", "Seed T2", "Seed T3"}
+    assert {cell["row"] for cell in protocol["cells"]} == MACHINES
+    assert protocol["paper"]["T3 error measure"]["Triway"] == 0.0789
+    assert not protocol["differences"]
+    assert "# Seed protocol" in (folder / "results.md").read_text()
+    config = json.loads((folder / "rooms-rbm/seed-0/run/config.json").read_text())
+    assert config["data"]["split"] == "random"
+
+
+def shuffled(folder, task):
+    return json.loads((folder / "shuffled" / task / "results.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("task", "rows"),
+    [
+        ("t1a-relations", {"relation popularity", "frequency table"}),
+        ("t1-pairs", {"relation popularity", "frequency table"}),
+        ("t2-missing", {"popularity", "EASE"}),
+        ("t2-partial", {"popularity", "EASE"}),
+    ],
+)
+def test_the_shuffled_control_has_a_page_for_each_task(finished, task, rows):
+    """With the rows that were wanted, and those that the others must fall to."""
+    control = shuffled(finished[1], task)
+    assert {cell["row"] for cell in control["cells"]} == rows | MACHINES
+    assert {gap["row"] for gap in control["differences"]} == (rows | MACHINES) - {control["ours"]}
+    text = (finished[1] / "shuffled" / task / "results.md").read_text()
+    assert f"above {control['ours']} over the whole interval: " in text
+
+
+def test_the_control_learns_from_other_scenes_and_is_asked_about_the_same(finished, results):
+    """Popularity finds what it always finds: no class is in more or fewer training scenes."""
+    cells, control = (
+        {
+            (c["row"], c["source"]): c["figure"]
+            for c in found["cells"]
+            if (c["task"], c["metric"]) == ("T2 missing", "MRR")
+        }
+        for found in (results, shuffled(finished[1], "t2-missing"))
+    )
+    assert control["popularity", "pooled"] == cells["popularity", "pooled"]
+    assert control["EASE", "pooled"] != cells["EASE", "pooled"]
+    first, second = (
+        load_run(finished[1] / part / "rooms-rbm/seed-0/run").machine for part in ("", "shuffled")
+    )
+    assert not torch.equal(first.W, second.W)
+
+
+def test_rows_above_the_yardstick_are_named():
+    """By their figures on all sources together, not on one of them."""
+    above, near = Figure(-0.2, -0.3, -0.1, 9), Figure(-0.1, -0.2, 0.1, 9)
+    figures = {
+        ("sees more", "x"): near, ("sees more", "pooled"): above,
+        ("falls", "x"): above, ("falls", "pooled"): near,
+    }  # fmt: skip
+    differences = tuple(
+        Difference(row, "T2 missing", source, "MRR", figure)
+        for (row, source), figure in figures.items()
+    )
+    text = shuffled_text("T2 missing", Results("popularity", (), differences))
+    assert "above popularity over the whole interval: sees more by 0.200." in text
+    none = shuffled_text("T2 missing", Results("popularity", (), ()))
+    assert "over the whole interval: none." in none
+
+
+def test_plots_lie_beside_the_results(finished):
+    names = {path.stem for path in finished[1].glob("*.png") if path.stat().st_size > 5000}
+    assert names == {"learning-curves", "recall"} | {
+        f"reliability-{machine}" for machine in MACHINES
+    }
+    epochs, values = read_curve(finished[1] / "rooms-triway/seed-0/run/curve.csv", "mrr_validation")
+    assert epochs == [1, 2]
+    assert all(0 < value <= 1 for value in values)
+
+
+def test_finished_rows_are_never_trained_again(finished, monkeypatch):
+    """A lost report is made again from the finished run."""
+    arguments, folder = finished
+    report = folder / "rooms-triway/seed-0/rooms.json"
+    before = [json.loads((folder / "results.json").read_text()), json.loads(report.read_text())]
+    report.unlink()
+    monkeypatch.setattr(Trainer, "run", None)
+    invoke("benchmark", *arguments)
+    after = [json.loads((folder / "results.json").read_text()), json.loads(report.read_text())]
+    assert after[0] == before[0]
+    outcomes = [found["tasks"]["T2 missing"]["outcome"] for found in (before[1], after[1])]
+    assert outcomes[0] == outcomes[1]
+
+
+def test_every_trial_is_kept(finished):
+    _, folder = finished
+    lines = (folder / "ease/seed-0/trials.jsonl").read_text().splitlines()
+    trials = [json.loads(line) for line in lines]
+    assert len([t for t in trials if t["model"] == "EASE"]) > 1
+    assert all(np.isfinite(t["validation"]) and t["seconds"] >= 0 for t in trials)
+
+
+@pytest.mark.parametrize(
+    ("others", "message"),
+    [
+        (("--baseline", "nobody"), "unknown baselines ['nobody']"),
+        (("--task", "T9"), "unknown task 'T9'"),
+        (("--shuffled", "--task", "T4"), f"at least one of the tasks {', '.join(YARDSTICKS)}"),
+    ],
+)
+def test_bad_requests_are_named(tmp_path, others, message):
+    where = ("--folder", tmp_path / "x", "--quick", *HERE)
+    assert message in invoke("benchmark", write(tmp_path), *where, *others, code=1)
+
+
+def test_some_tasks_are_measured_and_the_rest_later(tmp_path, monkeypatch):
+    arguments = (
+        write(tmp_path, epochs=1), "--folder", tmp_path, "--quick", "--baseline", "none",
+        *HERE,
+    )  # fmt: skip
+    invoke("benchmark", *arguments, "--task", "T2 missing")
+    tasks = json.loads((tmp_path / "rooms/rooms-triway/seed-0/rooms.json").read_text())["tasks"]
+    assert set(tasks) == {"T2 missing"}
+    monkeypatch.setattr(Trainer, "run", None)
+    invoke("benchmark", *arguments, "--task", "T1")
+    more = json.loads((tmp_path / "rooms/rooms-triway/seed-0/rooms.json").read_text())["tasks"]
+    assert set(more) == {
+        "T2 missing", "T1a relations", "T1 pairs", "T1 with evidence", "T1b completion",
+    }  # fmt: skip
+    kept, first = (t["T2 missing"]["outcome"]["metrics"]["MRR"]["made_of"] for t in (more, tasks))
+    assert kept == first
+
+
+def test_workers_find_what_one_process_finds(finished, tmp_path):
+    (first, *_), folder = finished
+    arguments = (first, "--folder", tmp_path, "--quick", *BASELINES, "--task", "T2 missing")
+    invoke("benchmark", *arguments, "--workers", "2")
+    for row in ("rooms-triway", "ease"):
+        ours, theirs = (
+            json.loads((place / row / "seed-0/rooms.json").read_text())["tasks"]["T2 missing"]
+            for place in (tmp_path / "rooms", folder)
+        )
+        assert ours["outcome"] == theirs["outcome"]
+
+
+def test_configurations_of_one_data_section_are_a_domain(tmp_path):
+    found = read_domains(["indoor-rbm", "open-triway", "indoor-triway"])
+    assert [domain.name for domain in found] == ["indoor", "open"]
+    assert [config.name for config in found[0].configs] == ["indoor-rbm", "indoor-triway"]
+    with pytest.raises(ConfigError, match="two configurations have the name indoor-rbm"):
+        read_domains(["indoor-rbm", "indoor-rbm"])
+    with pytest.raises(ConfigError, match="different data sections"):
+        read_domains([str(write(tmp_path)), str(write(tmp_path, variant="rbm", rooms=50))])
+
+
+def test_the_default_domain_begins_with_its_triway_machine():
+    (domain,) = read_domains(DEFAULT)
+    assert domain.name == "indoor"
+    assert [config.machine.variant for config in domain.configs] == ["triway", "gbm", "rbm"]
+
+
+def test_baselines_that_no_seed_changes_are_trained_once():
+    every = {entry.name for entry in baseline_rows(0)}
+    again = {entry.name for entry in baseline_rows(1)}
+    assert again == {
+        "scikit-learn BernoulliRBM", "masked transformer", "denoising autoencoder",
+        "autoencoder, heavily masked", "ComplEx",
+    }  # fmt: skip
+    assert again < every
+
+
+def test_tasks_go_by_name_or_by_how_they_begin():
+    assert chosen_tasks(None, quick=False) == tuple(TASKS)
+    assert "Density" not in chosen_tasks(None, quick=True)
+    assert chosen_tasks(["T2 missing"], quick=True) == ("T2 missing",)
+    assert chosen_tasks(["Density", "T1"], quick=True) == (
+        "T1a relations", "T1 pairs", "T1 with evidence", "T1b completion", "Density",
+    )  # fmt: skip
+
+
+def test_recall_curves_follow_the_figures():
+    cells = tuple(
+        Cell(row, "T2 missing", source, metric, Figure(value, 0, 1, 1), (value,))
+        for row, source, metric, value in [
+            ("a", "pooled", "top-10", 0.5), ("a", "pooled", "top-1", 0.2), ("a", "x", "top-1", 0.3),
+            ("a", "pooled", "MRR", 1.0), ("b", "pooled", "top-1", 0.4),
+        ]
+    )  # fmt: skip
+    found = recall_points(Results("a", cells, ()), "T2 missing", "top-", "pooled")
+    assert found == {"a": [(1, 0.2), (10, 0.5)], "b": [(1, 0.4)]}
+
+
+def test_a_summary_needs_our_row():
+    with pytest.raises(ValueError, match="no metric of the reference row ours"):
+        summarise({}, "ours")
+
+
+def test_interrupting_keeps_what_is_finished(tmp_path):
+    """Ctrl-C in the second row: the first row's report is there and is not made again."""
+    made = []
+
+    def make(name):
+        def maker(*_):
+            made.append(name)
+            if name == "second" and made.count(name) == 1:
+                raise KeyboardInterrupt
+            return lambda _: Contender()
+
+        return maker
+
+    plan = _plan(tmp_path)
+    entries = [Row(name, 0, name, make(name)) for name in ("first", "second")]
+    with pytest.raises(KeyboardInterrupt):
+        measure_rows(plan, entries, print)
+    assert set(measure_rows(plan, entries, print)[0]) == {("first", 0), ("second", 0)}
+    assert made == ["first", "second", "second"]
+
+
+def _plan(folder, material="these scenes"):
+    settings = {"none": Setting(tensors([scene([0], name="one")]), NO_STRUCTURE)}
+    return Plan(folder, Material(None, None, material), settings, ["T2 missing"])
+
+
+def test_a_folder_of_another_row_or_other_scenes_is_refused(tmp_path):
+    def row(identity):
+        return Row("row", 0, identity, lambda *_: lambda _: Contender())
+
+    measure_rows(_plan(tmp_path), [row("1")], print)
+    with pytest.raises(BenchmarkError, match="another configuration of row"):
+        measure_rows(_plan(tmp_path), [row("2")], print)
+    with pytest.raises(BenchmarkError, match="other training scenes"):
+        measure_rows(_plan(tmp_path, "other scenes"), [row("1")], print)
+    # Nor one that does not say what it learnt from.
+    (tmp_path / "row/seed-0/row.json").write_text(json.dumps({"identity": "1"}))
+    with pytest.raises(BenchmarkError, match="other training scenes"):
+        measure_rows(_plan(tmp_path), [row("1")], print)
+
+
+def test_rows_that_answered_in_other_sources_are_not_paired():
+    """A metric that one row has on two sources, and another row on one of them."""
+    both, one = Ratio.of_scenes(np.ones(4)), Ratio.of_scenes(np.ones(2))
+    reports = {
+        (name, 0): {"pooled": SourceReport("pooled", "", {"T2": Outcome({"MRR": metric}, 4, 0)})}
+        for name, metric in (("ours", both), ("other", one))
+    }
+    assert summarise(reports, "ours").differences == ()

@@ -1,0 +1,135 @@
+"""What rows learn from decides whether they are gone on with, and which rows there are."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.training.commands import invoke, small_config, write_config
+from training.fit.settings import ConfigError, DataConfig
+from training.research.benchmark import Options, compare_on_shuffled, read_domains
+from training.research.rows import Material, baseline_rows
+from training.runs.pipeline import read_sources, split_and_encode
+
+LABELS = ["bed", "sink", "lamp", "oven", "sofa", "desk", "shelf", "towel", "plant", "chair"]
+
+
+def write_scenes(folder, source, *, seed=0, relations=False):
+    """A file of 140 scenes of 3 to 6 objects; the same ids whatever the seed."""
+    rng = np.random.default_rng(seed)
+    lines = []
+    for k in range(140):
+        names = rng.choice(LABELS, size=rng.integers(3, 7), replace=False)
+        objects = [{"id": i, "label": str(name)} for i, name in enumerate(names)]
+        scene = {
+            "scene_id": f"{source}-{k}", "source": source, "group": f"{source}-{k}",
+            "room_type": None, "objects": objects,
+            "relations": [[0, "on-top", 1]] if relations else None,
+        }  # fmt: skip
+        lines.append(json.dumps(scene))
+    with gzip.open(folder / f"{source}.jsonl.gz", "wt") as file:
+        file.write("\n".join(lines))
+
+
+def rows_of(results):
+    return {cell["row"] for cell in results["cells"]}
+
+
+def material(folder, **settings):
+    data = DataConfig(**{"sources": ("flats",), "vocabulary": "source"} | settings)
+    return split_and_encode(data, read_sources(data, folder))
+
+
+def test_all_that_decides_what_is_learnt_is_in_the_digest(tmp_path):
+    for source in ("flats", "sheds"):
+        write_scenes(tmp_path, source)
+    scenes = material(tmp_path)
+    assert material(tmp_path).digest == scenes.digest
+    others = [
+        material(tmp_path, sources=("flats", "sheds")),
+        material(tmp_path, sources=("sheds",)),
+        material(tmp_path, vocabulary="indoor"),
+        material(tmp_path, split="random"),
+        material(tmp_path, split_seed=1),
+        material(tmp_path, limit=40),
+        scenes.shuffled(0),
+        scenes.shuffled(1),
+    ]
+    write_scenes(tmp_path, "flats", seed=1)
+    others.append(material(tmp_path))
+    assert len({scenes.digest, *(other.digest for other in others)}) == len(others) + 1
+    assert Material.of(scenes).digest == scenes.digest
+
+
+def test_every_part_needs_scenes(tmp_path):
+    write_scenes(tmp_path, "flats")
+    scenes = material(tmp_path)
+    for part in scenes.parts:
+        with pytest.raises(ConfigError, match=f"the {part} part contains no scenes"):
+            Material.of(replace(scenes, parts=scenes.parts | {part: []}))
+
+
+def test_relations_are_needed_to_learn_from_and_to_tune_on(tmp_path):
+    write_scenes(tmp_path, "flats", relations=True)
+    found = Material.of(material(tmp_path))
+    assert found.related
+    write_scenes(tmp_path, "flats")
+    bare = Material.of(material(tmp_path))
+    assert not bare.related
+    for part in ("train", "validation"):
+        assert not replace(found, data=replace(found.data, **{part: bare.data.train})).related
+
+
+@pytest.fixture(scope="module")
+def unrelated(tmp_path_factory):
+    """Everything that a quick run does, on scenes without relations."""
+    folder = tmp_path_factory.mktemp("unrelated")
+    write_scenes(folder, "flats")
+    data = {"sources": ["flats"], "vocabulary": "source"}
+    config = write_config(folder / "config.toml", small_config("flats-rbm", "rbm", **data))
+    where = ("--data", folder, "--folder", folder / "reports", "--workers", "1")
+    invoke("benchmark", config, *where, "--quick", "--shuffled")
+    return folder
+
+
+def test_rows_of_relations_are_left_out_where_there_are_none(unrelated):
+    folder = unrelated / "reports/flats"
+    results = json.loads((folder / "results.json").read_text())
+    assert {"flats-rbm", "popularity", "EASE"} <= rows_of(results)
+    tasks = {cell["task"] for cell in results["cells"]}
+    assert {"T2 missing", "T3 outliers, uniform"} <= tasks
+    assert not {task for task in tasks if task.startswith(("T1", "T2-at", "T3b"))}
+    assert not (folder / "frequency-table").exists()
+
+
+def test_the_control_leaves_relations_out_as_well(unrelated):
+    pages = unrelated / "reports/flats/shuffled"
+    tasks = {path.parent.name for path in pages.glob("*/results.json")}
+    assert tasks == {"t2-missing", "t2-partial"}
+    results = json.loads((pages / "t2-missing/results.json").read_text())
+    assert rows_of(results) >= {"flats-rbm", "popularity"}
+
+
+def test_a_control_of_relations_alone_needs_some(unrelated, tmp_path):
+    (domain,) = read_domains([str(unrelated / "config.toml")])
+    options = Options(unrelated, ("T1a relations",), quick=True)
+    with pytest.raises(ValueError, match="the scenes of flats contain no relations"):
+        compare_on_shuffled(domain, tmp_path, options)
+
+
+def test_every_trial_stands_once_when_a_row_is_made_again(tmp_path):
+    write_scenes(tmp_path, "flats", relations=True)
+    some = Material.of(material(tmp_path))
+    (entry,) = baseline_rows(0, ["EASE"])
+    kept = []
+    for _ in range(2):
+        entry.make(some, tmp_path / "row", lambda _: None)
+        lines = (tmp_path / "row/trials.jsonl").read_text().splitlines()
+        trials = [json.loads(line) for line in lines]
+        kept.append([{k: v for k, v in trial.items() if k != "seconds"} for trial in trials])
+    assert kept[1] == kept[0]
+    assert {trial["model"] for trial in kept[0]} > {"EASE"}

@@ -1,0 +1,50 @@
+"""Several processes: a row's own failure, and any other."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
+from training.evaluation.model import Contender
+from training.evaluation.setting import Setting
+from training.research.measure import Plan, measure_rows, place_of
+from training.research.rows import Material, Row
+
+
+def answers(*_):
+    return lambda _: Contender()
+
+
+def diverges(*_):
+    raise FloatingPointError("loss is nan")
+
+
+def plan(folder):
+    settings = {"none": Setting(tensors([scene([0], name="one")]), NO_STRUCTURE)}
+    return Plan(folder, Material(None, None, "these scenes"), settings, ["T2 missing"])
+
+
+@pytest.mark.slow
+def test_a_row_that_fails_stops_no_other(tmp_path):
+    """Processes take the failing rows and go on to the rest."""
+    makers = {"first": diverges, "second": answers, "third": diverges, "fourth": answers}
+    entries = [Row(name, 3, name, make) for name, make in makers.items()]
+    said = []
+    reports, failed = measure_rows(
+        plan(tmp_path), entries, lambda row, _, note: said.append((row, note)), workers=2,
+        failures=(FloatingPointError,),
+    )  # fmt: skip
+    assert failed == {"first": "seed 3: loss is nan", "third": "seed 3: loss is nan"}
+    assert set(reports) == {("second", 3), ("fourth", 3)}
+    for name in makers:
+        assert (place_of(tmp_path, name, 3) / "none.json").exists() is (
+            name in ("second", "fourth")
+        )
+    assert {("second", "done"), ("fourth", "done")} <= set(said)
+
+
+@pytest.mark.slow
+def test_errors_other_than_failures_of_a_row_are_raised(tmp_path):
+    entries = [Row("first", 0, "first", diverges), Row("second", 0, "second", answers)]
+    with pytest.raises(FloatingPointError, match="loss is nan"):
+        measure_rows(plan(tmp_path), entries, print, workers=2)

@@ -1,0 +1,76 @@
+"""Search spaces: what is read from TOML, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from training.fit.settings import Config, ConfigError
+from training.research.settings import shipped_files
+from training.research.tune import load_space
+from training.runs.config import load_config, with_settings
+
+CONFIG = Config.model_validate(
+    {
+        "name": "rooms-triway",
+        "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 60},
+        "machine": {"variant": "triway", "form": "local", "H1": 8, "H2": 0, "K": 4},
+        "objective": {"name": "composite"},
+    }
+)
+
+
+def read(folder, text):
+    path = folder / "space.toml"
+    path.write_text(text)
+    return load_space(path, CONFIG)
+
+
+@pytest.mark.parametrize("name", shipped_files("spaces"))
+def test_shipped_spaces_fit_their_configurations(name):
+    assert load_space(shipped_files("spaces")[name], load_config(name))
+
+
+def test_choices_and_intervals_are_read(tmp_path):
+    space = read(
+        tmp_path,
+        '"machine.H1" = { low = 4, high = 6 }\n"training.averaging" = [0.0, 0.9]\n'
+        '"objective.presence_weight" = { low = 0.01, high = 1.0, log = true }\n',
+    )
+    sizes, averages, weights = space.values()
+    assert (sizes.low, sizes.high) == (4, 6)
+    assert averages.choices == (0.0, 0.9)
+    assert (weights.low, weights.high, weights.log) == (0.01, 1.0, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('"training.rate" = [0.1]', "no setting 'training.rate': training has optimiser"),
+        ('"epochs" = [3]', "no setting 'epochs': name it section.entry"),
+        ('"training.epochs" = [0]', "training.epochs: Input should be greater"),
+        ('"training.seed" = [0, 1]', "'training.seed' must be equal in all trials"),
+        ('"data.limit" = [20]', "'data.limit' must be equal in all trials"),
+        ('"machine.H1" = [', "is not TOML"),
+        ('"machine.H1" = 3', "write a list of choices, or"),
+        ('"machine.H1" = []', "write a list of choices, or"),
+        ('"machine.H1" = { low = 3 }', "machine.H1: high: Field required"),
+        ('"machine.H1" = { low = 3, high = 2 }', "low must be below high"),
+        ('"machine.H1" = { low = 0, high = 2, log = true }', "low"),
+        ('"machine.H1" = { low = "a", high = 2 }', "machine.H1: low"),
+        ("", "contains no settings"),
+    ],
+)
+def test_bad_spaces_say_what_is_wrong(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message):
+        read(tmp_path, text)
+
+
+def test_a_missing_space_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"nowhere.toml does not exist"):
+        load_space(tmp_path / "nowhere.toml", CONFIG)
+
+
+def test_changed_settings_leave_the_rest_alone():
+    changed = with_settings(CONFIG, {"machine.H1": 5, "training.patience": 2})
+    assert (changed.machine.H1, changed.training.patience) == (5, 2)
+    assert with_settings(changed, {"machine.H1": 8, "training.patience": None}) == CONFIG

@@ -1,0 +1,109 @@
+"""Example scenes: their choice from a user's scenes, and their file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.registry import Example
+from app.scene import ObjectClass, Vocabulary
+from scene_client.schemas import SceneRequest
+from training.datasets import generate_rooms, source_vocabulary
+from training.datasets.rooms import DOMAINS
+from training.fit.settings import ConfigError
+from training.runs.example_scenes import (
+    choose_examples,
+    examples_json,
+    known_examples,
+    read_examples,
+)
+
+SCENES = generate_rooms(60, 0, DOMAINS["workplaces"])
+WORDS = source_vocabulary(SCENES, minimum=2)
+BOTH_LEFT = [
+    {"subject": "bed", "relation": "left", "object": "cup"},
+    {"subject": "bed", "relation": "right", "object": "cup"},
+]
+
+
+def test_chosen_scenes_are_requests_in_the_models_words_and_read_back(tmp_path) -> None:
+    chosen = choose_examples(SCENES, WORDS)
+    assert len(chosen) == len({example.scene.room_type for example in chosen}) == 3
+    for example in chosen:
+        request = SceneRequest.model_validate(example.request())
+        assert request.viewpoint is not None
+        assert len({thing.label for thing in request.objects}) >= 3
+        assert all(thing.label in WORDS.labels and thing.position for thing in request.objects)
+    (tmp_path / "examples.json").write_text(examples_json(chosen))
+    assert read_examples("examples.json", tmp_path) == chosen
+
+
+def test_a_chosen_scene_has_as_many_classes_as_the_median_of_its_room_type() -> None:
+    sizes: dict[str | None, list[int]] = {}
+    of_scene = {}
+    for scene in SCENES:
+        classes = {WORDS.index(thing.label) for thing in scene.objects} - {None}
+        of_scene[scene.scene_id] = sum(not WORDS.structure[index] for index in classes)
+        sizes.setdefault(scene.room_type, []).append(of_scene[scene.scene_id])
+    rooms = {scene.scene_id: scene.room_type for scene in SCENES}
+    for example in choose_examples(SCENES, WORDS):
+        own = example.name.split(", ")[1]
+        assert abs(of_scene[own] - np.median(sizes[rooms[own]])) <= 1
+
+
+def test_supports_become_relations_where_there_are_no_positions() -> None:
+    flat = [
+        replace(
+            scene,
+            objects=tuple(replace(thing, position=None, size=None) for thing in scene.objects),
+        )
+        for scene in SCENES
+    ]
+    chosen = choose_examples(flat, WORDS)
+    assert any(relation.relation == "on-top" for one in chosen for relation in one.scene.relations)
+
+
+def test_research_only_scenes_are_never_chosen() -> None:
+    copied = [replace(scene, source="sunrgbd") for scene in SCENES]
+    assert choose_examples(copied, WORDS) == ()
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (None, "cannot be read"),
+        ("{", "Invalid JSON"),
+        ([{"name": "a", "scene": {"objects": [{"id": "bed"}]}}], "label: Field required"),
+        ([{"name": "a", "scene": {"objects": ["bed"]}}] * 9, "at most 8 items"),
+        (
+            [{"name": "a", "scene": {"objects": ["bed", "cup"], "relations": BOTH_LEFT}}],
+            "0.scene: .*'left' is stated from 'bed' to 'cup' and also from 'cup' to 'bed'",
+        ),
+    ],
+)
+def test_an_unusable_file_is_named_with_the_reason(tmp_path, content, reason) -> None:
+    if content is not None:
+        text = content if isinstance(content, str) else json.dumps(content)
+        (tmp_path / "mine.json").write_text(text)
+    with pytest.raises(ConfigError, match=rf"mine\.json.*{reason}"):
+        read_examples("mine.json", tmp_path)
+
+
+def test_examples_beyond_an_edited_vocabulary_are_left_out_with_the_reason() -> None:
+    scenes = (
+        {"objects": ["bed"], "room_type": "bedroom"},
+        {"objects": ["bed", "unicorn"]},
+        {"objects": ["bed"], "room_type": "cave"},
+    )
+    examples = [Example.model_validate({"name": "a", "scene": scene}) for scene in scenes]
+    kept, reasons = known_examples(examples, Vocabulary([ObjectClass("bed")], ["bedroom"]))
+    assert kept == (examples[0],)
+    assert ["'unicorn'" in reasons[0], "'cave'" in reasons[1]] == [True, True]
+
+
+def test_a_label_alone_is_an_object() -> None:
+    example = Example.model_validate({"name": "a", "scene": {"objects": ["bed", "lamp"]}})
+    assert example.request() == {"objects": [{"label": "bed"}, {"label": "lamp"}]}

@@ -1,0 +1,189 @@
+"""Encoded scenes as tensors. A training objective reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from training.datasets import EncodedScene
+from training.machines import BoltzmannMachine
+from training.machines.edges import Edges
+
+
+@dataclass(frozen=True)
+class Batch:
+    """A batch of scenes as tensors.
+
+    Attributes:
+        v: presence of each class, (scenes, classes).
+        classes: indices of the n classes present in a scene, (scenes, n) int64. Padding is -1.
+        counts: number of instances of each class in `classes`, (scenes, n) int64. 0 means that the
+            data source gives no number.
+        holds: value of each relation between two classes of `classes`, (scenes, relations, n, n).
+        observed: True where the relation is annotated, shaped like `holds`.
+        room: index of the room type, (scenes,) int64. -1 means unknown.
+        source: index of the data source in `SceneTensors.source_names`, (scenes,) int64.
+    """
+
+    v: Tensor
+    classes: Tensor
+    counts: Tensor
+    holds: Tensor
+    observed: Tensor
+    room: Tensor
+    source: Tensor
+
+    def __len__(self) -> int:
+        return len(self.v)
+
+    def to(self, device: torch.device) -> Batch:
+        """Return the batch on a device."""
+        return Batch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+    def rows(self, index: Tensor) -> Batch:
+        """Return the scenes at the given indices. A mask selects the scenes where it is True."""
+        return Batch(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class SceneTensors:
+    """A set of scenes as tensors. `batch` returns some of the scenes.
+
+    Attributes:
+        v: presence of each class, (scenes, classes).
+        room: index of the room type, (scenes,). -1 means unknown.
+        source: index of the data source in annotated_classes and source_names, (scenes,) int64.
+        annotated_classes: True for classes that a data source mentions, (sources, classes) bool.
+        source_names: sorted names of the data sources.
+        weight: weight of each scene in the training of objects, (scenes,).
+        complete: True if the object list of the scene is nearly complete, (scenes,) bool.
+    """
+
+    scenes: Sequence[EncodedScene]
+    v: Tensor
+    room: Tensor
+    source: Tensor
+    annotated_classes: Tensor
+    source_names: tuple[str, ...] = ()
+
+    @cached_property
+    def weight(self) -> Tensor:
+        return torch.tensor([scene.weight for scene in self.scenes], dtype=torch.float32)
+
+    @cached_property
+    def complete(self) -> Tensor:
+        return torch.tensor([scene.complete for scene in self.scenes], dtype=torch.bool)
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def batch(self, index: Tensor, width: int = 0) -> Batch:
+        """Return the scenes at the given indices as one batch, with at least `width` classes."""
+        chosen = [self.scenes[k].evidence for k in index.tolist()]
+        n = max([width, *(len(e.classes) for e in chosen)])
+        relations = self.scenes[0].evidence.holds.shape[0] if self.scenes else 0
+        classes = np.full((len(chosen), n), -1, dtype=np.int64)
+        counts = np.ones((len(chosen), n), dtype=np.int64)
+        holds = np.zeros((len(chosen), relations, n, n), dtype=np.float32)
+        observed = np.zeros((len(chosen), relations, n, n), dtype=np.bool_)
+        for row, e in enumerate(chosen):
+            m = len(e.classes)
+            classes[row, :m], counts[row, :m] = e.classes, e.counts
+            holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
+        return Batch(
+            v=self.v[index],
+            classes=torch.from_numpy(classes),
+            counts=torch.from_numpy(counts),
+            holds=torch.from_numpy(holds),
+            observed=torch.from_numpy(observed),
+            room=self.room[index],
+            source=self.source[index],
+        )
+
+
+def scene_tensors(
+    scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], size: int
+) -> SceneTensors:
+    """Return encoded scenes as tensors.
+
+    Args:
+        annotated: maps the name of a data source to the classes that it mentions, (classes,) bool.
+
+    Raises:
+        ValueError: `annotated` has no entry for the source of a scene.
+    """
+    names = sorted(annotated)
+    if missing := {scene.source for scene in scenes} - set(names):
+        raise ValueError(
+            f"`annotated` has no entry for the sources {sorted(missing)}; add one for each source"
+        )
+    v = torch.zeros(len(scenes), size)
+    for row, scene in enumerate(scenes):
+        v[row, torch.from_numpy(scene.evidence.classes)] = 1.0
+    return SceneTensors(
+        scenes=scenes,
+        v=v,
+        room=torch.tensor([scene.room_type for scene in scenes], dtype=torch.int64),
+        source=torch.tensor([names.index(scene.source) for scene in scenes], dtype=torch.int64),
+        annotated_classes=torch.from_numpy(np.stack([annotated[name] for name in names])),
+        source_names=tuple(names),
+    )
+
+
+def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
+    """Return the scenes at the given indices."""
+    return replace(
+        scenes,
+        scenes=[scenes.scenes[k] for k in index.tolist()],
+        v=scenes.v[index],
+        room=scenes.room[index],
+        source=scenes.source[index],
+    )
+
+
+def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
+    """Return the layout, values and observed flags of the relation units of a batch."""
+    return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
+
+
+def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
+    """Return the sorted triples (relation, subject, object) of `minimum` or more scenes, (n, 3)."""
+    keys: list[np.ndarray] = []
+    for scene in scenes:
+        relation, subject, object_ = scene.evidence.holds.nonzero()
+        classes = scene.evidence.classes
+        keys.append((relation * size + classes[subject]) * size + classes[object_])
+    values, counts = np.unique(np.concatenate([*keys, np.zeros(0, np.int64)]), return_counts=True)
+    kept = values[counts >= minimum].astype(np.int64)
+    table = np.stack([kept // size // size, kept // size % size, kept % size], 1)
+    return torch.from_numpy(table).to(torch.int32)
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Scenes of the train, validation and test part, and data for the sizes of the machine.
+
+    Attributes:
+        digest: digest of the scenes, their vocabulary and split. A run resumes only if the digest
+            is unchanged.
+        words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
+    """
+
+    train: SceneTensors
+    validation: SceneTensors
+    test: SceneTensors
+    structure: Tensor
+    relations: int
+    room_types: int
+    digest: str = ""
+    words: Tensor | None = None
+
+
+def has_relations(scenes: SceneTensors) -> bool:
+    """Return True if any of the scenes has an annotated relation."""
+    return any(scene.evidence.holds.any() for scene in scenes.scenes)

@@ -1,0 +1,275 @@
+"""Turn scenes into test questions: choose the parts of a scene to state, hide or alter.
+
+The random choices for a scene depend only on the seed and the id of the scene. Every model
+therefore gets the same questions, whether the evaluation uses one data source or all sources.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Final, NamedTuple, TypeAlias
+from zlib import crc32
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.linear_model import LogisticRegression
+
+from app.scene import CANONICAL, Scene, SceneObject, Vocabulary
+from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Floats, Ints, Rng
+from training.datasets.batches import SceneTensors, subset
+from training.datasets.sources import SOURCES, meaning_of
+
+Triple: TypeAlias = tuple[int, int, int]
+
+MOST: Final = 12
+"""Largest number of instances that is told apart. It stands for larger numbers too."""
+
+RIDGE: Final = 1.0
+"""`C` of `logistic` for a few unweighted examples, such as those of 20 validation scenes."""
+
+_LISTED: Final = (0.25, 0.5, 0.75, 1.0)
+_VERTICAL = [CANONICAL.index("on-top"), CANONICAL.index("above")]
+
+
+def scene_rng(scene: EncodedScene, seed: int) -> Rng:
+    """Return the random generator of one scene, from the seed and the id of the scene."""
+    return np.random.default_rng([seed, crc32(scene.scene_id.encode())])
+
+
+def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> SceneTensors:
+    """Return at most `limit` random scenes in their original order.
+
+    The choice depends only on the seed and on the names of the scenes and their sources.
+    """
+    if limit is None or len(scenes) <= limit:
+        return scenes
+    place = [crc32(f"{seed} {scene.source} {scene.scene_id}".encode()) for scene in scenes.scenes]
+    return subset(scenes, torch.from_numpy(np.sort(np.argsort(place, kind="stable")[:limit])))
+
+
+def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Triple]) -> Scene:
+    """Return a scene, in the form of a request, with the object instances at the indices `kept`."""
+    objects = tuple(
+        SceneObject(id=str(k), label=str(c), class_index=int(c))
+        for k, c in enumerate(encoded.instance_classes[list(kept)])
+    )
+    room = encoded.room_type
+    return Scene(objects, tuple(triples) or None, room_type=room if room >= 0 else None)
+
+
+def known_relations(encoded: EncodedScene) -> Flags:
+    """Return a mask of the relations whose truth is known without selection bias.
+
+    The mask has the shape (relations, instances, instances). Some data sources list `left` and
+    `front` only occasionally and never as false. Such sources do not show how often these two
+    relations hold. The mask then contains only pairs with one object on or above the other. For
+    these pairs, an unlisted `left` or `front` is false.
+    """
+    unlisted = meaning_of(encoded.source).unlisted
+    known, holds = encoded.instance_observed.copy(), encoded.instance_holds
+    stacked = holds[_VERTICAL].any(0)
+    stacked |= stacked.T
+    for a in range(min(len(known), len(unlisted))):
+        off = known[a] & ~holds[a]
+        # Without poses, the "neighbours" are the pairs of objects that an annotator selected.
+        chosen = unlisted[a] == "off for neighbours" and encoded.instance_positions is None
+        if chosen or (unlisted[a] == "unobserved" and not (off & ~stacked).any()):
+            known[a] &= stacked & off.any()
+    return known
+
+
+def taken_away(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[int, list[int]] | None:
+    """Draw a class to remove. Return its index and the indices of the remaining instances.
+
+    Structure classes such as walls stay in the scene. The result is None if the scene has fewer
+    than two other classes.
+    """
+    classes = encoded.evidence.classes
+    removable = classes[~structure[classes]]
+    if len(removable) < 2:
+        return None
+    target = int(rng.choice(removable))
+    return target, [k for k, c in enumerate(encoded.instance_classes) if c != target]
+
+
+def told_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Flags, list[Triple]]:
+    """Draw half of the object pairs of a scene as observed pairs.
+
+    The draw ignores whether a pair has relations. If relations were drawn instead of pairs, pairs
+    without an observed relation would have fewer relations than other pairs.
+
+    Returns:
+        A mask of the unobserved pairs, (instances, instances) bool, and the observed triples
+        (relation, subject, object).
+    """
+    size = len(encoded.instance_classes)
+    half = np.triu(rng.random((size, size)) < 0.5, 1)
+    told = half | half.T
+    plain = ~structure[encoded.instance_classes]
+    triples = np.argwhere(encoded.instance_holds & told & plain[:, None] & plain).tolist()
+    return ~told, [(int(a), int(x), int(y)) for a, x, y in triples]
+
+
+class Part(NamedTuple):
+    """A part of a scene that a robot could list.
+
+    Attributes:
+        classes: (n,) listed classes without structure, in ascending order.
+        listed: (n,) number of listed instances of each class, from 1 to `number`.
+        number: (n,) number of instances of each class in the scene, at most `MOST`.
+        room: index of the room type. -1 means that the room type is unknown.
+    """
+
+    classes: Ints
+    listed: Ints
+    number: Ints
+    room: int
+
+
+def some_instances(encoded: EncodedScene, structure: Flags, rng: Rng) -> Part:
+    """Draw a part of a scene to list.
+
+    The part contains 25, 50, 75 or 100 % of the classes. Half of the parts list one instance of
+    each class. The other parts list any number of instances with equal probability, from one to all
+    instances. Half of the parts state the room type.
+    """
+    plain = np.flatnonzero(~structure[encoded.evidence.classes])
+    share = _LISTED[rng.integers(len(_LISTED))]
+    kept = np.sort(rng.permutation(plain)[: max(1, int(share * len(plain) + 0.5))])
+    number = np.minimum(encoded.evidence.counts[kept], MOST)
+    one = rng.random() < 0.5
+    listed = np.ones_like(number) if one else rng.integers(1, number + 1)
+    room = encoded.room_type if rng.random() < 0.5 else -1
+    return Part(encoded.evidence.classes[kept], listed, number, room)
+
+
+def occupied_place(
+    encoded: EncodedScene,
+    structure: Flags,
+    shown: Flags,
+    rng: Rng,
+) -> tuple[int, int] | None:
+    """Draw a place that is related to a shown object and contains another object.
+
+    The draw ignores whether the object at the place is shown or hidden. If only places of hidden
+    objects were drawn, a missing object would seem more likely at every place.
+
+    Args:
+        shown: True for shown objects, (instances,) bool.
+
+    Returns:
+        The canonical relation of the place, and the index of the shown object, which is the object
+        of the relation. None means that the scene has no such place.
+    """
+    usable = ~structure[encoded.instance_classes]
+    stands = encoded.instance_holds & known_relations(encoded) & usable[:, None] & (usable & shown)
+    places = np.argwhere(stands.any(1))
+    if not len(places):
+        return None
+    relation, anchor = places[rng.integers(len(places))]
+    return int(relation), int(anchor)
+
+
+def altered_case(
+    encoded: EncodedScene, structure: Flags, rng: Rng
+) -> tuple[Scene, Triple | None] | None:
+    """Return a scene with observed relations, of which one may be false, and the false relation.
+
+    Half of the scenes have a false triple (relation, subject, object) in place of a true triple. In
+    the other half, all triples are true, and the false triple is None.
+    """
+    triples = stated_relations(encoded, structure, rng)
+    if triples is None:
+        return None
+    if rng.random() < 0.5:
+        return scene_of(encoded, range(len(encoded.instance_classes)), triples), None
+    return altered_scene(encoded, structure, triples, rng)
+
+
+def stated_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> list[Triple] | None:
+    """Return at most 40 true relations of a scene, or None if fewer than two are known."""
+    usable = ~structure[encoded.instance_classes]
+    holds = encoded.instance_holds & usable[:, None] & usable[None, :]
+    triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(holds)]
+    if len(triples) > 40:
+        chosen = sorted(rng.choice(len(triples), 40, replace=False).tolist())
+        triples = [triples[k] for k in chosen]
+    return triples if len(triples) > 1 else None
+
+
+def altered_scene(
+    encoded: EncodedScene,
+    structure: Flags,
+    triples: Sequence[Triple],
+    rng: Rng,
+) -> tuple[Scene, Triple] | None:
+    """Replace one of `triples` by a false triple. Return the scene and this triple, or None."""
+    usable = ~structure[encoded.instance_classes]
+    holds = encoded.instance_holds
+    place = int(rng.integers(len(triples)))
+    for _ in range(50):
+        a, i, j = triples[place]
+        if rng.random() < 0.5:
+            a = int(rng.integers(len(CANONICAL)))
+        else:
+            j = int(rng.integers(len(usable)))
+        if i == j or not usable[j] or holds[a, i, j] or holds[a, j, i]:
+            continue
+        altered = [*triples[:place], (a, i, j), *triples[place + 1 :]]
+        return scene_of(encoded, range(len(usable)), altered), (a, i, j)
+    return None
+
+
+def logistic(
+    features: Floats,
+    truth: Flags,
+    weight: Floats | None = None,
+    C: float = 1e6,
+) -> list[float]:
+    """Return the coefficients and then the intercept of a logistic regression.
+
+    Args:
+        weight: weight of each example, (examples,). None means equal weights.
+        C: inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
+            unweighted examples are separable.
+    """
+    fit = LogisticRegression(C=C, max_iter=1000).fit(features, truth, weight)
+    return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]
+
+
+# Share of the classes of a scene that must occur several times. Other sources list each label once.
+_COUNTING: Final = 0.05
+
+
+def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, Flags]:
+    """Return the classes whose instances a data source counts, as masks (V,) by source name.
+
+    A source counts instances if its object lists are complete and if at least 5 % of the entries
+    (scene, class) have several instances.
+    """
+    plain = ~vocabulary.structure
+    entries, several = Counter[str](), Counter[str]()
+    repeated: dict[str, Flags] = {}
+    for scene in scenes:
+        if not scene.complete:
+            continue
+        evidence = scene.evidence
+        usable = plain[evidence.classes]
+        entries[scene.source] += int(usable.sum())
+        several[scene.source] += int((evidence.counts[usable] > 1).sum())
+        often = repeated.setdefault(scene.source, np.zeros(len(vocabulary), dtype=np.bool_))
+        often[evidence.classes[evidence.counts > 1]] = True
+    counting = [source for source in repeated if several[source] > _COUNTING * entries[source]]
+    partly = {name for name, source in SOURCES.items() if source.counts_movables}
+    return {source: plain & repeated[source] if source in partly else plain for source in counting}
+
+
+def listed_cases(
+    scene: EncodedScene, counted: Flags, structure: Flags, seed: int
+) -> tuple[Part, NDArray[np.intp]]:
+    """Return a listed part of a scene, and the places of its classes that the source counts."""
+    part = some_instances(scene, structure, scene_rng(scene, seed))
+    return part, np.flatnonzero(counted[part.classes])

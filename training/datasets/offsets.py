@@ -1,0 +1,52 @@
+"""Offsets (position differences) between related objects in scenes with poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Floats, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Observed offsets between related objects.
+
+    Attributes:
+        offset: position of the relation's subject minus position of its object, in metres and
+            viewer axes, (offsets, 3).
+        relation: index of the canonical relation, (offsets,).
+        subject, other: class indices of the relation's subject and object, (offsets,).
+        source: index of the data source of the scene, (offsets,).
+    """
+
+    offset: Floats
+    relation: Ints
+    subject: Ints
+    other: Ints
+    scene: Ints
+    source: Ints
+
+    def some(self, some: Flags) -> Seen:
+        """Return the offsets where the mask `some`, (offsets,), is True."""
+        return Seen(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
+
+
+def seen_offsets(scenes: Sequence[EncodedScene]) -> Seen:
+    """Return the offsets between all related objects in all scenes with poses."""
+    sources = sorted({scene.source for scene in scenes})
+    offsets, rows = [np.zeros((0, 3))], [np.zeros((0, 5), dtype=np.int64)]
+    for place, scene in enumerate(scenes):
+        if scene.instance_positions is None:
+            continue
+        relation, i, j = np.nonzero(scene.instance_holds)
+        offset = scene.instance_positions[i] - scene.instance_positions[j]
+        known = np.isfinite(offset).all(axis=1)
+        classes = scene.instance_classes
+        where = np.full(len(i), place), np.full(len(i), sources.index(scene.source))
+        offsets.append(offset[known])
+        rows.append(np.stack([relation, classes[i], classes[j], *where], axis=1)[known])
+    return Seen(np.concatenate(offsets), *np.concatenate(rows).T)

@@ -1,0 +1,394 @@
+"""`python -m training compare`: compare two models on scenes held out from both."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from app.registry import RegistryError, Store
+from app.scene import Vocabulary
+from training.datasets import DatasetError, annotated_classes, encode
+from training.datasets.batches import SceneTensors, scene_tensors
+from training.datasets.cases import some_scenes
+from training.datasets.files import DATA
+from training.domain.init_command import fail
+from training.domain.sides import BASELINE_SIDE, HeldOut, Rival, Say, Side, find, held_out
+from training.domain.translation import BEYOND, Translation, same_classes
+from training.evaluation.missing_tasks import leave_one_out
+from training.evaluation.model import ObjectScore
+from training.evaluation.report import Progress, SourceReport, digest, run, silent
+from training.evaluation.results import Difference, Results, only, summarise
+from training.evaluation.setting import Setting
+from training.evaluation.tasks import TASKS, in_words
+from training.fit.checkpoint import RunError
+from training.fit.settings import ConfigError
+from training.runs.pipeline import read_sources, split_and_encode
+
+COMPARED: dict[str, tuple[str, ...]] = {
+    "T2 missing": ("MRR", "top-1", "top-10"),
+    "T2-at missing at a place": ("MRR",),
+    "T3 outliers, uniform": ("hit@1", "AUROC"),
+    "T1a relations": ("R-precision, instance counts", "R-precision, distinct classes"),
+    "T1b completion": ("R-precision",),
+    "T3b placement": ("hit@1",),
+}
+"""Metrics to compare, by task. The first metric of a task is its primary metric. For all metrics,
+higher is better."""
+
+RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
+"""Tasks that need scenes with relations."""
+
+# Tasks that leave out scenes without relations.
+_RELATED = ("T2-at missing at a place", "T3b placement")
+# Number of answers per model in an example.
+_FIRST = 3
+_COLOURS = {"better": "green", "worse": "red"}
+
+console = Console()
+
+
+@dataclass(frozen=True)
+class Example:
+    """An example question: a scene with one removed object, and the answers of both models.
+
+    Attributes:
+        room_type: room type of the scene, or "" if unknown.
+        shown: labels of the remaining objects.
+        removed: label of the removed object.
+        ranks: rank that each model gives to the removed object, first model first. Objects with
+            equal scores share the best rank.
+        answers: labels of the most probable missing objects by each model, first model first.
+    """
+
+    scene: str
+    room_type: str
+    shown: tuple[str, ...]
+    removed: str
+    ranks: tuple[int, int]
+    answers: tuple[tuple[str, ...], tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Comparison of two models.
+
+    Attributes:
+        results: metrics of both models. The first model is the reference `ours`.
+        b: title of the second model.
+        groups: number of groups of near-duplicates among the compared scenes.
+        certain: False if a model may have learnt from some of the scenes.
+        notes: remarks on the results.
+        examples: questions for which the answers of the models differ most.
+        unmeasured: relation tasks that were measured for the second model before its publication,
+            but not in this comparison. Empty if this comparison measures any relation task.
+    """
+
+    results: Results
+    b: str
+    scenes: int
+    groups: int
+    certain: bool
+    notes: tuple[str, ...]
+    examples: tuple[Example, ...]
+    unmeasured: tuple[str, ...] = ()
+
+    @property
+    def a(self) -> str:
+        """Title of the first model."""
+        return self.results.ours
+
+    def worse_by(self, margin: float) -> list[Difference]:
+        """Return the primary metrics whose whole interval of the difference is below -margin."""
+        return [
+            row
+            for row in self.results.differences
+            if row.metric == COMPARED[row.task][0] and row.figure.high < -margin
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-serialisable dictionary with the results and all other attributes."""
+        own = asdict(self)
+        own.pop("results")
+        return self.results.to_dict() | {"a": self.a} | own
+
+
+def compare_command(
+    new: Annotated[str, typer.Argument(help="first model: folder of a run, or a stored model")],
+    old: Annotated[
+        str | None,
+        typer.Argument(
+            help=f"second model, or {BASELINE_SIDE}. By default the model with the alias "
+            f"`default`; if the store has no such alias, {BASELINE_SIDE}"
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option("--data", help="folder with the scenes of the first model")
+    ] = None,
+    store: Annotated[
+        str, typer.Option("--store", help="folder of the model store")
+    ] = "model_store",
+    limit: Annotated[int, typer.Option(min=2, help="maximum number of scenes")] = 300,
+    examples: Annotated[int, typer.Option(min=0, help="number of example questions to show")] = 3,
+    output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
+) -> None:
+    """Compare two models on scenes held out from both.
+
+    The scenes are the test scenes of the first model, without scenes that the second model learnt
+    from. The table shows the difference of each metric with its paired 95 % interval. The bootstrap
+    resamples groups of near-duplicate scenes.
+    """
+    try:
+        with console.status("reading") as status:
+            say: Say = status.update
+            models = Store(store)
+            a = find(new, models, data, say)
+            served = "default" if "default" in models.aliases() else BASELINE_SIDE
+            b = find(old or served, models, data, say)
+            comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
+    except (ConfigError, DatasetError, RegistryError, RunError) as error:
+        fail(error)
+    if output is not None:
+        text = json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False)
+        output.write_text(text + "\n", encoding="utf-8")
+    show(comparison, console)
+
+
+def _root(given: Path | None, *sides: Side) -> Path:
+    known = (side.data for side in sides)
+    return given or next((path for path in known if path is not None), DATA)
+
+
+def show(comparison: Comparison, console: Console) -> None:
+    """Print the metrics of a comparison as a table, with its notes and examples."""
+    console.print(
+        f"{comparison.scenes} held-out scenes of {comparison.groups} groups\n"
+        f"A: {comparison.a}\nB: {comparison.b}",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+    heads = "task, metric", "A", "B", "A - B, 95 % interval", "A is"
+    # Without edges and padding, the table fits into 80 columns.
+    table = Table(*heads, box=box.SIMPLE_HEAD, show_edge=False, padding=0)
+    cells = comparison.results.cells
+    values = {(cell.row, cell.task, cell.metric): cell.figure.value for cell in cells}
+    task = ""
+    for row in comparison.results.differences:
+        if row.task != task:
+            task = row.task
+            table.add_row(f"[bold]{in_words(task)}[/bold]")
+        colour, figure = _COLOURS.get(row.verdict, "dim"), row.figure
+        table.add_row(
+            f"  {row.metric}",
+            *(f"{values[x, row.task, row.metric]:.3f}" for x in (comparison.a, comparison.b)),
+            f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]",
+            f"[{colour}]{row.verdict}[/{colour}]",
+        )
+    console.print(table)
+    notes = list(comparison.notes)
+    if comparison.unmeasured:
+        names = ", ".join(map(in_words, comparison.unmeasured))
+        notes.append(f"{comparison.a} was not measured in {names}: the scenes contain no relations")
+    for note in notes:
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
+    if not comparison.examples:
+        return
+    console.print("Questions with the most different answers (one object removed from each scene):")
+    for example in comparison.examples:
+        room = f" ({example.room_type})" if example.room_type else ""
+        lines = [f"  {example.scene}{room}: {', '.join(example.shown)}"]
+        lines.append(f"    removed: {example.removed}")
+        for name, rank, answers in zip(
+            (comparison.a, comparison.b), example.ranks, example.answers, strict=True
+        ):
+            lines.append(f"    {name}, rank {rank}: {', '.join(answers)}, …")
+        console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def compare(
+    a: Side, b: Side, root: Path, *, limit: int | None, examples: int, say: Say
+) -> Comparison:
+    """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
+
+    Args:
+        root: folder with the scene files of the first model's configuration.
+
+    Raises:
+        ConfigError: the first model lacks its training configuration, its scene files are missing,
+            or too few scenes are held out from both models.
+    """
+    if a.config is None or a.vocabulary is None:
+        raise ConfigError(
+            f"{a.title} does not record its training configuration, so its held-out scenes are "
+            "unknown: choose a first model that was trained with this project"
+        )
+    say("reading scenes")
+    sources = read_sources(a.config.data, root)
+    held = held_out(a, b, sources, root)
+    data = split_and_encode(a.config.data, sources, a.vocabulary).training_data()
+    encoded = encode(held.scenes, a.vocabulary)
+    annotated = annotated_classes(encoded, a.vocabulary)
+    scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), limit)
+    rivals = (a.rival(a.vocabulary, data, say), b.rival(a.vocabulary, data, say))
+    try:
+        titles = a.title, b.title if b.title != a.title else f"{b.title} (second)"
+        results = side_by_side(titles, rivals, scenes, data.structure, progress=say)
+    except ValueError as error:
+        raise ConfigError(f"{a.title} and {b.title} cannot be compared: {error}") from error
+    if not results.differences:
+        raise ConfigError(
+            f"the {len(scenes)} held-out scenes are unsuitable for all compared tasks: provide "
+            "scenes with at least two object classes"
+        )
+    groups = len({scene.group for scene in scenes.scenes})
+    say("looking for examples")
+    first, second = (rival("T2 missing").objects for rival in rivals)
+    found: list[Example] = []
+    if first is not None and second is not None:
+        found = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
+    return Comparison(
+        results=results,
+        b=titles[1],
+        scenes=len(scenes),
+        groups=groups,
+        certain=held.certain,
+        notes=tuple(_notes(a, b, held, limit)),
+        examples=tuple(found),
+        unmeasured=unmeasured(results.differences, b),
+    )
+
+
+def side_by_side(
+    titles: tuple[str, str],
+    rivals: tuple[Rival, Rival],
+    scenes: SceneTensors,
+    structure: Tensor,
+    *,
+    progress: Progress = silent,
+) -> Results:
+    """Measure every metric that both models support, and the paired differences.
+
+    The bootstrap resamples groups of near-duplicate scenes.
+
+    Raises:
+        ValueError: for every task, the scenes belong to fewer than two groups, so intervals are
+            undefined.
+    """
+    setting = Setting(scenes, structure, limit=None)
+
+    def groups(task: str) -> list[str]:
+        asked = setting.complete if TASKS[task].of_objects else setting
+        return [scene.group for scene in asked.some(task in _RELATED).scenes]
+
+    tasks = [task for task in COMPARED if len(set(groups(task))) > 1]
+    if not tasks:
+        raise ValueError("the scenes belong to one group, but intervals need at least two groups")
+    reports = {}
+    for title, rival in zip(titles, rivals, strict=True):
+        report = SourceReport("held out", digest(setting))
+        for task in tasks:
+            for _ in run(rival(task), setting, report, tasks=[task], progress=progress):
+                pass
+        reports[title, 0] = {"held out": only(report, COMPARED)}
+    progress("resampling groups")
+    return summarise(reports, titles[0], groups=groups)
+
+
+def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
+    """Return the relation tasks that only the other card measures; () if `rows` measure any."""
+    if other.artifact is None or any(row.task in RELATIONAL for row in rows):
+        return ()
+    measured = {metric.task for metric in other.artifact.manifest.metrics}
+    return tuple(task for task in RELATIONAL if task in measured)
+
+
+def _notes(a: Side, b: Side, held: HeldOut, limit: int | None) -> Iterator[str]:
+    """Generate remarks on the results, for the user."""
+    yield from held.notes
+    asked, other = a.vocabulary, b.vocabulary
+    if asked is not None and other is not None and not same_classes(asked, other):
+        yield from _classes_note(a, b, asked, other, held)
+    if limit is not None and len(held.scenes) > limit:
+        yield f"only {limit} of {len(held.scenes)} held-out scenes are compared, because of --limit"
+
+
+def _classes_note(
+    a: Side, b: Side, asked: Vocabulary, other: Vocabulary, held: HeldOut
+) -> Iterator[str]:
+    """Generate a note on the classes of the first model that the second model lacks, if any."""
+    own = Translation.between(asked, other).own
+    if not (missing := int((own < 0).sum())):
+        return
+    labels = [thing.label for scene in held.scenes for thing in scene.objects]
+    mentions = [index for label in labels if (index := asked.index(label)) is not None]
+    lost = sum(int(own[index]) < 0 for index in mentions)
+    yield (
+        f"the questions use the {len(asked)} classes of {a.title}. {b.title} lacks "
+        f"{missing} of these classes ({lost / max(len(mentions), 1):.0%} of the "
+        "objects in the scenes). Objects of these classes are not part of its input, and it ranks "
+        "these classes last"
+    )
+
+
+def changed_most(
+    a: ObjectScore,
+    b: ObjectScore,
+    scenes: SceneTensors,
+    structure: Tensor,
+    vocabulary: Vocabulary,
+    count: int,
+) -> list[Example]:
+    """Return the questions for which the two models' reciprocal ranks differ most.
+
+    Each question removes one object from a scene. The result has at most `count` examples, and at
+    most one example per group of near-duplicate scenes.
+    """
+    first, second = (leave_one_out(scenes, structure, score) for score in (a, b))
+    change = np.abs(first.reciprocal_rank() - second.reciprocal_rank())
+    chosen: dict[str, int] = {}
+    for place in np.argsort(-change, kind="stable").tolist():
+        if len(chosen) == count or not change[place]:
+            break
+        chosen.setdefault(scenes.scenes[int(first.scene[place])].group, place)
+    found = []
+    for place in chosen.values():
+        row, target = int(first.scene[place]), int(first.target[place])
+        scene, v = scenes.scenes[row], scenes.v[row].clone()
+        v[target] = 0.0
+        room = vocabulary.room_types[scene.room_type] if scene.room_type >= 0 else ""
+        found.append(
+            Example(
+                scene=scene.scene_id,
+                room_type=room,
+                shown=tuple(vocabulary.labels[k] for k in v.nonzero().squeeze(1).tolist()),
+                removed=vocabulary.labels[target],
+                ranks=(int(first.above[place]) + 1, int(second.above[place]) + 1),
+                answers=(
+                    _answers(a, v, structure, vocabulary),
+                    _answers(b, v, structure, vocabulary),
+                ),
+            )
+        )
+    return found
+
+
+@torch.no_grad()
+def _answers(
+    score: ObjectScore, v: Tensor, structure: Tensor, vocabulary: Vocabulary
+) -> tuple[str, ...]:
+    """Return the labels of the most probable missing objects, best first."""
+    values = score(v.unsqueeze(0))[0].masked_fill((v > 0) | structure, -torch.inf)
+    order = values.argsort(descending=True, stable=True)[:_FIRST].tolist()
+    # The score -BEYOND marks classes that the model lacks.
+    return tuple(vocabulary.labels[index] for index in order if values[index] > -BEYOND)

@@ -1,0 +1,196 @@
+"""Decide whether an alias may point at a new version.
+
+First, the new version must be useful. On the test scenes of its run, it must rank missing objects
+better than popularity (the class frequencies) by at least `GAIN`, and not worse than EASE (class
+co-occurrence).
+
+Then the new version is compared with the version that the alias serves, on common held-out scenes
+(see compare.py). It is refused if a primary metric is lower by more than the margin, over the whole
+interval of the paired difference. Smaller or uncertain losses are accepted. The new version is also
+refused if the served version was measured on relation tasks and the comparison contains none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from app.registry import Artifact, ArtifactError, Store, StoreError
+from app.registry.references import AliasTarget
+from training.datasets.batches import TrainingData, subset
+from training.datasets.cases import some_scenes
+from training.domain.compare import Comparison, compare
+from training.domain.sides import Say, Side, stored_side
+from training.evaluation.baselines import EASE, POPULARITY
+from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
+from training.evaluation.missing_tasks import MachineScore, leave_one_out
+from training.evaluation.model import ObjectScore
+from training.evaluation.tasks import in_words
+from training.machines.arrays import machine_of
+from training.runs.folder import FinishedRun
+from training.runs.pipeline import SplitScenes
+
+# Accepted loss of a primary metric when a new version replaces the served version.
+MARGIN = 0.02
+
+GAIN = 0.02
+"""Minimum lead of a new version over popularity, in MRR. A smaller lead is of no use, even if it is
+certain: a model that is trained on shuffled labels can lead by 0.006."""
+
+NEW = "the new version"
+_REQUIRED = f"at least {GAIN:+.3f}, whole interval above zero"
+
+
+@dataclass(frozen=True)
+class Usefulness:
+    """A new version beside two baselines: MRR (mean reciprocal rank) of missing objects.
+
+    Attributes:
+        scenes, groups: number of test scenes, and of their groups of near-duplicates.
+        ours: MRR of the new version. None if no test scene can be used.
+        theirs: MRR of each baseline, by name.
+        differences: new version minus baseline, with the paired 95 % interval, by name.
+    """
+
+    scenes: int
+    groups: int
+    ours: float | None = None
+    theirs: Mapping[str, float] = field(default_factory=dict)
+    differences: Mapping[str, Figure] = field(default_factory=dict)
+
+    def lines(self) -> Iterator[str]:
+        """Generate the results as lines of at most 80 characters."""
+        if self.ours is None:
+            return
+        yield f"mean reciprocal rank of a missing object, {self._place()}:"
+        yield f"  {NEW:16} {self.ours:.3f}"
+        for name, value in self.theirs.items():
+            yield f"  {name:16} {value:.3f}  difference {_signed(self.differences[name])}"
+        yield f"  required over {POPULARITY.name}: {_REQUIRED}"
+
+    def objections(self) -> list[str]:
+        """Return the reasons against the new version; an empty list if it is useful."""
+        if self.ours is None or self.groups < FEWEST_GROUPS:
+            return [
+                f"{NEW} cannot be compared with {POPULARITY.name}: {self._place()}, and a "
+                f"comparison needs test scenes of at least {FEWEST_GROUPS} groups with two or more "
+                "classes. Provide more scenes"
+            ]
+        reasons = []
+        gain, loss = self.differences[POPULARITY.name], self.differences[EASE.name]
+        if not (gain.value >= GAIN and gain.low > 0):
+            reasons.append(
+                f"{NEW} is not clearly better than {POPULARITY.name}, which only knows how "
+                f"frequent each class is: difference {_signed(gain)} (required: {_REQUIRED}), "
+                f"{self._place()}. Check the labels, train longer or provide more scenes"
+            )
+        if loss.high < 0:
+            reasons.append(
+                f"{NEW} is worse than EASE, a plain model of co-occurrence: difference "
+                f"{_signed(loss)}, {self._place()}"
+            )
+        return reasons
+
+    def _place(self) -> str:
+        return f"{self.scenes} test scenes of {self.groups} groups"
+
+
+def _signed(figure: Figure) -> str:
+    return f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]"
+
+
+def measure_usefulness(
+    artifact: Artifact, data: TrainingData, *, limit: int | None, say: Say
+) -> Usefulness:
+    """Compare a new version with popularity and EASE on the test scenes of its run.
+
+    The baselines learn from the training scenes of the run. Scenes with incomplete object lists are
+    left out, unless all test scenes are such scenes.
+    """
+    complete = data.test.complete.nonzero().squeeze(1)
+    scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, limit)
+    # A question hides one class and lists at least one other class.
+    usable = ((scenes.v > 0) & ~data.structure).sum(1) > 1
+    scenes = subset(scenes, usable.nonzero().squeeze(1))
+    groups = [scene.group for scene in scenes.scenes]
+    size = len(scenes), len(set(groups))
+    if len(set(groups)) < FEWEST_GROUPS:
+        return Usefulness(*size)
+
+    def mrr(score: ObjectScore) -> Ratio:
+        return leave_one_out(scenes, data.structure, score).mrr()
+
+    ours = mrr(MachineScore(machine_of(artifact.weights)))
+    theirs = {}
+    for baseline in (POPULARITY, EASE):
+        say(f"fitting {baseline.name}")
+        fitted = baseline.fit(data.train, data.validation, data.structure)
+        theirs[baseline.name] = mrr(fitted.score)
+    return Usefulness(
+        *(*size, ours.value),
+        {name: other.value for name, other in theirs.items()},
+        {name: paired_difference(ours, other, groups=groups) for name, other in theirs.items()},
+    )
+
+
+@dataclass(frozen=True)
+class Seat:
+    """An alias of the model store, and the model that it serves now.
+
+    Attributes:
+        target: model version that the alias names now. None if the alias is new.
+        holder: the served model. None if the alias is new or the model cannot be read.
+        note: reason why a comparison with the served model is impossible, or "".
+    """
+
+    alias: str
+    target: AliasTarget | None
+    holder: Side | None
+    note: str
+
+
+def seat(store: Store, alias: str) -> Seat:
+    """Look up an alias in the store and load the model that it serves.
+
+    Raises:
+        StoreError: the aliases of the store cannot be read.
+    """
+    target = store.aliases().get(alias)
+    if target is None:
+        return Seat(alias, None, None, f"{alias} is a new alias, so there is no older version")
+    try:
+        return Seat(alias, target, stored_side(alias, store), "")
+    except (ArtifactError, StoreError) as error:
+        note = f"no comparison: the model served as {alias} cannot be read ({error})"
+        return Seat(alias, target, None, note)
+
+
+def compare_with_served(
+    run: FinishedRun,
+    scenes: SplitScenes,
+    artifact: Artifact,
+    holder: Side,
+    root: Path,
+    *,
+    limit: int | None,
+    say: Say,
+) -> Comparison:
+    """Compare a new version with the served version before publication."""
+    new = Side(NEW, run.config, scenes.digests, artifact, root)
+    return compare(new, holder, root, limit=limit, examples=3, say=say)
+
+
+def losses(comparison: Comparison, margin: float) -> list[str]:
+    """Return the reasons against the first model of a comparison."""
+    a, b, reasons = comparison.a, comparison.b, []
+    if rows := comparison.worse_by(margin):
+        names = ", ".join(f"{in_words(row.task)}, {row.metric} {row.figure}" for row in rows)
+        reasons.append(f"{a} is worse than {b} by more than {margin}: {names}")
+    if comparison.unmeasured:
+        names = ", ".join(map(in_words, comparison.unmeasured))
+        reasons.append(
+            f"{b} was measured in {names}, but {a} was not, because the compared scenes contain "
+            "no relations"
+        )
+    return reasons

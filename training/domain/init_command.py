@@ -1,0 +1,201 @@
+"""Two commands: `init` proposes a configuration for your scenes, `example` generates scenes."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Annotated, Literal, NoReturn
+
+import typer
+from rich.console import Console
+
+from app.registry import RegistryError
+from training.datasets import READERS, AnnotatedScene, DatasetError, generate_rooms, vocabulary_json
+from training.datasets.jsonl import scan_jsonl, write_jsonl
+from training.datasets.readers import guess_format
+from training.datasets.rooms import DOMAINS
+from training.domain.proposal import Proposal, propose
+from training.domain.proposal_report import as_dict, show
+from training.evaluation.report import write_whole
+from training.fit.settings import ConfigError, is_file, source_name
+from training.runs.config import shipped_configs
+from training.runs.example_scenes import examples_json
+
+# Maximum number of invalid lines that are printed. Further invalid lines are only counted.
+BAD_LINES = 20
+
+console = Console()
+
+
+class BadLinesError(ValueError):
+    """Some lines of a file are not valid scenes. `errors` contains the error of each line."""
+
+    def __init__(self, errors: list[DatasetError]) -> None:
+        n = len(errors)
+        super().__init__("1 line is not a scene" if n == 1 else f"{n} lines are not scenes")
+        self.errors = errors
+
+
+def init(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="name of the model, such as my-lab: words of a-z and 0-9, joined by hyphens; "
+            "capitals, underscores, dots and spaces are refused"
+        ),
+    ],
+    files: Annotated[list[Path], typer.Argument(help="files with the scenes of one domain")],
+    output: Annotated[
+        Path | None, typer.Option(help="output folder; default: a folder named like the model")
+    ] = None,
+    format_: Annotated[
+        str | None,
+        typer.Option("--format", help=f"{', '.join(READERS)}; default: derived from file names"),
+    ] = None,
+    terms: Annotated[str, typer.Option(help="terms of use of the scenes (model card)")] = "",
+    report: Annotated[Path | None, typer.Option("--json", help="file for a JSON report")] = None,
+    force: Annotated[bool, typer.Option("--force", help="overwrite existing files")] = False,
+) -> None:
+    """Analyse your scenes, and propose a vocabulary and a training configuration.
+
+    The command writes NAME.toml, vocabulary.json and examples.json (scenes for the visual page)
+    into the output folder. You can edit these files. The command overwrites existing files only
+    with --force.
+    """
+    folder = Path(name) if output is None else output
+    try:
+        _check_name(name)
+        names = (f"{name}.toml", "vocabulary.json", "examples.json")
+        targets = [folder / file for file in names]
+        if not force and (there := [path for path in targets if path.exists()]):
+            raise ConfigError(
+                f"{' and '.join(map(str, there))} would be overwritten: use --force, or choose "
+                "another folder with --output"
+            )
+        with console.status("reading scenes"):
+            found = {file: _read(file, format_) for file in files}
+        for file in files:
+            if not found[file]:
+                raise DatasetError(file, "", "the file contains no scene")
+        sources, copies = _sources(folder, found)
+        scenes = [scene for some in found.values() for scene in some]
+        with console.status("analysing scenes"):
+            proposal = propose(name, scenes, sources, terms=terms)
+            proposal.config  # noqa: B018  # raises an error if the proposal is invalid
+    except BadLinesError as error:
+        _fail_lines(error)
+    except (ConfigError, DatasetError, ValueError) as error:
+        fail(error)
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, some in copies.items():
+        write_jsonl(some, path)
+    write_whole(targets[0], proposal.toml())
+    write_whole(targets[1], vocabulary_json(proposal.vocabulary))
+    write_whole(targets[2], examples_json(proposal.examples))
+    if report is not None:
+        write_whole(report, json.dumps(as_dict(proposal), indent=1, ensure_ascii=False) + "\n")
+    show(proposal, console)
+    _next(proposal, folder, targets, copies)
+
+
+def _check_name(name: str) -> None:
+    if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
+        raise ConfigError(
+            f"the model name is {name!r}; use lower-case words and digits, joined by hyphens, "
+            "such as my-lab"
+        )
+    if name in shipped_configs():
+        raise ConfigError(f"{name} is the name of a shipped configuration; choose another name")
+
+
+def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
+    """Read the scenes of a file."""
+    if format_ is not None and format_ not in READERS:
+        raise ConfigError(f"unknown format {format_!r}: use one of {', '.join(READERS)}")
+    if (format_ or guess_format(path)) != "jsonl":
+        return READERS[format_ or guess_format(path)](path)
+    scenes: list[AnnotatedScene] = []
+    errors: list[DatasetError] = []
+    for found in scan_jsonl(path):
+        if isinstance(found, DatasetError):
+            errors.append(found)
+        else:
+            scenes.append(found)
+    if errors:
+        raise BadLinesError(errors)
+    return scenes
+
+
+def _sources(
+    folder: Path, found: dict[Path, list[AnnotatedScene]]
+) -> tuple[list[str], dict[Path, list[AnnotatedScene]]]:
+    """Return the paths of the scene files relative to the folder, and the files to copy.
+
+    A file is copied under a new name if its own name does not determine the format. The second
+    result maps the path of each copy to its scenes.
+    """
+    sources: list[str] = []
+    copies: dict[Path, list[AnnotatedScene]] = {}
+    for file, scenes in found.items():
+        try:
+            guess_format(file)
+            sources.append(Path(os.path.relpath(file, folder)).as_posix())
+        except DatasetError:
+            copy = f"{source_name(file.name) if is_file(file.name) else file.name}.jsonl"
+            sources.append(copy)
+            copies[folder / copy] = scenes
+    return sources, copies
+
+
+def _next(
+    proposal: Proposal, folder: Path, targets: list[Path], copies: dict[Path, list[AnnotatedScene]]
+) -> None:
+    written = ", ".join(map(str, [*targets, *copies]))
+    console.print(f"\nwritten: {written}", markup=False, soft_wrap=True)
+    console.print(
+        f"next: check these files, then run  python -m training train {folder}",
+        markup=False,
+        soft_wrap=True,
+    )
+    if folder.resolve().name != proposal.name:
+        console.print(f"      (the configuration is {targets[0]})", markup=False, soft_wrap=True)
+
+
+def _fail_lines(error: BadLinesError) -> NoReturn:
+    console.print(f"[red]error:[/red] {error}; no file was written", soft_wrap=True)
+    for line in error.errors[:BAD_LINES]:
+        console.print(f"  {line.path.name}, {line.where}: {line.problem}", markup=False)
+    if (more := len(error.errors) - BAD_LINES) > 0:
+        console.print(f"  and {more} more")
+    raise typer.Exit(1)
+
+
+def fail(error: Exception) -> NoReturn:
+    """Print the error, without the code of a registry error, and exit with code 1."""
+    reason = error.reason if isinstance(error, RegistryError) else error
+    console.print(f"[red]error:[/red] {reason}", soft_wrap=True)
+    raise typer.Exit(1) from None
+
+
+def example(
+    file: Annotated[Path, typer.Argument(help="output file, such as scenes.jsonl")],
+    domain: Annotated[
+        Literal["homes", "workplaces"],
+        typer.Option(
+            help="homes: furnished rooms; workplaces: laboratories, workshops, storerooms"
+        ),
+    ] = "workplaces",
+    scenes: Annotated[int, typer.Option(min=1, help="number of scenes")] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="random seed")] = 0,
+) -> None:
+    """Generate example scenes of a domain, and write them as JSON lines.
+
+    With the same seed, a larger number of scenes only adds scenes after the existing scenes.
+    """
+    if file.exists():
+        fail(ConfigError(f"{file} already exists; choose another output file"))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_jsonl(generate_rooms(scenes, seed, DOMAINS[domain]), file)
+    console.print(f"{scenes} generated scenes of {domain}: {file}", soft_wrap=True)

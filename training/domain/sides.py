@@ -1,0 +1,295 @@
+"""The two sides of a comparison of models, and the scenes held out from both sides.
+
+A side is the model of a finished run, a published model, or a set of baselines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from app.registry import Artifact, Store, StoreError
+from app.scene import Vocabulary
+from training.datasets import AnnotatedScene, DatasetError, split, stable_part
+from training.datasets.batches import TrainingData, has_relations
+from training.datasets.files import DATA
+from training.domain.translation import Translation, same_classes
+from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, placed_product
+from training.evaluation.baselines.fitting import Baseline
+from training.evaluation.contenders import artifact_contender
+from training.evaluation.model import Contender
+from training.fit.checkpoint import RunError
+from training.fit.settings import Config, ConfigError, DataConfig, source_name
+from training.runs.folder import load_run
+from training.runs.pipeline import digest_of, prepare, read_sources
+from training.runs.publish import calibrated_draft
+
+BASELINE_SIDE = "baselines"
+"""Name of the side of baselines: EASE for objects, and a frequency table for relations.
+
+Objects at a place are scored by the product of EASE and a frequency table of places.
+"""
+
+Say = Callable[[str], None]
+# Function that takes a task name and returns the scores of a side.
+Rival = Callable[[str], Contender]
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of the two compared models.
+
+    Attributes:
+        title: name of the model in tables.
+        learnt: digest of each data source of the training, by source name.
+        artifact: the model. None for the baselines.
+        data: folder with the scene files of a run. None if the side is not a run.
+    """
+
+    title: str
+    config: Config | None
+    learnt: dict[str, str]
+    artifact: Artifact | None
+    data: Path | None = None
+
+    @property
+    def vocabulary(self) -> Vocabulary | None:
+        """Classes of the model. None for the baselines, which use the classes of the other side."""
+        return None if self.artifact is None else self.artifact.vocabulary
+
+    def rival(self, scenes: Vocabulary, data: TrainingData, say: Say) -> Rival:
+        """Return a function that returns the scores of this side for a task.
+
+        Args:
+            scenes: vocabulary of the test scenes. If the model has other classes, the questions are
+                translated into the classes of the model.
+        """
+        if self.artifact is None:
+            fitted = _baselines(data, say)
+            return lambda _: fitted
+        own = artifact_contender(self.artifact, data.train)
+        if same_classes(scenes, self.artifact.vocabulary):
+            return lambda _: own
+        translation = Translation.between(scenes, self.artifact.vocabulary)
+        return lambda task: translation.contender(own, task)
+
+
+def run_side(folder: Path, data: Path | None, say: Say) -> Side:
+    """Load a finished run as a side, and calibrate its model as for publication.
+
+    Args:
+        data: folder with the scene files. None means the folder that the run records.
+
+    Raises:
+        RunError: the folder holds no finished run, or the scene files have changed since training.
+        ConfigError, DatasetError: the scene files cannot be read.
+    """
+    run = load_run(folder)
+    root = data if data is not None else Path(run.data) if run.data else DATA
+    say("reading scenes")
+    scenes = prepare(run.config, root)
+    run.require(scenes.digest)
+    say(f"calibrating {folder}")
+    artifact = calibrated_draft(run, scenes.vocabulary, scenes.training_data())
+    return Side(str(folder), run.config, scenes.digests, artifact, root)
+
+
+def stored_side(reference: str, store: Store) -> Side:
+    """Load a published model as a side.
+
+    Raises:
+        StoreError, ArtifactError: the model does not exist or cannot be used.
+    """
+    name, version = store.resolve(reference)
+    artifact = store.load(name, version)
+    manifest = artifact.manifest
+    try:
+        config = Config.model_validate(manifest.training.get("config"))
+    except ValidationError:
+        config = None
+    learnt = {source.source: source.digest for source in manifest.data}
+    return Side(f"{name}@{version}", config, learnt, artifact)
+
+
+def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
+    """Return the side that a reference names.
+
+    Args:
+        reference: folder of a run, `BASELINE_SIDE`, or a published model.
+
+    Raises:
+        ConfigError: the reference names neither a run nor the baselines nor a published model.
+        RunError: the folder holds no finished run. See also `run_side` and `stored_side`.
+    """
+    if reference == BASELINE_SIDE:
+        # The baselines are fitted later, on the training scenes of the other side.
+        return Side(BASELINE_SIDE, None, {}, None)
+    folder = Path(reference)
+    if (folder / "config.json").is_file():
+        return run_side(folder, data, say)
+    try:
+        return stored_side(reference, store)
+    except StoreError as error:
+        if folder.is_dir():
+            raise RunError(f"the folder {reference} contains no finished run") from error
+        raise ConfigError(
+            f"{reference!r} names neither the folder of a finished run nor a model in "
+            f"{store.root}: {error.reason}"
+        ) from error
+
+
+def _baselines(data: TrainingData, say: Say) -> Contender:
+    def fit(baseline: Baseline[Any]) -> Any:
+        say(f"fitting {baseline.name}")
+        return baseline.fit(data.train, data.validation, data.structure, progress=say).score
+
+    objects = fit(EASE)
+    if not has_relations(data.validation):
+        return Contender(objects=objects)
+    relations = fit(FREQUENCY_TABLE)
+    placed = fit(placed_product(EASE.name, objects, fit(PLACED)))
+    return Contender(objects, relations, relations, placed, relations)
+
+
+# --------------------------------------------------------------------------------- held-out scenes
+
+# Function that takes a scene. It returns False if a model is known to have learnt from the scene.
+Kept = Callable[[AnnotatedScene], bool]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Scenes held out from both models.
+
+    Attributes:
+        scenes: test scenes of the first model, without scenes that the second model learnt from.
+        dropped: number of test scenes of the first model that are left out.
+        notes: remarks on the choice of scenes.
+        certain: False if a model may have learnt from some of the scenes.
+    """
+
+    scenes: list[AnnotatedScene]
+    dropped: int
+    notes: tuple[str, ...]
+    certain: bool
+
+
+def held_out(
+    a: Side, b: Side, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
+) -> HeldOut:
+    """Return the first model's test scenes without scenes that the second model learnt from.
+
+    Args:
+        sources: current scenes of the first model's configuration, by data source.
+
+    Raises:
+        ConfigError: the first model does not record its split, its test part is empty, or the
+            second model learnt from all its test scenes.
+    """
+    if a.config is None:
+        raise ConfigError(
+            f"{a.title} does not record the split of its scenes, so its test scenes are unknown"
+        )
+    everything = [scene for some in sources.values() for scene in some]
+    data = a.config.data
+    candidates = split(everything, seed=data.split_seed, protocol=data.split)["test"]
+    if not candidates:
+        if data.split == "final":
+            raise ConfigError(
+                f"{a.title} learnt from all of its scenes, because it was trained with --final; "
+                "compare the run without --final"
+            )
+        raise ConfigError("the test part contains no scenes: provide more scenes or more groups")
+    notes: list[str] = []
+    certain = True
+    kept = candidates
+    for side in (a, b):
+        judge, note, sure = _kept(side, sources, root)
+        if note:
+            notes.append(note)
+        certain &= sure
+        kept = [scene for scene in kept if judge(scene)]
+    dropped = len(candidates) - len(kept)
+    if not kept:
+        raise ConfigError(
+            f"no scene is held out from both models: {b.title} has learnt from all test scenes of "
+            f"{a.title}"
+        )
+    if dropped:
+        notes.append(
+            f"{dropped} of {len(candidates)} test scenes of {a.title} are left out: {b.title} has "
+            "learnt from these scenes or from near-duplicates (same group)"
+        )
+    return HeldOut(kept, dropped, tuple(notes), certain)
+
+
+def _kept(
+    side: Side, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
+) -> tuple[Kept, str, bool]:
+    """Return a filter of the held-out scenes, a note or "", and whether the filter is certain."""
+    if side.artifact is None:
+        return _all, "", True  # the baselines are fitted on the training scenes of the first model
+    digests = {name: digest_of(some) for name, some in sources.items()}
+    shared = {
+        name
+        for name, digest in digests.items()
+        if name in side.learnt or digest in side.learnt.values()
+    }
+    if not shared:
+        names = ", ".join(side.learnt) or "unknown"
+        return _all, f"{side.title} learnt from other data sources ({names})", True
+    if side.config is None:
+        note = f"{side.title} does not record its split and may have learnt from these scenes"
+        return _all, note, False
+    data = side.config.data
+    if data.split == "stable":
+        seed = data.split_seed
+        return (
+            lambda scene: scene.source not in shared or stable_part(scene.group, seed) == "test",
+            "",
+            True,
+        )
+    if (own := _scenes_of(data, side.learnt, sources, digests, root)) is None:
+        note = (
+            f"{side.title} may have learnt from these scenes: it learnt from other versions of "
+            f"{', '.join(sorted(shared))}, so its split cannot be reproduced. Use the stable split "
+            "to avoid this"
+        )
+        return _all, note, False
+    parts = split(own, seed=data.split_seed, protocol=data.split)
+    # Filter by group for all protocols: scenes of one group are near-duplicates.
+    learnt = {scene.group for part in ("train", "validation") for scene in parts[part]}
+    return lambda scene: scene.group not in learnt, "", True
+
+
+def _all(_: AnnotatedScene) -> bool:
+    return True
+
+
+def _scenes_of(
+    data: DataConfig,
+    learnt: Mapping[str, str],
+    sources: Mapping[str, Sequence[AnnotatedScene]],
+    digests: Mapping[str, str],
+    root: Path,
+) -> list[AnnotatedScene] | None:
+    """Return all scenes of a side before its split, or None if a data source has changed."""
+    found: list[AnnotatedScene] = []
+    for source in data.sources:
+        name = source_name(source)
+        if name in digests and digests[name] == learnt.get(name):
+            found += sources[name]
+            continue
+        try:
+            one = data.model_copy(update={"sources": (source,), "words": ""})
+            (read,) = read_sources(one, root).values()
+        except (ConfigError, DatasetError):
+            return None
+        if digest_of(read) != learnt.get(name):
+            return None
+        found += read
+    return found

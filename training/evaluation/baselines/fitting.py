@@ -1,0 +1,155 @@
+"""Common interface of all baselines: fit on training scenes, select on validation scenes.
+
+A baseline is a generator function. It fits a model on the training scenes for each point of a
+hyperparameter grid, and yields pairs (parameters, score). A neural network yields a pair for each
+candidate number of epochs. `Baseline.fit` evaluates each score on the validation scenes of all data
+sources together, by the primary metric of the task. The generator function never sees the
+validation scenes. `Fitted` contains the results of all grid points.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, TypeAlias, TypeVar
+
+from torch import Tensor
+
+from training.datasets.batches import SceneTensors
+from training.evaluation.missing_tasks import hide, leave_one_out, leave_one_out_at, rank_hidden
+from training.evaluation.model import ObjectDensity, ObjectScore, PlacedScore, RelationScore
+from training.evaluation.relation_tasks import complete_scenes, rank, rank_relations
+
+Score = TypeVar("Score")
+Parameters: TypeAlias = Mapping[str, float | int | str]
+Proposals: TypeAlias = Iterator[tuple[Parameters, Score]]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The result of one point of a hyperparameter grid.
+
+    Attributes:
+        seconds: wall time of fit and evaluation in seconds. Work that was already done for earlier
+            grid points is not included.
+    """
+
+    parameters: Parameters
+    validation: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Fitted(Generic[Score]):
+    """The score of the best grid point, and the trials of all grid points in order.
+
+    If two grid points have the same metric, the first is the best.
+    """
+
+    score: Score
+    trials: tuple[Trial, ...]
+
+
+def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
+    """Return the mean reciprocal rank (MRR) of removed objects (task T2)."""
+    return leave_one_out(scenes, structure, score).mrr().value
+
+
+def partial_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
+    """Return the mean reciprocal rank (MRR) of the hidden half of the objects (T2 partial)."""
+    return rank_hidden(hide(scenes, structure, 0.5), structure, score)[0].value
+
+
+def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
+    """Return the mean reciprocal rank (MRR) of removed objects at a known place (T2-at)."""
+    return leave_one_out_at(scenes, structure, score)[0].mrr().value
+
+
+def r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+    """Return the R-precision of relations, given the instance counts of classes (task T1a)."""
+    return rank_relations(scenes, structure, score).pooled().value
+
+
+def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+    """Return the R-precision of half of the relations, given the other half (task T1b)."""
+    return rank(complete_scenes(scenes, structure, score), len(scenes)).pooled().value
+
+
+def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDensity) -> float:
+    """Return a lower estimate of the mean log-likelihood of objects in nats (upper log Z)."""
+    return float(density.log_unnormalised(scenes.v).double().mean()) - density.upper
+
+
+@dataclass(frozen=True)
+class Baseline(Generic[Score]):
+    """One baseline, shown as one row of a result table.
+
+    Attributes:
+        propose: generator function that yields (parameters, score) for each grid point. Its
+            arguments are the training scenes, a mask of structure classes, (classes,) bool, and a
+            seed.
+        judge: function that returns the metric of a score; higher is better. Its arguments are the
+            validation scenes, the mask of structure classes and the score.
+        scores: fields of `Contender` for which the score is used.
+        stochastic: True if the fit depends on the seed.
+    """
+
+    name: str
+    propose: Callable[[SceneTensors, Tensor, int], Proposals[Score]]
+    judge: Callable[[SceneTensors, Tensor, Any], float] = missing_mrr
+    scores: tuple[str, ...] = ("objects",)
+    stochastic: bool = False
+
+    @property
+    def learns_relations(self) -> bool:
+        """True if the baseline needs scenes with annotated relations."""
+        return self.scores not in (("objects",), ("density",))
+
+    def fit(
+        self,
+        train: SceneTensors,
+        validation: SceneTensors,
+        structure: Tensor,
+        *,
+        seed: int = 0,
+        progress: Callable[[str], None] = lambda _: None,
+    ) -> Fitted[Score]:
+        """Fit on training scenes, and select the best grid point on validation scenes.
+
+        Raises:
+            ValueError: the numbers of classes differ, or scenes needed for fit or metric are
+                missing.
+            FloatingPointError: the metric of a grid point is NaN.
+        """
+        V = train.v.shape[1]
+        if validation.v.shape[1] != V or structure.shape != (V,):
+            raise ValueError(
+                f"the numbers of classes differ: training scenes have {V} classes, validation "
+                f"scenes have {validation.v.shape[1]}, and structure has shape "
+                f"{tuple(structure.shape)}"
+            )
+        if not train.v.any():
+            raise ValueError(
+                f"the {len(train)} training scenes contain no objects; a baseline needs objects"
+            )
+        trials: list[Trial] = []
+        chosen: list[Score] = []
+        highest = -math.inf
+        start = time.perf_counter()
+        for parameters, score in self.propose(train, structure, seed):
+            figure = self.judge(validation, structure, score)
+            if math.isnan(figure):
+                raise FloatingPointError(
+                    f"{self.name}: the validation metric with {dict(parameters)} is NaN; leave "
+                    "this grid point out"
+                )
+            if figure > highest:
+                highest, chosen = figure, [score]
+            now = time.perf_counter()
+            trials.append(Trial(dict(parameters), figure, now - start))
+            shown = ", ".join(f"{key} {value}" for key, value in parameters.items())
+            progress(f"{self.name} {shown}: {figure:.4f}")
+            start = now
+        return Fitted(chosen[0], tuple(trials))

@@ -1,0 +1,276 @@
+"""Calibration: compare the probabilities of the service with the truth.
+
+An answer has a probability and a truth value. The answer to each question is true if:
+
+    relations    the relation holds between the two objects. In one variant, the relations of half
+                 of the pairs are evidence. In another variant, one object was removed. Relations
+                 with unknown truth are left out (see `training.datasets.cases.known_relations`)
+    missing      the class is in the scene and was hidden. A request lists 25, 50 or 75 % of the
+                 classes of the scene, or all classes but one. The share is drawn at random
+    at a place   the class is in the scene at the place of the request. A place is a relation to an
+                 object. The place is drawn from the places that hold an object
+    outliers     the object is an intruder, a random object added for the test. Half of the scenes
+                 contain one intruder
+    misplaced    the listed relation is false. Half of the scenes contain one altered relation
+
+The questions about hidden classes and intruders use scenes with complete object lists. Requests
+contain no room type and use default parameters. Candidates that the service does not return are
+left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from app.questions import misplaced, missing, outliers, relations
+from app.registry import NEVER, Artifact, Calibration, CountSlope, Slope
+from app.scene import CANONICAL, Scene, canonicalise
+from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Ints, Rng
+from training.datasets.batches import SceneTensors
+from training.datasets.cases import (
+    altered_case,
+    known_relations,
+    occupied_place,
+    scene_of,
+    scene_rng,
+    taken_away,
+    told_pairs,
+)
+from training.evaluation.asking import labels_alone, with_intruder
+from training.evaluation.intruders import kinds_of_intruders
+from training.evaluation.metrics import Items, Metric
+from training.evaluation.missing_tasks import SHARES, shown_classes
+from training.evaluation.model import Contender
+from training.evaluation.setting import Outcome, Setting
+
+# Number of removed objects per scene in `ask_placements`. A removed object gives only 3 answers,
+# while a scene has about 20 relations. With one removed object per scene, chance alone gives an
+# expected calibration error (ECE) of .02 to .03.
+_REMOVALS = 4
+# (probability, truth) of each answer about one scene.
+Answered = list[tuple[float, bool]]
+Ask = Callable[[Artifact, EncodedScene, Rng], Answered | None]
+
+
+def uncalibrated(artifact: Artifact) -> Artifact:
+    """Return the artifact with raw log-odds in place of calibrated log-odds.
+
+    Calibration multiplies log-odds by a slope. The slope -1 turns the log-odds of an object or
+    relation into the log-odds that the object or relation is wrong.
+    """
+    plain = Calibration.neutral(artifact.spec.A).model_copy(
+        update={
+            "outlier": CountSlope(slope=-1.0),
+            "outlier_thresholds": NEVER,
+            "misplaced": Slope(intercept=0.0, slope=-1.0),
+            "misplaced_thresholds": NEVER,
+        }
+    )
+    return replace(artifact, calibration=plain)
+
+
+def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
+    """Ask one of `QUESTIONS` about every scene, and collect the answers with their truth."""
+    answers: list[tuple[int, float, bool]] = []
+    skipped = 0
+    for k, scene in enumerate(scenes.scenes):
+        found = ask(artifact, scene, scene_rng(scene, seed))
+        skipped += found is None
+        answers += [(k, probability, so) for probability, so in found or ()]
+    place, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
+    return Items(place.astype(np.int64), probability, truth > 0, len(scenes), skipped)
+
+
+def ask_relations(
+    artifact: Artifact,
+    encoded: EncodedScene,
+    rng: Rng,  # noqa: ARG001
+) -> Answered | None:
+    """Ask for all relations of a scene. The request contains only the labels of the objects."""
+    known = known_relations(encoded)
+    if not known.any():
+        return None
+    return _judged(artifact, encoded, labels_alone(encoded), known) or None
+
+
+def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+    """Ask for the relations of half of the pairs. The relations of the other half are evidence."""
+    asked, given = told_pairs(encoded, artifact.vocabulary.structure, rng)
+    if not given:
+        return None
+    scene = replace(scene_of(encoded, range(len(asked)), given), room_type=None)
+    return _judged(artifact, encoded, scene, known_relations(encoded) & asked) or None
+
+
+def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Flags) -> Answered:
+    """Return the answers about the relations that are True in ``judged``.
+
+    The shape of ``judged`` is (relations, objects, objects).
+    """
+    found: Answered = []
+    for answer in relations(artifact, scene)[0]:
+        triple = CANONICAL.index(answer.relation), answer.subject, answer.object
+        if judged[triple]:
+            found.append((answer.probability, bool(encoded.instance_holds[triple])))
+    return found
+
+
+def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+    """Ask where a removed object belongs. Up to `_REMOVALS` objects are removed one at a time."""
+    found: Answered = []
+    if known_relations(encoded).any():
+        for _ in range(_REMOVALS):
+            found += _places_of_one(artifact, encoded, rng)
+    return found or None
+
+
+def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered:
+    taken = taken_away(encoded, artifact.vocabulary.structure, rng)
+    if taken is None:
+        return []
+    target, kept = taken
+    gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
+    known = known_relations(encoded)
+    found: Answered = []
+    for answer in missing(artifact, labels_alone(encoded, kept), candidates=[target]):
+        for place in answer.placements:
+            triple = canonicalise(gone, place.relation, kept[place.object])
+            if known[triple]:
+                found.append((place.probability, bool(encoded.instance_holds[triple])))
+    return found
+
+
+def ask_missing(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+    """Ask for missing classes. A random share of the classes, or one class, is hidden."""
+    hidden = _hidden(artifact, encoded, rng)
+    if hidden is None:
+        return None
+    labels = {artifact.vocabulary.labels[index] for index in hidden}
+    kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden)).tolist()
+    found = missing(artifact, labels_alone(encoded, kept), details=False)
+    return [(answer.probability, answer.label in labels) for answer in found]
+
+
+def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+    """Ask for the hidden classes at one place, which is a relation to an object.
+
+    A class is left out if it is unknown whether the class has this relation to the object.
+    """
+    hidden = _hidden(artifact, encoded, rng)
+    if hidden is None:
+        return None
+    is_hidden = np.isin(encoded.instance_classes, hidden)
+    place = occupied_place(encoded, artifact.vocabulary.structure, ~is_hidden, rng)
+    if place is None:
+        return None
+    relation, anchor = place
+    kept = np.flatnonzero(~is_hidden).tolist()
+    labels = np.array(artifact.vocabulary.labels, dtype=object)[encoded.instance_classes]
+    there = set(labels[encoded.instance_holds[relation, :, anchor] & is_hidden])
+    unknown = set(labels[~known_relations(encoded)[relation, :, anchor] & is_hidden]) - there
+    at = CANONICAL[relation], kept.index(anchor)
+    found = missing(artifact, labels_alone(encoded, kept), at=at, details=False)
+    return [(a.probability, a.label in there) for a in found if a.label not in unknown]
+
+
+def _hidden(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Ints | None:
+    """Draw the classes of a scene to hide. The share of hidden classes is drawn for each scene."""
+    structure = artifact.vocabulary.structure
+    classes = encoded.evidence.classes
+    classes = classes[~structure[classes]]
+    if not encoded.complete or len(classes) < 2:
+        return None
+    share = list(SHARES.values())[rng.integers(len(SHARES))]
+    hidden: Ints = rng.permutation(classes)[shown_classes(len(classes), share) :]
+    return hidden
+
+
+def ask_outliers(
+    artifact: Artifact,
+    encoded: EncodedScene,
+    rng: Rng,
+    intruders: Mapping[tuple[str, str], Ints] | None = None,
+) -> Answered | None:
+    """Ask for outliers. An intruder (an object of an absent class) is added to half of the scenes.
+
+    Args:
+        intruders: maps (source, scene id) to the classes from which the intruder is drawn, see
+            `kinds_of_intruders`. None means any absent class.
+    """
+    structure = artifact.vocabulary.structure
+    classes = encoded.evidence.classes
+    if not encoded.complete or (~structure[classes]).sum() < 3:
+        return None
+    choice = np.setdiff1d(np.flatnonzero(~structure), classes)
+    if intruders is not None:
+        choice = intruders[encoded.source, encoded.scene_id]
+    if not len(choice):
+        return None
+    scene, intruder = labels_alone(encoded), -1
+    if rng.random() < 0.5:
+        intruder = len(scene.objects)
+        scene = with_intruder(artifact, scene, int(rng.choice(choice)))
+    found = outliers(artifact, scene, details=False).outliers
+    usable = [not structure[thing.class_index] for thing in scene.objects]
+    return [(a.probability, a.object == intruder) for a in found if usable[a.object]] or None
+
+
+def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
+    """Ask for misplaced relations. One relation is altered in half of the scenes."""
+    case = altered_case(encoded, artifact.vocabulary.structure, rng)
+    if case is None:
+        return None
+    scene, false = case
+    found = misplaced(artifact, replace(scene, room_type=None))
+    return [
+        (a.probability, (CANONICAL.index(a.relation), a.subject, a.object) == false) for a in found
+    ] or None
+
+
+QUESTIONS: dict[str, Ask] = {
+    "relations": ask_relations,
+    "relations, others given": ask_given,
+    "placements": ask_placements,
+    "missing": ask_missing,
+    "missing at a place": ask_placed,
+    "outliers": ask_outliers,
+    "misplaced": ask_misplaced,
+}
+
+
+def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure the calibration of each `QUESTIONS` entry, with and without the calibration maps."""
+    if contender.artifact is None:
+        return None
+    related = setting.some(related=True, share=3)
+    complete = setting.complete.some(share=3)
+    at_place = setting.complete.some(related=True, share=3)
+    of_objects = {"missing": complete, "outliers": complete, "missing at a place": at_place}
+    metrics: dict[str, Metric] = {}
+    skipped = 0
+    published, plain = contender.artifact, uncalibrated(contender.artifact)
+    for name, ask in _questions(complete, setting).items():
+        asked = of_objects.get(name, related)
+        found = collect(published, asked, ask, setting.seed)
+        skipped += found.skipped
+        if len(found.scene):
+            before = collect(plain, asked, ask, setting.seed)
+            for figure in ("ECE", "Brier skill"):
+                metrics[f"{figure}, {name}"] = found.metric(figure)
+                metrics[f"{figure}, {name}, uncalibrated"] = before.metric(figure)
+    # Brier skill is undefined if all answers are true or all answers are false.
+    metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
+    return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None
+
+
+def _questions(complete: SceneTensors, setting: Setting) -> dict[str, Ask]:
+    """Return `QUESTIONS`, where `ask_outliers` draws from the intruders in `kinds_of_intruders`."""
+    intruders = kinds_of_intruders(
+        complete, setting.structure, setting.complete.train, setting.seed
+    )
+    return QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}

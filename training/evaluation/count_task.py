@@ -1,0 +1,124 @@
+"""Test the expected numbers of instances of a model on held-out scenes.
+
+A robot lists a part of each scene (`datasets.cases.some_instances`) and asks for the expected
+number of instances of each listed class. The task measures the mean absolute error of this number.
+It compares the error with the errors of two means:
+
+- the class mean: the mean number in the training scenes of the model that have at least the listed
+  number;
+- the mean of the source: the mean number in the training scenes of the same data source. If it is
+  smaller than the listed number, the listed number takes its place.
+
+Classes without statistics, and classes whose instances the source does not count, are left out.
+Intervals come from resampled groups of scenes, because the scenes of a group are near-duplicates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from app import questions
+from app.questions.counts import LIKELY
+from app.registry import Artifact
+from app.registry.counts import Counts
+from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.cases import MOST, counted_classes, listed_cases
+from training.evaluation.asking import of_classes
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.model import Contender
+from training.evaluation.setting import Outcome, Setting
+
+METRICS: Final = (
+    "error of the expected count",
+    "error of the class mean",
+    "change of error, class mean",
+    "change of error, mean of the source",
+    "count in the interval",
+    "proposals that are right",
+)
+
+
+def counts_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure the errors, the share of counts in the interval and the precision of proposals.
+
+    Return None if the model has no counts, or if the data source does not count instances.
+    """
+    artifact, train = contender.artifact, setting.train
+    if artifact is None or artifact.counts is None or train is None:
+        return None
+    counting = counted_classes(train.scenes, artifact.vocabulary)
+    scenes = [scene for scene in setting.scenes.scenes if scene.source in counting]
+    answers = [
+        (place, *answer)
+        for place, scene in enumerate(scenes)
+        for answer in _asked(artifact, scene, counting[scene.source], setting.seed)
+    ]
+    if not answers:
+        return None
+    place, index, number, listed, expected, low, high, p = np.array(answers).T
+    _, group = np.unique([scene.group for scene in scenes], return_inverse=True)
+    unit, units = group[place.astype(np.int64)], int(group.max()) + 1
+    index, k = index.astype(np.int64), listed.astype(np.int64)
+
+    def error(guess: Floats) -> Ratio:
+        return Ratio.of_items(unit, np.abs(guess - number), units)
+
+    row = np.searchsorted(artifact.counts.classes, index)
+    found, mean = error(expected), error(class_mean(artifact.counts, row, k))
+    of_source = error(np.maximum(_means(train.scenes, artifact)[index], listed))
+    inside = ((low <= number) & (number <= high)).astype(np.float64)
+    metrics: dict[str, Metric] = dict(
+        zip(METRICS, (found, mean, found - mean, found - of_source), strict=False)
+    )
+    metrics["count in the interval"] = Ratio.of_items(unit, inside, units)
+    if (likely := p >= LIKELY).any():
+        right = (number > listed)[likely].astype(np.float64)
+        metrics["proposals that are right"] = Ratio.of_items(unit[likely], right, units)
+    return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(place)))
+
+
+def _asked(
+    artifact: Artifact, scene: EncodedScene, counted: Flags, seed: int
+) -> list[tuple[float, ...]]:
+    """Return the answers about a partly listed scene.
+
+    An answer is (class, number in the scene, listed number, expected number, low, high,
+    probability).
+    """
+    part, asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
+    room = part.room if part.room >= 0 else None
+    listed = replace(of_classes(np.repeat(part.classes, part.listed).tolist()), room_type=room)
+    wanted = part.classes[asked].tolist()
+    labels = artifact.vocabulary.labels
+    pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
+    known = {labels[index]: (index, number) for index, number in pairs}
+    found = questions.more(artifact, listed, top_k=len(wanted), candidates=wanted)
+    return [(*known[answer.label], *answer[1:]) for answer in found]
+
+
+def _means(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:
+    """Return the mean number of instances of each class in the scenes with the class, (V,)."""
+    times, total = np.zeros((2, len(artifact.vocabulary)))
+    for scene in scenes:
+        times[scene.evidence.classes] += 1
+        total[scene.evidence.classes] += np.minimum(scene.evidence.counts, MOST)
+    means: Floats = total / np.maximum(times, 1)
+    return means
+
+
+def class_mean(counts: Counts, row: Ints, listed: Ints) -> Floats:
+    """Return the mean number in training scenes with at least the listed number, (k,).
+
+    Args:
+        row: (k,) rows of the classes in `counts`.
+        listed: (k,) number of listed instances of each class.
+    """
+    numbers = np.arange(1, counts.log_share.shape[1] + 1)
+    p = np.exp(counts.log_share[row].astype(np.float64)) * (numbers >= listed[:, None])
+    mean: Floats = p @ numbers / p.sum(axis=1)
+    return mean

@@ -1,0 +1,217 @@
+"""Everyday facts: questions with answers that people agree on, for acceptance tests only.
+
+People wrote the facts by hand before any model was evaluated. Training and tuning must never use
+the facts, so only this module of the package reads the facts file. The requests use the default
+parameters of the service. Labels outside the vocabulary are ignored.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app import questions
+from app.registry import Artifact
+from app.scene import Scene, SceneObject, opposite
+from training.datasets.files import DATA
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.model import Contender
+from training.evaluation.setting import Outcome, Setting
+
+EVERYDAY = DATA.parent / "everyday"
+"""Default folder of the facts, outside the repository: facts.json, which people wrote by hand.
+Without this file, the task is skipped."""
+
+SOURCE = "facts"
+
+LINES = (
+    "relations: the fact is the likeliest of eight",
+    "relations: the fact is the likeliest vertical one",
+    "relations: the fact has p of at least .5",
+    "missing: an expected object is among five",
+    "missing_at: an expected object is among five",
+    "outliers: the intruder comes first",
+    "outliers: the intruder is flagged at the default",
+    "outliers: plain scenes with an alarm at the default",
+    "generate: the scene has what makes the room",
+    "generate: the scene has what never belongs",
+    "generate: scenes of fewer than three classes",
+)
+"""Names of the eleven counts of the report.
+
+Lower is better for the alarms in plain scenes (scenes without intruder) and for the last two names.
+"""
+
+_VERTICAL = ("on-top", "under", "above", "below")
+_RELATIONS = 50
+_LISTED = 5
+_DRAWN = 8
+_FEW = 3
+
+# Maps each name in `LINES` to a list of (number of hits, number of questions), one pair per fact.
+Lines = dict[str, list[tuple[int, int]]]
+
+
+def facts_file(folder: Path = EVERYDAY) -> Path | None:
+    """Return the path of the facts file in a folder, or None if the file does not exist."""
+    path = folder / "facts.json"
+    return path if path.is_file() else None
+
+
+def facts_digest(folder: Path) -> str:
+    """Return the SHA-256 of the facts file, or an empty string if the file does not exist."""
+    path = facts_file(folder)
+    return "" if path is None else sha256(path.read_bytes()).hexdigest()
+
+
+def everyday_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure the everyday facts. Each fact counts as one scene. `setting.scenes` is not used."""
+    artifact, folder = contender.artifact, setting.everyday
+    if artifact is None or folder is None or facts_file(folder) is None:
+        return None
+    metrics: dict[str, Metric] = {}
+    count = 0
+    for line, found in ask_everyday(artifact, folder).items():
+        hits, asked = np.array(found, dtype=np.float64).reshape(-1, 2).T
+        count += len(found)
+        if asked.sum():
+            metrics[line] = Ratio(hits, asked)
+    return Outcome(metrics, count, 0)
+
+
+def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> Lines:
+    """Ask about every fact in the folder.
+
+    Raises:
+        FileNotFoundError: the folder contains no facts.
+    """
+    path = facts_file(folder)
+    if path is None:
+        raise FileNotFoundError(f"{folder} contains no facts.json")
+    facts: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return (
+        _relations(artifact, facts["relations"])
+        | _missing(artifact, "missing", facts["missing"])
+        | _missing(artifact, "missing_at", facts["missing_at"])
+        | _outliers(artifact, facts["intruders"], facts["plain"])
+        | _scenes(artifact, facts["rooms"], facts["seeds"])
+    )
+
+
+def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
+    """Build a scene of the known labels; several objects of a label have the ids label_number."""
+    objects = []
+    taken: set[str] = set()
+    for label in labels:
+        name, number = label, 0
+        while name in taken or (number == 0 and labels.count(label) > 1):
+            number += 1
+            name = f"{label}_{number}"
+        taken.add(name)
+        if (index := artifact.vocabulary.index(label)) is not None:
+            objects.append(SceneObject(name, label, index))
+    return Scene(tuple(objects))
+
+
+def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
+    lines: Lines = {line: [] for line in LINES[:3]}
+    likeliest, vertical, sure = lines.values()
+    for fact in facts:
+        relation = fact["relation"]
+        p = _of_eight(artifact, fact["subject"], fact["object"])
+        upright = {name: value for name, value in p.items() if name in _VERTICAL}
+        likeliest.append((int(bool(p) and max(p, key=p.__getitem__) == relation), 1))
+        right = bool(upright) and max(upright, key=upright.__getitem__) == relation
+        vertical.append((int(right), 1))
+        sure.append((int(p.get(relation, 0.0) >= 0.5), 1))
+    return lines
+
+
+def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
+    """Return the probability of each of the eight relations of the subject to the other object."""
+    scene = _scene(artifact, [subject, other])
+    names = [thing.id for thing in scene.objects]
+    if not names:
+        return {}
+    found, _ = questions.relations(artifact, scene, top_k=_RELATIONS, include_opposites=True)
+    p: dict[str, float] = {}
+    for answer in found:
+        mine = names[answer.subject] == subject
+        name = answer.relation if mine else opposite(answer.relation)
+        p[name] = max(p.get(name, 0.0), answer.probability)
+    return p
+
+
+def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Lines:
+    hits = []
+    for fact in facts:
+        found = {answer.label for answer in _five(artifact, fact)}
+        hits.append((int(bool(found & set(fact["expected"]))), 1))
+    return {f"{name}: an expected object is among five": hits}
+
+
+def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[questions.MissingAnswer, ...]:
+    """Return the first five answers, or an empty tuple if the service would reject the request."""
+    scene = _scene(artifact, fact["objects"])
+    at = None
+    if "at" in fact:
+        if (anchor := _place(artifact, scene, fact["at"]["object"])) is None:
+            return ()
+        at = fact["at"]["relation"], anchor
+    if not scene.objects:
+        return ()
+    return questions.missing(artifact, scene, top_k=_LISTED, at=at)
+
+
+def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
+    """Return the index of the object with the id `name`, or of the only object of class `name`."""
+    index = artifact.vocabulary.index(name)
+    named = [k for k, thing in enumerate(scene.objects) if thing.id == name]
+    places = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]
+    return places[0] if len(places) == 1 else None
+
+
+def _outliers(
+    artifact: Artifact, intruders: list[dict[str, Any]], plain: list[dict[str, Any]]
+) -> Lines:
+    first, caught, alarms = [], [], []
+    for fact in intruders:
+        found = _judged(artifact, [*fact["objects"], fact["intruder"]])
+        first.append((int(bool(found) and found[0].label == fact["intruder"]), 1))
+        flagged = any(a.label == fact["intruder"] and a.is_outlier for a in found)
+        caught.append((int(flagged), 1))
+    for fact in plain:
+        loud = any(answer.is_outlier for answer in _judged(artifact, fact["objects"]))
+        alarms.append((int(loud), 1))
+    return dict(zip(LINES[5:8], (first, caught, alarms), strict=True))
+
+
+def _judged(artifact: Artifact, labels: Sequence[str]) -> tuple[questions.OutlierAnswer, ...]:
+    scene = _scene(artifact, labels)
+    return questions.outliers(artifact, scene).outliers
+
+
+def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -> Lines:
+    typical, foreign, empty = [], [], []
+    for room, drawn in _drawn(artifact, rooms, seeds):
+        typical.append((sum(bool(one & set(room["one_of"])) for one in drawn), len(drawn)))
+        foreign.append((sum(bool(one & set(room["never"])) for one in drawn), len(drawn)))
+        empty.append((sum(len(one) < _FEW for one in drawn), len(drawn)))
+    return dict(zip(LINES[8:], (typical, foreign, empty), strict=True))
+
+
+def _drawn(
+    artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]
+) -> Iterator[tuple[dict[str, Any], list[set[str]]]]:
+    for room in rooms:
+        index = artifact.vocabulary.room_index(room["room"])
+        given = replace(Scene(()), room_type=index)
+        for seed in seeds:
+            found = questions.generate(artifact, given, count=_DRAWN, seed=seed)
+            yield room, [set(scene.objects) for scene in found]

@@ -1,0 +1,251 @@
+"""Measure how additional evidence changes the answers: relations, poses or the room type.
+
+Each question is asked twice about the same scene: with the object labels only, and with labels and
+one kind of evidence. The result is the paired change of a metric, with an interval over scenes.
+
+    T2   (missing objects) One class is removed with all its instances. The evidence is the
+         relations or poses of the remaining instances, or the room type. Metric: change of the
+         mean reciprocal rank (MRR) of the removed class among absent classes
+    T3   (outliers) A uniformly drawn absent class is added as an intruder. The relations of the
+         intruder are unknown. Metric: change of the share of scenes whose intruder ranks first
+    T1   (relations) The evidence is the relations or poses between the instances of half of the
+         classes. Metric: change of R-precision on all other ordered pairs. The number of
+         predictions is the number of listed relations. An unlisted relation counts as wrong
+
+Poses also show which relations do not hold. Only data sources with positions have poses. Scenes
+without a relation between the remaining instances are left out. The evidence never contains the
+answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from app.registry import Artifact
+from app.scene import PoseRelations, Scene
+from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Ints
+from training.datasets.batches import SceneTensors
+from training.datasets.cases import scene_of, scene_rng
+from training.evaluation.asking import (
+    ask_every,
+    judge,
+    missing_probabilities,
+    relation_probabilities,
+    things,
+    with_intruder,
+)
+from training.evaluation.intruders import draw_intruders
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.model import Contender
+from training.evaluation.outlier_tasks import share_of_first
+from training.evaluation.relation_tasks import expected_hits
+from training.evaluation.setting import Outcome, Setting
+
+KINDS = ("relations", "poses", "room type")
+
+# Number of questions per scene in T2, each with another removed class. With one question per scene,
+# the random choice of the class changes the result of a small data source by about 0.01.
+_REMOVALS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One question about a scene, asked with labels only and with additional evidence.
+
+    Attributes:
+        scenes: the scene with labels only, and the scene with evidence.
+        target: index of the removed class in T2, or index of the intruding object in T3. Unused in
+            T1.
+        truth: (relations, objects, objects) bool, the relations that hold. Empty in T2 and T3.
+        asked: (relations, objects, objects) bool, the queried relations. Empty in T2 and T3.
+        items: number of relations to find in T1; 1 in T2 and T3.
+    """
+
+    place: int
+    scenes: tuple[Scene, Scene]
+    target: int = -1
+    truth: Flags = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.bool_))
+    asked: Flags = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.bool_))
+    items: int = 1
+
+
+def told(
+    encoded: EncodedScene, kept: list[int], kind: str, between: Flags | None = None
+) -> tuple[Scene, Scene] | None:
+    """Return a scene twice: with labels only, and with evidence.
+
+    The result is None if the scene lacks this kind of evidence.
+
+    Args:
+        between: (instances, instances) bool, the pairs of instances with evidence. None means all
+            pairs.
+    """
+    bare = replace(scene_of(encoded, kept, ()), room_type=None)
+    if kind == "room type":
+        known = scene_of(encoded, kept, ())
+        return None if known.room_type is None else (bare, known)
+    mask = np.ones((len(kept),) * 2, dtype=np.bool_) if between is None else between
+    holds = encoded.instance_holds[:, kept][:, :, kept] & mask
+    triples = tuple((int(a), int(i), int(j)) for a, i, j in np.argwhere(holds))
+    if not triples or (kind == "poses" and encoded.instance_positions is None):
+        return None
+    poses = None
+    if kind == "poses":
+        poses = PoseRelations(holds, encoded.instance_observed[:, kept][:, :, kept] & mask)
+    return bare, replace(bare, relations=triples, poses=poses)
+
+
+def removals(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
+    """Generate the T2 questions: up to two questions per scene, each with one removed class."""
+    for place, encoded in enumerate(scenes.scenes):
+        classes = encoded.evidence.classes
+        removable = classes[~structure[classes]]
+        if len(removable) < 2:
+            continue
+        for target in scene_rng(encoded, seed).permutation(removable)[:_REMOVALS]:
+            kept = np.flatnonzero(encoded.instance_classes != target).tolist()
+            if (both := told(encoded, kept, kind)) is not None:
+                yield Case(place, both, int(target))
+
+
+def intrusions(
+    artifact: Artifact,
+    scenes: SceneTensors,
+    intruders: Ints,
+    kind: str,
+) -> Iterator[Case]:
+    """Generate the T3 questions: each scene with its intruder, (scenes,); -1 skips the scene."""
+    for place, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
+        both = told(encoded, list(range(len(encoded.instance_classes))), kind)
+        if intruder < 0 or both is None:
+            continue
+        bare, more = (_intruded(artifact, scene, int(intruder)) for scene in both)
+        yield Case(place, (bare, more), len(bare.objects) - 1)
+
+
+def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
+    """Return the scene with an intruder, of which only the label is known."""
+    if scene.poses is not None:
+        pad = ((0, 0), (0, 1), (0, 1))
+        poses = PoseRelations(np.pad(scene.poses.holds, pad), np.pad(scene.poses.observed, pad))
+        larger = with_intruder(artifact, replace(scene, poses=None), intruder)
+        return replace(larger, poses=poses)
+    return with_intruder(artifact, scene, intruder)
+
+
+def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
+    """Generate the T1 questions: evidence about half of the classes, all other pairs queried."""
+    for place, encoded in enumerate(scenes.scenes):
+        own, classes = encoded.instance_classes, encoded.evidence.classes
+        usable = classes[~structure[classes]]
+        if len(usable) < 3:
+            continue
+        half = scene_rng(encoded, seed).permutation(usable)[: max(2, len(usable) // 2)]
+        known, plain = np.isin(own, half), ~structure[own]
+        between = known[:, None] & known
+        both = told(encoded, list(range(len(own))), kind, between)
+        pair = plain[:, None] & plain & ~between & ~np.eye(len(own), dtype=np.bool_)
+        asked = np.broadcast_to(pair, encoded.instance_holds.shape)
+        truth = encoded.instance_holds & asked
+        if both is not None and truth.any():
+            yield Case(place, both, truth=truth, asked=asked, items=int(truth.sum()))
+
+
+def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
+    """Return the reciprocal rank of a removed class among absent classes, expected over ties."""
+    p = missing_probabilities(artifact, scene)
+    above, ties = int((p > p[target]).sum()), int((p == p[target]).sum())
+    return float((1.0 / np.arange(above + 1, above + ties + 1)).mean())
+
+
+def missing_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure T2 (missing objects) with labels only and with additional evidence."""
+
+    def value(artifact: Artifact, scene: Scene, case: Case) -> float:
+        return reciprocal_rank(artifact, scene, case.target)
+
+    return _changes(
+        "MRR",
+        contender,
+        setting,
+        lambda _, scenes, kind: removals(scenes, setting.structure.numpy(), kind, setting.seed),
+        value,
+    )
+
+
+def outliers_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure T3 (outliers) with labels only and with additional evidence."""
+    structure = setting.structure.numpy()
+
+    def cases(artifact: Artifact, scenes: SceneTensors, kind: str) -> Iterator[Case]:
+        intruders = draw_intruders(scenes, setting.structure, seed=setting.seed).numpy()
+        return intrusions(artifact, scenes, intruders, kind)
+
+    def value(artifact: Artifact, scene: Scene, case: Case) -> float:
+        p = np.where(things(scene, structure), judge(artifact, scene)[:, 0], -np.inf)
+        return share_of_first(p, case.target)
+
+    return _changes("hit@1", contender, setting, cases, value)
+
+
+def relations_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure T1 (relations) with labels only and with additional evidence."""
+
+    def value(artifact: Artifact, scene: Scene, case: Case) -> float:
+        p, truth = relation_probabilities(artifact, scene)[case.asked], case.truth[case.asked]
+        return expected_hits(p, truth, case.items)
+
+    return _changes(
+        "R-precision",
+        contender,
+        setting,
+        lambda _, scenes, kind: halves(scenes, setting.structure.numpy(), kind, setting.seed),
+        value,
+        KINDS[:2],
+    )
+
+
+def _changes(
+    metric: str,
+    contender: Contender,
+    setting: Setting,
+    cases_of: Callable[[Artifact, SceneTensors, str], Iterator[Case]],
+    value: Callable[[Artifact, Scene, Case], float],
+    kinds: tuple[str, ...] = KINDS,
+) -> Outcome | None:
+    """Return the metric without and with each kind of evidence, and the change of the metric.
+
+    Args:
+        cases_of: function that takes a model, scenes and a kind of evidence, and yields questions.
+        value: function that takes a model, one of the two scenes of a question, and the question.
+            It returns the metric of the answer, summed over the items of the question.
+    """
+    artifact = contender.artifact
+    if artifact is None:
+        return None
+    scenes = setting.some(related=True)
+    metrics: dict[str, Metric] = {}
+    skipped: list[int] = []
+    for kind in kinds:
+        cases = list(cases_of(artifact, scenes, kind))
+        if not cases:
+            continue
+        values = np.array(
+            ask_every(lambda case: np.array([value(artifact, s, case) for s in case.scenes]), cases)
+        )
+        place = [case.place for case in cases]
+        without, given, below = (
+            np.bincount(place, weights=column, minlength=len(scenes)).astype(np.float64)
+            for column in (*values.T, [case.items for case in cases])
+        )
+        metrics |= {
+            f"change of {metric}, {kind}": Ratio(given - without, below),
+            f"{metric}, {kind}": Ratio(given, below),
+            f"{metric}, {kind} withheld": Ratio(without, below),
+        }
+        skipped.append(int((below == 0).sum()))
+    return Outcome(metrics, len(scenes), skipped[0]) if metrics else None

@@ -1,0 +1,321 @@
+"""Task T4: compare generated scenes with held-out scenes.
+
+The metrics use only annotated classes, without structure classes such as walls. For intervals, the
+held-out scenes are resampled and the generated scenes are fixed.
+
+    MMD²        squared maximum mean discrepancy, unbiased. The kernel is
+                exp(-Hamming distance / bandwidth). The bandwidth is the median distance between
+                two held-out scenes
+    marginals   sum_i |p_i - q_i| / sum_i q_i over classes i. p_i is the share of generated scenes
+                with class i, and q_i is the share of held-out scenes
+    pairs       correlation (Pearson r) between the class covariances cov(v_i, v_j) of generated
+                scenes and of held-out scenes, over pairs of classes
+    copies      share of generated scenes with the same set of classes as a training scene
+    mirrored    share of related pairs of classes with both a(x, y) and a(y, x), for a relation a.
+                Both can be true if a class has several instances, also in held-out scenes
+    cycles      share of scenes with a cycle of on-top relations, among scenes with on-top
+                relations. A cycle of classes can be true if a class has several instances
+
+Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from zlib import crc32
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.questions.generate import STEPS
+from training.datasets.array_types import Floats
+from training.datasets.batches import SceneTensors, subset
+from training.datasets.cases import some_scenes
+from training.evaluation.contradictions import Contradictions
+from training.evaluation.metrics import Metric, Ratio, Resampled
+from training.evaluation.model import Contender, Drawn, Sampler
+from training.evaluation.setting import Outcome, Setting
+from training.machines import BoltzmannMachine
+from training.machines.chain_samples import ChainSamples
+from training.machines.edges import present_classes
+from training.machines.gibbs import Clamp, State, gibbs_step, run
+
+_RESAMPLES = 200
+# Maximum number of held-out scenes for the bandwidth, and of classes for the covariances.
+_BANDWIDTH_SCENES = 1000
+_COMMON_CLASSES = 200
+_CHAINS = 256
+
+
+def drawn_of(scenes: SceneTensors) -> Drawn:
+    """Return held-out scenes in the format of generated scenes."""
+    parts = [
+        Contradictions.of(scenes.batch(index).holds)
+        for index in torch.arange(len(scenes)).split(64)
+    ]
+    return Drawn(scenes.v, Contradictions.joined(parts))
+
+
+def independent_sampler(train: SceneTensors) -> Sampler:
+    """Return a sampler that draws each class independently, with its frequency in training."""
+    frequency = train.v.mean(0)
+
+    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
+        generator = torch.Generator().manual_seed(seed)
+        v = torch.rand(given.shape, generator=generator) < frequency
+        return Drawn((v | given).to(train.v.dtype))
+
+    return sample
+
+
+def scene_sampler(scenes: SceneTensors) -> Sampler:
+    """Return a sampler that returns real scenes, to estimate the best possible value of a metric.
+
+    Without given classes, the sample with index k is scene k if its room type fits. Otherwise the
+    sample is a random scene with the given classes and room type.
+
+    Raises:
+        ValueError: no scene has the given classes and room type (raised by the sampler).
+    """
+    real = drawn_of(scenes)
+
+    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
+        rng = np.random.default_rng(seed)
+        free = not bool(given.any())
+        chosen = []
+        for row in range(len(given)):
+            fits = (scenes.v >= given[row].to(scenes.v.dtype)).all(1)
+            if room[row] >= 0:
+                fits &= scenes.room == room[row]
+            places = fits.nonzero().squeeze(1).numpy()
+            if not len(places):
+                raise ValueError(
+                    f"no real scene has the observed classes and the room type of test scene {row}"
+                )
+            own = free and row in places
+            chosen.append(row if own else int(rng.choice(places)))
+        index = torch.tensor(chosen)
+        found = real.contradictions
+        return Drawn(real.v[index], None if found is None else found.at(index))
+
+    return sample
+
+
+def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler:
+    """Return a sampler that runs the Gibbs chains of the service, and also samples relations.
+
+    Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
+    keeps both.
+
+    Args:
+        steps: number of Gibbs sweeps per scene.
+    """
+    samples = ChainSamples(machine)
+
+    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
+        generator = torch.Generator().manual_seed(seed)
+        parts = []
+        for index in torch.arange(len(given)).split(_CHAINS):
+            clamp = Clamp(v=given[index], room=room[index] if machine.spec.C else None)
+            state = samples.start(given[index].to(machine.b.dtype), generator, clamp)
+            state = _sweep(machine, state, generator, clamp, steps)
+            parts.append((state.v, Contradictions.of(_grid(machine, state))))
+        objects, found = zip(*parts, strict=True)
+        return Drawn(torch.cat(objects), Contradictions.joined(found))
+
+    return sample
+
+
+def _sweep(
+    machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp, steps: int
+) -> State:
+    """Run Gibbs sweeps. If relations do not affect objects, only the last sweep samples them."""
+    always = machine.relations_act
+    state = run(machine, state, generator, steps - 1, clamp, relations=always)
+    return gibbs_step(machine, state, generator, clamp)
+
+
+def _grid(machine: BoltzmannMachine, state: State) -> Tensor:
+    """Return the relations between present classes, (scenes, relations, classes, classes)."""
+    r = state.r * state.edges.ends_present(state.v)
+    return machine.between(state.edges, r, present_classes(state.v)).clamp(min=0)
+
+
+def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
+    """Split held-out scenes into two halves: reference scenes, and scenes of an ideal sampler.
+
+    A group of near-duplicate scenes stays in one half. The limit of the setting applies to each
+    half.
+    """
+    scenes = setting.scenes
+    odd = torch.tensor([crc32(scene.group.encode()) % 2 for scene in scenes.scenes]).bool()
+    first, second = (subset(scenes, some.nonzero().squeeze(1)) for some in (~odd, odd))
+    return (
+        some_scenes(first, setting.limit, setting.seed),
+        some_scenes(second, setting.limit, setting.seed),
+    )
+
+
+def hamming(x: Tensor, y: Tensor) -> Tensor:
+    """Return the Hamming distances (N, M) between the binary rows of `x` (N, V) and `y` (M, V)."""
+    return (x.sum(1, keepdim=True) + y.sum(1) - 2 * x @ y.T).clamp(min=0)
+
+
+def median_distance(v: Tensor) -> float:
+    """Return the median Hamming distance between two scenes, at least 1."""
+    v = v[:_BANDWIDTH_SCENES]
+    row, column = torch.triu_indices(len(v), len(v), 1)
+    return max(1.0, float(hamming(v, v)[row, column].median()))
+
+
+def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[Floats], float]:
+    """Return a function that takes weights of the held-out scenes and returns MMD².
+
+    The statistic excludes pairs of a scene with itself, or with a copy of itself in a resample.
+    """
+
+    def kernel(x: Tensor, y: Tensor) -> Floats:
+        return torch.exp(-hamming(x, y) / bandwidth).double().numpy()
+
+    yy, xx = kernel(held_out, held_out), kernel(drawn, drawn)
+    xy = kernel(drawn, held_out).mean(0)
+    n = len(xx)
+    within = float((xx.sum() - np.trace(xx)) / (n * (n - 1)))
+    np.fill_diagonal(yy, 0.0)
+
+    def at(weight: Floats) -> float:
+        pairs = weight.sum() ** 2 - (weight**2).sum()
+        if not pairs > 0:
+            return float("nan")
+        across = weight @ xy / weight.sum()
+        return float(within + weight @ yy @ weight / pairs - 2 * across)
+
+    return at
+
+
+def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
+    """Return a function that takes weights of the held-out scenes and returns sum |p - q| / sum q.
+
+    p and q are the frequencies of a class in generated and in held-out scenes.
+    """
+    p = drawn.mean(0)
+
+    def at(weight: Floats) -> float:
+        q = weight @ held_out
+        if not q.sum() > 0:
+            return float("nan")
+        return float(np.abs(p - q / weight.sum()).sum() / q.sum() * weight.sum())
+
+    return at
+
+
+def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
+    """Return a function that takes weights of the held-out scenes and returns Pearson r.
+
+    r correlates the class covariances of generated scenes with those of held-out scenes, over all
+    pairs of the most common held-out classes.
+    """
+    common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
+    common = common[held_out[:, common].any(0)]
+    x, y = drawn[:, common], held_out[:, common]
+    pair = np.triu_indices(len(common), 1)
+
+    def covariance(v: Floats, weight: Floats) -> Floats:
+        total = weight.sum()
+        mean = weight @ v / total
+        return ((v.T * weight) @ v / total - np.outer(mean, mean))[pair]
+
+    ours = covariance(x, np.ones(len(x)))
+
+    def at(weight: Floats) -> float:
+        if not weight.sum() > 0:
+            return float("nan")
+        theirs = covariance(y, weight)
+        if len(ours) < 2 or not ours.std() or not theirs.std():
+            return float("nan")
+        return float(np.corrcoef(ours, theirs)[0, 1])
+
+    return at
+
+
+def copies(drawn: Tensor, train: Tensor) -> Floats:
+    """Return 1 for each generated scene whose classes are those of a training scene, else 0."""
+    known = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
+    rows = np.packbits(drawn.numpy() > 0, axis=1)
+    return np.array([row.tobytes() in known for row in rows], dtype=np.float64)
+
+
+def generation_metrics(
+    drawn: Drawn,
+    held_out: Tensor,
+    train: Tensor,
+    asked: Tensor,
+    bandwidth: float,
+    emphasis: Tensor | None = None,
+) -> dict[str, Metric]:
+    """Compute all metrics of T4.
+
+    Args:
+        drawn: at least two generated scenes.
+        asked: (classes,) bool, the classes that the metrics use.
+        bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
+        emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
+    """
+    x, y, known = drawn.v[:, asked], held_out[:, asked], train[:, asked]
+    ours, theirs = x.double().numpy(), y.double().numpy()
+    each = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
+
+    def resampled(statistic: Callable[[Floats], float]) -> Resampled:
+        return Resampled.of(lambda weight: statistic(weight * each), len(y), len(x), _RESAMPLES)
+
+    metrics: dict[str, Metric] = {
+        "MMD²": resampled(discrepancy(y, x, bandwidth)),
+        "marginal error": resampled(marginal_error(theirs, ours)),
+        "classes per scene": Ratio.of_scenes(ours.sum(1)),
+        "copies of training scenes": Ratio.of_scenes(copies(x, known)),
+    }
+    pairs = resampled(pair_correlation(theirs, ours))
+    if np.isfinite(pairs.value):
+        metrics["pair correlation"] = pairs
+    if drawn.contradictions is not None:
+        metrics |= drawn.contradictions.metrics()
+    return metrics
+
+
+def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure T4: compare generated scenes with the first half of the held-out scenes.
+
+    The number of generated scenes is the number of scenes in the second half. The scenes are
+    generated under three conditions: without evidence, with the room types of the second half, and
+    with one given class. The given classes are drawn from all (scene, class) pairs of the second
+    half, so scenes with many classes are drawn more often. With a given class, each scene of the
+    first half is therefore weighted by its number of classes. A perfect sampler then has no
+    discrepancy.
+    """
+    if contender.sampler is None or setting.train is None:
+        return None
+    first, second = held_out_halves(setting)
+    asked = first.annotated_classes[first.source].any(0) & ~setting.structure
+    mentions = ((second.v > 0) & asked).nonzero()
+    if min(len(first), len(second), len(mentions)) < 2 or not first.v[:, asked].any():
+        return None
+    bandwidth = median_distance(first.v[:, asked])
+    nothing = torch.zeros_like(second.v, dtype=torch.bool)
+    nowhere = torch.full_like(second.room, -1)
+    order = np.random.default_rng(setting.seed).permutation(len(mentions))[: len(second)]
+    classes = mentions[torch.from_numpy(order), 1]
+    one = nothing[: len(classes)].scatter(1, classes.unsqueeze(1), True)
+    size = first.v[:, asked].sum(1)
+    conditions = {
+        "free": (nothing, nowhere, None),
+        "given room types": (nothing, second.room, None),
+        "given one class": (one, nowhere[: len(one)], size),
+    }
+    metrics: dict[str, Metric] = {}
+    for name, (given, room, emphasis) in conditions.items():
+        drawn = contender.sampler(given, room, setting.seed)
+        found = generation_metrics(drawn, first.v, setting.train.v, asked, bandwidth, emphasis)
+        metrics |= {f"{metric}, {name}": value for metric, value in found.items()}
+    notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
+    return Outcome(metrics, len(first), 0, notes)

@@ -1,0 +1,66 @@
+"""Test the placement offsets of a model on held-out scenes.
+
+An offset is the position of a relation's subject minus the position of its object, in metres. The
+model has a distribution of offsets for each relation and pair of classes. The distribution gives an
+ellipse in the horizontal plane and an ellipsoid in space. Each of these regions should contain 80 %
+of the offsets. The task measures the share of held-out offsets in these regions. It also measures
+the distance from an offset to two means of the model: the mean for the relation and classes, and
+the mean for the relation alone.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from scipy.stats import chi2
+
+from app.scene import CANONICAL
+from training.datasets.offsets import seen_offsets
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.model import Contender
+from training.evaluation.setting import Outcome, Setting
+
+SHARE: Final = 0.8
+"""Share of the offsets that each ellipse or ellipsoid should contain."""
+
+_REGIONS: Final = {"the ellipse": 2, "the ellipsoid": 3}
+"""Number of axes of each region: two axes are x and y, three axes are x, y and z."""
+
+METRICS: Final = (
+    *(f"in {region}, {name}" for name in CANONICAL for region in _REGIONS),
+    "distance (m)",
+    "distance (m), relation alone",
+)
+
+
+def offsets_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure the share of covered offsets for each relation, and the distances for all relations.
+
+    Return None if the model has no offsets, or if no scene has related objects with poses.
+    """
+    if contender.artifact is None or (offsets := contender.artifact.offsets) is None:
+        return None
+    scenes = setting.scenes.scenes
+    every = seen_offsets(scenes)
+    known = offsets.relation_scenes[every.relation] > 0
+    if not known.any():
+        return None
+    seen = every.some(known)
+    values, _ = offsets.find(seen.relation, seen.subject, seen.other)
+    away = seen.offset - values[:, :3]
+    squares = np.square(away / values[:, 3:])
+    metrics: dict[str, Metric] = {}
+    for a, name in enumerate(CANONICAL):
+        asked = seen.relation == a
+        for region, axes in _REGIONS.items():
+            inside = squares[asked, :axes].sum(axis=1) <= chi2.ppf(SHARE, axes)
+            if asked.any():
+                metrics[f"in {region}, {name}"] = Ratio.of_items(
+                    seen.scene[asked], inside.astype(np.float64), len(scenes)
+                )
+    alone = seen.offset - offsets.relation[seen.relation, :3]
+    for name, vectors in (("distance (m)", away), ("distance (m), relation alone", alone)):
+        distance = np.linalg.norm(vectors, axis=1)
+        metrics[name] = Ratio.of_items(seen.scene, distance, len(scenes))
+    return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(seen.scene)))

@@ -1,0 +1,222 @@
+"""T1 pairs: which of eight relations holds between two vertically related classes?
+
+A question is a pair of different classes of a scene for which the scene lists a vertical relation
+(on-top, under, above, below). The evidence is the labels of all objects of the scene, without
+relations. The eight relations are the four canonical relations in both directions. A pair may have
+several listed relations; each of them is correct.
+
+    accuracy   share of pairs whose most probable relation is listed (expectation over ties)
+    log-loss   -log of the listed relations' share of the eight probabilities, in nats
+
+Pairs with structure classes are excluded. Scenes without such a pair are skipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.registry import Artifact
+from app.scene import CANONICAL
+from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.batches import SceneTensors, seen_triples
+from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.model import Contender, RelationScore
+from training.evaluation.relation_tasks import telling
+from training.evaluation.setting import Outcome, Setting
+
+RARE = 10
+"""A class is rare if training relates it to at most this many classes."""
+
+VERTICAL = (CANONICAL.index("on-top"), CANONICAL.index("above"))
+
+# Lower bound of the listed relations' share, so that the log-loss of a pair is at most 21 nats.
+_LEAST = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePairs:
+    """The questions about one scene.
+
+    Attributes:
+        place: index of the scene in its set.
+        ends: (P, 2) indices into the scene's classes, the smaller index first.
+        listed: (P, 8) bool, relations of the first class to the second, then of the second to the
+            first.
+    """
+
+    place: int
+    scene: EncodedScene
+    ends: Ints
+    listed: Flags
+
+    @property
+    def classes(self) -> Ints:
+        """Class indices of the two classes of each pair, (P, 2)."""
+        ends: Ints = self.scene.evidence.classes[self.ends]
+        return ends
+
+
+# Function that returns probabilities (P, 8) for the pairs of a scene.
+PairScore = Callable[[ScenePairs], Floats]
+
+
+def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
+    """Return the vertical pairs of every scene that has such pairs."""
+    plain = ~structure.numpy()
+    found = []
+    for place, scene in enumerate(scenes.scenes):
+        holds = scene.evidence.holds
+        vertical = holds[[a for a in VERTICAL if a < len(holds)]].any(0)
+        usable = plain[scene.evidence.classes]
+        pair = np.triu(vertical | vertical.T, 1) & usable[:, None] & usable
+        ends = np.argwhere(pair)
+        if len(ends):
+            x, y = ends.T
+            listed = np.concatenate([holds[:, x, y], holds[:, y, x]]).T
+            found.append(ScenePairs(place, scene, ends, listed))
+    return found
+
+
+def service_score(artifact: Artifact) -> PairScore:
+    """Return a score: probabilities of `/relations` between the first instances of both classes."""
+
+    def score(asked: ScenePairs) -> Floats:
+        scene, own = asked.scene, asked.scene.evidence.classes
+        first = [int(np.flatnonzero(scene.instance_classes == c)[0]) for c in own]
+        ends = [(first[x], first[y]) for x, y in asked.ends.tolist()]
+        both = ends + [(y, x) for x, y in ends]
+        p = relation_probabilities(artifact, labels_alone(scene), both)
+        x, y = np.array(ends).T
+        return np.concatenate([p[:, x, y], p[:, y, x]]).T
+
+    return score
+
+
+def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
+    """Return a score from log-odds of relations between classes."""
+
+    @torch.no_grad()
+    def score(asked: ScenePairs) -> Floats:
+        batch = scenes.batch(torch.tensor([asked.place]))
+        p = relations(telling(batch))[0].double().sigmoid().numpy()
+        x, y = asked.ends.T
+        return np.concatenate([p[:, x, y], p[:, y, x]]).T
+
+    return score
+
+
+@dataclass(frozen=True, eq=False)
+class PairAnswers:
+    """Answers about all N pairs of a set of scenes.
+
+    Attributes:
+        scene: (N,) index of the scene of each pair.
+        classes: (N, 2) indices of the two classes of each pair.
+        p: (N, 8) probability of each of the eight relations.
+        listed: (N, 8) bool, True for relations that the scene lists.
+    """
+
+    scene: Ints
+    classes: Ints
+    p: Floats
+    listed: Flags
+    scenes: int
+
+    def where(self, mask: Flags) -> PairAnswers:
+        """Select the pairs with a True value in `mask` (N,)."""
+        return PairAnswers(
+            self.scene[mask], self.classes[mask], self.p[mask], self.listed[mask], self.scenes
+        )
+
+    def accuracy(self) -> Ratio:
+        """Return the share of pairs whose most probable relation is listed in the scene."""
+        best = self.p == self.p.max(1, keepdims=True)
+        right = (best & self.listed).sum(1) / best.sum(1)
+        return Ratio.of_items(self.scene, right, self.scenes)
+
+    def upright(self) -> Ratio:
+        """Return the share of pairs whose most probable vertical relation is listed."""
+        columns = [a + back for back in (0, self.p.shape[1] // 2) for a in VERTICAL]
+        return replace(self, p=self.p[:, columns], listed=self.listed[:, columns]).accuracy()
+
+    def log_loss(self) -> Ratio:
+        """Return the mean -log of the listed relations' share of the probabilities."""
+        total = self.p.sum(1)
+        share = np.divide(
+            (self.p * self.listed).sum(1), total, where=total > 0, out=self.listed.mean(1)
+        )
+        return Ratio.of_items(self.scene, -np.log(np.maximum(share, _LEAST)), self.scenes)
+
+
+def answer_pairs(asked: list[ScenePairs], score: PairScore, scenes: int) -> PairAnswers:
+    """Compute the probabilities of the eight relations for all pairs of all scenes."""
+    found = ask_every(score, asked)
+    return PairAnswers(
+        scene=np.repeat([one.place for one in asked], [len(one.ends) for one in asked]),
+        classes=np.concatenate([one.classes for one in asked]),
+        p=np.concatenate(found),
+        listed=np.concatenate([one.listed for one in asked]),
+        scenes=scenes,
+    )
+
+
+def pairs_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure T1 pairs; the primary metric is the accuracy over all pairs."""
+    related = {one.place for one in vertical_pairs(setting.scenes, setting.structure)}
+    if not related:
+        return None
+    index = torch.tensor(sorted(related), dtype=torch.int64)
+    scenes = setting.at(index).some()
+    asked = vertical_pairs(scenes, setting.structure)
+    if contender.artifact is not None:
+        score = service_score(contender.artifact)
+    elif contender.relations is not None:
+        score = baseline_score(scenes, contender.relations)
+    else:
+        return None
+    answers = answer_pairs(asked, score, len(scenes))
+    metrics: dict[str, Metric] = {
+        "accuracy": answers.accuracy(),
+        "accuracy, vertical": answers.upright(),
+        "log-loss": answers.log_loss(),
+    }
+    for name, which in _little_known(answers.classes, setting).items():
+        if which.any():
+            some = answers.where(which)
+            metrics[f"accuracy, {name}"] = some.accuracy()
+            metrics[f"log-loss, {name}"] = some.log_loss()
+    return Outcome(metrics, len(scenes), 0)
+
+
+def _little_known(classes: Ints, setting: Setting) -> dict[str, Flags]:
+    """Return masks (N,) of unseen pairs and of rare classes; empty without training scenes.
+
+    "unseen pairs": training lists no relation of the two classes. "rare classes": training relates
+    one of the two classes to at most `RARE` classes. Training here means all data that the
+    contender may have learnt from, not only the scenes of one source.
+    """
+    V = setting.scenes.v.shape[1]
+    triples = setting.seen
+    if triples is None:
+        if setting.train is None:
+            return {}
+        triples = seen_triples(setting.train.scenes, V)
+    known = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
+    partners = np.bincount(known.ravel(), minlength=V)
+    rare: Flags = np.any(partners[classes] <= RARE, axis=1)
+    return {
+        "unseen pairs": ~np.isin(_keys(classes, V), _keys(known, V)),
+        "rare classes": rare,
+    }
+
+
+def _keys(pairs: Ints, classes: int) -> Ints:
+    keys: Ints = pairs[:, 0] * classes + pairs[:, 1]
+    return keys

@@ -1,0 +1,364 @@
+"""Tasks T1a, T1b and T3b: the annotated relations between the classes of a scene.
+
+    T1a   the evidence is the classes
+    T1b   the evidence is the classes and a random half of the triples. Given triples a(x, y) and
+          their mirror images a(y, x) are not candidates
+    T3b   one triple is false. The model scores each triple given the other triples. The false
+          triple should rank as the least likely
+
+The metric of T1 is R-precision: the number of predictions is the number of annotated triples. The
+candidates are all ordered pairs i ≠ j of present classes × canonical relations. An unlisted triple
+counts as wrong, although annotators list only a few relations per scene. Structure classes are
+excluded. Scenes without annotated triples are skipped; T1b and T3b need two triples.
+
+Triples are canonical and distinct. So the evidence of T1b never contains a held-out relation in its
+opposite form (right for left). Relations outside the evidence are unobserved.
+
+The false triple of T3b has another relation between the two classes, or another present class at
+one end, with equal probability. The scene annotates neither the false triple nor its mirror image,
+because the other triples would contradict these directly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.scene import CANONICAL
+from training.datasets.array_types import Flags, Floats, Ints, Rng
+from training.datasets.batches import Batch, SceneTensors
+from training.datasets.cases import Triple, scene_rng
+from training.evaluation.metrics import Items, Metric, Ratio
+from training.evaluation.model import Contender, RelationScore
+from training.evaluation.setting import Outcome, Setting
+from training.machines import BoltzmannMachine
+from training.machines.edges import triple_keys
+from training.machines.log_odds import relation_log_odds
+from training.machines.mean_field import Evidence
+
+FIRST = (1, 2, 5, 10, 20, 50, 100)
+"""Numbers of predictions per scene for recall."""
+_RECALLS = (20, 50, 100)
+_TRIES = 50
+
+
+def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScore:
+    """Return a score: log-odds of every relation, with all relations unobserved."""
+
+    def score(batch: Batch) -> Tensor:
+        edges = machine.edges(batch.classes, batch.counts)
+        values, _ = relation_log_odds(machine, edges, Evidence(batch.v, edges), count=draws)
+        return machine.between(edges, values, batch.classes)
+
+    return score
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """The k ranked triples of one scene.
+
+    Attributes:
+        scene: index of the scene among the scored scenes.
+        relation: (k,) int64, index of the canonical relation.
+        key: (k,) int64, number of the triple (relation, class, class), see `triple_keys`.
+        score: (k,) score of each triple. A higher score means more likely true.
+        truth: (k,) bool, the triple is annotated.
+    """
+
+    scene: int
+    relation: Ints
+    key: Ints
+    score: Floats
+    truth: Flags
+
+    def where(self, mask: Flags) -> Candidates:
+        """Select the triples with a True value in `mask` (k,)."""
+        return Candidates(
+            self.scene, self.relation[mask], self.key[mask], self.score[mask], self.truth[mask]
+        )
+
+
+def scorable(batch: Batch, structure: Tensor) -> Tensor:
+    """Return a mask (B, A, n, n) of triples between two different classes without structure."""
+    n = batch.classes.shape[1]
+    usable = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
+    pair = usable[:, :, None] & usable[:, None, :] & ~torch.eye(n, dtype=torch.bool)
+    return pair[:, None].expand_as(batch.holds)
+
+
+def telling(batch: Batch, given: Tensor | None = None) -> Batch:
+    """Return the batch with only the given relations (B, A, n, n) observed."""
+    if given is None:
+        given = torch.zeros_like(batch.observed)
+    return replace(batch, holds=given.to(batch.holds.dtype), observed=given)
+
+
+def _batches(
+    scenes: SceneTensors, triples: int, block: int = 16
+) -> Iterator[tuple[list[int], Batch]]:
+    """Yield (indices, batch) of the scenes with at least `triples` annotated triples."""
+    related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.sum() >= triples]
+    for start in range(0, len(related), block):
+        index = related[start : start + block]
+        yield index, scenes.batch(torch.tensor(index, dtype=torch.int64))
+
+
+def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candidates]:
+    """Return the candidates of every scene, numbered in order."""
+    found: list[Candidates] = []
+    for batch, values, mask in batches:
+        for row, own in enumerate(batch.classes):
+            relation, x, y = mask[row].nonzero(as_tuple=True)
+            score = values[row, relation, x, y].double().numpy()
+            if np.isnan(score).any():
+                raise FloatingPointError(f"the score of a triple in scene {row} of a batch is NaN")
+            key = triple_keys(relation, own[x], own[y], batch.v.shape[1]).numpy()
+            truth = (batch.holds[row, relation, x, y] > 0).numpy()
+            found.append(Candidates(len(found), relation.numpy(), key, score, truth))
+    return found
+
+
+@torch.no_grad()
+def score_scenes(
+    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, counts: bool = True
+) -> list[Candidates]:
+    """Score the T1a candidates of annotated scenes. Without `counts`, all counts are 0, unknown."""
+
+    def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
+        for _, batch in _batches(scenes, 1, block=32):
+            asked = telling(batch)
+            if not counts:
+                asked = replace(asked, counts=torch.zeros_like(asked.counts))
+            yield batch, score(asked), scorable(batch, structure)
+
+    return _candidates(scored())
+
+
+@torch.no_grad()
+def complete_scenes(
+    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
+) -> list[Candidates]:
+    """Score the T1b candidates of scenes with at least two triples, given half of the triples."""
+
+    def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
+        for index, batch in _batches(scenes, 2):
+            mask = scorable(batch, structure)
+            given = random_half((batch.holds > 0) & mask, scenes, index, seed)
+            # With a single triple the observed half is empty: the scene is left out.
+            divided = given.flatten(1).any(1)[:, None, None, None]
+            yield batch, score(telling(batch, given)), mask & ~given & ~given.mT & divided
+
+    return _candidates(scored())
+
+
+def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed: int) -> Tensor:
+    """Return half of each scene's triples (rounded down), (B, A, n, n) bool."""
+    given = torch.zeros_like(truth)
+    for row, k in enumerate(index):
+        triples = truth[row].nonzero()
+        order = scene_rng(scenes.scenes[k], seed).permutation(len(triples))
+        chosen = triples[torch.from_numpy(order[: len(triples) // 2])]
+        given[row][tuple(chosen.T)] = True
+    return given
+
+
+@dataclass(frozen=True, eq=False)
+class RelationRanking:
+    """Number of annotated triples per scene, and number of hits among the predictions.
+
+    Attributes:
+        annotated: (scenes,) int64, 0 for a skipped scene.
+        hits: (scenes,) expected number of annotated triples among the predictions.
+    """
+
+    annotated: Ints
+    hits: Floats
+
+    @property
+    def skipped(self) -> int:
+        """Number of scenes without annotated triples among the candidates."""
+        return int((self.annotated == 0).sum())
+
+    def pooled(self) -> Ratio:
+        """Return the R-precision pooled over scenes."""
+        return Ratio(self.hits, self.annotated.astype(np.float64))
+
+    def per_scene(self) -> Ratio:
+        """Return the mean over scenes of their R-precision."""
+        return self.pooled().mean_over_scenes()
+
+
+def rank(scored: Iterable[Candidates], scenes: int, *, first: int | None = None) -> RelationRanking:
+    """Count annotated triples among the first candidates, by default as many as are annotated."""
+    annotated, hits = np.zeros(scenes, dtype=np.int64), np.zeros(scenes)
+    for scene in scored:
+        if count := int(scene.truth.sum()):
+            annotated[scene.scene] = count
+            hits[scene.scene] = expected_hits(scene.score, scene.truth, first or count)
+    return RelationRanking(annotated, hits)
+
+
+def rank_relations(
+    scenes: SceneTensors, structure: Tensor, score: RelationScore
+) -> RelationRanking:
+    """Compute the R-precision of a score on a set of scenes."""
+    return rank(score_scenes(scenes, structure, score), len(scenes))
+
+
+def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Candidates]:
+    """Select the candidates that are not among the training triples `seen`, (T, 3) (zero-shot)."""
+    relation, subject, object_ = seen.long().unbind(1)
+    keys = triple_keys(relation, subject, object_, classes).numpy()
+    return [scene.where(~np.isin(scene.key, keys)) for scene in scored]
+
+
+def expected_hits(score: Floats, truth: Flags, count: int) -> float:
+    """Return the expected number of true items among the first `count`; ties in random order."""
+    if count >= len(score):
+        return float(truth.sum())
+    threshold = np.partition(score, -count)[-count]
+    above, level = score > threshold, score == threshold
+    share = (count - above.sum()) / level.sum()
+    return float(truth[above].sum() + share * truth[level].sum())
+
+
+# -------------------------------------------------------------------------------------------- T3b
+
+
+def alter(holds: Flags, usable: Flags, rng: Rng) -> tuple[Triple, Triple] | None:
+    """Draw a triple of a scene and a false replacement; return (true, false) or None."""
+    triples = np.argwhere(holds & usable)
+    if len(triples) < 2:
+        return None
+    A, n, _ = holds.shape
+    a, x, y = triples[rng.integers(len(triples))].tolist()
+    for _ in range(_TRIES):
+        kind, other = rng.random(), int(rng.integers(n))
+        if kind < 0.5:
+            false = (int(rng.integers(A)), x, y)
+        elif kind < 0.75:
+            false = (a, x, other)
+        else:
+            false = (a, other, y)
+        b, i, j = false
+        if usable[false] and not holds[b, i, j] and not holds[b, j, i]:
+            return (a, x, y), false
+    return None
+
+
+@torch.no_grad()
+def placement_scores(
+    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
+) -> Items:
+    """Score all triples of scenes in which one triple is false.
+
+    Args:
+        score: function of a batch that observes the triples. It must judge each triple without
+            using that triple; higher means more likely true.
+
+    Returns:
+        The triples as items. The score of an item is the suspicion that its triple is false, and
+        the truth of an item is True for the false triple.
+    """
+    scene = [torch.zeros(0, dtype=torch.int64)]
+    values = [torch.zeros(0, dtype=torch.float64)]
+    false = [torch.zeros(0, dtype=torch.bool)]
+    for index, batch in _batches(scenes, 2):
+        usable = scorable(batch, structure)
+        truth = (batch.holds > 0) & usable
+        stated, wrong = torch.zeros_like(truth), torch.zeros_like(truth)
+        for row, k in enumerate(index):
+            rng = scene_rng(scenes.scenes[k], seed)
+            case = alter(batch.holds[row].numpy() > 0, usable[row].numpy(), rng)
+            if case is not None:
+                before, after = case
+                stated[row] = truth[row]
+                stated[row][before] = False
+                stated[row][after] = wrong[row][after] = True
+        result = score(telling(batch, stated))
+        scene.append(torch.tensor(index)[stated.nonzero()[:, 0]])
+        values.append(result[stated].double())
+        false.append(wrong[stated])
+    place, likely, is_false = (torch.cat(column).numpy() for column in (scene, values, false))
+    skipped = len(scenes) - len(np.unique(place))
+    return Items(place, -likely, is_false, len(scenes), skipped)
+
+
+# ------------------------------------------------------------------------------------------ tasks
+
+
+def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure T1a."""
+    if contender.relations is None:
+        return None
+    scenes, structure, score = setting.scenes, setting.structure, contender.relations
+    with_counts = score_scenes(scenes, structure, score)
+    plain = score_scenes(scenes, structure, score, counts=False)
+    if not _any_true(plain):
+        return None
+    ranking, counted = rank(plain, len(scenes)), rank(with_counts, len(scenes))
+    metrics: dict[str, Metric] = {
+        "R-precision, distinct classes": ranking.pooled(),
+        "R-precision, instance counts": counted.pooled(),
+        "R-precision, distinct classes, mean over scenes": ranking.per_scene(),
+        "R-precision, mean over scenes": counted.per_scene(),
+    }
+    metrics |= _parts(with_counts, setting, FIRST)
+    return Outcome(metrics, len(scenes), ranking.skipped)
+
+
+def completion_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure T1b. Also score the same candidates without given triples."""
+    if contender.completion is None:
+        return None
+    scenes, structure, seed = setting.scenes, setting.structure, setting.seed
+    given = complete_scenes(scenes, structure, contender.completion, seed=seed)
+    if not _any_true(given):
+        return None
+    ranking = rank(given, len(scenes))
+    metrics: dict[str, Metric] = {
+        "R-precision": ranking.pooled(),
+        "R-precision, mean over scenes": ranking.per_scene(),
+    }
+    metrics |= _parts(given, setting, _RECALLS)
+    if contender.relations is not None:
+        blind = complete_scenes(scenes, structure, contender.relations, seed=seed)
+        metrics["R-precision, nothing given"] = rank(blind, len(scenes)).pooled()
+    return Outcome(metrics, len(scenes), ranking.skipped)
+
+
+def _any_true(scored: list[Candidates]) -> bool:
+    return any(scene.truth.any() for scene in scored)
+
+
+def _parts(scored: list[Candidates], setting: Setting, first: Sequence[int]) -> dict[str, Metric]:
+    """Return R-precision by relation, recall at k, and R-precision of unseen triples."""
+    count = len(setting.scenes)
+    metrics: dict[str, Metric] = {}
+    for a, name in enumerate(CANONICAL):
+        some = [scene.where(scene.relation == a) for scene in scored]
+        if _any_true(some):
+            metrics[f"R-precision, {name}"] = rank(some, count).pooled()
+    for k in first:
+        metrics[f"R@{k}"] = rank(scored, count, first=k).per_scene()
+    if setting.seen is not None:
+        new = unseen(scored, setting.seen, setting.scenes.v.shape[1])
+        if _any_true(new):
+            metrics["R-precision, zero-shot"] = rank(new, count).pooled()
+    return metrics
+
+
+def placement_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Measure T3b."""
+    if contender.placement is None:
+        return None
+    scenes = setting.some(related=True)
+    scores = placement_scores(scenes, setting.structure, contender.placement, seed=setting.seed)
+    if not len(scores.scene):
+        return None
+    metrics: dict[str, Metric] = {"hit@1": scores.hit_at_1(), "AUROC": scores.metric("AUROC")}
+    return Outcome(metrics, len(scenes), scores.skipped)

@@ -1,0 +1,340 @@
+"""Results of an experiment: means over training seeds, paired differences, JSON and Markdown.
+
+A row of a result table is a model: a machine, a baseline or a reference.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from training.evaluation.metrics import Figure, MeanOverSeeds, Metric, paired_difference
+from training.evaluation.report import SourceReport, write_whole
+from training.evaluation.tasks import TASKS, in_words
+
+Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
+Shown = Mapping[str, tuple[str, ...]]
+
+SHOWN: Shown = {name: task.shown for name, task in TASKS.items()}
+"""Names of the metrics in tables, by task."""
+
+# Annotators list only a part of the relations that hold.
+UNLISTED = "An unlisted relation counts as wrong"
+
+_RELATION_TASKS = ("T1a", "T1b", "T1 with")
+
+_LOWER_IS_BETTER = (
+    "MMD²",
+    "marginal error",
+    "copies",
+    "mirrored",
+    "on-top cycles",
+    "alarms",
+    "ECE",
+    "error",
+    "log-loss",
+    "outliers: plain scenes with an alarm",
+    "generate: the scene has what never belongs",
+    "generate: scenes of fewer",
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One metric of one row on one data source.
+
+    Attributes:
+        figure: mean over training seeds, with the bootstrap interval over scenes.
+        seeds: value of the metric for each training seed.
+    """
+
+    row: str
+    task: str
+    source: str
+    metric: str
+    figure: Figure
+    seeds: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Difference in one metric: the reference row minus another row, with its paired interval."""
+
+    row: str
+    task: str
+    source: str
+    metric: str
+    figure: Figure
+
+    @property
+    def verdict(self) -> str:
+        """`better` or `worse` than the other row, or `undecided` if the interval contains zero."""
+        low, high = self.figure.low, self.figure.high
+        if self.metric.startswith(_LOWER_IS_BETTER):
+            low, high = -high, -low
+        return "better" if low > 0 else "worse" if high < 0 else "undecided"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Number of scenes of one task, for one row, training seed and data source."""
+
+    row: str
+    seed: int
+    task: str
+    source: str
+    scenes: int
+    skipped: int
+    notes: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The results of an experiment.
+
+    Attributes:
+        ours: name of the reference row of all comparisons.
+        cells: metrics of all rows, sorted by row, data source and task.
+        differences: paired differences from the reference row, sorted by row, data source and task.
+        parameters: number of trained weights by row name, for rows with weights.
+        asked: number of scenes of each task.
+    """
+
+    ours: str
+    cells: tuple[Cell, ...]
+    differences: tuple[Difference, ...]
+    parameters: Mapping[str, int] = field(default_factory=dict)
+    asked: tuple[Asked, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-serialisable dictionary."""
+        return {
+            "ours": self.ours,
+            "parameters": dict(self.parameters),
+            "cells": [asdict(cell) for cell in self.cells],
+            "differences": [asdict(one) | {"verdict": one.verdict} for one in self.differences],
+            "asked": [asdict(asked) for asked in self.asked],
+        }
+
+    def markdown(self, shown: Shown = SHOWN, *, changes: bool = False) -> str:
+        """Return one Markdown table per metric, and remarks on each task.
+
+        A table has one line per row and one column per data source. A star marks a row that is
+        worse than the reference row: the whole interval of the paired difference agrees.
+
+        Args:
+            shown: names of the metrics by task.
+            changes: True replaces the intervals of the metrics by intervals of the differences. A
+                difference is the row minus the reference row.
+        """
+        parts: list[str] = []
+        for task, metrics in shown.items():
+            tables = [table for name in metrics if (table := self._table(task, name, changes))]
+            if tables:
+                asked = [asked for asked in self.asked if asked.task == task]
+                parts += [*tables, *remarks(asked)]
+        return "\n\n".join(parts) + "\n"
+
+    def tables(
+        self, shown: Shown = SHOWN, words: Callable[[str], str] = in_words
+    ) -> Iterator[Table]:
+        """Generate one table per task for the terminal, of the pooled sources if there are any.
+
+        A star has the meaning of `markdown`.
+
+        Args:
+            words: function that takes a task name and returns the title of its table.
+        """
+        sources = list(dict.fromkeys(cell.source for cell in self.cells))
+        chosen = [source for source in sources if "pooled" in source] or sources
+        for task, metrics in shown.items():
+            table = Table("metric, model", *chosen, title=words(task), box=box.SIMPLE_HEAD)
+            for metric in metrics:
+                texts = self._texts(task, metric)
+                rows = {row: found for row, found in texts.items() if found.keys() & set(chosen)}
+                if rows:
+                    table.add_row(f"[bold]{metric}[/bold]")
+                for row, found in rows.items():
+                    table.add_row(f"  {row}", *(found.get(source, "") for source in chosen))
+            if table.row_count:
+                yield table
+
+    def _texts(self, task: str, metric: str, changes: bool = False) -> dict[str, dict[str, str]]:
+        """Return the cells of a metric as texts, by row and data source."""
+        gaps = {
+            (gap.row, gap.source): gap
+            for gap in self.differences
+            if (gap.task, gap.metric) == (task, metric)
+        }
+        texts: dict[str, dict[str, str]] = {}
+        for cell in self.cells:
+            if (cell.task, cell.metric) == (task, metric):
+                gap = gaps.get((cell.row, cell.source))
+                texts.setdefault(cell.row, {})[cell.source] = _text(cell, gap, changes)
+        return texts
+
+    def _table(self, task: str, metric: str, changes: bool) -> str:
+        texts = self._texts(task, metric, changes)
+        if not texts:
+            return ""
+        sources = list(dict.fromkeys(source for found in texts.values() for source in found))
+        lines = []
+        for row, found in texts.items():
+            name = f"**{row}**" if row == self.ours else row
+            weights = f"{self.parameters[row]:,}" if row in self.parameters else ""
+            lines.append([name, weights, *(found.get(source, "") for source in sources)])
+        parts = [f"### {task}: {metric}"]
+        if task.startswith(_RELATION_TASKS):
+            parts.append(f"{UNLISTED}.")
+        if changes:
+            parts.append(f"In brackets: paired 95 % interval of the row minus {self.ours}.")
+        return "\n\n".join([*parts, grid(["", "weights", *sources], lines)])
+
+
+def _text(cell: Cell, gap: Difference | None, changes: bool) -> str:
+    if changes and gap is not None:
+        low, high = (0.0 - round(bound, 3) for bound in (gap.figure.high, gap.figure.low))
+        return f"{cell.figure.value:.3f} ({low:+.3f}, {high:+.3f})"
+    if changes:
+        return f"{cell.figure.value:.3f}"
+    return f"{cell.figure}{' *' if gap is not None and gap.verdict == 'better' else ''}"
+
+
+def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
+    """Write `values` into results.json and `text` into results.md. Replace each file atomically."""
+    write_whole(folder / "results.md", text)
+    write_whole(folder / "results.json", json.dumps(values, indent=1) + "\n")
+
+
+def summarise(
+    reports: Reports,
+    ours: str,
+    parameters: Mapping[str, int] | None = None,
+    *,
+    groups: Callable[[str], Sequence[str]] | None = None,
+) -> Results:
+    """Compute the metrics of every row, and the paired differences from the reference row.
+
+    Args:
+        groups: function that takes a task name and returns the group of each scene. With this
+            function, the bootstrap of differences resamples groups instead of scenes.
+
+    Raises:
+        ValueError: the reports lack the reference row.
+    """
+    means = {
+        (row, source, task, name): MeanOverSeeds(metrics)
+        for row in dict.fromkeys(name for name, _ in reports)
+        for source, task, name, metrics in _by_metric(reports, row)
+    }
+    if not any(key[0] == ours for key in means):
+        raise ValueError(f"the reports contain no metric of the reference row {ours}")
+    cells = tuple(
+        Cell(row, task, source, name, mean.figure(), tuple(m.value for m in mean.members))
+        for (row, source, task, name), mean in means.items()
+    )
+    differences = tuple(
+        Difference(
+            *(row, task, source, name),
+            paired_difference(mine, mean, groups=None if groups is None else groups(task)),
+        )
+        for (row, source, task, name), mean in means.items()
+        if row != ours
+        and (mine := means.get((ours, source, task, name))) is not None
+        # A row may lack a pooled metric on some data sources. Its scenes then cannot be paired.
+        and mine.scenes == mean.scenes
+    )
+    return Results(ours, cells, differences, parameters or {}, tuple(_asked(reports)))
+
+
+def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:
+    """Return the report with only the wanted metrics, because resampling all metrics is slow."""
+    outcomes = {
+        task: outcome
+        and replace(
+            outcome,
+            metrics={name: outcome.metrics[name] for name in names if name in outcome.metrics},
+        )
+        for task, names in wanted.items()
+        if task in report.outcomes
+        for outcome in [report.outcomes[task]]
+    }
+    return replace(report, outcomes=outcomes)
+
+
+def _asked(reports: Reports) -> Iterator[Asked]:
+    for (row, seed), by_source in reports.items():
+        for source, report in by_source.items():
+            for task, outcome in report.outcomes.items():
+                if outcome is not None:
+                    counts = outcome.scenes, outcome.skipped
+                    yield Asked(row, seed, task, source, *counts, outcome.notes)
+
+
+def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:
+    """Iterate over (data source, task, metric name, metrics) of a row, with one metric per seed.
+
+    A pooled metric is left out if its data sources differ between seeds. For example, the Brier
+    skill of a seed is undefined on a source where all queried relations hold.
+    """
+    found: dict[tuple[str, str, str], list[Metric]] = {}
+    for (name, _), by_source in reports.items():
+        if name != row:
+            continue
+        for source, report in by_source.items():
+            for task, outcome in report.outcomes.items():
+                for metric, value in (outcome.metrics if outcome else {}).items():
+                    found.setdefault((source, task, metric), []).append(value)
+    for (source, task, metric), values in found.items():
+        if len({value.scenes for value in values}) == 1:
+            yield source, task, metric, values
+
+
+def remarks(asked: Sequence[Asked]) -> list[str]:
+    """Return remarks on one task: the number of skipped scenes, and a table of the notes."""
+    skipped = []
+    for source in dict.fromkeys(one.source for one in asked):
+        here = [one for one in asked if one.source == source]
+        count, scenes = _range(one.skipped for one in here), _range(one.scenes for one in here)
+        if count != "0":
+            skipped.append(f"{source} {count} of {scenes}")
+    parts = [f"Scenes that could not be scored: {', '.join(skipped)}."] if skipped else []
+    noted = [one for one in asked if one.notes]
+    return [*parts, _notes(noted)] if noted else parts
+
+
+def _range(counts: Iterable[int]) -> str:
+    """Format one count if all rows have the same count, else the range of the counts."""
+    low, *others = sorted(set(counts))
+    return f"{low:,}–{others[-1]:,}" if others else f"{low:,}"
+
+
+def _notes(asked: Sequence[Asked]) -> str:
+    """Return a table of notes, with one line per source or row if the others have equal notes."""
+    found: dict[str, Mapping[str, float]] = {}
+    for place in ("{0.source}", "{0.row}, seed {0.seed}", "{0.row}, seed {0.seed}, {0.source}"):
+        found = {place.format(one): one.notes for one in asked}
+        if all(found[place.format(one)] == one.notes for one in asked):
+            break
+    names = list(dict.fromkeys(name for values in found.values() for name in values))
+    rows = (
+        [key, *(_number(values[name]) if name in values else "" for name in names)]
+        for key, values in found.items()
+    )
+    return grid(["", *names], rows)
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if float(value).is_integer() else f"{value:,.3f}"

@@ -1,0 +1,1 @@
+"""Training of one configuration: objectives, the trainer, statistics and calibration."""

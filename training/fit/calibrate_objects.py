@@ -1,0 +1,510 @@
+"""Fit the calibration of answers about objects.
+
+    coverage   Assumed share of the objects that a scene lists, and the weight of the posterior for
+               partly listed scenes. Both are chosen by the rank of hidden classes.
+    missing    Probability that an unlisted class is present, fitted to scenes that show 25 %, 50 %,
+               75 % or all but one of their classes. Near-duplicate scenes have a lower weight.
+    outlier    Probability that a class is an intruder, with thresholds. Half of the scenes contain
+               an intruder.
+    evidence   See `fit_evidence`.
+
+The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
+logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
+uniformly, by the frequency of classes, or from the typical classes of another room type.
+
+Source: Platt, "Probabilistic outputs for support vector machines" (1999).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.questions.generate import room_fit
+from app.questions.posterior import posterior
+from app.registry import NEVER, Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
+from app.scene import Scene
+from training.datasets.array_types import Flags, Floats, Rng
+from training.datasets.batches import SceneTensors, subset
+from training.datasets.cases import RIDGE, logistic
+from training.evaluation.alarms import ALARMS
+from training.evaluation.asking import of_classes
+from training.evaluation.evidence_tasks import removals
+from training.evaluation.intruders import (
+    IntruderScores,
+    by_popularity,
+    by_signature,
+    clean_scores,
+    intruder_scores,
+)
+from training.evaluation.missing_tasks import SHARES, MachineScore, hide
+from training.evaluation.outlier_tasks import alarm_threshold
+from training.machines.arrays import machine_of
+
+COVERAGES = (0.3, 0.4, 0.5, 0.6, 0.7)
+WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
+# Tested exponents alpha. With 0.5, the detected share of uniformly drawn intruders in sunrgbd falls
+# from .47 to .35.
+ALPHAS = (0.0, 0.125, 0.25, 0.375)
+PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
+# Minimum thresholds. If the scores of intruders and other objects do not overlap, as in scenes that
+# hardly vary, the target shares would need alarms for objects that probably belong to the scene.
+LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
+# Lists of up to `_SHORT_LISTS` classes have separate thresholds, until the threshold of whole
+# scenes raises alarms in at most `_ENOUGH` times the target share of the shortened lists. Each
+# threshold is fitted to at least `_SHORTENED` shortened lists; few scenes are shortened several
+# times.
+_SHORT_LISTS = 8
+_ENOUGH = 1.5
+_SHORTENED = 200
+# Number of scenes used from each source.
+_PARTIAL_SCENES = 120
+# Number of times that the hidden class is drawn, for scenes that show all but one class.
+_DRAWS_OF_ONE = 4
+# Quantiles over real rooms of a room type. A generated scene is too small if its number of classes
+# is below quantile `_SMALL`. A generated scene does not suit its room type if its `room_fit` is
+# below quantile `_UNSUITED`. A room type needs `_ROOM_SCENES` scenes for separate limits.
+_SMALL = 0.1
+_UNSUITED = 0.15
+_ROOM_SCENES = 20
+_EVIDENCE_SCENES = 400
+# Number of scenes for a machine whose log-odds have no closed form. Sampling the log-odds takes a
+# hundred times longer than a closed form.
+_EVIDENCE_SCENES_OF_DRAWS = 100
+# Maximum accepted losses. `_UNIFORM_LOSS`: hit@1 and detected share of uniformly drawn intruders.
+# `_COMPLETE_LOSS`: mean reciprocal rank (MRR) of hidden classes in nearly complete lists.
+_UNIFORM_LOSS = np.array([0.04, 0.06])
+_COMPLETE_LOSS = 0.002
+_NEARLY_COMPLETE = ("75 %", "all but one")
+# Weights whose MRR differs from the best MRR by at most this value count as equal. The smallest of
+# these weights is used.
+_AS_GOOD = 0.006
+# Number of classes in the fit of each scene. An answer of the service lists ten by default.
+_LISTED = 10
+
+
+def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
+    """Return the scenes with complete object lists, or all scenes if no list is complete.
+
+    A near-duplicate scene is kept with a probability equal to its weight.
+    """
+    rng = np.random.default_rng(seed)
+    complete = scenes.complete.numpy()
+    # Photographs have no complete object lists. If all scenes are photographs, use all of them.
+    complete = complete if complete.any() else ~complete
+    kept = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
+    return subset(scenes, torch.from_numpy(np.flatnonzero(kept)))
+
+
+def calibrate_objects(
+    artifact: Artifact,
+    validation: SceneTensors,
+    train: SceneTensors,
+    structure: Tensor,
+    seed: int = 0,
+    chosen: Calibration | None = None,
+) -> Calibration:
+    """Return the model's calibration with newly fitted entries about objects.
+
+    Args:
+        train: training scenes. They give the frequency of each class, and limits for room types.
+        chosen: a calibration that was fitted on other validation scenes. Its coverage, coverage
+            weight, weights of evidence and alpha are copied. None chooses new values.
+    """
+    scenes = complete_scenes(validation, seed)
+    if not len(scenes):
+        return artifact.calibration
+    every = validation.complete if bool(validation.complete.any()) else ~validation.complete
+    every_scene = subset(validation, every.nonzero().squeeze(1))
+    learnt = complete_scenes(train, seed)
+    popular = tuple(np.round(popularity(train), 4).tolist())
+    artifact = recalibrated(artifact, popularity=popular)
+    coverage = fit_coverage(artifact, every_scene, structure, seed, chosen)
+    artifact = recalibrated(artifact, **coverage)
+    weights = chosen.evidence if chosen else fit_evidence(artifact, validation, structure, seed)
+    artifact = recalibrated(artifact, evidence=weights)
+    return recalibrated(
+        artifact,
+        **fit_outliers(artifact, scenes, learnt, structure, seed, chosen),
+        smallest=smallest_scenes(learnt, structure, artifact.spec.C),
+        room_fit=room_limits(artifact, learnt),
+    ).calibration
+
+
+def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
+    """Return a copy of the model in which some entries of the calibration are replaced."""
+    return replace(artifact, calibration=artifact.calibration.model_copy(update=entries))
+
+
+def popularity(train: SceneTensors) -> Floats:
+    """Return the smoothed log-odds that a complete training scene contains a class, (classes,)."""
+    weight = train.weight * (train.complete if bool(train.complete.any()) else 1.0)
+    count = (train.v * weight.unsqueeze(1)).sum(0).double().numpy()
+    total = float(weight.sum())
+    found: Floats = np.log((count + 0.5) / (total - count + 0.5))
+    return found
+
+
+def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
+    """Return the 10 % quantile of the number of classes in a scene, for each room type.
+
+    The last value is the quantile over all scenes. It also replaces the quantile of a room type
+    with fewer than 20 scenes.
+    """
+    sizes = ((train.v > 0) & ~structure).sum(1).numpy()
+    every = int(np.quantile(sizes, _SMALL))
+    of = [sizes[train.room.numpy() == t] for t in range(rooms)]
+    found = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else every for n in of]
+    return (*found, every)
+
+
+def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
+    """Return the 15 % quantile of `room_fit` for each room type, (room types,).
+
+    The value is -1e9 for a room type with fewer than 20 scenes.
+    """
+    found = []
+    for t in range(artifact.spec.C):
+        own = train.v[train.room == t].numpy()
+        limit = -1e9
+        if len(own) >= _ROOM_SCENES:
+            limit = float(np.quantile(room_fit(artifact.weights, own, t), _UNSUITED))
+        found.append(round(limit, 4))
+    return tuple(found)
+
+
+# ------------------------------------------------------------------------------ unlisted classes
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """A scene that lists only some of its classes. The remaining classes are hidden.
+
+    Attributes:
+        closed: log-odds of the unlisted classes if the list were complete, (unlisted classes,).
+        partial: maps an assumed coverage to the log-odds of the unlisted classes, (unlisted
+            classes,). The log-odds allow for an incomplete list.
+        hidden: True for unlisted classes that are in the scene, (unlisted classes,) bool.
+        share: share of listed classes as text, such as "75 %".
+        weight: number of scenes of the data source that this sampled scene represents.
+    """
+
+    closed: Floats
+    partial: dict[float, Floats]
+    hidden: Flags
+    listed: int
+    share: str
+    source: int
+    weight: float
+
+
+def fit_coverage(
+    artifact: Artifact,
+    scenes: SceneTensors,
+    structure: Tensor,
+    seed: int = 0,
+    chosen: Calibration | None = None,
+) -> dict[str, Any]:
+    """Fit the entries `coverage`, `coverage_weight` and `missing` of the calibration."""
+    cases = list(_shown(artifact, scenes, structure, seed))
+    if not cases:
+        return {}
+    if artifact.completions is None:
+        coverage, weight = artifact.calibration.coverage, 0.0
+    elif chosen:
+        coverage, weight = chosen.coverage, chosen.coverage_weight
+    else:
+        coverage, weight = _choose_coverage(cases)
+    rows = [_rows(case, coverage, weight) for case in cases]
+    examples = np.concatenate(rows)
+    weights = np.repeat([case.weight for case in cases], [len(own) for own in rows])
+    entry = CountSlope()
+    if len(np.unique(examples[:, 2])) == 2:
+        slope, count, intercept = logistic(examples[:, :2], examples[:, 2] > 0, weights)
+        entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
+    return {"coverage": coverage, "coverage_weight": weight, "missing": entry}
+
+
+def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
+    """Return the coverage and the coverage weight with the best MRR of hidden classes.
+
+    On nearly complete lists, their MRR must be at most `_COMPLETE_LOSS` below the MRR of weight 0.
+    """
+    nearly = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
+    least = [_mrr(some, 0.5, 0.0) - _COMPLETE_LOSS for some in nearly]
+    allowed = [(0.5, 0.0)] + [
+        pair
+        for pair in itertools.product(COVERAGES, WEIGHTS)
+        if all(_mrr(some, *pair) >= limit for some, limit in zip(nearly, least, strict=True))
+    ]
+    return max(allowed, key=lambda pair: _mrr(cases, *pair))
+
+
+def _shown(
+    artifact: Artifact, scenes: SceneTensors, structure: Tensor, seed: int
+) -> Iterable[_Shown]:
+    order = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(seed))
+    source = scenes.source[order]
+    place = torch.zeros(len(order), dtype=torch.int64)
+    stands_for = torch.zeros(len(order))
+    for one in source.unique():
+        own = source == one
+        count = int(own.sum())
+        place[own] = torch.arange(count)
+        stands_for[own] = scenes.weight[order][own].sum() / min(count, _PARTIAL_SCENES)
+    chosen = place < _PARTIAL_SCENES
+    some, weight = subset(scenes, order[chosen]), stands_for[chosen].tolist()
+    source_of = source[chosen].tolist()
+    whole = recalibrated(artifact, coverage_weight=1.0)
+    # If only one class is hidden, several hidden classes are tried to reduce the effect of chance.
+    draws = [
+        (name, share, seed + draw)
+        for name, share in SHARES.items()
+        for draw in range(1 if share else _DRAWS_OF_ONE)
+    ]
+    for name, share, draw in draws:
+        cases = hide(some, structure, share, draw)
+        for k, v, hidden in zip(cases.scene, cases.v.numpy(), cases.hidden.numpy(), strict=True):
+            classes = np.flatnonzero(v)
+            absent = np.flatnonzero((v == 0) & ~structure.numpy())
+            given = posterior(whole, of_classes(classes.tolist()))
+            partial = {}
+            if whole.completions is not None:
+                partial = {
+                    coverage: given.absent_posterior(absent, coverage).astype(np.float64)
+                    for coverage in COVERAGES
+                }
+            closed = given.absent_log_odds(absent).astype(np.float64)
+            listed = max(1, int((~structure.numpy()[classes]).sum()))
+            own = weight[int(k)] / (1 if share else _DRAWS_OF_ONE)
+            yield _Shown(closed, partial, hidden[absent], listed, name, source_of[int(k)], own)
+
+
+def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
+    closed = case.closed + np.log1p(-coverage)
+    if not weight:
+        return closed
+    mixed: Floats = (1 - weight) * closed + weight * case.partial[coverage]
+    return mixed
+
+
+def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
+    """Return the mean reciprocal rank of hidden classes. All data sources have the same weight."""
+    found: dict[int, list[Floats]] = {}
+    for case in cases:
+        z = _mixed(case, coverage, weight)
+        others = np.sort(z[~case.hidden])
+        above = len(others) - np.searchsorted(others, z[case.hidden], side="right")
+        found.setdefault(case.source, []).append(1.0 / (1.0 + above.astype(np.float64)))
+    return float(np.mean([np.concatenate(own).mean() for own in found.values()]))
+
+
+def _rows(case: _Shown, coverage: float, weight: float) -> Floats:
+    """Return the data for the fit, one row for each of the best classes, (classes, 3).
+
+    The columns are the log-odds, the log of the number of listed classes, and 1 for a hidden class.
+    """
+    z = _mixed(case, coverage, weight)
+    first = np.argsort(-z, kind="stable")[:_LISTED]
+    size = np.full(len(first), np.log(case.listed))
+    return np.stack([z[first], size, case.hidden[first]], 1)
+
+
+# ------------------------------------------------------------------------------------- intruders
+
+
+def fit_outliers(
+    artifact: Artifact,
+    scenes: SceneTensors,
+    train: SceneTensors,
+    structure: Tensor,
+    seed: int = 0,
+    chosen: Calibration | None = None,
+) -> dict[str, Any]:
+    """Fit `popularity_weight`, `outlier`, `outlier_thresholds` and `short_list_thresholds`.
+
+    A robot that starts to explore a room lists few classes. The probability of an intruder is
+    fitted to whole scenes and is too high for short lists. For example, a stove without other
+    objects is rare in a generated room. Short lists therefore have separate thresholds, fitted by
+    the same rule to parts of the same scenes. The threshold never falls when the list gets shorter.
+    """
+    score = MachineScore(machine_of(artifact.weights))
+    prior = np.array(artifact.calibration.popularity)
+    laws = {
+        "uniform": None,
+        "popularity": by_popularity(scenes, train),
+        "signature": by_signature(scenes, train),
+    }
+    kinds = {
+        name: intruder_scores(scenes, structure, score, weights=weights, seed=seed)
+        for name, weights in laws.items()
+    }
+    kinds = {name: found for name, found in kinds.items() if found.intruder.any()}
+    if not kinds:
+        return {}
+    alpha = chosen.popularity_weight if chosen else choose_alpha(kinds, prior)
+    judged = {name: found.with_prior(alpha * prior) for name, found in kinds.items()}
+    rng = np.random.default_rng(seed)
+    parts = []
+    for found in judged.values():
+        clean_scene = rng.random(found.scenes) < 0.5
+        used = found.clean == clean_scene[found.scene]
+        features = np.stack([found.log_odds, np.log(found.size)], 1)[used]
+        parts.append(np.column_stack([features, found.intruder[used]]))
+    examples = np.concatenate(parts)
+    slope, size, intercept = logistic(examples[:, :2], examples[:, 2] > 0, C=RIDGE)
+    if slope >= 0:
+        return {}
+    entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
+    whole = [(next(iter(judged.values())), scenes)]
+    limits = thresholds(partial(limit_of, whole, entry, rng))
+    fitted: dict[str, Any] = {
+        "popularity_weight": alpha,
+        "outlier": entry,
+        "outlier_thresholds": limits,
+    }
+    short: list[Thresholds] = []
+    for listed in range(1, _SHORT_LISTS + 1):
+        lists = [listing(scenes, structure, listed, rng)]
+        if not len(lists[0][0]):
+            break
+        while len(lists) * len(lists[0][0]) < _SHORTENED:
+            lists.append(listing(scenes, structure, listed, rng))
+        parts_scored = [
+            (clean_scores(parts_of, structure, score).with_prior(alpha * prior), some)
+            for some, parts_of in lists
+        ]
+        share = _ENOUGH * ALARMS["medium"]
+        if limit_of(parts_scored, entry, np.random.default_rng(seed), share) <= limits.medium:
+            break
+        own = thresholds(partial(limit_of, parts_scored, entry, rng))
+        short.append(_between(limits, own, short[-1] if short else NEVER))
+    return fitted | {"short_list_thresholds": tuple(short)}
+
+
+def listing(
+    scenes: SceneTensors, structure: Tensor, listed: int, rng: Rng
+) -> tuple[SceneTensors, Tensor]:
+    """Return the scenes with more than `listed` classes, and shortened object lists.
+
+    A shortened list contains `listed` random classes and all structure classes of the scene. The
+    lists have the shape (scenes, classes).
+    """
+    plain = (scenes.v > 0) & ~structure
+    large = (plain.sum(1) > listed).nonzero().squeeze(1)
+    order = torch.from_numpy(rng.random(plain[large].shape)).masked_fill(~plain[large], 2.0)
+    kept = order.argsort(1)[:, :listed]
+    shown = scenes.v[large] * structure
+    return subset(scenes, large), shown.scatter(1, kept, 1.0)
+
+
+Scored = Sequence[tuple[IntruderScores, SceneTensors]]
+"""Scores of untouched scenes, and these scenes: one entry for each shortening of the scenes."""
+
+
+def thresholds(limit: Callable[[float], float]) -> Thresholds:
+    """Return the limits of the target shares of alarms, each at least the minimum."""
+    return Thresholds(**{name: max(LEAST[name], limit(share)) for name, share in ALARMS.items()})
+
+
+def limit_of(untouched: Scored, entry: CountSlope, rng: Rng, share: float) -> float:
+    """Return the probability that raises alarms in a share of the untouched scenes.
+
+    The function averages over the shortenings, because several shortenings of a scene are not
+    several scenes for `alarm_threshold`.
+    """
+    logits = [
+        alarm_threshold(
+            entry.log_odds(scores.log_odds, scores.size).astype(np.float64),
+            *(scores, scenes, rng, share),
+        )
+        for scores, scenes in untouched
+    ]
+    return float(1 / (1 + np.exp(-np.mean(logits))))
+
+
+def _between(low: Thresholds, found: Thresholds, high: Thresholds) -> Thresholds:
+    return Thresholds(
+        **{
+            name: min(max(getattr(found, name), getattr(low, name)), getattr(high, name))
+            for name in ALARMS
+        }
+    )
+
+
+def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
+    """Return the alpha with the best mean of hit@1 and detected share over all intruder kinds.
+
+    For uniformly drawn intruders, hit@1 may be at most .04 lower than with alpha 0, and the
+    detected share at most .06 lower.
+    """
+    found = {
+        alpha: {name: _found(scores.with_prior(alpha * prior)) for name, scores in kinds.items()}
+        for alpha in ALPHAS
+    }
+    floor = found[0.0].get("uniform", np.zeros(2)) - _UNIFORM_LOSS
+    allowed = [alpha for alpha in ALPHAS if (found[alpha].get("uniform", floor) >= floor).all()]
+    return max(allowed, key=lambda alpha: (sum(map(np.sum, found[alpha].values())), -alpha))
+
+
+def _found(scores: IntruderScores) -> Floats:
+    """Return hit@1 and the share of intruders that an alarm in 10 % of unaltered scenes detects."""
+    worst = np.full(scores.scenes, np.inf)
+    np.minimum.at(worst, scores.scene[scores.clean], scores.log_odds[scores.clean])
+    limit = np.quantile(worst[np.isfinite(worst)], ALARMS["medium"])
+    caught = (scores.log_odds[scores.intruder] <= limit).mean()
+    return np.array([scores.hit_at_1().figure().value, caught])
+
+
+# -------------------------------------------------------------------------------------- evidence
+
+
+def fit_evidence(
+    artifact: Artifact, validation: SceneTensors, structure: Tensor, seed: int = 0
+) -> EvidenceWeights:
+    """Choose the weights of relations and poses in answers about objects.
+
+    The criterion is the mean reciprocal rank (MRR) of removed objects. Evidence without validation
+    scenes has no effect on answers about objects.
+    """
+    plain = structure.numpy()
+    found = EvidenceWeights(relations_on_objects=0.0, poses_on_objects=0.0)
+    scenes = complete_scenes(validation, seed)
+    related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
+    rng = np.random.default_rng(seed)
+    count = _EVIDENCE_SCENES if artifact.oracle is None else _EVIDENCE_SCENES_OF_DRAWS
+    chosen = rng.permutation(related)[:count].astype(np.int64)
+    some = subset(scenes, torch.from_numpy(chosen))
+    if not len(some):
+        return found
+    for kind, name in (("relations", "relations_on_objects"), ("poses", "poses_on_objects")):
+        cases = list(removals(some, plain, kind, seed))
+        if not cases:
+            continue
+        scores = {}
+        for pull in PULLS:
+            asked = recalibrated(artifact, evidence=found.model_copy(update={name: pull}))
+            ranks = [_rank(asked, case.scenes[1], case.target, plain) for case in cases]
+            scores[pull] = float(np.mean([1 / rank for rank in ranks]))
+        found = found.model_copy(update={name: least_of_the_best(scores)})
+    return found
+
+
+def least_of_the_best(scores: dict[float, float]) -> float:
+    """Return the smallest weight whose score is at most `_AS_GOOD` below the best score."""
+    enough = max(scores.values()) - _AS_GOOD
+    return min(pull for pull, score in scores.items() if score >= enough)
+
+
+def _rank(artifact: Artifact, scene: Scene, target: int, structure: Flags) -> int:
+    given = posterior(artifact, scene)
+    absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
+    z = given.absent_posterior(absent, artifact.calibration.coverage)
+    return 1 + int((z > z[absent == target]).sum())

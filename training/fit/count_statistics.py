@@ -1,0 +1,272 @@
+"""Fit statistics of the numbers of instances of a class, such as the chairs of a kitchen.
+
+`app.questions.counts` has the formula. s(n) is a weighted share of the training scenes with n
+instances, shrunk towards the shares over all classes. The weights maximise the penalised likelihood
+of the numbers in partly listed scenes (`some_instances`). A weight is the sum of a term of the
+class and a term that all classes share. `docs/decisions/counts.md` describes the alternatives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.optimize import minimize
+
+from app.questions.counts import distribution, functions
+from app.registry.counts import EXPONENTS, INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
+from app.scene import Vocabulary
+from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.cases import MOST, Part, counted_classes, listed_cases
+from training.datasets.sources import SOURCES
+from training.evaluation.count_task import class_mean
+from training.fit.offset_statistics import half_precision, source_weights
+
+# Maximum number of scenes of a group. Scenes of a group are near-duplicates.
+_OF_GROUP: Final = 8
+_DRAWS: Final = 2  # listings of each training and validation scene
+# Weight of the shares over all classes in s(n), in scenes.
+_PRIOR: Final = 8.0
+# Penalties on the squares of the terms of a class and of the shared terms.
+_OWN, _SHARED = 0.3, 0.15
+# A smaller relative change of the loss ends the fit.
+_PRECISION: Final = 1e-6
+# A class needs this many scenes, and this many groups that have several instances.
+_SCENES, _GROUPS = 20, 10
+# Three or more listed instances are covered if this many groups have as many.
+_GROUPS_OF_MANY: Final = 20
+_FOLDS: Final = 5
+
+
+def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts | None:
+    """Fit the statistics of counts. Return None if no class has enough data.
+
+    All data sources that count instances have the same total weight. Camera frames are left out,
+    because they show a part of a room. A class gets statistics only if, in a cross-validation, the
+    expected number is closer to the truth than the class mean.
+    """
+    views = {name for name, source in SOURCES.items() if source.of_one_view}
+    counting = counted_classes(scenes, vocabulary)
+    counting = {source: counted for source, counted in counting.items() if source not in views}
+    known = [scene for scene in scenes if scene.source in counting]
+    most = _most(known, counting, vocabulary)
+    if (most > 1).any():
+        known = _few_of_group(known)
+        most *= _better(known, most, counting, vocabulary)
+    return _fit(known, most, counting, vocabulary) if (most > 1).any() else None
+
+
+def folds(
+    scenes: Sequence[EncodedScene],
+) -> Iterator[tuple[list[EncodedScene], list[EncodedScene]]]:
+    """Yield the training and the test scenes of five folds. A group is in the test of one fold."""
+    groups = sorted({scene.group for scene in scenes})
+    order = np.random.default_rng(0).permutation(len(groups)).tolist()
+    place = dict(zip(groups, order, strict=True))
+    for number in range(_FOLDS):
+        train: list[EncodedScene] = []
+        test: list[EncodedScene] = []
+        for scene in scenes:
+            (test if place[scene.group] % _FOLDS == number else train).append(scene)
+        yield train, test
+
+
+def _fit(
+    scenes: Sequence[EncodedScene],
+    most: Ints,
+    counting: dict[str, Flags],
+    vocabulary: Vocabulary,
+) -> Counts:
+    """Fit the statistics to all cases of the scenes. Return those of the classes with a `most`."""
+    cases = _Cases.of(scenes, counting, vocabulary, _DRAWS)
+    share = _shares(cases, len(vocabulary))
+    weights = _weights(cases, share, len(vocabulary))
+    # The exponent -1 stands for the listed number, which is uniform from 1 to n.
+    weights[:, 0, INTERCEPT] -= 1.0
+    itself = ROOM + len(vocabulary.room_types) + np.arange(len(vocabulary))
+    weights[np.arange(len(vocabulary)), :, itself] = 0.0
+    classes = np.flatnonzero(most)
+    return Counts(
+        classes, most[classes], half_precision(share[classes]), half_precision(weights[classes])
+    )
+
+
+def _few_of_group(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
+    """Return at most `_OF_GROUP` scenes of each group."""
+    found, seen = [], Counter[tuple[str, str]]()
+    for scene in scenes:
+        seen[scene.source, scene.group] += 1
+        if seen[scene.source, scene.group] <= _OF_GROUP:
+            found.append(scene)
+    return found
+
+
+def _most(
+    scenes: Sequence[EncodedScene], counting: dict[str, Flags], vocabulary: Vocabulary
+) -> Ints:
+    """Return the maximum listed number of each class that the data can tell about, (V,).
+
+    It is at least 2 for a class with enough scenes and enough groups with several instances, and 0
+    for the other classes.
+    """
+    times = np.zeros(len(vocabulary), dtype=np.int64)
+    of_group: dict[tuple[int, str, str], int] = {}
+    for scene in scenes:
+        usable = counting[scene.source][scene.evidence.classes]
+        classes, counts = scene.evidence.classes[usable], scene.evidence.counts[usable]
+        times[classes] += 1
+        for index, count in zip(classes.tolist(), counts.tolist(), strict=True):
+            key = index, scene.source, scene.group
+            of_group[key] = max(count, of_group.get(key, 0))
+    numbers = np.array([(index, count) for (index, _, _), count in of_group.items()]).reshape(-1, 2)
+    most = np.zeros_like(times)
+    for index in np.flatnonzero(times >= _SCENES).tolist():
+        of_class = numbers[numbers[:, 0] == index, 1]
+        groups = np.array([(of_class >= number).sum() for number in range(2, MOST)])
+        if groups[0] >= _GROUPS:
+            most[index] = max(2, 1 + (groups >= _GROUPS_OF_MANY).sum())
+    return most
+
+
+@dataclass(frozen=True, eq=False)
+class _Cases:
+    """N cases: a class of a partly listed scene.
+
+    Attributes:
+        index: (N,) the class.
+        listed: (N,) number of listed instances, from 1 to `number`.
+        number: (N,) number of instances in the scene.
+        features: (N, 3 + C + V) features of the listed part, in the columns of `Counts.weights`.
+        weight: (N,) weight that balances the data sources.
+    """
+
+    index: Ints
+    listed: Ints
+    number: Ints
+    features: sparse.csr_matrix
+    weight: Floats
+
+    @classmethod
+    def of(
+        cls,
+        scenes: Sequence[EncodedScene],
+        counting: dict[str, Flags],
+        vocabulary: Vocabulary,
+        draws: int,
+    ) -> _Cases:
+        """List each scene in part, `draws` times."""
+        names, start = sorted(counting), ROOM + len(vocabulary.room_types)
+        rows: list[tuple[Ints, Floats]] = []
+        cases: list[tuple[int, ...]] = []
+        for place, scene in enumerate(scenes):
+            counted, source = counting[scene.source], names.index(scene.source)
+            for seed in range(draws):
+                part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
+                rows += [_features(part, k, start) for k in asked.tolist()]
+                numbers = np.stack([part.classes, part.listed, part.number])[:, asked]
+                cases += [(*case, place, source) for case in numbers.T.tolist()]
+        index, listed, number, places, sources = np.array(cases, dtype=np.int64).T
+        columns, values = (np.concatenate(some) for some in zip(*rows, strict=True))
+        bounds = np.cumsum([0, *(len(row) for row, _ in rows)])
+        shape = (len(cases), start + len(vocabulary))
+        features = sparse.csr_matrix((values, columns, bounds), shape=shape)
+        return cls(index, listed, number, features, source_weights(sources, places) / draws)
+
+
+def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
+    """Return columns of `Counts.weights` and their values for the k-th class of a part."""
+    others, listed = np.delete(part.classes, k), np.delete(part.listed, k)
+    columns = [INTERCEPT, SINGLE, SEVERAL, *(start + others).tolist()]
+    values = [1.0, float(part.listed[k] == 1), float((listed > 1).any())]
+    values += [1 / math.sqrt(max(len(others), 1))] * len(others)
+    if part.room >= 0:
+        columns.append(ROOM + part.room)
+        values.append(1.0)
+    return np.array(columns, dtype=np.int64), np.array(values)
+
+
+def _shares(cases: _Cases, V: int) -> Floats:
+    """Return the log of the share of each number of instances, (V, M)."""
+    table = np.zeros((V, MOST))
+    np.add.at(table, (cases.index, cases.number - 1), cases.weight)
+    # Each number needs a positive share, because the fitted scene may favour it.
+    overall = 0.999 * table.sum(axis=0) / table.sum() + 0.001 / MOST
+    table += _PRIOR * overall
+    share: Floats = np.log(table / table.sum(axis=1, keepdims=True))
+    return share
+
+
+def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
+    """Return the weights of each class, (V, 2, 3 + C + V), by maximum penalised likelihood."""
+    features, (N, width) = cases.features, cases.features.shape
+    # The terms of a class act only on cases of this class.
+    entries = features.tocoo()
+    own = sparse.csr_matrix(
+        (entries.data, (entries.row, cases.index[entries.row] * width + entries.col)),
+        shape=(N, V * width),
+    )
+    used = np.unique(own.indices)
+    both = sparse.hstack([own[:, used], features]).tocsr()
+    penalty = np.repeat([_OWN, _SHARED], [len(used), width])[:, None]
+    numbers, of_number = np.arange(1, MOST + 1), functions(MOST)
+    place, case = cases.number - 1, np.arange(N)
+    base = share.T[:, cases.index] - np.log(numbers)[:, None]
+    base[numbers[:, None] < cases.listed] = -np.inf
+
+    def loss(flat: Floats) -> tuple[float, Floats]:
+        terms = flat.reshape(-1, EXPONENTS)
+        logits = of_number.T @ (both @ terms).T
+        logits += base
+        logits -= logits.max(axis=0)
+        p = np.exp(logits)
+        total = p.sum(axis=0)
+        fit = cases.weight @ (logits[place, case] - np.log(total))
+        error = cases.weight * (of_number @ p / total - of_number[:, place])
+        slope = both.T @ error.T + penalty * terms
+        return 0.5 * (penalty * terms**2).sum() - fit, slope.ravel()
+
+    start, options = np.zeros(both.shape[1] * EXPONENTS), {"ftol": _PRECISION}
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", options=options)
+    terms = found.x.reshape(-1, EXPONENTS)
+    weights = np.zeros((V * width, EXPONENTS))
+    weights[used] = terms[: len(used)]
+    of_class: Floats = weights.reshape(V, width, EXPONENTS) + terms[len(used) :]
+    return of_class.swapaxes(1, 2)
+
+
+def _better(
+    scenes: Sequence[EncodedScene],
+    most: Ints,
+    counting: dict[str, Flags],
+    vocabulary: Vocabulary,
+) -> Flags:
+    """Return the classes, (V,), whose expected number is closer than the class mean."""
+    gain = np.zeros(len(vocabulary))
+    for train, test in folds(scenes):
+        counts = _fit(train, most, counting, vocabulary)
+        for scene in test:
+            for seed in range(_DRAWS):
+                counted = counting[scene.source]
+                part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
+                classes, change = _changes(counts, part, asked, len(vocabulary))
+                gain[classes] -= change
+    return gain > 0
+
+
+def _changes(counts: Counts, part: Part, asked: NDArray[np.intp], V: int) -> tuple[Ints, Floats]:
+    """Return classes (k,), and error of the expected number minus error of the mean."""
+    room = part.room if part.room >= 0 else None
+    which, p = distribution(counts, V, part.classes, part.listed, room)
+    usable = np.isin(which, asked)
+    which, expected = which[usable], p[usable] @ np.arange(1, MOST + 1)
+    classes, number = part.classes[which], part.number[which]
+    mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[which])
+    change: Floats = np.abs(expected - number) - np.abs(mean - number)
+    return classes, change

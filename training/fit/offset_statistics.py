@@ -1,0 +1,279 @@
+"""Fit the distribution of offsets (position differences) between related objects.
+
+The training data are scenes with poses. Each canonical relation and each axis have a separate
+model. The offset from an object of class j to an object of class i is normal, with a mean m and a
+variance s for each pair of classes:
+
+    s ~ inverse-gamma(alpha, beta)    m given s ~ normal(mu + u_i + v_j, s / kappa)
+    u_i and v_j given s ~ normal(0, s / (kappa lambda))
+
+All pairs of classes share mu, kappa, alpha and beta. Training alternates between these parameters,
+by maximum likelihood over all pairs, and the class effects u and v. Given all these values, the
+distribution of the offset of a pair has a closed form. The distribution of a frequent pair depends
+mainly on the data of the pair. The distribution of a rare pair depends mainly on the two classes
+and the relation.
+`docs/decisions/offsets.md` describes the alternatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import gammaln
+
+from app.registry import Offsets
+from app.scene import CANONICAL
+from training.datasets import EncodedScene
+from training.datasets.array_types import Floats, Ints
+from training.datasets.offsets import Seen, seen_offsets
+
+# Shrinkage of the class effects u and v. It acts like `LAMBDA` additional pairs with effect 0.
+LAMBDA: Final = 4.0
+# Minimum of alpha. With alpha <= 1, the variance of an unseen pair of classes is not finite.
+_LEAST_ALPHA: Final = 1.5
+# Minimum number of scenes for which a data source can lower the weights of larger sources.
+_FEW: Final = 100
+_ROUNDS, _SWEEPS = 4, 10
+# Resolution of annotated box centres in metres. It keeps the variance above 0 if all heights are
+# equal.
+_RESOLUTION: Final = 0.005
+
+
+def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
+    """Fit the distribution of offsets. Return None if no scene has poses.
+
+    All offsets of a pair of classes in one scene have a total weight of 1, because they depend on
+    each other. All data sources have the same total weight, because boxes of one source are
+    similar.
+    """
+    seen = seen_offsets(scenes)
+    if not len(seen.offset):
+        return None
+    A = len(CANONICAL)
+    relation, scenes_of = np.zeros((A, 6)), np.zeros(A, dtype=np.int32)
+    subject, other = np.zeros((A, V, 6)), np.zeros((A, V, 6))
+    pair = [np.zeros(0, dtype=np.int64)]
+    known, counts = [np.zeros((0, 6))], [np.zeros(0, dtype=np.int32)]
+    for a in range(A):
+        some = seen.some(seen.relation == a)
+        if not len(some.offset):
+            continue
+        pairs = _pairs(some)
+        fit = _fit(pairs, V)
+        relation[a], subject[a], other[a] = fit.tables()
+        mean, variance = fit.predict(pairs)
+        scenes_of[a] = len(np.unique(some.scene))
+        pair.append((a * V + pairs.subject) * V + pairs.other)
+        known.append(np.concatenate([mean, np.sqrt(variance)], axis=1))
+        counts.append(pairs.scenes.astype(np.int32))
+    return Offsets(
+        *(half_precision(relation), scenes_of, half_precision(subject), half_precision(other)),
+        *(np.concatenate(pair), half_precision(np.concatenate(known)), np.concatenate(counts)),
+    )
+
+
+class Pairs(NamedTuple):
+    """Pairs of classes in one relation, with the moments of their offsets.
+
+    Attributes:
+        subject, other: class indices of the relation's subject and object, (pairs,). The pairs are
+            sorted by subject, then by object.
+        scenes: number of scenes with the pair, (pairs,).
+        n: total weight of the offsets of the pair, (pairs, 1).
+        mean: weighted mean of the offsets, (pairs, 3).
+        scatter: weighted sum of squared deviations from the mean, (pairs, 3).
+    """
+
+    subject: Ints
+    other: Ints
+    scenes: Ints
+    n: Floats
+    mean: Floats
+    scatter: Floats
+
+
+def _pairs(seen: Seen) -> Pairs:
+    classes = np.stack([seen.subject, seen.other], axis=1)
+    found, pair = np.unique(classes, axis=0, return_inverse=True)
+    pair = pair.reshape(-1)
+    # Group the offsets by scene and pair of classes.
+    _, first, group, size = np.unique(
+        np.stack([pair, seen.scene]),
+        axis=1,
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
+    )
+    weight = source_weights(seen.source, seen.scene) / size[group.reshape(-1)]
+    P, weights = len(found), weight[:, None]
+    n = _sums(pair, weights, P)
+    mean = _sums(pair, weights * seen.offset, P) / n
+    squares = np.square(seen.offset - mean[pair]) + _RESOLUTION**2
+    subject, other = found.T
+    scenes = np.bincount(pair[first], minlength=P)
+    return Pairs(subject, other, scenes, n, mean, _sums(pair, weights * squares, P))
+
+
+def _sums(group: Ints, values: Floats, groups: int) -> Floats:
+    """Return the sum of the values, (rows, k), over each group of rows, (groups, k)."""
+    found = np.zeros((groups, values.shape[1]))
+    np.add.at(found, group, values)
+    return found
+
+
+def source_weights(source: Ints, scene: Ints) -> Floats:
+    """Return weights of N items, (N,), that balance large and small data sources.
+
+    Args:
+        source: (N,) index of the data source of each item.
+        scene: (N,) index of the scene of each item.
+    """
+    count = np.array([len(np.unique(scene[source == s])) for s in range(source.max() + 1)])
+    least = count[count >= _FEW].min(initial=count.max())
+    weight: Floats = np.minimum(1.0, least / np.maximum(count, 1))[source]
+    return weight
+
+
+@dataclass(eq=False)
+class _Fit:
+    """Fitted parameters of one relation. The last dimension of each array is x, y and z.
+
+    Attributes:
+        kappa, alpha, beta, mu: parameters of the prior (see the module), one for each axis, (3,).
+        u, v: effects of the class of the relation's subject (u) and object (v), (classes, 3).
+        doubt_u, doubt_v: variances of u and v in units of s / kappa, (classes, 3).
+    """
+
+    kappa: Floats
+    alpha: Floats
+    beta: Floats
+    mu: Floats
+    u: Floats
+    v: Floats
+    doubt_u: Floats
+    doubt_v: Floats
+
+    def expected(self, pairs: Pairs) -> Floats:
+        """Return the prior mean of the offset of each pair, (pairs, 3)."""
+        return self.mu + self.u[pairs.subject] + self.v[pairs.other]
+
+    def predict(self, pairs: Pairs) -> tuple[Floats, Floats]:
+        """Return mean and variance of a new offset of each pair, both (pairs, 3)."""
+        kappa = self.kappa / (1 + self.doubt_u[pairs.subject] + self.doubt_v[pairs.other])
+        return posterior(
+            *(self.expected(pairs), kappa, self.alpha, self.beta),
+            *(pairs.n, pairs.mean, pairs.scatter),
+        )
+
+    def tables(self) -> tuple[Floats, Floats, Floats]:
+        """Return three tables whose sum gives mean and variance of a pair without data.
+
+        The first table, (6,), contains three means and three variances for unknown classes. The
+        other tables, (classes, 6), contain the contributions of the subject class and of the object
+        class. The sum equals `predict`.
+        """
+        spread = self.beta / (self.alpha - 1)
+        unknown = 1 / LAMBDA
+        relation = np.concatenate([self.mu, spread * (1 + (1 + 2 * unknown) / self.kappa)])
+        subject, other = (
+            np.concatenate([effect, spread * (doubt - unknown) / self.kappa], axis=1)
+            for effect, doubt in ((self.u, self.doubt_u), (self.v, self.doubt_v))
+        )
+        return relation, subject, other
+
+
+def posterior(
+    expected: Floats,
+    kappa: Floats,
+    alpha: Floats,
+    beta: Floats,
+    n: Floats,
+    mean: Floats,
+    scatter: Floats,
+) -> tuple[Floats, Floats]:
+    """Return mean and variance of a new value given n values, under a normal–inverse-gamma prior.
+
+    Args:
+        expected, kappa, alpha, beta: parameters of the prior. alpha + n / 2 must be above 1.
+        scatter: sum of the squared deviations from the mean.
+    """
+    after = kappa + n
+    rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
+    variance = rate / (alpha + n / 2 - 1) * (1 + 1 / after)
+    return (kappa * expected + n * mean) / after, variance
+
+
+def log_likelihood(
+    expected: Floats,
+    kappa: float,
+    alpha: float,
+    beta: float,
+    n: Floats,
+    mean: Floats,
+    scatter: Floats,
+) -> Floats:
+    """Return the log-likelihood of n values, with their mean and variance integrated out.
+
+    `posterior` describes the arguments.
+    """
+    after, shape = kappa + n, alpha + n / 2
+    rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
+    found: Floats = (
+        gammaln(shape) - gammaln(alpha) + alpha * np.log(beta) - shape * np.log(rate)
+        + (np.log(kappa) - np.log(after) - n * np.log(2 * np.pi)) / 2
+    )  # fmt: skip
+    return found
+
+
+def _fit(pairs: Pairs, V: int) -> _Fit:
+    """Fit the parameters of one relation, by alternation between the prior and class effects."""
+    nothing = np.zeros((V, 3))
+    start = (pairs.n * pairs.mean).sum(axis=0) / pairs.n.sum()
+    fit = _Fit(
+        np.ones(3), np.full(3, 2.0), np.full(3, 0.1), start, nothing, nothing, nothing, nothing
+    )
+    for _ in range(_ROUNDS):
+        expected = fit.expected(pairs)
+        found = [_hyperparameters(pairs, axis, expected[:, axis]) for axis in range(3)]
+        fit.kappa, fit.alpha, fit.beta = np.array(found).T
+        _effects(fit, pairs, V)
+    return fit
+
+
+def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
+    """Return kappa, alpha and beta of one axis, fitted by maximum likelihood."""
+
+    def loss(logs: Floats) -> float:
+        kappa, alpha, beta = np.exp(logs)
+        n, mean, scatter = pairs.n[:, 0], pairs.mean[:, axis], pairs.scatter[:, axis]
+        return -float(log_likelihood(expected, kappa, alpha, beta, n, mean, scatter).sum())
+
+    bounds = [(-7.0, 7.0), (np.log(_LEAST_ALPHA), 7.0), (-12.0, 7.0)]
+    found: Floats = np.exp(minimize(loss, np.log([1.0, 2.0, 0.1]), bounds=bounds).x)
+    return found
+
+
+def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
+    """Fit mu and the effects u and v, shrunk towards 0, by alternation, in place."""
+    # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
+    weight = pairs.n / (pairs.n + fit.kappa)
+
+    below_u = _sums(pairs.subject, weight, V) + LAMBDA
+    below_v = _sums(pairs.other, weight, V) + LAMBDA
+    for _ in range(_SWEEPS):
+        rest = pairs.mean - fit.u[pairs.subject] - fit.v[pairs.other]
+        fit.mu = (weight * rest).sum(axis=0) / weight.sum(axis=0)
+        rest = pairs.mean - fit.mu
+        fit.u = _sums(pairs.subject, weight * (rest - fit.v[pairs.other]), V) / below_u
+        fit.v = _sums(pairs.other, weight * (rest - fit.u[pairs.subject]), V) / below_v
+    fit.doubt_u, fit.doubt_v = 1 / below_u, 1 / below_v
+
+
+def half_precision(table: Floats) -> NDArray[np.float32]:
+    """Round a table to half precision, the precision of the model file."""
+    return table.astype(np.float16).astype(np.float32)

@@ -1,0 +1,430 @@
+"""The trainer of every machine and objective: updates, early stopping, checkpoints, curves.
+
+With one thread, two runs with the same seed give bit-identical weights, even if a run is
+interrupted and resumed after an epoch. `machines.distributed` splits the batches between processes.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from app.inference.variants import VARIANTS
+from training.datasets.batches import Batch, SceneTensors, TrainingData, seen_triples, subset
+from training.evaluation.missing_tasks import MachineScore, leave_one_out
+from training.evaluation.reconstruction import reconstruction_error
+from training.evaluation.relation_tasks import machine_score as relation_score
+from training.evaluation.relation_tasks import rank_relations
+from training.fit.checkpoint import (
+    Epoch,
+    TrainingResult,
+    load_checkpoint,
+    save_checkpoint,
+    write_csv,
+    write_plot,
+)
+from training.fit.object_weights import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
+from training.fit.objectives import OBJECTIVES, Objective
+from training.fit.settings import Config
+from training.machines import BoltzmannMachine, MachineSpec, build, distributed
+from training.machines.bernoulli import log_odds_of
+from training.machines.edges import find_triples, triple_keys
+
+_VALIDATION_SCENES = 400
+_DRAWN_EVERY = 20.0  # s
+# Attributes of the trainer that a checkpoint stores as they are.
+_COUNTERS = ("objects_trained", "best_epoch", "best_score", "updates", "seconds")
+# Function that is called in the first training phase (objects only) with the finished share of it.
+ObjectProgress = Callable[[float], None]
+# Names of the weights with the full learning rate. The setting `relation_rate` can lower the rate
+# of all other weights. Relation weights can overfit within one epoch.
+_FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
+
+# Function that is called after every update. The arguments are the epoch, the finished share of the
+# epoch and the mean loss in the epoch so far.
+Progress = Callable[[int, float, float], None]
+# Function that is called with the figures of every finished epoch.
+Ended = Callable[[Epoch], None]
+
+
+def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
+    """Return a machine with small random matrices and log-odds of training counts as biases."""
+    shape = config.machine
+    V = data.train.v.shape[1]
+    triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
+    spec = MachineSpec(
+        variant=shape.variant,
+        V=V,
+        A=data.relations,
+        H1=shape.H1,
+        H2=shape.H2,
+        C=data.room_types,
+        K=shape.K if VARIANTS[shape.variant].factorised else 0,
+        T=len(triples),
+        G=shape.G,
+        N=shape.N,
+        form=shape.form,
+    )
+    machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
+    with torch.no_grad():
+        annotated = data.train.annotated_classes[data.train.source].sum(0)
+        # If no data source annotates a class, its bias must mean a rare class. The formula alone
+        # would give a probability of 1/2.
+        annotated = torch.where(annotated > 0, annotated, len(data.train))
+        machine.b.copy_(log_odds_of(data.train.v.sum(0), annotated))
+        machine.c1.fill_(shape.initial_c1)
+        machine.Q.zero_()
+        _start_relations(machine, data.train)
+        for name in shape.without:
+            machine.get_parameter(name).zero_().requires_grad_(False)
+    return machine
+
+
+def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
+    """Set the relation biases to the log-odds of relations in scenes with annotated relations."""
+    A, V, T = machine.spec.A, machine.spec.V, machine.spec.T
+    held, seen, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
+    logs, times, annotated = torch.zeros(V), torch.zeros(V), 0
+    for scene in scenes.scenes:
+        e = scene.evidence
+        if not e.observed.any():
+            continue
+        annotated += 1
+        held += torch.from_numpy(e.holds.sum((1, 2)))
+        seen += torch.from_numpy(e.observed.sum((1, 2)))
+        classes = torch.from_numpy(e.classes)
+        relation, subject, object_ = torch.from_numpy(e.holds).nonzero(as_tuple=True)
+        keys = triple_keys(relation, classes[subject], classes[object_], V)
+        place, found = find_triples(machine.triple_keys, keys)
+        per_unit[place[found]] += 1
+        logs[classes] += torch.from_numpy(e.counts).log()
+        times[classes] += 1
+    machine.start_relations(
+        log_odds_of(held, seen),
+        log_odds_of(per_unit, torch.full_like(per_unit, annotated)),
+        logs / times.clamp(min=1),
+    )
+
+
+class _Loss(nn.Module):
+    """The loss of this process' share of a batch; the mean over processes is the global loss."""
+
+    def __init__(self, objective: Objective, machine: BoltzmannMachine) -> None:
+        super().__init__()
+        self.objective, self.machine = objective, machine
+        self.more = nn.ParameterList(objective.parameters())
+
+    def forward(self, batch: Batch, generator: torch.Generator) -> Tensor:
+        """Return the loss, times the number of processes."""
+        return self.objective.loss(self.machine, batch, generator) * distributed.size()
+
+
+class Trainer:
+    """Train one configuration on one set of scenes.
+
+    Args:
+        folder: folder of `checkpoint.pt`, `curve.csv` and `curve.png`; None writes no files. Only
+            the first process writes.
+    """
+
+    def __init__(self, config: Config, data: TrainingData, folder: Path | None = None) -> None:
+        self.config, self.data, self.folder = config, data, folder
+        torch.set_num_threads(config.training.threads)
+        self.device = distributed.device_of(config.training.device)
+        self.generator = distributed.new_generator(config.training.seed)
+        self.machine = new_machine(config, data, self.generator).to(self.device)
+        self.machine.index_triples()
+        kind = OBJECTIVES[config.objective.name]
+        with self._placed():
+            self.objective: Objective = kind.of(config.objective, self.machine, data)
+        self.train = data.train
+        if config.objects.epochs:
+            self.train = _with_relations(data.train)
+            for name in OBJECT_WEIGHTS:
+                self.machine.get_parameter(name).requires_grad_(False)
+        self.loss = distributed.parallel(_Loss(self.objective, self.machine))
+        self.optimiser = self._optimiser()
+        self.steps_per_epoch = math.ceil(len(self.train) / config.training.batch_size)
+        self.scheduler = self._scheduler()
+        self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
+        self.updates = 0
+        self.epochs: list[Epoch] = []
+        self.best: dict[str, Tensor] = {}
+        self.best_epoch, self.best_score = -1, -math.inf
+        self.seconds = 0.0
+        self.objects_trained = not config.objects.epochs
+        self._drawn = -math.inf
+
+    def _placed(self) -> torch.device | nullcontext[None]:
+        """Return a context in which new tensors are on the device."""
+        return nullcontext() if self.device.type == "cpu" else self.device
+
+    def _on_cpu(self) -> BoltzmannMachine:
+        """Return the machine, on a GPU a copy; objects and validation use the CPU."""
+        if self.device.type == "cpu":
+            return self.machine
+        machine = copy.deepcopy(self.machine).cpu()
+        machine.index_triples()
+        return machine
+
+    def _optimiser(self) -> torch.optim.Optimizer:
+        t = self.config.training
+        matrices: list[Tensor] = []
+        biases: list[Tensor] = []
+        relations: list[Tensor] = []
+        for name, parameter in self.machine.named_parameters():
+            if not parameter.requires_grad:
+                continue
+            group = matrices if parameter.dim() > 1 else biases
+            (group if name in _FULL_RATE else relations).append(parameter)
+        rate = t.learning_rate * t.relation_rate
+        biases += self.objective.parameters()
+        groups = [
+            {"params": matrices, "weight_decay": t.weight_decay, "lr": t.learning_rate},
+            {"params": biases, "weight_decay": 0.0, "lr": t.learning_rate},
+            {"params": relations, "weight_decay": t.relation_decay, "lr": rate},
+        ]
+        if t.optimiser == "sgd":
+            return torch.optim.SGD(groups, lr=t.learning_rate, fused=True)
+        return torch.optim.AdamW(groups, lr=t.learning_rate, fused=True)
+
+    def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
+        """Return the schedule of the learning rate.
+
+        In the one-cycle schedule, the rate rises linearly over the first tenth of the updates. It
+        then falls to 0 along a cosine.
+        """
+        t = self.config.training
+        if t.schedule == "constant":
+            return torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda _: 1.0)
+        total = t.epochs * self.steps_per_epoch
+        rise = max(1, total // 10)
+
+        def factor(step: int) -> float:
+            if step < rise:
+                return (step + 1) / rise
+            return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(total - rise, 1))))
+
+        return torch.optim.lr_scheduler.LambdaLR(self.optimiser, factor)
+
+    # -- the run --------------------------------------------------------------------------------
+
+    def resume(self) -> bool:
+        """Load the checkpoint in the folder of the run. Return False if there is no checkpoint.
+
+        Raises:
+            RunError: the checkpoint cannot be read or belongs to another configuration.
+        """
+        if self.folder is None:
+            return False
+        state = distributed.on_first(partial(_checkpoint, self.folder, self._digest))
+        if state is None:
+            return False
+        for name in ("objective", "average", "best"):
+            state[name] = {key: value.to(self.device) for key, value in state[name].items()}
+        self.machine.load_state_dict(state["machine"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.scheduler.load_state_dict(state["scheduler"])
+        self.objective.load_state(state["objective"])
+        self.generator.set_state(state["generator"])
+        self.average, self.best = state["average"], state["best"]
+        for name in _COUNTERS:
+            setattr(self, name, state[name])
+        self.epochs = [Epoch(**row) for row in state["epochs"]]
+        return True
+
+    def run(
+        self,
+        progress: Progress | None = None,
+        ended: Ended | None = None,
+        objects: ObjectProgress = lambda _: None,
+    ) -> TrainingResult:
+        """Run the first training phase (objects only) if there is one, then all epochs.
+
+        Training ends after the last epoch. It ends earlier if the validation score does not improve
+        for `training.patience` epochs. After a KeyboardInterrupt, the checkpoint of the last
+        finished epoch is on disk.
+        """
+        if not self.objects_trained:
+            began = time.perf_counter()
+            state = distributed.on_first(partial(self._fit_objects, objects))
+            self.machine.load_state_dict(state)
+            self.objects_trained = True
+            self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
+            self.seconds += time.perf_counter() - began
+            self._save()
+        while len(self.epochs) < self.config.training.epochs and not self._out_of_patience():
+            self._epoch(progress)
+            self._save()
+            if ended is not None:
+                ended(self.epochs[-1])
+        self._draw()
+        parameters = dict(self.machine.named_parameters())
+        with torch.no_grad():
+            for name, value in self.best.items():
+                parameters[name].copy_(value)
+        self.machine.cpu().index_triples()
+        machine = self.objective.finish(self.machine, self.train)
+        if not self.config.objects.epochs:
+            fine_tune(
+                self.machine,
+                self.data.train,
+                self.config.polish,
+                self.config.objective.room_dropout,
+                self.config.training.seed,
+            )
+        return TrainingResult(machine, self.epochs, self.best_epoch, self.seconds)
+
+    def _fit_objects(self, progress: ObjectProgress) -> dict[str, Tensor]:
+        machine, seed = self._on_cpu(), self.config.training.seed
+        fit_objects(machine, self.data.train, self.config.objects, seed, progress)
+        store_samples(machine, self.data.train, self.config.objective.room_dropout, seed)
+        return machine.state_dict()
+
+    @property
+    def _digest(self) -> str:
+        return f"{self.config.digest} {self.data.digest}"
+
+    def _out_of_patience(self) -> bool:
+        patience = self.config.training.patience
+        return patience is not None and len(self.epochs) - 1 - self.best_epoch >= patience
+
+    def _epoch(self, progress: Progress | None) -> None:
+        began = time.perf_counter()
+        number = len(self.epochs)
+        total, steps = 0.0, 0
+        order = torch.randperm(len(self.train), generator=self.generator)
+        for index in order.split(self.config.training.batch_size):
+            total, steps = total + self._update(index), steps + 1
+            if progress is not None:
+                progress(number, steps / self.steps_per_epoch, total / steps)
+        everyone = distributed.total(torch.tensor(total, dtype=torch.float64))
+        loss = float(everyone) / distributed.size() / steps
+        finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
+        if not math.isfinite(loss) or not finite:
+            raise FloatingPointError(
+                f"the training diverged in epoch {number}, with a loss of {loss}: lower the "
+                "learning rate (training.learning_rate)"
+            )
+        self._close_epoch(number, loss, began)
+
+    def _update(self, index: Tensor) -> float:
+        width = max(len(self.train.scenes[k].evidence.classes) for k in index.tolist())
+        batch = self.train.batch(distributed.share(index), width).to(self.device)
+        with self._placed():
+            loss = self.loss(batch, self.generator)
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.objective.adjust_gradients(self.machine)
+        self.optimiser.step()
+        self.scheduler.step()
+        self.updates += 1
+        decay = self.config.training.averaging
+        if decay:
+            # During the first updates, a smaller decay reduces the share of the initial weights in
+            # the average.
+            weight = 1 - min(decay, self.updates / (self.updates + 10))
+            for name, parameter in self.machine.named_parameters():
+                self.average[name].lerp_(parameter.detach(), weight)
+        return float(loss.detach())
+
+    @torch.no_grad()
+    def _close_epoch(self, number: int, loss: float, began: float) -> None:
+        """Evaluate the weights, or their average, on validation scenes. Keep the best weights."""
+        parameters = dict(self.machine.named_parameters())
+        current = {name: p.detach().clone() for name, p in parameters.items()}
+        if self.config.training.averaging:
+            for name, p in parameters.items():
+                p.copy_(self.average[name])
+        machine = self._on_cpu()
+        works: list[Callable[[], tuple[float, ...]]] = [
+            partial(self._rank_objects, machine),
+            partial(self._rank_relations, machine),
+            partial(reconstruction_error, machine, self.data.train),
+            partial(reconstruction_error, machine, self.data.validation),
+        ]
+        (mrr,), (precision,), train, validation = distributed.spread(works)
+        score = mrr + (0.0 if math.isnan(precision) else precision)
+        if score > self.best_score or self.objective.keeps_last:
+            self.best_score, self.best_epoch = score, number
+            self.best = {name: p.detach().clone() for name, p in parameters.items()}
+        for name, p in parameters.items():
+            p.copy_(current[name])
+        seconds = time.perf_counter() - began
+        self.seconds += seconds
+        errors = train[0], train[1], validation[0], validation[1]
+        self.epochs.append(Epoch(number, loss, *errors, mrr, precision, seconds))
+
+    def _rank_objects(self, machine: BoltzmannMachine) -> tuple[float]:
+        """Return the MRR of removed objects on fixed validation scenes."""
+        generator = torch.Generator().manual_seed(0)
+        pick = torch.randperm(len(self.data.validation), generator=generator)[:_VALIDATION_SCENES]
+        sample = subset(self.data.validation, pick)
+        result = leave_one_out(sample, self.data.structure, MachineScore(machine))
+        return (float(result.reciprocal_rank().mean()) if len(result.target) else math.nan,)
+
+    def _rank_relations(self, machine: BoltzmannMachine) -> tuple[float]:
+        """Return the R-precision of relations on fixed validation scenes."""
+        annotated = [
+            k for k, scene in enumerate(self.data.validation.scenes) if scene.evidence.holds.any()
+        ][:_VALIDATION_SCENES]
+        if not annotated:
+            return (math.nan,)
+        sample = subset(self.data.validation, torch.tensor(annotated))
+        ranking = rank_relations(sample, self.data.structure, relation_score(machine, draws=16))
+        return (float(ranking.hits.sum() / max(ranking.annotated.sum(), 1)),)
+
+    def _save(self) -> None:
+        if self.folder is None:
+            return
+        objective = self.objective.state()
+        if not distributed.is_first():
+            return
+        save_checkpoint(
+            self.folder / "checkpoint.pt",
+            {
+                "digest": self._digest,
+                "machine": self.machine.state_dict(),
+                "optimiser": self.optimiser.state_dict(),
+                "scheduler": self.scheduler.state_dict(),
+                "objective": objective,
+                "generator": self.generator.get_state(),
+                "average": self.average,
+                "best": self.best,
+                **{name: getattr(self, name) for name in _COUNTERS},
+                "epochs": [asdict(epoch) for epoch in self.epochs],
+            },
+        )
+        if not self.epochs:
+            return
+        write_csv(self.folder / "curve.csv", self.epochs)
+        # Plot at most once in _DRAWN_EVERY seconds. With few scenes, a plot takes longer than an
+        # epoch.
+        if time.perf_counter() - self._drawn > _DRAWN_EVERY:
+            self._draw()
+
+    def _draw(self) -> None:
+        if self.folder is not None and distributed.is_first():
+            write_plot(self.folder / "curve.png", self.epochs, self.config.name)
+            self._drawn = time.perf_counter()
+
+
+def _checkpoint(folder: Path, digest: str) -> dict[str, Any] | None:
+    path = folder / "checkpoint.pt"
+    return load_checkpoint(path, digest) if path.exists() else None
+
+
+def _with_relations(scenes: SceneTensors) -> SceneTensors:
+    """Return the scenes with an annotated relation, or all scenes if no scene has one."""
+    kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
+    return subset(scenes, torch.tensor(kept, dtype=torch.int64)) if kept else scenes

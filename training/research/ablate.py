@@ -1,0 +1,225 @@
+"""`python -m training ablate`: compare a full model with ablations, its variants."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from rich.console import Console
+
+from training.datasets.batches import TrainingData, seen_triples
+from training.evaluation.report import SourceReport, pooled, settings_by_source
+from training.evaluation.results import grid, only, summarise, write
+from training.evaluation.setting import Setting
+from training.fit.checkpoint import RunError
+from training.fit.settings import Config, ConfigError, first_error
+from training.research.measure import Plan, Reports, measure_rows, place_of, resumable, shown
+from training.research.rows import Material, machine_row
+from training.research.settings import own_or_shipped
+from training.runs.config import data_folder, load_config, read_toml, with_settings
+from training.runs.folder import load_run
+from training.runs.pipeline import prepare
+
+PRIMARY: dict[str, tuple[str, ...]] = {
+    "T1a relations": ("R-precision, instance counts",),
+    "T1 pairs": ("accuracy", "accuracy, unseen pairs", "accuracy, rare classes"),
+    "T1b completion": ("R-precision",),
+    "T2 missing": ("MRR",),
+    "T2-at missing at a place": ("MRR",),
+    "T3 outliers, uniform": ("hit@1", "AUROC"),
+}
+"""Metrics in the result tables, by task. The report files hold all metrics of these tasks."""
+
+console = Console()
+
+
+def ablate(
+    configuration: Annotated[str, typer.Argument(help="configuration of the full model")],
+    rows: Annotated[
+        Path | None, typer.Option(help="TOML file of the ablations; by default the shipped file")
+    ] = None,
+    row: Annotated[
+        list[str] | None, typer.Option(help="train only these ablations and the full model")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="number of training seeds per model")] = 1,
+    limit: Annotated[int | None, typer.Option(min=10, help="maximum scenes per source")] = None,
+    asked: Annotated[
+        int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")
+    ] = 300,
+    epochs: Annotated[int | None, typer.Option(min=1, help="maximum epochs per model")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="number of single-threaded processes")] = 2,
+    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
+    folder: Annotated[Path, typer.Option("--folder", help="folder for runs and results")] = Path(
+        "runs/ablation"
+    ),
+    fresh: Annotated[bool, typer.Option("--fresh", help="delete earlier runs")] = False,
+) -> None:
+    """Train the full model and each of its ablations, and compare them on the same scenes.
+
+    The command writes results.json and results.md into FOLDER/CONFIGURATION. If the training of
+    an ablation diverges, the results contain the error in place of its metrics. After Ctrl-C, run
+    the same command again: it continues from the last finished epoch or task.
+    """
+    with resumable(console):
+        configs = _configs(configuration, rows, row, limit, epochs)
+        place = folder / configs[0].name
+        with console.status("reading and encoding scenes"):
+            material = Material.of(
+                prepare(configs[0], data_folder(configuration, configs[0], data))
+            )
+        plan = Plan(place, material, _settings(material.data, asked), tasks=tuple(PRIMARY))
+        entries = [
+            machine_row(with_settings(config, {"training.seed": seed}))
+            for config in configs
+            for seed in range(seeds)
+        ]
+        with shown(console, "ablation", len(entries) * len(plan.settings)) as progress:
+            measured, failures = measure_rows(
+                *(plan, entries, progress),
+                workers=workers,
+                fresh=fresh,
+                failures=(FloatingPointError,),
+            )
+    if configs[0].name in failures:
+        console.print(f"[red]error:[/red] {configs[0].name}: {failures[configs[0].name]}")
+        raise typer.Exit(1)
+    with console.status("resampling scenes"):
+        reports: Reports = {row: _with_pools(found) for row, found in measured.items()}
+        weights, seconds = _costs(place, configs, seeds)
+        results = summarise(reports, configs[0].name, weights)
+    parts = [
+        grid(
+            ["", "", "training, s"],
+            ([c.name, c.description, f"{seconds.get(c.name, 0):.0f}"] for c in configs),
+        ),
+        results.markdown(PRIMARY, changes=True),
+        *(f"- {row} could not be measured: {why}" for row, why in failures.items()),
+    ]
+    text = "\n\n".join(parts).rstrip() + "\n"
+    write(place, results.to_dict() | {"failures": failures}, text)
+    console.print(*results.tables(PRIMARY))
+    for name, why in failures.items():
+        console.print(f"{name} could not be measured: {why}", markup=False, soft_wrap=True)
+    console.print(f"all results: {place / 'results.md'}, {place / 'results.json'}", soft_wrap=True)
+
+
+def _configs(
+    reference: str,
+    path: Path | None,
+    names: Sequence[str] | None,
+    limit: int | None,
+    epochs: int | None,
+) -> list[Config]:
+    """Return the configurations of the full model and of the selected ablations."""
+    full = load_config(reference)
+    if limit is not None:
+        full = with_settings(full, {"data.limit": limit})
+    found = load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
+    if unknown := sorted(set(names or ()) - {config.name for config in found}):
+        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(c.name for c in found)}")
+    chosen = [full, *(config for config in found if not names or config.name in names)]
+    if epochs is None:
+        return chosen
+    return [
+        with_settings(config, {"training.epochs": min(epochs, config.training.epochs)})
+        for config in chosen
+    ]
+
+
+def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
+    """Return the evaluation settings of the validation and test part of each data source."""
+    seen = seen_triples(scenes.train.scenes, scenes.train.v.shape[1])
+    parts = {"validation": scenes.validation, "test": scenes.test}
+    return {
+        f"{part} {source}": setting
+        for part, some in parts.items()
+        for source, setting in settings_by_source(
+            some, scenes.structure, scenes.train, seen, limit=limit
+        )
+    }
+
+
+def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
+    """Return the `PRIMARY` metrics, first of the pooled validation and test parts."""
+    pools = {
+        f"{part} pooled": pooled(
+            [report for name, report in reports.items() if name.startswith(part)], f"{part} pooled"
+        )
+        for part in ("validation", "test")
+    }
+    return {name: only(report, PRIMARY) for name, report in (pools | reports).items()}
+
+
+def _costs(
+    folder: Path, configs: Sequence[Config], seeds: int
+) -> tuple[dict[str, int], dict[str, float]]:
+    """Return the number of weights not held at zero, and the mean seconds, by model name."""
+    weights, seconds = {}, {}
+    for config in configs:
+        places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]
+        try:
+            runs = [load_run(place) for place in places]
+        except RunError:
+            continue
+        held = {"kappa", *config.machine.without}
+        parameters = runs[0].machine.named_parameters()
+        weights[config.name] = sum(p.numel() for name, p in parameters if name not in held)
+        seconds[config.name] = sum(run.seconds for run in runs) / seeds
+    return weights, seconds
+
+
+# ------------------------------------------------------------------------------- rows from a file
+
+
+class _Change(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    what: str
+    start: str | None = Field(default=None, alias="from")
+    changes: dict[str, Any] = Field(default_factory=dict)
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    row: tuple[_Change, ...] = Field(min_length=1)
+
+
+def load_rows(path: Path, full: Config) -> list[Config]:
+    """Read the ablations in a TOML file: one configuration for each `[[row]]` of the file.
+
+    All ablations use the scenes of the full model. The description of an ablation states how it
+    differs from the full model.
+
+    Raises:
+        ConfigError: the file is missing or not TOML, a setting is unknown or invalid, two ablations
+            have the same name, or an ablation has the same settings as the full model.
+    """
+    try:
+        file = _File.model_validate(read_toml(path))
+    except ValidationError as error:
+        raise ConfigError(f"{path.name}: {first_error(error)}") from error
+    configs: dict[str, Config] = {}
+    for row in file.row:
+        if row.name in configs or row.name == full.name:
+            raise ConfigError(f"{path.name}: the name {row.name} occurs twice: rename one row")
+        configs[row.name] = _config(row, full, path.name)
+    return list(configs.values())
+
+
+def _config(row: _Change, full: Config, file: str) -> Config:
+    try:
+        start = load_config(row.start) if row.start else full
+        changed = with_settings(start, row.changes).model_copy(update={"data": full.data})
+        if changed == full:
+            raise ConfigError(f"the row has the same settings as {full.name}: change a setting")
+        values = changed.model_dump() | {"name": row.name, "description": row.what}
+        return Config.model_validate(values)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {row.name}: {error}") from error
+    except ValidationError as error:
+        raise ConfigError(f"{file}: {row.name}: {error.errors()[0]['msg']}") from error

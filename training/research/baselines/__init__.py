@@ -1,0 +1,64 @@
+"""Baselines that the benchmark trains on the same scenes as the models."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from training.evaluation.baselines import (
+    EASE,
+    FREQUENCY_TABLE,
+    PLACED,
+    POPULARITY,
+    RELATIONS,
+    fitting,
+    triples,
+)
+from training.evaluation.baselines.fitting import Baseline
+from training.research.baselines import networks, object_models, relation_models
+
+_EVERY: tuple[Baseline[Any], ...] = (
+    POPULARITY,
+    Baseline("co-occurrence naive Bayes", object_models.naive_bayes),
+    Baseline("kNN over scenes", object_models.nearest),
+    EASE,
+    Baseline("pairwise logistic", object_models.pairwise),
+    Baseline("scikit-learn BernoulliRBM", object_models.bernoulli_rbm, stochastic=True),
+    Baseline("masked transformer", networks.transformer, stochastic=True),
+    Baseline("denoising autoencoder", networks.autoencoder, stochastic=True),
+    Baseline(
+        "autoencoder, heavily masked",
+        networks.autoencoder_for_parts,
+        fitting.partial_mrr,
+        stochastic=True,
+    ),
+    Baseline(
+        "relation popularity", relation_models.relation_popularity, fitting.r_precision, RELATIONS
+    ),
+    FREQUENCY_TABLE,
+    Baseline(
+        *("ComplEx", relation_models.complex_embedding, fitting.r_precision, RELATIONS),
+        stochastic=True,
+    ),
+    Baseline(
+        "frequency table, completing",
+        triples.frequency_table,
+        fitting.completion_r_precision,
+        ("completion",),
+    ),
+    Baseline(
+        "frequency table + closure, completing",
+        relation_models.frequency_table_with_closure,
+        fitting.completion_r_precision,
+        ("completion",),
+    ),
+    PLACED,
+    Baseline(
+        "pairwise, by likelihood",
+        object_models.pairwise_densities,
+        fitting.log_likelihood,
+        ("density",),
+    ),
+)
+
+BASELINES: Final[dict[str, Baseline[Any]]] = {entry.name: entry for entry in _EVERY}
+"""Maps the row name of each baseline in the result tables to the baseline."""

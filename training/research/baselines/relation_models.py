@@ -1,0 +1,185 @@
+"""Baselines for relations, and for objects at a place, from counts of triples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from training.datasets.batches import Batch, SceneTensors
+from training.evaluation.baselines.fitting import Proposals
+from training.evaluation.baselines.triples import (
+    TripleCounts,
+    TripleTable,
+    count_triples,
+    smoothed_log_odds,
+)
+from training.evaluation.contradictions import transitive_closure
+from training.evaluation.model import RelationScore
+
+# Counts of triples (relation a, subject class i, object class j), and score tables over triples.
+
+
+# Frequency of each relation over all pairs of classes.
+
+
+def relation_popularity(
+    train: SceneTensors, structure: Tensor, _seed: int
+) -> Proposals[RelationScore]:
+    """Yield a single score: the log-odds of each relation over all pairs of classes."""
+    counts = count_triples(train, structure)
+    overall = counts.overall().logit()[:, None, None]
+    yield {}, TripleTable(overall.expand_as(counts.held))
+
+
+# Smoothed frequency table p(r | i, j): a strong baseline for relations.
+#
+# R. Zellers et al., "Neural Motifs: Scene Graph Parsing with Global Context", CVPR 2018, show that
+# the labels of subject and object predict most relations. The estimate for a rare pair depends
+# mainly on its two classes. The estimate for a rare class depends mainly on p(r):
+#
+#     p(r | i, j) = (held + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
+#     p(r | i)    = (held with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
+
+
+# ComplEx: complex embeddings of classes. Complex numbers allow different scores for left(i, j) and
+# left(j, i).
+#
+# Source: T. Trouillon et al., "Complex Embeddings for Simple Link Prediction", ICML 2016, equation
+# 11: logit p(a, i, j) = d_a + Re sum_k S[i,k] R[a,k] conj(S[j,k]). The fit uses all pairs of
+# classes that occur in the same scene. The likelihood of a triple is binomial, with `held`
+# successes in `together` trials. The penalty is the nuclear 3-norm of T. Lacroix et al., ICML 2018.
+
+
+_RANKS = (16, 64)
+_PENALTIES = (0.03, 0.1, 0.3)
+_COMPLEX_MULTIPLICITY = (0.0, 1.0)
+_STEPS = 200
+_LEARNING_RATE = 0.05
+
+
+def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -> Tensor:
+    """Fit ComplEx, and return the logits of all triples, (relations, classes, classes).
+
+    Args:
+        rank: number of complex dimensions of an embedding.
+        penalty: weight of the penalty, the mean cubed modulus of the factors of each pair.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    A, V, _ = counts.held.shape
+
+    def factors(rows: int, scale: float) -> Tensor:
+        values = torch.randn(rows, rank, dtype=torch.cfloat, generator=generator)
+        return (scale * values).requires_grad_()
+
+    classes, relations = factors(V, 0.1), factors(A, 1.0)
+    bias = counts.overall().logit().requires_grad_()
+    i, j = counts.together.nonzero(as_tuple=True)
+    trials, held = counts.together[i, j], counts.held[:, i, j]
+    optimiser = torch.optim.Adam([classes, relations, bias], lr=_LEARNING_RATE)
+    cycle = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
+    for _ in range(_STEPS):
+        optimiser.zero_grad()
+        values = complex_logits(bias, relations, classes)[:, i, j]
+        misfit = (trials * softplus(values) - held * values).sum()
+        size = classes.abs() ** 3
+        norm = (size[i] + size[j]).sum() + len(i) / A * (relations.abs() ** 3).sum()
+        ((misfit + penalty * norm) / len(i)).backward()
+        optimiser.step()
+        cycle.step()
+    with torch.no_grad():
+        return complex_logits(bias, relations, classes)
+
+
+def complex_logits(bias: Tensor, relations: Tensor, classes: Tensor) -> Tensor:
+    """Return the logits d_a + Re <S_i, R_a, conj S_j>, (relations, classes, classes)."""
+    turned = classes * relations[:, None]
+    # Re(x conj(y)) = Re x Re y + Im x Im y. Two real products are faster than a complex product.
+    real = turned.real @ classes.real.T + turned.imag @ classes.imag.T
+    return bias[:, None, None] + real
+
+
+def complex_embedding(
+    train: SceneTensors, structure: Tensor, seed: int
+) -> Proposals[RelationScore]:
+    """Yield a ComplEx score for each rank, penalty and weight of the instance counts."""
+    counts = count_triples(train, structure)
+    for rank in _RANKS:
+        for penalty in _PENALTIES:
+            table = fit_complex(counts, rank=rank, penalty=penalty, seed=seed)
+            for weight in _COMPLEX_MULTIPLICITY:
+                parameters = {"rank": rank, "penalty": penalty, "multiplicity": weight}
+                yield parameters, TripleTable(table, weight)
+
+
+# Frequency table with logical rules: the log-odds change by consequences of observed relations.
+#
+# The score adds a bonus to a relation a(i, k) that follows by transitivity from observed a(i, j)
+# and a(j, k). The score subtracts a penalty from the reverse a(k, i) of each observed or implied
+# relation. Canonical relations represent right as left with exchanged subject and object. Bonus and
+# penalty are finite, because classes can have several instances, and because annotated on-top is
+# not always transitive.
+#
+# In the batches of task T1b, only the given relations of a scene are marked as observed. This score
+# needs such batches.
+
+
+_CLOSURE_PAIR = (3.0, 10.0, 30.0)
+_CLOSURE_END = 30.0
+_CLOSURE_MULTIPLICITY = (0.5, 1.0)
+_BONUS = (0.0, 1.0, 2.0, 4.0)
+_PENALTY = (0.0, 1.0, 3.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ClosureScore:
+    """The score of a frequency table, changed by logical rules.
+
+    Attributes:
+        table: score without observed relations.
+        bonus: value that is added to the log-odds of an implied relation, at least 0.
+        penalty: value that is subtracted from the log-odds of the reverse of an observed or implied
+            relation, at least 0.
+    """
+
+    table: TripleTable
+    bonus: float
+    penalty: float
+
+    def __call__(self, batch: Batch) -> Tensor:
+        """Return log-odds given the observed relations of a batch, (scenes, relations, n, n)."""
+        given = (batch.holds > 0) & batch.observed
+        closed = transitive_closure(given)
+        follows, mirror = closed & ~given, closed.mT & ~closed
+        return self.table(batch) + self.bonus * follows - self.penalty * mirror
+
+
+def frequency_table_with_closure(
+    train: SceneTensors, structure: Tensor, _seed: int
+) -> Proposals[RelationScore]:
+    """Yield a score for each smoothing, weight of the instance counts, bonus and penalty."""
+    counts = count_triples(train, structure)
+    for pair in _CLOSURE_PAIR:
+        log_odds = smoothed_log_odds(counts, pair, _CLOSURE_END)
+        for weight in _CLOSURE_MULTIPLICITY:
+            table = TripleTable(log_odds, weight)
+            for bonus in _BONUS:
+                for penalty in _PENALTY:
+                    parameters = {"pair": pair, "multiplicity": weight, "bonus": bonus}
+                    yield parameters | {"penalty": penalty}, ClosureScore(table, bonus, penalty)
+
+
+# Baselines for an object of class i at a place (a, j), such as "on-top of the desk". They are the
+# frequency table p(i | a, j), and the product of this table and an object score.
+#
+#     p(i | a, j) = (scenes with a(i, j) + s · p(i | a)) / (scenes with a of any class to j + s)
+#
+# p(i | a) is smoothed in the same way towards p(i), with m in place of s. There are separate tables
+# for i as subject and for i as object. The score of the product is
+#
+#     score(i | rest) + w · log p(i | a, j) - u · log p(i).
+#
+# score(i | rest) is the log-odds of i given the other objects of the scene. Both factors depend on
+# the class frequency. The last term corrects for this.

@@ -1,0 +1,458 @@
+"""`python -m training benchmark`: compare machines and baselines on the same scenes.
+
+Each machine or baseline is one row of the result tables. An interrupted run can be continued. The
+command writes these files:
+
+<folder>/<domain>/results.*                  results of the comparison
+<folder>/<domain>/seed-protocol/results.*    results by the protocol of Bozcan et al. (2018)
+<folder>/<domain>/shuffled/<task>/results.*  results after training on shuffled scenes
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from training.datasets.batches import seen_triples
+from training.evaluation.baselines import RELATIONS
+from training.evaluation.everyday_task import EVERYDAY, facts_file
+from training.evaluation.report import settings_by_source
+from training.evaluation.results import Results, grid, only, summarise, write
+from training.evaluation.setting import Setting
+from training.evaluation.tasks import TASKS
+from training.fit.settings import Config, ConfigError, DataConfig
+from training.research.baselines import BASELINES
+from training.research.measure import (
+    POOLED,
+    Plan,
+    Reports,
+    measure_rows,
+    parameters,
+    resumable,
+    shown,
+    slug,
+)
+from training.research.plots import write_plots
+from training.research.rows import Material, Row, baseline_rows, machine_row, reference_rows
+from training.runs.config import data_folder, load_config, with_settings
+from training.runs.pipeline import SplitScenes, prepare
+from training.seed.protocol import PAPER, SEED_TASKS
+
+DEFAULT = ("indoor-triway", "indoor-gbm", "indoor-rbm")
+"""Configurations that the command measures if it is called without configurations."""
+
+YARDSTICKS = {
+    "T1a relations": ("relation popularity", "R-precision, distinct classes"),
+    "T1 pairs": ("relation popularity", "accuracy"),
+    "T2 missing": ("popularity", "MRR"),
+    "T2 partial": ("popularity", "MRR, 50 %"),
+    "T3 signature": ("popularity", "hit@1"),
+}
+"""Reference baseline and metric of each task, for training on shuffled scenes.
+
+After training on shuffled scenes, no other model should exceed this baseline.
+"""
+
+_SEED_SHOWN = {name: task.shown for name, task in SEED_TASKS.items()}
+_RELATION_TASKS = ("T1a relations", "T1 pairs")
+# Tasks that a quick run leaves out. The annealing that estimates log Z (the log of the partition
+# function) is slow even for a few scenes.
+_SLOW_TASKS = ("Density",)
+# Settings of a quick run. A quick run only tests the command, so its results are meaningless.
+_QUICK_SCENES = 150
+_QUICK_EPOCHS = 2
+_QUICK_LIMIT = 30
+QUICK_BASELINES = (
+    "popularity",
+    "EASE",
+    "frequency table",
+    "frequency table, completing",
+    "frequency table p(i | a, j)",
+)
+
+console = Console()
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Configurations with the same data section, for one comparison.
+
+    Attributes:
+        name: name of the first configuration without its last word: "indoor" for "indoor-triway".
+        configs: the configurations. The machine of the first one is the reference of all paired
+            differences.
+    """
+
+    name: str
+    configs: tuple[Config, ...]
+
+    @property
+    def leaks(self) -> bool:
+        """True if the training part may contain near-duplicates of test scenes."""
+        return self.configs[0].data.split == "random"
+
+    def require_groups(self) -> None:
+        """Check that the split keeps near-duplicates of test scenes out of the training part.
+
+        Raises:
+            ConfigError: the domain uses a random split, which separates near-duplicates.
+        """
+        if self.leaks:
+            names = ", ".join(config.name for config in self.configs)
+            raise ConfigError(
+                f'{names}: data.split = "random" leaves near-duplicates of test scenes in the '
+                'training part. Set data.split = "group", or run only --seed-protocol, which uses '
+                "a random split"
+            )
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the command."""
+
+    root: Path
+    tasks: tuple[str, ...]
+    seeds: int = 1
+    baselines: tuple[str, ...] | None = None
+    limit: int = 300
+    workers: int = 1
+    quick: bool = False
+    fresh: bool = False
+
+    def configs(self, domain: Domain, seed: int) -> list[Config]:
+        """Return the configurations of the domain with the given training seed."""
+        most = _QUICK_EPOCHS if self.quick else None
+        return [
+            with_settings(
+                config,
+                {
+                    "training.seed": seed,
+                    "training.epochs": min(config.training.epochs, most or config.training.epochs),
+                },
+            )
+            for config in domain.configs
+        ]
+
+    def scenes(self, domain: Domain, **changes: Any) -> SplitScenes:
+        """Read and split the scenes of the domain. `changes` replace values of its data section."""
+        data: DataConfig = domain.configs[0].data.model_copy(update=changes)
+        if self.quick:
+            few = min(data.limit or _QUICK_SCENES, _QUICK_SCENES)
+            data = data.model_copy(update={"limit": few})
+        return prepare(domain.configs[0].model_copy(update={"data": data}), self.root)
+
+
+def benchmark(
+    machines: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="configurations; those with the same data section are compared with each other, "
+            "and the first is the reference. Default: the indoor machines."
+        ),
+    ] = None,
+    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
+    folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
+        "runs/benchmark"
+    ),
+    seeds: Annotated[
+        int, typer.Option(min=1, help="training seeds, for models with random training")
+    ] = 3,
+    baseline: Annotated[
+        list[str] | None, typer.Option(help="measure only these baselines; 'none' leaves out all")
+    ] = None,
+    task: Annotated[
+        list[str] | None, typer.Option(help="measure only these tasks, by name or prefix: T2, T3")
+    ] = None,
+    limit: Annotated[
+        int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")
+    ] = 300,
+    workers: Annotated[int, typer.Option(min=1, help="processes with one thread each")] = 2,
+    seed_protocol: Annotated[
+        bool, typer.Option("--seed-protocol", help="also use the protocol of Bozcan et al. (2018)")
+    ] = False,
+    shuffled: Annotated[
+        bool, typer.Option("--shuffled", help="also train all models on shuffled scenes")
+    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="small run to test the command")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="delete earlier reports")] = False,
+) -> None:
+    """Train machines and baselines on the same scenes, and evaluate all on the same test scenes.
+
+    The command writes results.json, results.md and plots into one folder per domain. The options
+    --seed-protocol and --shuffled write into subfolders. After Ctrl-C, run the same command again:
+    it continues and skips finished tasks.
+    """
+    with resumable(console, ValueError, FloatingPointError):
+        wanted = None if baseline is None else tuple(b for b in baseline if b != "none")
+        names = machines or DEFAULT
+        domains = read_domains(names)
+        options = Options(
+            root=data_folder(names[0], domains[0].configs[0], data),
+            tasks=chosen_tasks(task, quick),
+            seeds=1 if quick else seeds,
+            baselines=QUICK_BASELINES if quick and wanted is None else wanted,
+            limit=_QUICK_LIMIT if quick else limit,
+            workers=workers,
+            quick=quick,
+            fresh=fresh,
+        )
+        if shuffled:
+            shuffled_tasks(options.tasks)  # report invalid tasks before hours of training
+        for domain in domains:
+            if shuffled or not seed_protocol:
+                domain.require_groups()
+        for domain in domains:
+            place = folder / domain.name
+            # With a random split, only the seed protocol (Bozcan et al., 2018) is valid.
+            if not domain.leaks:
+                compare_domain(domain, place, options)
+            if seed_protocol:
+                compare_by_seed_protocol(domain, place / "seed-protocol", options)
+            if shuffled:
+                compare_on_shuffled(domain, place / "shuffled", options)
+            console.print(
+                f"all results: results.md and results.json in {place} and its subfolders, with "
+                "plots beside them",
+                soft_wrap=True,
+            )
+
+
+def read_domains(references: Sequence[str]) -> list[Domain]:
+    """Read configurations, and group them by data section into domains.
+
+    Raises:
+        ConfigError: a configuration cannot be read, or two configurations or two domains have the
+            same name.
+    """
+    groups: dict[DataConfig, list[Config]] = {}
+    for reference in references:
+        config = load_config(reference)
+        if any(config.name == other.name for group in groups.values() for other in group):
+            raise ConfigError(f"two configurations have the name {config.name}: rename one of them")
+        groups.setdefault(config.data, []).append(config)
+    domains: dict[str, Domain] = {}
+    for configs in groups.values():
+        name = configs[0].name.rpartition("-")[0] or configs[0].name
+        if name in domains:
+            raise ConfigError(
+                f"{configs[0].name} and {domains[name].configs[0].name} have different data "
+                f"sections, but their results have the same folder {name!r}: rename one of them"
+            )
+        domains[name] = Domain(name, tuple(configs))
+    return list(domains.values())
+
+
+def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
+    """Return the names of the wanted tasks. Without `wanted`, return all tasks.
+
+    Args:
+        wanted: task names, or prefixes of task names.
+        quick: True leaves out slow tasks, unless they are wanted.
+
+    Raises:
+        ValueError: a wanted name matches no task.
+    """
+    if not wanted:
+        return tuple(name for name in TASKS if not quick or name not in _SLOW_TASKS)
+    found: set[str] = set()
+    for part in wanted:
+        # A full name selects only that task, even if it is a prefix of other names.
+        named = {part} & set(TASKS) or {name for name in TASKS if name.startswith(part)}
+        if not named:
+            raise ValueError(f"unknown task {part!r}: use a name, or the start, of {list(TASKS)}")
+        found |= named
+    return tuple(name for name in TASKS if name in found)
+
+
+def shuffled_tasks(tasks: Sequence[str]) -> tuple[str, ...]:
+    """Return the tasks that training on shuffled scenes supports, see `YARDSTICKS`.
+
+    Raises:
+        ValueError: no task is supported.
+    """
+    found = tuple(task for task in YARDSTICKS if task in tasks)
+    if not found:
+        raise ValueError(f"--shuffled needs at least one of the tasks {', '.join(YARDSTICKS)}")
+    return found
+
+
+def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
+    """Measure the machines and baselines of a domain on its test scenes; write tables and plots.
+
+    Raises:
+        ConfigError: the split is random, or the scene files are missing.
+        ValueError: a baseline in `options` is unknown.
+    """
+    domain.require_groups()
+    scenes = options.scenes(domain)
+    plan = _plan(folder, scenes, options, options.tasks)
+    rows: list[Row] = []
+    for seed in range(options.seeds):
+        rows += [machine_row(config) for config in options.configs(domain, seed)]
+        rows += baseline_rows(seed, options.baselines, related=plan.material.related)
+    rows += reference_rows()
+    reports = _measured(plan, rows, options, domain.name)
+    results = summarise(reports, domain.configs[0].name, parameters(folder, rows))
+    _write(folder, scenes, results.to_dict(), f"# {domain.name}\n\n{results.markdown()}")
+    console.print(*results.tables())
+    names = {config.name for config in domain.configs}
+    write_plots(plan, [row for row in rows if row.name in names], reports, results)
+    return results
+
+
+def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> Results:
+    """Measure each machine, trained once on a random split, by the seed protocol."""
+    scenes = options.scenes(domain, split="random")
+    plan = replace(_plan(folder, scenes, options, tuple(SEED_TASKS)), known_tasks=SEED_TASKS)
+    rows = [
+        machine_row(with_settings(config, {"data.split": "random"}), calibrated=False)
+        for config in options.configs(domain, 0)
+    ]
+    reports = _measured(plan, rows, options, f"{domain.name}, seed protocol")
+    found = summarise(reports, domain.configs[0].name, parameters(folder, rows))
+    # The seed protocol does not rank the machines, so the results contain no paired differences.
+    results = replace(found, differences=())
+    _write(folder, scenes, results.to_dict() | {"paper": PAPER}, _protocol_text(results))
+    console.print(*results.tables(_SEED_SHOWN, lambda task: SEED_TASKS[task].words))
+    return results
+
+
+def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[str, Results]:
+    """Run the control experiment: train models on shuffled scenes, and test them on real scenes.
+
+    Baseline settings and training epochs are selected on shuffled validation scenes. Each model is
+    trained with one seed. The reference of a task is its baseline in `YARDSTICKS`. These baselines
+    are always measured.
+
+    Raises:
+        ValueError: no task is supported (see `shuffled_tasks`), or all supported tasks need
+            relations and the scenes contain none.
+    """
+    domain.require_groups()
+    real = options.scenes(domain)
+    scenes = real.shuffled(seed=0)
+    asked = shuffled_tasks(options.tasks)
+    plan = _plan(folder, scenes, options, asked, asked_by=real)
+    if not plan.material.related:
+        asked = tuple(task for task in asked if task not in _RELATION_TASKS)
+        if not asked:
+            raise ValueError(
+                f"the scenes of {domain.name} contain no relations, but the selected tasks need "
+                "relations: select other tasks"
+            )
+        plan = replace(plan, tasks=asked)
+    rows = [machine_row(config, calibrated=False) for config in options.configs(domain, 0)]
+    # A baseline that supports several of the tasks is fitted once.
+    names = [name for name, one in BASELINES.items() if one.scores in (("objects",), RELATIONS)]
+    if options.baselines is not None:
+        yardsticks = {YARDSTICKS[task][0] for task in asked}
+        names = [name for name in names if name in yardsticks | set(options.baselines)]
+    rows += baseline_rows(0, names, related=plan.material.related, whole=False)
+    reports = _measured(plan, rows, options, f"{domain.name}, shuffled")
+    weights = parameters(folder, rows)
+    results = {}
+    for task in asked:
+        yardstick, metric = YARDSTICKS[task]
+        some: Reports = {
+            row: {source: only(report, {task: (metric,)}) for source, report in by_source.items()}
+            for row, by_source in reports.items()
+        }
+        # A task without metrics needs data that these scenes lack, for example room types.
+        if any(report.outcomes[task] for report in some[yardstick, 0].values()):
+            results[task] = summarise(some, yardstick, weights)
+            text = shuffled_text(task, results[task])
+            _write(folder / slug(task), scenes, results[task].to_dict(), text)
+            console.print("trained on shuffled scenes:", *results[task].tables({task: (metric,)}))
+    return results
+
+
+def _plan(
+    folder: Path,
+    scenes: SplitScenes,
+    options: Options,
+    tasks: tuple[str, ...],
+    asked_by: SplitScenes | None = None,
+) -> Plan:
+    """Plan the measurement of models that learn from the given scenes.
+
+    Args:
+        asked_by: scenes whose training part determines the questions, for example the classes that
+            are typical of a room type. None means `scenes`.
+    """
+    material = Material.of(scenes)
+    data = material.data
+    train = data.train if asked_by is None else asked_by.training_data().train
+    seen = seen_triples(data.train.scenes, data.train.v.shape[1])
+    limit = options.limit
+    settings = dict(settings_by_source(data.test, data.structure, train, seen, limit=limit))
+    facts = EVERYDAY if facts_file() else None
+    settings[POOLED] = Setting(data.test, data.structure, train, seen, limit, everyday=facts)
+    return Plan(folder, material, settings, tasks)
+
+
+def _measured(plan: Plan, rows: Sequence[Row], options: Options, title: str) -> Reports:
+    with shown(console, title, len(rows) * len(plan.settings)) as progress:
+        reports, _ = measure_rows(
+            *(plan, rows, progress),
+            workers=options.workers,
+            fresh=options.fresh,
+        )
+    return reports
+
+
+def _write(folder: Path, scenes: SplitScenes, values: dict[str, Any], text: str) -> None:
+    """Write the results and the sha256 of each data source."""
+    write(folder, {"contents": dict(scenes.digests)} | values, text)
+
+
+def _protocol_text(results: Results) -> str:
+    names = list(dict.fromkeys(name for values in PAPER.values() for name in values))
+    paper = grid(
+        ["", *names],
+        (
+            [figure, *(f"{values[name]:.4f}" if name in values else "" for name in names)]
+            for figure, values in PAPER.items()
+        ),
+    )
+    return f"""# Seed protocol
+
+This is the protocol of Bozcan et al. (2018). One random reconstruction of a scene gives each
+answer. Scenes are split at random into training, test and validation scenes (60 / 30 / 10 %). The
+figures cannot be compared with other tables:
+
+- The training part contains near-duplicates of test scenes.
+- Some T2 questions contain relations of the removed object, which force or reveal the object.
+- Switching on more relations can only improve T1.
+- A model of V classes that returns its input scores 1/V in T3.
+
+{results.markdown(_SEED_SHOWN)}
+Results of the paper on its own data:
+
+{paper}
+"""
+
+
+def shuffled_text(task: str, results: Results) -> str:
+    """Return the Markdown page of one task of the control experiment."""
+    _, metric = YARDSTICKS[task]
+    above = [
+        f"{gap.row} by {-gap.figure.value:.3f}"
+        for gap in results.differences
+        if gap.source == POOLED and gap.verdict == "worse"
+    ]
+    return f"""# Shuffled scenes, {task}
+
+All models are trained on shuffled scenes: the objects are permuted between scenes. Each scene keeps
+its number of classes, and each class keeps its number of scenes, but co-occurrence is random. Test
+scenes are real. No model should exceed {results.ours}. A model above it uses information from
+outside the training scenes. A star marks a model that is worse than the bold model: the whole
+interval of the paired difference is on one side of zero.
+
+{results.markdown({task: (metric,)})}
+Models above {results.ours} over the whole interval: {", ".join(above) or "none"}.
+"""

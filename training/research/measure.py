@@ -1,0 +1,375 @@
+"""Measure models on every data source, and reuse finished reports on disk.
+
+A row is one model of an experiment: a machine, a baseline or a reference.
+
+<folder>/<row>/seed-<n>/row.json          settings, training scenes (as digest), number of weights
+                        trials.jsonl      all settings that the tuning of a baseline tried
+                        run/              training run of a machine, and its calibration
+                        <source>.json     report on one data source
+                        pooled.json       report on all data sources together (tasks of `WHOLE_SET`)
+
+Several processes fill these files in parallel. One process with one thread measures each row.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import pickle  # nosec B403
+import re
+import shutil
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing.queues import SimpleQueue
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
+
+from training.datasets import DatasetError
+from training.evaluation.report import SourceReport, digest, measure, pooled, write_whole
+from training.evaluation.setting import Setting
+from training.evaluation.tasks import EVERY_TASK, ONCE, WHOLE_SET, Task
+from training.fit.checkpoint import RunError
+from training.fit.settings import ConfigError
+from training.research.rows import Material, Rival, Row
+
+# A progress function receives the row, the source, and a note on the current step.
+Progress: TypeAlias = Callable[[str, str, str], None]
+# Measures a row; returns the error of a row that failed.
+Work: TypeAlias = Callable[[Row, Progress], Exception | None]
+
+# Seconds between two checks for messages of the processes.
+_TICK = 0.2
+# Linear algebra libraries read these variables when a process loads them.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+# The last note on a row and source tells whether the report was measured now or read from a file.
+DONE, KNOWN = "done", "known"
+Reports = dict[tuple[str, int], dict[str, SourceReport]]
+
+POOLED = "pooled"
+"""Name of the union of all data sources."""
+
+
+class BenchmarkError(RuntimeError):
+    """A folder or report belongs to another experiment. The message names the folder or file."""
+
+
+@contextmanager
+def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
+    """Print expected errors and exit; after Ctrl-C, print how to continue.
+
+    Args:
+        others: further exception types that are printed without a traceback.
+    """
+    expected: tuple[type[Exception], ...] = (
+        *(ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool),
+        *others,
+    )
+    try:
+        yield
+    except expected as error:
+        console.print(f"[red]error:[/red] {error}")
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        console.print("stopped; run the same command again to continue")
+        raise typer.Exit(130) from None
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The questions of an experiment. All rows get the same questions.
+
+    Attributes:
+        folder: folder of the reports.
+        material: scenes for training, validation and test.
+        settings: evaluation setting by data source. The key `POOLED` is the union of all sources.
+        tasks: names of the tasks to measure, which are keys of `known_tasks`.
+    """
+
+    folder: Path
+    material: Material
+    settings: Mapping[str, Setting]
+    tasks: Sequence[str]
+    known_tasks: Mapping[str, Task] = field(default_factory=lambda: EVERY_TASK)
+
+    def place(self, row: Row) -> Path:
+        """Return the folder of a row and its training seed."""
+        return place_of(self.folder, row.name, row.seed)
+
+    def asked(self, source: str) -> list[str]:
+        """Return the names of the tasks to measure on a data source, or on `POOLED`."""
+        if source == POOLED:
+            return [task for task in self.tasks if task in WHOLE_SET]
+        return [task for task in self.tasks if task not in ONCE]
+
+    def known(self, row: Row) -> dict[str, SourceReport]:
+        """Return the finished reports of a row, by data source.
+
+        Raises:
+            BenchmarkError: the folder holds reports of other test scenes, other training scenes, or
+                another configuration of the row.
+        """
+        claim(self.place(row), row, self.material.digest)
+        found = {}
+        for source, setting in self.settings.items():
+            path = self.place(row) / f"{source}.json"
+            if not self.asked(source):
+                found[source] = SourceReport(source, digest(setting))
+            elif path.exists():
+                report = read_report(path, setting)
+                if set(self.asked(source)) <= set(report.outcomes):
+                    found[source] = report
+        return found
+
+    def measure(self, row: Row, progress: Progress) -> None:
+        """Measure a row on every data source that lacks a finished report.
+
+        The model is trained only if a report is missing. On KeyboardInterrupt, the results of
+        finished tasks are already on disk.
+        """
+        known = self.known(row)
+        rival: Rival | None = None
+        for source, setting in self.settings.items():
+            if source in known:
+                progress(row.name, source, KNOWN)
+                continue
+            say = partial(progress, row.name, source)
+            place = self.place(row)
+            if rival is None:
+                say("training")
+                rival = row.make(self.material, place, say)
+            contender = rival(setting)
+            _note_parameters(place, contender.parameters)
+            path = place / f"{source}.json"
+            measure(
+                *(path, contender, setting, source),
+                tasks=self.asked(source),
+                known=self.known_tasks,
+                progress=say,
+            )
+            say(DONE)
+
+    def report(self, row: Row) -> dict[str, SourceReport]:
+        """Return the reports of a measured row, by data source. The pooled report has all tasks."""
+        found = self.known(row)
+        sources = [found[source] for source in self.settings if source != POOLED]
+        if POOLED in self.settings:
+            whole = found[POOLED]
+            every = pooled(sources, POOLED)
+            every.outcomes |= whole.outcomes
+            found[POOLED] = every
+        return {source: found[source] for source in self.settings}
+
+
+def measure_rows(
+    plan: Plan,
+    rows: Sequence[Row],
+    progress: Progress,
+    *,
+    workers: int = 1,
+    fresh: bool = False,
+    failures: tuple[type[Exception], ...] = (),
+) -> tuple[Reports, dict[str, str]]:
+    """Measure all rows, and skip finished reports.
+
+    KeyboardInterrupt stops the processes. The results of finished tasks are then already on
+    disk.
+
+    Args:
+        workers: number of processes with one thread each. 1 measures in this process.
+        fresh: delete earlier reports of these rows.
+        failures: exception types that end only the row in which they occur.
+
+    Returns:
+        The reports by (row name, seed), and the error messages of failed rows by row name.
+
+    Raises:
+        BrokenProcessPool: a worker process died.
+    """
+    if fresh:
+        for row in rows:
+            shutil.rmtree(plan.place(row), ignore_errors=True)
+    failed: dict[tuple[str, int], Exception] = {}
+    missing = [row for row in rows if len(plan.known(row)) < len(plan.settings)]
+    for row in rows:
+        if row not in missing:
+            plan.measure(row, progress)
+    work = partial(_failure, plan, failures)
+    if missing and workers > 1:
+        failed = _measure_in_processes(work, missing, progress, min(workers, len(missing)))
+    else:
+        for row in missing:
+            if error := work(row, progress):
+                failed[row.name, row.seed] = error
+    reasons = {name: f"seed {seed}: {error}" for (name, seed), error in failed.items()}
+    kept = [row for row in rows if row.name not in reasons]
+    return {(row.name, row.seed): plan.report(row) for row in kept}, reasons
+
+
+def _failure(
+    plan: Plan, failures: tuple[type[Exception], ...], row: Row, progress: Progress
+) -> Exception | None:
+    try:
+        plan.measure(row, progress)
+    except failures as error:
+        return error
+    return None
+
+
+def _measure_in_processes(
+    work: Work, rows: Sequence[Row], progress: Progress, workers: int
+) -> dict[tuple[str, int], Exception]:
+    """Measure rows in processes; return the errors of failed rows by (name, seed)."""
+    context = multiprocessing.get_context("spawn")
+    # SimpleQueue has no sending thread, so all messages of a finished row are already in the queue.
+    messages: SimpleQueue[tuple[str, str, str]] = context.SimpleQueue()
+    # Pickling avoids the shared memory of torch, which is small in containers.
+    begin = (pickle.dumps(work), messages)
+    with _one_thread(), ProcessPoolExecutor(workers, context, _begin, begin) as pool:
+        try:
+            futures = {pool.submit(_measure_here, row): (row.name, row.seed) for row in rows}
+            while True:
+                done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
+                while not messages.empty():
+                    progress(*messages.get())
+                failed = {futures[future]: error for future in done if (error := future.result())}
+                if not waiting:
+                    return failed
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let processes that start here use one thread each."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+_work: Work
+_progress: Progress
+
+
+def _begin(material: bytes, messages: SimpleQueue[tuple[str, str, str]]) -> None:
+    global _work, _progress  # set once in each process
+    torch.set_num_threads(1)
+    # Ctrl-C reaches every process of the terminal; only the main process handles it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The main process wrote these bytes and passed them on in memory.
+    _work = pickle.loads(material)  # noqa: S301  # nosec B301
+    _progress = lambda *message: messages.put(message)  # noqa: E731
+
+
+def _measure_here(row: Row) -> Exception | None:
+    return _work(row, _progress)
+
+
+@contextmanager
+def shown(console: Console, title: str, total: int) -> Iterator[Progress]:
+    """Show a progress bar for finished pairs (row, data source). `total` is the number of pairs."""
+    columns = (
+        "[progress.description]{task.description}",
+        BarColumn(),
+        "{task.completed}/{task.total}",
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Bar(*columns, console=console) as bar:
+        task = bar.add_task(title, total=total, note="")
+
+        def show(row: str, source: str, note: str) -> None:
+            bar.update(task, note=f"{row}, {source}: {note}")
+            if note in (DONE, KNOWN):
+                bar.advance(task)
+
+        yield show
+
+
+def place_of(folder: Path, name: str, seed: int) -> Path:
+    """Return the folder of a row and its training seed."""
+    return folder / slug(name) / f"seed-{seed}"
+
+
+def slug(name: str) -> str:
+    """Convert a name to a folder name: lower-case words joined by hyphens."""
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+
+
+def parameters(folder: Path, rows: Sequence[Row]) -> dict[str, int]:
+    """Return the number of trained weights by row name, for rows that record this number."""
+    found = {}
+    for row in rows:
+        path = place_of(folder, row.name, row.seed) / "row.json"
+        count = json.loads(path.read_text(encoding="utf-8")).get("parameters")
+        if count is not None:
+            found[row.name] = int(count)
+    return found
+
+
+def claim(place: Path, row: Row, material: str) -> None:
+    """Reserve a folder for a row, or check that the folder already belongs to the row.
+
+    Raises:
+        BenchmarkError: the folder belongs to a row with other settings or other scenes.
+    """
+    path = place / "row.json"
+    if path.exists():
+        known = json.loads(path.read_text(encoding="utf-8"))
+        if known["identity"] != row.identity:
+            raise BenchmarkError(
+                f"{place} holds reports of another configuration of {row.name}: use --fresh or "
+                "another folder"
+            )
+        if known.get("material") != material:
+            raise BenchmarkError(
+                f"the reports in {place} belong to other training scenes, or do not record their "
+                "scenes (files, sources, limit, split and vocabulary must be equal): use --fresh "
+                "or another folder"
+            )
+        return
+    values = {"name": row.name, "seed": row.seed, "identity": row.identity}
+    write_whole(path, json.dumps(values | {"material": material}))
+
+
+def read_report(path: Path, setting: Setting) -> SourceReport:
+    """Read a report from a file, and check that it belongs to `setting`.
+
+    Raises:
+        BenchmarkError: the report belongs to other scenes or questions.
+    """
+    report = SourceReport.read(path)
+    if report.scenes != digest(setting):
+        raise BenchmarkError(
+            f"the report {path} belongs to other scenes or questions: use --fresh or another folder"
+        )
+    return report
+
+
+def _note_parameters(place: Path, count: int | None) -> None:
+    path = place / "row.json"
+    values = json.loads(path.read_text(encoding="utf-8"))
+    if values.get("parameters") != count:
+        write_whole(path, json.dumps(values | {"parameters": count}))

@@ -1,0 +1,143 @@
+"""Plots of the results of `benchmark`.
+
+learning-curves.png   validation metrics by epoch, for every machine and training seed
+reliability-*.png     predicted probability against observed frequency, one file per machine
+recall.png            recall among the first k predictions, for relations and for removed objects
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from training.evaluation.calibration_task import QUESTIONS
+from training.evaluation.item_statistics import reliability
+from training.evaluation.metrics import Scored
+from training.evaluation.report import SourceReport
+from training.evaluation.results import Results
+from training.evaluation.setting import Outcome
+from training.research.measure import POOLED, Plan, slug
+from training.research.rows import Row
+
+Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
+
+_CURVES = {
+    "mrr_validation": "MRR of removed objects",
+    "r_precision_validation": "R-precision of relations",
+    "object_error_validation": "reconstruction error, objects",
+    "relation_error_validation": "reconstruction error, relations",
+}
+_RECALL = {
+    "T1a relations": ("R@", "annotated relations among the first k of a scene"),
+    "T2 missing": ("top-", "removed objects in the first k places"),
+}
+
+
+def write_plots(
+    plan: Plan, machines: Sequence[Row], reports: Reports, results: Results
+) -> list[Path]:
+    """Write all plots that have data, and return the paths of the files.
+
+    Args:
+        machines: trained and calibrated machines, one per training seed. The reliability plots use
+            the seed of the first machine.
+    """
+    runs: dict[str, list[Path]] = {}
+    for entry in machines:
+        runs.setdefault(entry.name, []).append(plan.place(entry) / "run" / "curve.csv")
+    drawn = {"learning-curves": learning_curves(runs), "recall": recall_curves(results, POOLED)}
+    for entry in machines:
+        outcome = reports[entry.name, entry.seed][POOLED].outcomes.get("Calibration")
+        if outcome is not None and entry.seed == machines[0].seed:
+            title = f"{entry.name}, {POOLED}"
+            drawn[f"reliability-{slug(entry.name)}"] = reliability_diagrams(outcome, title)
+    written = []
+    for name, figure in drawn.items():
+        path = plan.folder / f"{name}.png"
+        figure.savefig(path, dpi=110)
+        written.append(path)
+    return written
+
+
+def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
+    """Plot validation metrics by epoch, with one colour per machine and one line per seed."""
+    figure = Figure(figsize=(11, 6.5), layout="constrained")
+    axes = figure.subplots(2, 2).flat
+    for axis, (column, title) in zip(axes, _CURVES.items(), strict=True):
+        for colour, (name, paths) in enumerate(runs.items()):
+            for k, path in enumerate(paths):
+                epochs, values = read_curve(path, column)
+                label = name if k == 0 else None
+                axis.plot(epochs, values, color=f"C{colour}", alpha=0.8, label=label)
+        axis.set(xlabel="epoch", title=title)
+        axis.legend()
+    return figure
+
+
+def read_curve(path: Path, column: str) -> tuple[list[int], list[float]]:
+    """Return the epochs (counted from 1) and the values of one column of a curve file."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return [int(row["epoch"]) + 1 for row in rows], [float(row[column]) for row in rows]
+
+
+def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
+    """Plot reliability diagrams, one per question, with and without calibration.
+
+    Each bin holds the same number of answers. The axes are logarithmic because most probabilities
+    are small.
+    """
+    asked = [name for name in QUESTIONS if f"ECE, {name}" in outcome.metrics]
+    figure = Figure(figsize=(3.2 * max(len(asked), 1), 3.6), layout="constrained")
+    figure.suptitle(title)
+    for axis, name in zip(_axes(figure, len(asked)), asked, strict=True):
+        axis.plot([1e-5, 1], [1e-5, 1], color="0.7", linewidth=1)
+        for suffix, marker in ((", uncalibrated", "x"), ("", "o")):
+            metric = outcome.metrics[f"ECE, {name}{suffix}"]
+            if not isinstance(metric, Scored):
+                raise TypeError(f"the metric ECE of {name} does not store its answers")
+            bins = reliability(metric.score, metric.truth)
+            label = f"{suffix[2:] or 'as published'}, ECE {metric.value:.3f}"
+            axis.plot(bins.probability, bins.frequency, marker=marker, linewidth=1, label=label)
+        axis.set_xscale("symlog", linthresh=1e-3)
+        axis.set_yscale("symlog", linthresh=1e-3)
+        axis.set(xlim=(0, 1.1), ylim=(0, 1.1), xlabel="probability", title=name)
+        axis.legend(fontsize=7)
+    return figure
+
+
+def recall_curves(results: Results, source: str) -> Figure:
+    """Plot recall by number of predictions, one line per model, for one data source."""
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    axes = _axes(figure, len(_RECALL))
+    for axis, (task, (prefix, title)) in zip(axes, _RECALL.items(), strict=True):
+        for row, points in recall_points(results, task, prefix, source).items():
+            k, values = zip(*points, strict=True)
+            ours = row == results.ours
+            axis.plot(
+                k, values, label=row, linewidth=2.5 if ours else 1, marker="." if ours else ""
+            )
+        axis.set(xscale="log", xlabel="k", title=f"{title}, {source}", ylim=(0, 1))
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(fontsize=7)
+    return figure
+
+
+def recall_points(
+    results: Results, task: str, prefix: str, source: str
+) -> dict[str, list[tuple[int, float]]]:
+    """Return the points (k, recall at k) of the metrics "<prefix>k", by model name."""
+    found: dict[str, list[tuple[int, float]]] = {}
+    for cell in results.cells:
+        k = cell.metric.removeprefix(prefix)
+        if (cell.task, cell.source) == (task, source) and k != cell.metric and k.isdigit():
+            found.setdefault(cell.row, []).append((int(k), cell.figure.value))
+    return {row: sorted(points) for row, points in found.items()}
+
+
+def _axes(figure: Figure, columns: int) -> Iterator[Any]:
+    return iter(figure.subplots(1, columns, squeeze=False).flat) if columns else iter(())

@@ -1,0 +1,424 @@
+"""`python -m training tune`: search for settings on validation scenes with optuna.
+
+<folder>/<configuration>/study.log   all trials, as a journal of optuna
+                         trial-<n>/  curve, reports and checkpoint of a trial
+                         best.toml   the best configuration
+
+Several processes may run the same command. They share the trials through the journal. On several
+machines, --folder is on a shared file system.
+
+A search space is a TOML file of settings with choices or intervals:
+
+    "machine.H1" = [100, 200, 400]
+    "training.weight_decay" = { low = 0.01, high = 0.1, log = true }
+
+Source: Akiba et al., "Optuna: a next-generation hyperparameter optimization framework" (2019).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import socket
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+
+import typer
+from pydantic import BaseModel, ConfigDict, ValidationError
+from rich.console import Console
+from rich.table import Table
+
+from training.datasets.batches import TrainingData
+from training.evaluation.metrics import Metric, paired_difference
+from training.evaluation.missing_tasks import MachineScore
+from training.evaluation.model import Contender
+from training.evaluation.relation_tasks import machine_score
+from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
+from training.evaluation.tasks import in_words
+from training.fit.settings import Config, ConfigError, first_error
+from training.fit.trainer import Trainer
+from training.research.measure import resumable
+from training.research.settings import own_or_shipped
+from training.runs.config import config_toml, data_folder, load_config, read_toml, with_settings
+from training.runs.pipeline import prepare
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+    from optuna.distributions import BaseDistribution
+    from optuna.trial import FrozenTrial
+
+By: TypeAlias = Literal["mrr", "r-precision", "both"]
+
+FIGURES = {
+    "MRR": ("T2 missing", "MRR"),
+    "R-precision": ("T1a relations", "R-precision, instance counts"),
+}
+"""Metrics that rank the trials, by short name: (task, metric) of the evaluation."""
+
+_BY: dict[By, tuple[str, ...]] = {
+    "mrr": ("MRR",),
+    "r-precision": ("R-precision",),
+    "both": tuple(FIGURES),
+}
+# Settings that cannot be searched: trials are comparable only with the same scenes and seed.
+_FIXED = ("data.", "training.seed", "training.threads")
+# Pruning stops a trial whose metric is below the median of earlier trials. It needs this number of
+# finished trials, and it starts after this share of the epochs of a trial.
+_RIVALS = 4
+_WARM_UP = 1 / 3
+
+console = Console()
+
+
+class _Interval(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    low: int | float
+    high: int | float
+    log: bool = False
+
+
+def tune(
+    configuration: Annotated[str, typer.Argument(help="a TOML file, or a shipped configuration")],
+    space: Annotated[
+        Path | None, typer.Option(help="TOML file of the search space; by default the shipped file")
+    ] = None,
+    trials: Annotated[
+        int, typer.Option(min=1, help="number of trials, including earlier trials")
+    ] = 20,
+    by: Annotated[By, typer.Option(help="metric to maximise")] = "both",
+    seed: Annotated[int, typer.Option(help="seed of the sampler")] = 0,
+    epochs: Annotated[int | None, typer.Option(min=1, help="epochs of a trial")] = None,
+    study: Annotated[
+        Path | None,
+        typer.Option(help="journal of the trials, which processes share; default: in the folder"),
+    ] = None,
+    prune: Annotated[bool, typer.Option(help="stop trials below the median")] = True,
+    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
+    folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
+        "runs/tuning"
+    ),
+    fresh: Annotated[bool, typer.Option("--fresh", help="delete earlier trials")] = False,
+) -> None:
+    """Search for better settings on validation scenes only.
+
+    The first trial uses the unchanged configuration. Optuna chooses the settings of the other
+    trials. The command writes the best configuration to FOLDER/CONFIGURATION/best.toml. After
+    Ctrl-C, run the same command again: it keeps finished trials and resumes the interrupted trial.
+    """
+    with resumable(console):
+        original = load_config(configuration)
+        distributions = load_space(own_or_shipped(space, original, "spaces", "--space"), original)
+        place = folder / original.name
+        journal = study or place / "study.log"
+        if fresh:
+            shutil.rmtree(place, ignore_errors=True)
+            journal.unlink(missing_ok=True)
+        config = with_settings(original, {"training.epochs": epochs} if epochs else {})
+        with console.status("reading and encoding scenes"):
+            scenes = prepare(config, data_folder(configuration, config, data))
+        search = Search(place, config, scenes.training_data(), distributions, by, journal)
+        found = search.open(scenes.digest, seed, prune=prune)
+        search.run(found, trials + 1, seed)
+    console.print(_table(found, original.name))
+    if not _finished(found):
+        console.print("[red]error:[/red] all trials failed or were stopped early")
+        raise typer.Exit(1)
+    _conclude(search, found, original)
+
+
+def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
+    """Read a search space, and check its values in the configuration.
+
+    Returns:
+        The distribution of each searched setting, by setting name.
+
+    Raises:
+        ConfigError: the file is missing or not TOML, an entry is neither a list of choices nor an
+            interval, a value is invalid for its setting, or a setting cannot be searched.
+    """
+    values = read_toml(path)
+    if not values:
+        raise ConfigError(f"the search space {path.name} contains no settings")
+    found = {}
+    for name, entry in values.items():
+        if name.startswith(_FIXED):
+            raise ConfigError(f"{name!r} must be equal in all trials: remove it from the space")
+        try:
+            found[name] = _distribution(entry)
+        except ValueError as error:
+            reason = first_error(error) if isinstance(error, ValidationError) else error
+            raise ConfigError(
+                f"{path.name}: {name}: {reason}; write a list of choices, or "
+                "{ low = ..., high = ... }"
+            ) from error
+        for value in entry if isinstance(entry, list) else (entry["low"], entry["high"]):
+            with_settings(config, {name: value})
+    return found
+
+
+def _distribution(entry: Any) -> BaseDistribution:
+    from optuna.distributions import (
+        CategoricalDistribution,
+        FloatDistribution,
+        IntDistribution,
+    )
+
+    if isinstance(entry, list):
+        return CategoricalDistribution(entry)
+    bounds = _Interval.model_validate(entry)
+    if not bounds.low < bounds.high:
+        raise ValueError(f"low must be below high, not {bounds.low} and {bounds.high}")
+    if isinstance(bounds.low, int) and isinstance(bounds.high, int):
+        return IntDistribution(bounds.low, bounds.high, log=bounds.log)
+    return FloatDistribution(bounds.low, bounds.high, log=bounds.log)
+
+
+class Search:
+    """A search for settings. Each trial trains a machine and measures it on validation scenes."""
+
+    def __init__(
+        self,
+        folder: Path,
+        config: Config,
+        data: TrainingData,
+        space: Mapping[str, BaseDistribution],
+        by: By,
+        journal: Path | None = None,
+    ) -> None:
+        self.folder, self.config, self.data, self.space, self.by = folder, config, data, space, by
+        self.journal = journal or folder / "study.log"
+
+    def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
+        """Open the optuna study in the folder, or create it.
+
+        Raises:
+            ConfigError: the folder holds a search with another configuration, scenes or metric.
+        """
+        import optuna
+        from optuna.storages.journal import JournalFileBackend
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.journal.parent.mkdir(parents=True, exist_ok=True)
+        backend = JournalFileBackend(str(self.journal))
+        warm_up = math.ceil(self.config.training.epochs * _WARM_UP) - 1
+        study = optuna.create_study(
+            storage=optuna.storages.JournalStorage(backend),
+            study_name=self.config.name,
+            direction="maximize",
+            load_if_exists=True,
+            pruner=optuna.pruners.MedianPruner(_RIVALS, warm_up)
+            if prune
+            else optuna.pruners.NopPruner(),
+        )
+        identity = {"config": self.config.digest, "scenes": scenes, "by": self.by}
+        if study.user_attrs.setdefault("identity", identity) != identity:
+            raise ConfigError(
+                f"{self.journal} holds a search with another configuration, scenes or metric; use "
+                "--fresh or another folder"
+            )
+        study.set_user_attr("identity", identity)
+        return study
+
+    def run(self, study: Study, trials: int, seed: int = 0) -> None:
+        """Run trials until the study has `trials`; the first uses the unchanged settings."""
+        import optuna
+
+        self._requeue(study)
+        while len(_counted(study)) < trials:
+            trial = study.ask()
+            if sum(other.number < trial.number for other in _counted(study)) >= trials:
+                # Another process took the last trial in the meantime.
+                study.tell(trial, state=optuna.trial.TrialState.FAIL)
+                return
+            trial.set_user_attr("process", _process())
+            # With one seed for all, each process would draw the same settings.
+            study.sampler = optuna.samplers.TPESampler(seed=seed + trial.number)
+            original = trial.user_attrs.get("as it is", trial.number == 0)
+            self._run(study, trial, {} if original else _suggested(trial, self.space))
+
+    def _requeue(self, study: Study) -> None:
+        """Queue the trials of ended processes again; the new trials resume from the checkpoints."""
+        from optuna.trial import TrialState
+
+        for halted in study.get_trials(states=(TrialState.RUNNING,)):
+            if _alive(halted.user_attrs.get("process", "")):
+                continue
+            attributes = {
+                "as it is": halted.user_attrs.get("as it is", halted.number == 0),
+                "folder": _folder(halted),
+            }
+            study.enqueue_trial(halted.params, user_attrs=attributes)
+            study.tell(halted.number, state=TrialState.FAIL)
+
+    def _run(self, study: Study, trial: Trial, settings: Mapping[str, Any]) -> None:
+        import optuna
+        from optuna.trial import TrialState
+
+        state, reason, value = TrialState.COMPLETE, "", None
+        try:
+            value = self.value_of(trial, settings)
+        except FloatingPointError as error:
+            state, reason = TrialState.FAIL, str(error)
+        except optuna.TrialPruned:
+            state, reason = TrialState.PRUNED, "below the median of earlier trials"
+        trial.set_user_attr("settings", settings)
+        trial.set_user_attr("reason", reason)
+        study.tell(trial, value, state)
+        console.print(f"{shown(settings)}: {reason or value}", markup=False)
+
+    def value_of(self, trial: Trial, settings: Mapping[str, Any]) -> float:
+        """Train the machine of one trial, and return its metric on validation scenes.
+
+        Raises:
+            optuna.TrialPruned: the best epoch is below the median of earlier trials.
+        """
+        import optuna
+
+        config = with_settings(self.config, settings)
+        place = self.folder / _folder(trial)
+        trainer = Trainer(config, self.data, place)
+        trainer.resume()
+        reported = 0
+
+        def report(*_: object) -> None:
+            nonlocal reported
+            for epoch in trainer.epochs[reported:]:
+                both = {"MRR": epoch.mrr_validation, "R-precision": epoch.r_precision_validation}
+                value = sum(both[name] for name in _BY[self.by] if not math.isnan(both[name]))
+                trial.report(value, reported)
+                reported += 1
+                if trial.should_prune():
+                    raise optuna.TrialPruned
+
+        try:
+            trainer.run(ended=report)
+        except (FloatingPointError, optuna.TrialPruned):
+            (place / "checkpoint.pt").unlink(missing_ok=True)
+            raise
+        metrics = self._judge(trainer, place)
+        (place / "checkpoint.pt").unlink(missing_ok=True)
+        trial.set_user_attr("figures", {name: str(m.figure()) for name, m in metrics.items()})
+        return sum(metrics[name].value for name in _BY[self.by] if name in metrics)
+
+    def _judge(self, trainer: Trainer, place: Path) -> dict[str, Metric]:
+        machine = trainer.machine
+        contender = Contender(objects=MachineScore(machine), relations=machine_score(machine))
+        tasks = [task for task, _ in FIGURES.values()]
+        for source, setting in settings_by_source(
+            self.data.validation, self.data.structure, self.data.train, seen=None
+        ):
+            measure(place / f"{source}.json", contender, setting, source, tasks=tasks)
+        return self.metrics(place)
+
+    def metrics(self, place: Path) -> dict[str, Metric]:
+        """Return `FIGURES` of a finished trial in its folder, over all validation scenes."""
+        sources = sorted({scene.source for scene in self.data.validation.scenes})
+        report = pooled([SourceReport.read(place / f"{source}.json") for source in sources])
+        return {
+            name: outcome.metrics[metric]
+            for name, (task, metric) in FIGURES.items()
+            if (outcome := report.outcomes.get(task))
+        }
+
+
+def shown(settings: Mapping[str, Any]) -> str:
+    """Format the changed settings of a trial in one line."""
+    parts = (
+        f"{name.partition('.')[2]} {f'{value:.4g}' if isinstance(value, float) else value}"
+        for name, value in settings.items()
+    )
+    return ", ".join(parts) or "as it is"
+
+
+def _counted(study: Study) -> list[FrozenTrial]:
+    """Return the trials that ended by themselves or that still run."""
+    return [
+        trial
+        for trial in study.trials
+        if "settings" in trial.user_attrs or trial.state.name == "RUNNING"
+    ]
+
+
+def _folder(trial: Trial | FrozenTrial) -> str:
+    """Return the name of a trial's folder, which a trial that is queued again keeps."""
+    return str(trial.user_attrs.get("folder", f"trial-{trial.number}"))
+
+
+def _process() -> str:
+    return f"{socket.gethostname()} {os.getpid()}"
+
+
+def _alive(process: str) -> bool:
+    """Return whether another process runs; those of other machines count as running."""
+    host, _, number = process.partition(" ")
+    if host != socket.gethostname():
+        return True
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return False
+    return process != _process()
+
+
+def _finished(study: Study) -> list[FrozenTrial]:
+    from optuna.trial import TrialState
+
+    return study.get_trials(states=(TrialState.COMPLETE,))
+
+
+def _suggested(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str, Any]:
+    from optuna.distributions import FloatDistribution, IntDistribution
+
+    found: dict[str, Any] = {}
+    for name, entry in space.items():
+        if isinstance(entry, IntDistribution):
+            found[name] = trial.suggest_int(name, entry.low, entry.high, log=entry.log)
+        elif isinstance(entry, FloatDistribution):
+            found[name] = trial.suggest_float(name, entry.low, entry.high, log=entry.log)
+        else:
+            found[name] = trial.suggest_categorical(name, entry.choices)  # type: ignore[attr-defined]
+    return found
+
+
+def _table(study: Study, title: str) -> Table:
+    """Return a table of the trials from best to worst. Trials without a metric come last."""
+    heads = (f"{in_words(task)}, {name}" for name, (task, _) in FIGURES.items())
+    table = Table(*heads, "state", "settings", title=title)
+    trials = [trial for trial in study.trials if "settings" in trial.user_attrs]
+    for trial in sorted(trials, key=lambda t: math.inf if t.value is None else -t.value):
+        figures = trial.user_attrs.get("figures", {})
+        reason = trial.user_attrs.get("reason", "")
+        state = f"{trial.state.name.lower()}: {reason}" if reason else trial.state.name.lower()
+        settings = shown(trial.user_attrs["settings"])
+        table.add_row(*(figures.get(name, "") for name in FIGURES), state, settings)
+    return table
+
+
+def _conclude(search: Search, study: Study, original: Config) -> None:
+    """Write the best configuration to best.toml, with the original number of epochs."""
+    best = study.best_trial
+    base = next((t for t in _finished(study) if not t.user_attrs["settings"]), None)
+    settings = best.user_attrs["settings"]
+    tuned = with_settings(original, settings).model_copy(update={"name": f"{original.name}-tuned"})
+    figures = ", ".join(f"{name} {text}" for name, text in best.user_attrs["figures"].items())
+    comment = [
+        f"{original.name}, {shown(settings)}.",
+        f"Metrics on validation scenes, {search.config.training.epochs} epochs: {figures}.",
+    ]
+    if settings and base is not None:
+        ours, theirs = (search.metrics(search.folder / _folder(trial)) for trial in (best, base))
+        gaps = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
+        comment.append(f"Paired difference from {original.name}: {', '.join(gaps)}.")
+        comment.append(
+            f"The figures of the best of {len(study.trials)} trials are optimistic: train both "
+            "configurations with several seeds."
+        )
+    path = search.folder / "best.toml"
+    text = "".join(f"# {line}\n" for line in comment) + "\n" + config_toml(tuned)
+    path.write_text(text, encoding="utf-8")
+    console.print("\n".join(comment), markup=False)
+    console.print(f"best configuration: {path}")

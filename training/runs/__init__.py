@@ -1,0 +1,1 @@
+"""Training runs: configurations, scenes, a run's folder, live curves and publication."""

@@ -1,0 +1,127 @@
+"""The files of configurations: which exist, how to read and write them."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from training.datasets.files import DATA
+from training.fit.settings import Config, ConfigError, first_error
+
+_TRAINING = Path(__file__).resolve().parents[1]
+_CONFIGS = (_TRAINING / "runs" / "configs", _TRAINING / "seed" / "configs")
+
+
+def shipped_configs() -> dict[str, Path]:
+    """Return the files of the shipped configurations by name."""
+    return {path.stem: path for folder in _CONFIGS for path in sorted(folder.glob("*.toml"))}
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        ConfigError: the file is missing or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path} does not exist") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path.name} is not TOML: {error}") from error
+
+
+def config_path(reference: str) -> Path:
+    """Return the file of a reference: a shipped name, a file, or a folder made by `init`."""
+    path = shipped_configs().get(reference, Path(reference))
+    return path / f"{path.resolve().name}.toml" if path.is_dir() else path
+
+
+def data_folder(reference: str, config: Config, given: Path | None = None) -> Path:
+    """Return the data folder of a configuration.
+
+    The folder is `given` if it is set. If the configuration names files, the folder is that of the
+    configuration file. Otherwise the folder is `DATA`.
+    """
+    if given is not None:
+        return given
+    return config_path(reference).parent if config.data.files else DATA
+
+
+def load_config(reference: str, *, seed: int | None = None) -> Config:
+    """Read a configuration. `config_path` describes the possible references.
+
+    Raises:
+        ConfigError: the file is missing, is not TOML, or has an invalid entry.
+    """
+    path = config_path(reference)
+    if not path.is_file():
+        known = ", ".join(shipped_configs())
+        raise ConfigError(
+            f"there is no configuration {reference!r}: pass a TOML file or one of {known}"
+        )
+    values = read_toml(path)
+    if seed is not None:
+        values.setdefault("training", {})["seed"] = seed
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{path.name}: {first_error(error)}") from error
+
+
+def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
+    """Return a configuration with changed entries.
+
+    Args:
+        settings: maps the full name of an entry, such as "training.epochs", to its new value.
+
+    Raises:
+        ConfigError: an entry does not exist, or a value is invalid.
+    """
+    values = config.model_dump()
+    for name, value in settings.items():
+        section, _, entry = name.partition(".")
+        known = getattr(type(getattr(config, section, None)), "model_fields", {})
+        if entry not in known:
+            choice = f"{section} has {', '.join(known)}" if known else "name it section.entry"
+            raise ConfigError(f"there is no setting {name!r}: {choice}")
+        values[section][entry] = value
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(
+            f"the settings {dict(settings)} are invalid: {first_error(error)}"
+        ) from error
+
+
+def config_toml(config: Config) -> str:
+    """Return the configuration as TOML text that `load_config` reads."""
+    return sections_toml(config.model_dump(mode="json", exclude_none=True))
+
+
+def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None = None) -> str:
+    """Return entries and sections as TOML text.
+
+    Args:
+        values: maps each entry to its value, and each section to a mapping of its entries.
+        reasons: maps "section.entry" to a comment for the line above the entry.
+    """
+    sections = {name: own for name, own in values.items() if isinstance(own, Mapping)}
+    lines = [_entry(name, value) for name, value in values.items() if name not in sections]
+    for section, entries in sections.items():
+        lines += ["", f"[{section}]"]
+        for name, value in entries.items():
+            if reason := (reasons or {}).get(f"{section}.{name}"):
+                lines.append(f"# {reason}")
+            lines.append(_entry(name, value))
+    return "\n".join(lines) + "\n"
+
+
+def _entry(name: str, value: Any) -> str:
+    # JSON and TOML write these values in the same way.
+    return f"{name} = {json.dumps(value, ensure_ascii=False)}"

@@ -1,0 +1,232 @@
+"""Example scenes for the visual page: choose them from a user's scenes, and read them from a file.
+
+`publish` stores the examples in the artifact. So they must come from the user's own scenes or be
+written by hand: a copy of a research-only scene would put its terms on the artifact.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from app.registry.examples import MAX_WORD, Example, Examples
+from app.scene import Vocabulary, canonicalise
+from training.datasets import AnnotatedScene, curated_names
+from training.datasets.encoding import room_viewpoint
+from training.datasets.records import AnnotatedObject
+from training.datasets.sources import SOURCES
+from training.fit.settings import ConfigError, first_error
+
+_SHIPPED: Final = Path(__file__).parent / "examples"
+_READER: Final = TypeAdapter(Examples)
+_CHOSEN: Final = 3
+# The page shows one object beside the other, so more objects would hide each other.
+_MOST_OBJECTS: Final = 12
+_MOST_RELATIONS: Final = 32
+_FEWEST_CLASSES: Final = 3
+
+
+def read_examples(reference: str, root: Path) -> tuple[Example, ...]:
+    """Read the examples of a configuration.
+
+    Args:
+        reference: entry `examples` of the configuration: the name of a shipped file, or a file in
+            `root` that ends in .json. An empty text means no examples.
+
+    Raises:
+        ConfigError: the file is missing or invalid.
+    """
+    if not reference:
+        return ()
+    is_file = reference.endswith(".json")
+    path = root / reference if is_file else _SHIPPED / f"{reference}.json"
+    try:
+        examples: tuple[Example, ...] = _READER.validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise ConfigError(f"{path}, {first_error(error)}") from error
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be read: {error}. Remove the entry `examples` of the configuration, or "
+            "provide the file"
+        ) from error
+    return examples
+
+
+def known_examples(
+    examples: Sequence[Example], vocabulary: Vocabulary
+) -> tuple[tuple[Example, ...], list[str]]:
+    """Return the examples that a vocabulary covers, and the reasons against the others."""
+    kept, reasons = [], []
+    for example in examples:
+        try:
+            example.require_known(vocabulary)
+            kept.append(example)
+        except ValueError as error:
+            reasons.append(str(error))
+    return tuple(kept), reasons
+
+
+def examples_json(examples: Sequence[Example]) -> str:
+    """Return examples as JSON text that people can edit, with one object or relation on a line."""
+    return "[\n" + ",\n".join(map(_lines, examples)) + "\n]\n"
+
+
+def _lines(example: Example) -> str:
+    scene = example.request()
+    entries = []
+    for field, value in scene.items():
+        text = json.dumps(value, ensure_ascii=False)
+        if isinstance(value, list):
+            rows = ",\n".join(f"  {json.dumps(row, ensure_ascii=False)}" for row in value)
+            text = f"[\n{rows}]"
+        entries.append(f' "{field}": {text}')
+    name = json.dumps(example.name, ensure_ascii=False)
+    return f'{{"name": {name}, "scene": {{\n' + ",\n".join(entries) + "}}"
+
+
+def choose_examples(
+    scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary
+) -> tuple[Example, ...]:
+    """Return up to three typical scenes, if possible of different room types.
+
+    A typical scene contains frequent classes, and as many classes as the median scene of its room
+    type: in a complete scene, nothing would be missing. Scenes with positions take precedence.
+    Scenes of research-only data sets are left out.
+    """
+    known = {
+        scene: _known(scene, vocabulary)
+        for scene in scenes
+        if scene.source not in SOURCES or not SOURCES[scene.source].research_only
+    }
+    classes = {scene: {index for index, _ in found} for scene, found in known.items()}
+    frequency = Counter(index for found in classes.values() for index in found)
+    usable = [scene for scene in known if len(classes[scene]) >= _FEWEST_CLASSES]
+    sizes: dict[str | None, list[int]] = {}
+    for scene in usable:
+        sizes.setdefault(scene.room_type, []).append(len(classes[scene]))
+    usual = {room: np.median(found) for room, found in sizes.items()}
+    ranked = sorted(
+        usable,
+        key=lambda scene: (
+            not any(thing.position for _, thing in known[scene]),
+            abs(len(classes[scene]) - usual[scene.room_type]),
+            -sum(frequency[index] for index in classes[scene]),
+        ),
+    )
+    first: dict[str | None, AnnotatedScene] = {}
+    for scene in ranked:
+        first.setdefault(scene.room_type, scene)
+    groups = {scene.group for scene in first.values()}
+    others = [scene for scene in ranked if scene.group not in groups]
+    return tuple(
+        _example(scene, known[scene], vocabulary, frequency)
+        for scene in [*first.values(), *others][:_CHOSEN]
+    )
+
+
+def _known(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, AnnotatedObject]]:
+    """Return the objects of a scene that a request can contain, with their class indices."""
+    found = []
+    for thing in scene.objects:
+        index = vocabulary.index(thing.label)
+        if index is None or vocabulary.structure[index]:
+            continue
+        label = vocabulary.labels[index]
+        if len(label) <= MAX_WORD and label.isprintable():
+            found.append((index, thing))
+    return found
+
+
+def _example(
+    scene: AnnotatedScene,
+    known: Sequence[tuple[int, AnnotatedObject]],
+    vocabulary: Vocabulary,
+    frequency: Counter[int],
+) -> Example:
+    kept = _foremost(known, frequency)
+    labels = {thing.id: vocabulary.labels[index] for index, thing in kept}
+    repeats = Counter(labels.values())
+    numbers: Counter[str] = Counter()
+    names: dict[str, str] = {}
+    for own, label in labels.items():
+        numbers[label] += 1
+        names[own] = f"{label[:90]}_{numbers[label]}" if repeats[label] > 1 else label
+    values: dict[str, Any] = {}
+    room = curated_names().canonical_room(scene.room_type)
+    if room is not None and vocabulary.room_index(room) is not None:
+        values["room_type"] = room
+    if any(thing.position for _, thing in kept):
+        values |= {"frame_id": "map", "viewpoint": _viewpoint(scene)}
+    elif relations := _relations(scene, names):
+        values["relations"] = relations
+    values["objects"] = [
+        {"id": names[thing.id], "label": labels[thing.id], **_pose(thing)} for _, thing in kept
+    ]
+    own = "".join(filter(str.isprintable, scene.scene_id))
+    title = f"{values.get('room_type', 'scene').capitalize()}, {own}"
+    return Example.model_validate({"name": title[:MAX_WORD], "scene": values})
+
+
+def _foremost(
+    known: Sequence[tuple[int, AnnotatedObject]], frequency: Counter[int]
+) -> list[tuple[int, AnnotatedObject]]:
+    """Return the first objects of all classes, frequent classes first, then the second ones."""
+    seen: Counter[int] = Counter()
+    ranks = []
+    for index, _ in known:
+        ranks.append((seen[index], -frequency[index]))
+        seen[index] += 1
+    order = sorted(range(len(known)), key=ranks.__getitem__)[:_MOST_OBJECTS]
+    return [known[place] for place in sorted(order)]
+
+
+def _viewpoint(scene: AnnotatedScene) -> dict[str, float]:
+    """Return the viewpoint from which training derives the relations of a scene."""
+    if scene.viewer_frame:
+        return {"x": 0.0, "y": 0.0, "yaw": 0.0}
+    unknown = (math.nan,) * 3
+    view = room_viewpoint(
+        scene.scene_id, np.array([thing.position or unknown for thing in scene.objects])
+    )
+    return {"x": round(view.x, 3), "y": round(view.y, 3), "yaw": round(view.yaw, 4)}
+
+
+def _pose(thing: AnnotatedObject) -> dict[str, Any]:
+    pose: dict[str, Any] = {}
+    for name, values in (("position", thing.position), ("size", thing.size)):
+        if values is not None:
+            pose[name] = {axis: round(value, 3) for axis, value in zip("xyz", values, strict=True)}
+    if thing.position is not None and thing.yaw:
+        half = thing.yaw / 2
+        turn = {"z": round(math.sin(half), 4), "w": round(math.cos(half), 4)}
+        pose["orientation"] = {"x": 0.0, "y": 0.0} | turn
+    return pose
+
+
+def _relations(scene: AnnotatedScene, names: dict[str, str]) -> list[dict[str, str]]:
+    """Return the annotated relations between named objects, without contradictions."""
+    place = {thing.id: index for index, thing in enumerate(scene.objects)}
+    held = list(scene.relations or ())
+    if scene.relations is None:
+        held = [
+            (place[thing.id], "on-top", place[thing.supported_by])
+            for thing in scene.objects
+            if thing.supported_by is not None
+        ]
+    canonical = {canonicalise(*triple) for triple in held}
+    found = []
+    for triple in held:
+        relation, i, j = canonicalise(*triple)
+        ends = [scene.objects[end].id for end in (triple[0], triple[2])]
+        if i == j or (relation, j, i) in canonical or not names.keys() >= set(ends):
+            continue
+        subject, other = (names[end] for end in ends)
+        found.append({"subject": subject, "relation": triple[1], "object": other})
+    return found[:_MOST_RELATIONS]

@@ -1,0 +1,105 @@
+"""The folder of a training run. It contains these files:
+
+config.json        the validated configuration
+checkpoint.pt      training state after the last finished epoch, to resume an interrupted run
+model.safetensors  weights of the best epoch; the header contains the sizes of the machine
+curve.csv, .png    reconstruction error of each epoch
+result.json        best epoch, duration in seconds, data folder and digest of the scenes
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from training.fit.checkpoint import RunError, TrainingResult
+from training.fit.settings import Config
+from training.machines import BoltzmannMachine, MachineSpec, build
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A finished training run, loaded from its folder.
+
+    Attributes:
+        data: folder of the scenes on the computer that trained the run.
+        scenes: digest of the scenes, their vocabulary and split. An empty text means that the run
+            has no digest.
+    """
+
+    config: Config
+    machine: BoltzmannMachine
+    best_epoch: int
+    epochs: int
+    seconds: float
+    data: str = ""
+    scenes: str = ""
+
+    def require(self, scenes: str) -> None:
+        """Check that the run was trained on given scenes.
+
+        Raises:
+            RunError: the run was trained on other scenes.
+        """
+        if self.scenes and self.scenes != scenes:
+            raise RunError(
+                "the scenes, vocabulary or split have changed since the training of "
+                f"{self.config.name}: train this configuration again with --fresh"
+            )
+
+
+def save_run(
+    folder: Path,
+    config: Config,
+    result: TrainingResult,
+    *,
+    data: Path | None = None,
+    scenes: str = "",
+) -> None:
+    """Write the weights, and then `result.json`, which marks the run as finished."""
+    machine = result.machine
+    state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
+    spec = json.dumps(machine.spec.to_dict())
+    save_file(state, folder / "model.safetensors", metadata={"spec": spec})
+    (folder / "config.json").write_text(config.model_dump_json(indent=1), encoding="utf-8")
+    outcome = {
+        "best_epoch": result.best_epoch,
+        "epochs": len(result.epochs),
+        "seconds": round(result.seconds, 1),
+        "data": "" if data is None else str(data.resolve()),
+        "scenes": scenes,
+    }
+    (folder / "result.json").write_text(json.dumps(outcome), encoding="utf-8")
+
+
+def load_run(folder: Path) -> FinishedRun:
+    """Read a finished run.
+
+    Raises:
+        RunError: a file is missing or cannot be read.
+    """
+    for name in ("config.json", "model.safetensors", "result.json"):
+        if not (folder / name).is_file():
+            runs = ", ".join(str(path.parent) for path in sorted(folder.glob("*/result.json")))
+            advice = f"name a folder of a run: {runs}" if runs else "finish the training first"
+            raise RunError(
+                f"{folder} contains no finished run: the file {name} is missing; {advice}"
+            )
+    try:
+        config = Config.model_validate_json((folder / "config.json").read_text(encoding="utf-8"))
+        outcome = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise RunError(
+            f"{folder} contains a training run that this release cannot read: {error}"
+        ) from error
+    with safe_open(folder / "model.safetensors", "pt") as file:
+        spec = MachineSpec.from_dict(json.loads(file.metadata()["spec"]))
+        state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    machine = build(spec)
+    machine.load_state_dict(state)
+    machine.requires_grad_(False).eval()
+    return FinishedRun(config, machine, **outcome)

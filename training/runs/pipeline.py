@@ -1,0 +1,256 @@
+"""Read, split and encode the scenes of a configuration, for training and evaluation."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from app.registry import Example
+from app.scene import CANONICAL, Vocabulary
+from training.datasets import (
+    AnnotatedScene,
+    EncodedScene,
+    annotated_classes,
+    encode,
+    generate_rooms,
+    indoor_vocabulary,
+    priors,
+    read_scenes,
+    read_vocabulary,
+    rooms_vocabulary,
+    shuffle_objects,
+    source_vocabulary,
+    split,
+    with_typical_sizes,
+)
+from training.datasets.batches import SceneTensors, TrainingData, scene_tensors
+from training.datasets.files import DATA
+from training.datasets.words import class_vectors, read_word_vectors
+from training.fit.settings import Config, ConfigError, DataConfig, is_file, source_name
+
+
+@dataclass(frozen=True)
+class SplitScenes:
+    """The encoded scenes of the train, validation and test part, and their origin.
+
+    Attributes:
+        data: the configuration section that names the sources.
+        vocabulary: classes; the scenes use their indices.
+        counts, digests: number of scenes and sha256 of their contents, by source.
+        shuffle: seed of the permutation of objects; None if the objects are not permuted.
+        words: (V, D) unit word vectors of the classes; None without word vectors.
+        examples: example scenes for the artifact.
+    """
+
+    data: DataConfig
+    vocabulary: Vocabulary
+    parts: dict[str, list[EncodedScene]]
+    counts: dict[str, int]
+    digests: dict[str, str]
+    shuffle: int | None = None
+    words: torch.Tensor | None = None
+    examples: tuple[Example, ...] = ()
+
+    @property
+    def digest(self) -> str:
+        """The sha256 of the training input: scenes, vocabulary, split and permutation.
+
+        The sha256 depends on the contents of the files, because a corrected file keeps its name.
+        """
+        decisive = {
+            "data": self.data.model_dump(mode="json"),
+            "contents": self.digests,
+            "vocabulary": self.vocabulary.to_dict(),
+            "shuffle": self.shuffle,
+        }
+        return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
+
+    def training_data(self) -> TrainingData:
+        """Return the tensors for the trainer.
+
+        A data source annotates the classes that occur in its training part.
+
+        Raises:
+            ConfigError: a source has no scene in the training part.
+        """
+        annotated = annotated_classes(self.parts["train"], self.vocabulary)
+        every = {scene.source for scenes in self.parts.values() for scene in scenes}
+        for source in every - set(annotated):
+            raise ConfigError(
+                f"the training part contains no scene of the source {source!r}; add scenes, or "
+                "remove the source from data.sources"
+            )
+        tensors: dict[str, SceneTensors] = {
+            part: scene_tensors(scenes, annotated, len(self.vocabulary))
+            for part, scenes in self.parts.items()
+        }
+        return TrainingData(
+            train=tensors["train"],
+            validation=tensors["validation"],
+            test=tensors["test"],
+            structure=torch.from_numpy(self.vocabulary.structure.copy()),
+            relations=len(CANONICAL),
+            room_types=len(self.vocabulary.room_types),
+            digest=self.digest,
+            words=self.words,
+        )
+
+    def shuffled(self, seed: int) -> SplitScenes:
+        """Return a copy in which objects are permuted between scenes, except in test scenes."""
+        structure = self.vocabulary.structure
+        permuted = {
+            part: shuffle_objects(self.parts[part], structure, seed)
+            for part in ("train", "validation")
+        }
+        return replace(self, parts=self.parts | permuted, shuffle=seed)
+
+
+def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
+    """Read the scenes of every data source. Return a mapping from source names to scenes.
+
+    A data source is a file, or a name. A name means `<name>.jsonl.gz` in `root` or in `root/extra`
+    (`<name>.tsv.gz` for the placing priors).
+
+    Raises:
+        ConfigError: a file is missing.
+        DatasetError: a file is invalid.
+    """
+    _require_files(data, root)
+    scenes: dict[str, list[AnnotatedScene]] = {}
+    for source in data.sources:
+        name = source_name(source)
+        if source == "rooms":
+            found = generate_rooms(data.rooms, seed=data.split_seed)
+        elif source == priors.SOURCE:
+            found = priors.read_prior_scenes(_path(source, root))
+        else:
+            path = _path(source, root)
+            found = [replace(scene, source=name) for scene in read_scenes(path)]
+        scenes[name] = found[: data.limit]
+    return scenes
+
+
+def _path(source: str, root: Path) -> Path:
+    if is_file(source):
+        return root / source
+    file = f"{source}.tsv.gz" if source == priors.SOURCE else f"{source}.jsonl.gz"
+    extra = root / "extra" / file
+    return extra if extra.is_file() else root / file
+
+
+def _require_files(data: DataConfig, root: Path) -> None:
+    """Raise ConfigError if a file of a source, or the file of word vectors, is missing."""
+    paths = {source: _path(source, root) for source in data.sources if source != "rooms"}
+    if data.words:
+        paths["word vectors"] = root / data.words
+    missing = {source: path for source, path in paths.items() if not path.is_file()}
+    if not missing:
+        return
+    names = ", ".join(path.relative_to(root).as_posix() for path in missing.values())
+    text = f"{len(missing)} of {len(paths)} files of scenes are missing in {root}: {names}. "
+    if all(map(is_file, missing)):
+        advice = (
+            "The paths start at the folder of your configuration file. Pass this folder with "
+            "--data, such as --data my-lab"
+        )
+    else:
+        advice = (
+            "The repository does not contain the public data sets. docs/training.md (The "
+            "public data sets) names them and their files. Pass the folder of the files with --data"
+        )
+    raise ConfigError(text + advice)
+
+
+def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
+    """Return the vocabulary of a configuration, with typical object sizes from the scenes.
+
+    Raises:
+        ConfigError: the vocabulary name is unknown, or the file contains no vocabulary.
+    """
+    if data.vocabulary == "indoor":
+        vocabulary = indoor_vocabulary()
+    elif data.vocabulary == "source":
+        vocabulary = source_vocabulary(scenes)
+    elif data.vocabulary == "rooms":
+        vocabulary = rooms_vocabulary()
+    elif data.vocabulary.endswith(".json"):
+        vocabulary = _read_vocabulary(root / data.vocabulary)
+    else:
+        raise ConfigError(
+            f"data.vocabulary is {data.vocabulary!r}; it must be indoor, source, rooms, or the "
+            "name of a .json file"
+        )
+    return with_typical_sizes(vocabulary, scenes)
+
+
+def _read_vocabulary(path: Path) -> Vocabulary:
+    try:
+        return read_vocabulary(path)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"data.vocabulary: {path} cannot be used: {error}") from error
+
+
+def split_and_encode(
+    data: DataConfig,
+    scenes: dict[str, list[AnnotatedScene]],
+    vocabulary: Vocabulary | None = None,
+    root: Path = DATA,
+) -> SplitScenes:
+    """Split the scenes into train, validation and test parts, and encode them.
+
+    The split includes all data sources at once, because sources can contain the same room.
+
+    Args:
+        vocabulary: vocabulary of a published model. The default is the vocabulary of the
+            configuration.
+
+    Raises:
+        ConfigError: the vocabulary is invalid; see `build_vocabulary`.
+    """
+    everything = [scene for source in scenes.values() for scene in source]
+    parts = split(everything, seed=data.split_seed, protocol=data.split)
+    if vocabulary is None:
+        vocabulary = build_vocabulary(data, list(parts["train"]), root)
+    return SplitScenes(
+        data=data,
+        vocabulary=vocabulary,
+        parts={part: encode(some, vocabulary) for part, some in parts.items()},
+        counts={source: len(some) for source, some in scenes.items()},
+        digests={source: digest_of(some) for source, some in scenes.items()},
+        words=_word_vectors(data, vocabulary, root),
+    )
+
+
+def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch.Tensor | None:
+    """Return the word vectors of the classes, (classes, dimensions), or None if none are set.
+
+    Raises:
+        DatasetError: the file of word vectors is missing or invalid.
+    """
+    if not data.words:
+        return None
+    vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)
+    return torch.from_numpy(vectors)
+
+
+def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
+    """Return the sha256 of the contents of the scenes. It does not depend on the file format."""
+    sha = hashlib.sha256()
+    for scene in scenes:
+        sha.update(repr(scene).encode())
+    return sha.hexdigest()
+
+
+def prepare(config: Config, root: Path) -> SplitScenes:
+    """Read the scenes of a configuration from the folder `root`, split and encode them.
+
+    Raises:
+        ConfigError: a file is missing, or the vocabulary is invalid.
+        DatasetError: a file of scenes is invalid.
+    """
+    return split_and_encode(config.data, read_sources(config.data, root), root=root)

@@ -1,0 +1,320 @@
+"""Publish a new model version: a finished training run, or a version with refitted statistics."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from app.inference.posterior import ClosedForm
+from app.registry import (
+    Artifact,
+    Calibration,
+    DataSource,
+    Description,
+    Metric,
+    Store,
+    VocabularyEntry,
+)
+from app.scene import Vocabulary
+from training.datasets.batches import TrainingData
+from training.datasets.sources import SOURCES
+from training.datasets.vocabulary import with_aliases, with_room_aliases
+from training.evaluation.alarms import untouched_alarms
+from training.evaluation.everyday_task import EVERYDAY
+from training.evaluation.report import evaluate
+from training.evaluation.tasks import STATISTICS
+from training.fit.calibrate import calibrate
+from training.fit.checkpoint import RunError
+from training.fit.count_statistics import fit_counts
+from training.fit.offset_statistics import fit_offsets
+from training.fit.oracle.drawn import DrawnPosterior
+from training.fit.settings import Config, DataConfig
+from training.machines import BoltzmannMachine
+from training.machines.arrays import weights_of
+from training.runs.config import load_config, shipped_configs
+from training.runs.example_scenes import known_examples, read_examples
+from training.runs.folder import FinishedRun
+from training.runs.pipeline import SplitScenes, read_sources, split_and_encode
+
+_LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
+
+
+class RefusedError(RuntimeError):
+    """The new version is refused. The text gives the reasons."""
+
+    def __init__(self, reasons: Sequence[str]) -> None:
+        super().__init__("; ".join(reasons))
+
+
+def publish_run(
+    run: FinishedRun,
+    scenes: SplitScenes,
+    store: Store,
+    version: str,
+    *,
+    measured: tuple[FinishedRun, SplitScenes] | None = None,
+    judge: Callable[[Artifact], Sequence[str]] = lambda _: (),
+    accept: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Artifact:
+    """Calibrate on validation scenes, fit statistics, evaluate on test scenes, and publish.
+
+    The calibrated model answers `/outliers` about untouched validation scenes. It is refused if it
+    certainly raises too many alarms; see `training.evaluation.alarms`.
+
+    The store keeps weights in half precision. Calibration and evaluation use the same precision.
+
+    Args:
+        measured: second run of the same configuration, and its scenes, for a `run` that was trained
+            on test scenes. The second run did not use test scenes. Its test results and chosen
+            calibration values are published.
+        judge: function that returns further reasons against the calibrated model.
+        accept: function that is called with each reason against the model, which is published all
+            the same. None refuses a model with such a reason.
+
+    Raises:
+        RefusedError: there is a reason against the model.
+        RunError: the run was trained on other scenes than `scenes`.
+        StoreError, ArtifactError: see `Store.publish`.
+    """
+    run.require(scenes.digest)
+    data = scenes.training_data()
+    machine = as_stored(run.machine)
+    progress("calibrating")
+    if measured is None:
+        calibrated = calibrated_draft(run, scenes.vocabulary, data)
+        asked = calibrated = with_statistics(calibrated, scenes)
+        test = data
+    else:
+        other, kept_back = measured
+        other.require(kept_back.digest)
+        test = kept_back.training_data()
+        asked = calibrated_draft(other, kept_back.vocabulary, test)
+        calibrated = calibrated_draft(run, scenes.vocabulary, data, asked.calibration)
+        asked, calibrated = with_statistics(asked, kept_back), with_statistics(calibrated, scenes)
+    untouched = untouched_alarms(calibrated, scenes.parts["validation"])
+    reasons = [*filter(None, (one.objection() for one in untouched)), *judge(calibrated)]
+    for reason in reasons:
+        if accept is None:
+            raise RefusedError(reasons)
+        accept(reason)
+    rows = _measure(asked, test, progress)
+    progress("publishing")
+    description = Description(
+        name=run.config.name,
+        version=version,
+        created=_now(),
+        spec=machine.spec.to_dict(),
+        vocabulary=VocabularyEntry.of(with_room_aliases(scenes.vocabulary), machine.spec.A),
+        calibration=calibrated.calibration,
+        training=_training(run, measured),
+        data=data_sources(scenes),
+        metrics=tuple(rows),
+        terms=terms(scenes),
+        libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
+        examples=scenes.examples,
+    )
+    return _stored(store, description, calibrated)
+
+
+def refit(
+    artifact: Artifact,
+    root: Path,
+    store: Store,
+    version: str,
+    *,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Artifact:
+    """Publish a new version of a published model with refitted statistics, without training.
+
+    The new version keeps weights, calibration and metrics. Only the statistics (offsets, counts),
+    their metrics, the example scenes and the built-in synonyms of classes are new. The examples are
+    those of the shipped configuration with the name of the model, otherwise those of its own
+    configuration. The metrics of weights that were trained on test scenes come from statistics that
+    were not fitted to test scenes.
+
+    Args:
+        root: folder of the training scenes.
+
+    Raises:
+        RunError: the scenes in `root` are not the training scenes of the model.
+        ConfigError, DatasetError: the scenes cannot be read.
+        StoreError, ArtifactError: see `Store.publish`.
+    """
+    manifest = artifact.manifest
+    config = Config.model_validate(manifest.training["config"])
+    data, named = config.data, config.examples
+    if manifest.name in shipped_configs():
+        named = load_config(manifest.name).examples
+    examples, reasons = known_examples(read_examples(named, root), artifact.vocabulary)
+    for reason in reasons:
+        progress(reason)
+    progress("reading scenes")
+    annotated = read_sources(data, root)
+    scenes = split_and_encode(data, annotated, artifact.vocabulary, root)
+    digests = {source.source: source.digest for source in manifest.data}
+    if changed := sorted(name for name, found in scenes.digests.items() if digests[name] != found):
+        raise RunError(
+            f"{root} does not contain the training scenes of {manifest.name}@{manifest.version}: "
+            f"the scenes of {', '.join(changed)} have changed"
+        )
+    kept_back = scenes
+    if "measured_split" in manifest.training:
+        split = {"split": manifest.training["measured_split"]}
+        kept_back = split_and_encode(
+            DataConfig.model_validate(data.model_dump() | split),
+            annotated,
+            artifact.vocabulary,
+            root,
+        )
+    progress("fitting statistics")
+    asked = with_statistics(artifact, kept_back)
+    rows = _measure(asked, kept_back.training_data(), progress, tuple(STATISTICS))
+    fields = {name: getattr(manifest, name) for name in Description.model_fields}
+    fields["metrics"] = (
+        *(metric for metric in manifest.metrics if metric.task not in STATISTICS),
+        *rows,
+    )
+    changes = {"version": version, "created": _now(), "examples": examples}
+    changes["vocabulary"] = VocabularyEntry.of(with_aliases(artifact.vocabulary), artifact.spec.A)
+    description = Description(**fields | changes)
+    return _stored(store, description, with_statistics(artifact, scenes))
+
+
+def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
+    """Return the model with the offsets and counts of the scenes."""
+    train, vocabulary = scenes.parts["train"], scenes.vocabulary
+    return replace(
+        artifact,
+        offsets=fit_offsets(train, len(vocabulary)),
+        counts=fit_counts([*train, *scenes.parts["validation"]], vocabulary),
+    )
+
+
+def _stored(store: Store, description: Description, artifact: Artifact) -> Artifact:
+    """Publish weights and statistics in half precision."""
+    state = dict(artifact.weights.arrays)
+    for statistics in (artifact.offsets, artifact.counts):
+        if statistics is not None:
+            state |= statistics.tensors()
+    return store.publish(description, state, storage_dtype="float16")
+
+
+def _now() -> datetime:
+    return datetime.now(UTC).replace(microsecond=0)
+
+
+def calibrated_draft(
+    run: FinishedRun,
+    vocabulary: Vocabulary,
+    data: TrainingData,
+    chosen: Calibration | None = None,
+) -> Artifact:
+    """Return the calibrated model of a run in half precision. `chosen`: see `calibrate_objects`."""
+    machine = as_stored(run.machine)
+    calibration = calibrate(
+        draft_artifact(machine, vocabulary),
+        data.validation,
+        data.train,
+        run.config.training.seed,
+        chosen,
+    )
+    return draft_artifact(machine, vocabulary, calibration)
+
+
+@torch.no_grad()
+def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
+    """Round the weight matrices to half precision, the precision of the store, in place."""
+    for parameter in machine.parameters():
+        if parameter.dim() > 1:
+            parameter.copy_(parameter.half().float())
+    return machine.requires_grad_(False).eval()
+
+
+def draft_artifact(
+    machine: BoltzmannMachine,
+    vocabulary: Vocabulary,
+    calibration: Calibration | None = None,
+) -> Artifact:
+    """Return a model in memory, without files. The default calibration leaves log-odds as is."""
+    return Artifact(
+        manifest=None,  # type: ignore[arg-type]  # questions never read it
+        weights=weights_of(machine),
+        vocabulary=vocabulary,
+        calibration=calibration or Calibration.neutral(machine.spec.A),
+        digest="",
+        card="",
+        path=Path(),
+        oracle=None if ClosedForm.fits(weights_of(machine)) else DrawnPosterior,
+    )
+
+
+def _measure(
+    artifact: Artifact,
+    data: TrainingData,
+    progress: Callable[[str], None],
+    tasks: Collection[str] | None = None,
+) -> list[Metric]:
+    """Return the metrics on test scenes, or an empty list if there are no test scenes."""
+    if not len(data.test):
+        return []
+    return evaluate(
+        *(artifact, data.test, data.structure, data.train),
+        everyday=EVERYDAY,
+        tasks=tasks,
+        progress=progress,
+    )
+
+
+def _training(run: FinishedRun, measured: tuple[FinishedRun, SplitScenes] | None) -> dict[str, Any]:
+    kept = {} if measured is None else {"measured_split": measured[0].config.data.split}
+    return kept | {
+        "config": json.loads(run.config.model_dump_json()),
+        "best_epoch": run.best_epoch,
+        "epochs": run.epochs,
+        "parameters": run.machine.parameter_count,
+    }
+
+
+def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
+    """Return the data sources with the digests of their scenes and their terms of use."""
+    sources = []
+    for source, count in scenes.counts.items():
+        words, research_only = terms_of(source, scenes.data)
+        sources.append(
+            DataSource(
+                source=source,
+                scenes=count,
+                digest=scenes.digests[source],
+                terms=words,
+                research_only=research_only,
+            )
+        )
+    return tuple(sources)
+
+
+def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
+    """Return a source's terms of use, and True if they allow only research."""
+    if source in SOURCES and source in data.sources:
+        return SOURCES[source].terms, SOURCES[source].research_only
+    words = data.terms or "the user's own scenes, without stated terms of use"
+    return words, data.research_only
+
+
+def terms(scenes: SplitScenes) -> str:
+    """Return a sentence about the permitted use of the trained weights."""
+    every = {source: terms_of(source, scenes.data) for source in scenes.counts}
+    if research := [source for source, (_, research_only) in every.items() if research_only]:
+        return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."
+    if own := {source: words for source, (words, _) in every.items() if source not in SOURCES}:
+        return " ".join(
+            f"Trained on {source}: {words.rstrip('.')}." for source, words in own.items()
+        )
+    return "No restriction from the training data beyond its attribution."
