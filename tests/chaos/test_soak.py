@@ -63,7 +63,7 @@ def test_nothing_grows(service: LiveService) -> None:
             "/generate": {"steps": 8},
         }.items()
     ]
-    every = list(corpus.everything())
+    every = list(corpus.requests())
     readings: list[int] = []
     faults: list[str] = []
 

@@ -142,29 +142,6 @@ def test_connections_without_a_request_are_closed(proxy: Proxy) -> None:
     assert time.monotonic() - began < 3
 
 
-@pytest.mark.parametrize(
-    "head",
-    [
-        LIVE[:-2] + b"A: " + b"a" * 20_000 + b"\r\n\r\n",
-        b"GET /" + b"a" * 20_000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
-        LIVE[:-2] + b"A: b\r\n" * 3_000 + b"\r\n",
-        LIVE[:-2] + b"A: b\r\n" * 100 + b"\r\n",
-    ],
-    ids=["value", "path", "fields", "hundred fields"],
-)
-def test_a_large_head_is_refused(proxy: Proxy, head: bytes) -> None:
-    refused(proxy, head, 400)
-
-
-@pytest.mark.parametrize(
-    "hosts",
-    [b"", b"Host: localhost\r\nHost: evil.example\r\n"],
-    ids=["none", "two"],
-)
-def test_a_request_has_one_host(proxy: Proxy, hosts: bytes) -> None:
-    refused(proxy, b"GET /models HTTP/1.1\r\n" + hosts + b"\r\n", 400)
-
-
 def test_the_old_protocol_has_no_chunks(proxy: Proxy) -> None:
     head = HEAD.replace(b"HTTP/1.1", b"HTTP/1.0") + b"Transfer-Encoding: chunked\r\n\r\n"
     refused(proxy, head + b"%x\r\n%s\r\n0\r\n\r\n" % (len(BODY), BODY), 400)
