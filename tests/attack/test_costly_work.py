@@ -96,21 +96,6 @@ async def test_no_model_waits_for_another(
         assert all(answer.is_success for answer in await asyncio.gather(*costly))
 
 
-@pytest.mark.anyio
-async def test_the_server_limits_deadlines(shared_store: Path) -> None:
-    async with serve(shared_store, max_request_timeout_ms=20_000) as client:
-        for given, status in (("20000", 200), ("20001", 400), ("600000", 400), ("999999", 400)):
-            headers = {"X-Request-Timeout-Ms": given}
-            for path, body in (("/missing", HOME), ("/missing/batch", {"scenes": [HOME]})):
-                answer = await client.post(path, json=body, headers=headers)
-                assert answer.status_code == status
-        answer = await client.post("/missing", json=HOME, headers={"X-Request-Timeout-Ms": "20001"})
-        assert "from 1 to 20000" in answer.json()["detail"]
-        document = (await client.get("/openapi.json")).json()
-        parameters = document["paths"]["/missing"]["post"]["parameters"]
-        assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [20_000]
-
-
 def test_the_longest_deadline_is_no_shorter_than_the_default(shared_store: Path) -> None:
     with pytest.raises(ValidationError, match="SCENE_MAX_REQUEST_TIMEOUT_MS"):
         Settings(store=shared_store, request_timeout_ms=2_000, max_request_timeout_ms=1_000)
