@@ -11,10 +11,11 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,36 @@ def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
         monkeypatch.setattr(questions, name, replaced)
 
     return replace
+
+
+@dataclass(frozen=True)
+class Held:
+    """A question that waits in its worker thread for the event `release`."""
+
+    started: threading.Event = field(default_factory=threading.Event)
+    release: threading.Event = field(default_factory=threading.Event)
+
+
+Hold = Callable[..., Held]
+
+
+@pytest.fixture
+def hold(replace: Replace) -> Iterator[Hold]:
+    """Hold a question from the call on, of all models or of some."""
+    held = Held()
+
+    def hold(name: str, of: Callable[[Any], bool] = lambda manifest: True) -> Held:
+        def wait(question: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
+            if of(artifact.manifest):
+                held.started.set()
+                assert held.release.wait(30)
+            return question(artifact, *args, **parameters)
+
+        replace(name, wait)
+        return held
+
+    yield hold
+    held.release.set()
 
 
 def defect(*_: Any, **__: Any) -> Any:

@@ -258,16 +258,10 @@ def insert(members: dict[str, object], place: str, value: object) -> None:
     members[last] = value
 
 
-@pytest.mark.anyio
-async def test_an_unfinished_version_is_not_listed_and_keeps_nothing_back(published: Path) -> None:
+def test_an_unfinished_version_is_not_listed_and_is_no_failure(published: Path) -> None:
     (published / "broken" / "1.0.0").mkdir(parents=True)
     (published / "healthy" / "2.0.0").mkdir()
     (published / "healthy" / "2.0.0" / "model.safetensors").write_bytes(b"half")
-    async with serve(published, store_poll=0) as client:
-        refresh = await client.post("/models/refresh", headers=ADMIN)
-        assert (refresh.status_code, refresh.json()["failures"]) == (200, [])
-        listed = (await client.get("/models")).json()["models"]
-        assert {model["name"] for model in listed} == {"healthy", "hostile"}
-        assert (await client.get("/models/healthy/versions/2.0.0")).status_code == 404
-        (published / "late" / "1.0.0").mkdir(parents=True)
-        assert (await client.post("/models/refresh", headers=ADMIN)).status_code == 200
+    models = load_model_set(Store(published))
+    assert (models.failure, models.failures) == (None, {})
+    assert dict(models.versions) == {"healthy": ("1.0.0",), "hostile": ("1.0.0",)}

@@ -22,7 +22,7 @@ from app.registry import Store, StoreError
 from app.scene.relations import CANONICAL
 from tests.http.stores import VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import ADMIN_KEY, Replace, defect, serve
+from tests.services import ADMIN_KEY, Hold, Replace, defect, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -221,25 +221,17 @@ async def test_requests_are_answered_while_the_store_is_read(
 
 
 async def test_a_request_keeps_the_models_it_started_with(
-    store: Path, admin: dict[str, str], replace: Replace
+    store: Path, admin: dict[str, str], hold: Hold
 ) -> None:
-    started, go_on = threading.Event(), threading.Event()
-
-    def slow(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-        if artifact.manifest.version == "1.0.0":
-            started.set()
-            assert go_on.wait(30)
-        return missing(artifact, *args, **parameters)
-
     async with serve(store) as client:
-        replace("missing", slow)
+        held = hold("missing", lambda manifest: manifest.version == "1.0.0")
         batch = {"scenes": [{"objects": ["bed"]}] * 3}
         asking = asyncio.create_task(client.post("/missing/batch", json=batch))
-        assert await asyncio.to_thread(started.wait, 30)
+        assert await asyncio.to_thread(held.started.wait, 30)
         publish(store, "home", "2.0.0", seed=2, alias="default")
         assert (await client.post("/models/refresh", headers=admin)).status_code == 200
         assert await default(client) == "home@2.0.0"
-        go_on.set()
+        held.release.set()
         results = (await asking).json()["results"]
         assert [entry["result"]["model"]["version"] for entry in results] == ["1.0.0"] * 3
 
