@@ -61,8 +61,8 @@ async def test_a_version_tells_everything(client: httpx.AsyncClient) -> None:
     assert version["status"] == "ready"
     assert version["aliases"] == ["default"]
     assert version["metrics"][0] | {"low": 0.4, "high": 0.6} == version["metrics"][0]
-    assert version["data"][0]["source"] == "made up"
-    assert version["terms"] == "public domain"
+    assert version["data"][0]["source"] == "generated"
+    assert version["terms"] == "Apache-2.0"
     assert version["card"].startswith("#")
     assert version["parameters"] > 0
     answer = await client.post("/relations", json={"objects": ["bed"], "model": "home@1.0.0"})
