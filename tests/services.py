@@ -287,3 +287,32 @@ def shipped(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
     log = tmp_path_factory.mktemp("shipped") / "log"
     with launch(repository / "model_store", log) as service:
         yield service
+
+
+def live_service(*, logs_errors: bool = False, **variables: str) -> Any:
+    """Return a fixture of one module: a service as a separate process, with a store of its own.
+
+    Unless `logs_errors`, a traceback in its log fails the module.
+    """
+
+    @pytest.fixture(scope="module")
+    def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+        from tests.http.stores import make_store
+
+        folder = tmp_path_factory.mktemp("service")
+        with launch(make_store(folder / "store"), folder / "log", **variables) as service:
+            yield service
+            assert logs_errors or "Traceback" not in service.log.read_text()
+
+    return service
+
+
+def client_of_service(**settings: Any) -> Any:
+    """Return a fixture of one module: a client of a service in process with these settings."""
+
+    @pytest.fixture(scope="module")
+    async def client(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
+        async with serve(shared_store, **settings) as client:
+            yield client
+
+    return client

@@ -6,7 +6,6 @@ import asyncio
 import socket
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +17,13 @@ from app.questions import more
 from app.serving.reading import read_scene
 from scene_client.schemas import MissingRequest
 from tests.http.test_problems import problem
-from tests.services import LiveService, Replace, launch, serve
+from tests.services import LiveService, Replace, live_service, serve
 
 API_KEY = "0123456789abcdef"
 JSON = {"Content-Type": "application/json"}
 
 
-@pytest.fixture(scope="module")
-def locked(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    log = tmp_path_factory.mktemp("locked") / "log"
-    with launch(shared_store, log, SCENE_API_KEY=API_KEY) as service:
-        yield service
+locked = live_service(SCENE_API_KEY=API_KEY)
 
 
 @pytest.mark.anyio

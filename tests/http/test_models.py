@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import errno
 import gc
 import json
@@ -162,38 +161,30 @@ async def test_a_broken_new_version_changes_nothing(store: Path, admin: dict[str
         assert (await client.get("/health/ready")).status_code == 200
 
 
+@pytest.mark.parametrize("log_odds", [None, math.inf], ids=["raises", "not finite"])
 async def test_a_version_that_cannot_answer_is_refused(
-    store: Path, admin: dict[str, str], replace: Replace
+    store: Path,
+    admin: dict[str, str],
+    replace: Replace,
+    caplog: pytest.LogCaptureFixture,
+    log_odds: float | None,
 ) -> None:
-    def fails(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
-        if artifact.manifest.version == "2.0.0":
-            defect()
-        return outliers(artifact, scene, **parameters)
+    def fails(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
+        entries = missing(artifact, *args, **parameters)
+        if artifact.manifest.version != "2.0.0":
+            return entries
+        return [entry._replace(log_odds=log_odds) for entry in entries] if log_odds else defect()
 
-    replace("outliers", fails)
+    replace("missing", fails)
     async with serve(store) as client:
         publish(store, "home", "2.0.0", seed=2, alias="default")
         response = await client.post("/models/refresh", headers=admin)
         document = problem(response, 409, "refresh-refused")
         reasons = {failure["subject"]: failure["reason"] for failure in document["failures"]}
         assert reasons == {"home@2.0.0": "warm_up_failed", "default": "warm_up_failed"}
+        assert ("not finite" in caplog.text) == (log_odds is not None)
         assert "secret" not in response.text
         assert await default(client) == "home@1.0.0"
-
-
-async def test_a_model_whose_answers_are_not_finite_is_refused(
-    store: Path, admin: dict[str, str], replace: Replace
-) -> None:
-    def not_finite(missing: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
-        found = missing(artifact, scene, **parameters)
-        if artifact.manifest.version != "2.0.0":
-            return found
-        return tuple(dataclasses.replace(entry, log_odds=math.inf) for entry in found)
-
-    replace("missing", not_finite)
-    async with serve(store) as client:
-        publish(store, "home", "2.0.0", seed=2)
-        problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
 
 
 async def test_requests_are_answered_while_the_store_is_read(
