@@ -11,10 +11,11 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,36 @@ def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
         monkeypatch.setattr(questions, name, replaced)
 
     return replace
+
+
+@dataclass(frozen=True)
+class Held:
+    """A question that waits in its worker thread for the event `release`."""
+
+    started: threading.Event = field(default_factory=threading.Event)
+    release: threading.Event = field(default_factory=threading.Event)
+
+
+Hold = Callable[..., Held]
+
+
+@pytest.fixture
+def hold(replace: Replace) -> Iterator[Hold]:
+    """Hold a question from the call on, of all models or of some."""
+    held = Held()
+
+    def hold(name: str, of: Callable[[Any], bool] = lambda manifest: True) -> Held:
+        def wait(question: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
+            if of(artifact.manifest):
+                held.started.set()
+                assert held.release.wait(30)
+            return question(artifact, *args, **parameters)
+
+        replace(name, wait)
+        return held
+
+    yield hold
+    held.release.set()
 
 
 def defect(*_: Any, **__: Any) -> Any:
@@ -256,3 +287,32 @@ def shipped(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
     log = tmp_path_factory.mktemp("shipped") / "log"
     with launch(repository / "model_store", log) as service:
         yield service
+
+
+def live_service(*, logs_errors: bool = False, **variables: str) -> Any:
+    """Return a fixture of one module: a service as a separate process, with a store of its own.
+
+    Unless `logs_errors`, a traceback in its log fails the module.
+    """
+
+    @pytest.fixture(scope="module")
+    def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+        from tests.http.stores import make_store
+
+        folder = tmp_path_factory.mktemp("service")
+        with launch(make_store(folder / "store"), folder / "log", **variables) as service:
+            yield service
+            assert logs_errors or "Traceback" not in service.log.read_text()
+
+    return service
+
+
+def client_of_service(**settings: Any) -> Any:
+    """Return a fixture of one module: a client of a service in process with these settings."""
+
+    @pytest.fixture(scope="module")
+    async def client(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
+        async with serve(shared_store, **settings) as client:
+            yield client
+
+    return client

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import pytest
 from scene_client.schemas import MAX_BATCH
 from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
-from tests.services import launch, serve
+from tests.services import client_of_service, launch
 
 pytestmark = pytest.mark.anyio
 
@@ -23,11 +23,7 @@ LIMIT = 16 * 2**20
 SMALL = 2**16
 
 
-@pytest.fixture(scope="module")
-async def limited(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
-    """A client of a service whose answers are small."""
-    async with serve(shared_store, max_answer_bytes=SMALL) as client:
-        yield client
+limited = client_of_service(max_answer_bytes=SMALL)
 
 
 def scene(objects: int, letter: str = "x", **parameters: Any) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import asyncio
 import socket
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +17,13 @@ from app.questions import more
 from app.questions.reading import read_scene
 from scene_client.schemas import MissingRequest
 from tests.http.test_problems import problem
-from tests.services import LiveService, Replace, launch, serve
+from tests.services import LiveService, Replace, live_service, serve
 
 API_KEY = "0123456789abcdef"
 JSON = {"Content-Type": "application/json"}
 
 
-@pytest.fixture(scope="module")
-def locked(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    log = tmp_path_factory.mktemp("locked") / "log"
-    with launch(shared_store, log, SCENE_API_KEY=API_KEY) as service:
-        yield service
-
-
-def objects(size: int) -> bytes:
-    return b'{"objects":[' + b",".join([b"{}"] * (size // 3 - 8)) + b"]}"
+locked = live_service(SCENE_API_KEY=API_KEY)
 
 
 @pytest.mark.anyio
@@ -66,41 +57,6 @@ async def test_the_body_of_one_scene_has_a_limit_of_its_own(client: httpx.AsyncC
     batch = b'{"scenes":[%b]}' % scene
     response = await client.post("/missing/batch", content=batch.ljust(2**21), headers=JSON)
     assert response.status_code == 200
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("path", "body", "status"),
-    [
-        ("/missing", objects(2**21), 413),
-        ("/missing", objects(2**18), 422),
-        ("/missing/batch", b'{"scenes":[%b]}' % objects(2**21 - 20), 200),
-    ],
-)
-def test_health_answers_beside_bodies_of_empty_objects(
-    live: LiveService, path: str, body: bytes, status: int
-) -> None:
-    """One connection made health wait 459 ms."""
-    ends = threading.Event()
-
-    def attack() -> None:
-        with httpx.Client(base_url=live.url, timeout=30) as client:
-            while not ends.is_set():
-                assert client.post(path, content=body, headers=JSON).status_code == status
-
-    attacker = threading.Thread(target=attack)
-    attacker.start()
-    waits = []
-    try:
-        for _ in range(100):
-            asked = time.monotonic()
-            assert live.client.get("/health/live").is_success
-            waits.append(time.monotonic() - asked)
-            time.sleep(0.01)
-    finally:
-        ends.set()
-        attacker.join()
-    assert sorted(waits)[98] < 0.2
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-import threading
 import time
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -18,28 +16,11 @@ from pydantic import ValidationError
 
 from app.settings import Settings
 from tests.http.stores import VOCABULARY
-from tests.services import Replace, launch, serve
+from tests.services import Hold, launch, serve
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 DEEP = {"objects": LABELS[:4], "model": "deep"}
 HOME = {"objects": LABELS[:4]}
-
-
-@pytest.fixture
-def blocked(replace: Replace) -> Iterator[Callable[[], threading.Event]]:
-    """Let /outliers wait from now on until the event it returns is set, or for five seconds."""
-    release = threading.Event()
-
-    def slow(outliers: Any, *args: Any, **parameters: Any) -> Any:
-        release.wait(5)
-        return outliers(*args, **parameters)
-
-    def block() -> threading.Event:
-        replace("outliers", slow)
-        return release
-
-    yield block
-    release.set()
 
 
 def related(objects: int) -> dict[str, Any]:
@@ -56,13 +37,13 @@ def related(objects: int) -> dict[str, Any]:
 @pytest.mark.anyio
 @pytest.mark.parametrize("cheap", [DEEP, {**DEEP, "objects": [LABELS[0]] * 14}])
 async def test_health_answers_beside_a_first_question(
-    shared_store: Path, blocked: Callable[[], threading.Event], cheap: dict[str, Any]
+    shared_store: Path, hold: Hold, cheap: dict[str, Any]
 ) -> None:
     """Neither a cheap question of the same size nor many of them make it look cheap."""
     async with serve(shared_store) as client:
         for _ in range(20):
             assert (await client.post("/outliers", json=cheap)).is_success
-        release = blocked()
+        release = hold("outliers").release
         costly = asyncio.ensure_future(client.post("/outliers", json=related(14)))
         began = time.monotonic()
         while not costly.done() and time.monotonic() - began < 0.5:
@@ -76,11 +57,9 @@ async def test_health_answers_beside_a_first_question(
 
 
 @pytest.mark.anyio
-async def test_no_model_waits_for_another(
-    shared_store: Path, blocked: Callable[[], threading.Event]
-) -> None:
+async def test_no_model_waits_for_another(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store) as client:
-        release = blocked()
+        release = hold("outliers").release
         batch = {"scenes": [related(count) for count in (3, 6, 9, 14)]}
         costly = [
             asyncio.ensure_future(client.post("/outliers/batch", json=batch)) for _ in range(8)
@@ -94,21 +73,6 @@ async def test_no_model_waits_for_another(
         assert not any(job.done() for job in costly)
         release.set()
         assert all(answer.is_success for answer in await asyncio.gather(*costly))
-
-
-@pytest.mark.anyio
-async def test_the_server_limits_deadlines(shared_store: Path) -> None:
-    async with serve(shared_store, max_request_timeout_ms=20_000) as client:
-        for given, status in (("20000", 200), ("20001", 400), ("600000", 400), ("999999", 400)):
-            headers = {"X-Request-Timeout-Ms": given}
-            for path, body in (("/missing", HOME), ("/missing/batch", {"scenes": [HOME]})):
-                answer = await client.post(path, json=body, headers=headers)
-                assert answer.status_code == status
-        answer = await client.post("/missing", json=HOME, headers={"X-Request-Timeout-Ms": "20001"})
-        assert "from 1 to 20000" in answer.json()["detail"]
-        document = (await client.get("/openapi.json")).json()
-        parameters = document["paths"]["/missing"]["post"]["parameters"]
-        assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [20_000]
 
 
 def test_the_longest_deadline_is_no_shorter_than_the_default(shared_store: Path) -> None:

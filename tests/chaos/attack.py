@@ -13,7 +13,7 @@ from typing import Any
 
 from app.errors import ERRORS
 from scene_client.schemas import Problem
-from tests.chaos.corpus import JSON, MARKER, NUMBER, Hostile
+from tests.chaos.corpus import MARKER, NUMBER, Hostile
 from tests.services import ADMIN_KEY
 
 _LEAKS = (
@@ -88,8 +88,8 @@ def attack(port: int, requests: Iterable[Hostile]) -> Report:
     """Send requests one after another on one connection, as long as it lasts."""
     report = Report()
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    headers = {"Content-Type": "application/json", "X-Admin-Key": ADMIN_KEY}
     for request in requests:
-        headers = JSON | {"X-Admin-Key": ADMIN_KEY} | request.headers
         # Refused before all of it was sent: the answer is there all the same.
         with suppress(BrokenPipeError, ConnectionResetError):
             connection.request(request.method, request.path, request.body, headers)

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,8 +17,7 @@ from tests.chaos import corpus
 from tests.chaos.attack import attack
 from tests.chaos.load import ConstantLoad
 from tests.chaos.trends import trend
-from tests.http.stores import make_store
-from tests.services import ADMIN_KEY, LiveService, launch
+from tests.services import ADMIN_KEY, LiveService, live_service
 
 MINUTES = float(os.environ.get("CHAOS_SOAK_MINUTES", "0"))
 CYCLE = 5.0
@@ -28,12 +25,7 @@ CYCLE = 5.0
 pytestmark = pytest.mark.skipif(MINUTES <= 0, reason="CHAOS_SOAK_MINUTES says how long")
 
 
-@pytest.fixture
-def service(tmp_path: Path) -> Iterator[LiveService]:
-    with launch(
-        make_store(tmp_path / "store"), tmp_path / "log", SCENE_ACCESS_LOG="false"
-    ) as service:
-        yield service
+service = live_service(SCENE_ACCESS_LOG="false")
 
 
 def cycle(service: LiveService, hostile: list[corpus.Hostile]) -> list[str]:
@@ -63,7 +55,7 @@ def test_nothing_grows(service: LiveService) -> None:
             "/generate": {"steps": 8},
         }.items()
     ]
-    every = list(corpus.everything())
+    every = list(corpus.requests())
     readings: list[int] = []
     faults: list[str] = []
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from app.scene import Scene, SceneObject
 from benchmarks.load.connections import prepared
 from tests.chaos.load import ConstantLoad
 from tests.chaos.trends import trend
-from tests.http.stores import make_store, publish
+from tests.http.stores import corrupt, make_store, publish
 from tests.services import ADMIN_KEY, LiveService, launch
 
 SWAPS = int(os.environ.get("CHAOS_SWAPS", "500"))
@@ -33,6 +33,7 @@ SCENES: list[dict[str, Any]] = [
     {"objects": ["sink", {"label": "toilet", "confidence": 0.5}], "top_k": 4},
     {"objects": ["sofa", "television"], "room_type": "office", "top_k": 4},
 ]
+REQUESTS = [prepared("/missing", body) for body in SCENES]
 Answers = list[list[tuple[str, float, float]]]
 
 
@@ -54,6 +55,29 @@ def offline(artifact: Artifact) -> Answers:
     return answers
 
 
+class Judge:
+    """Compares each answer with that of the version that it names, asked in this process.
+
+    Attributes:
+        expected: the answers by the digest of their version.
+        seen: digests of the versions that answered.
+    """
+
+    def __init__(self, store: Store, versions: Iterable[str]) -> None:
+        artifacts = [store.load("home", version) for version in versions]
+        self.expected = {artifact.digest: offline(artifact) for artifact in artifacts}
+        self.seen: set[str] = set()
+
+    def __call__(self, number: int, status: int, answer: Any) -> str | None:
+        if status != 200:
+            return f"status {status}: {answer}"
+        digest = answer["model"]["digest"]
+        self.seen.add(digest)
+        missing = [(m["label"], m["probability"], m["log_odds"]) for m in answer["missing"]]
+        expected = self.expected[digest][number]
+        return None if missing == expected else f"{answer['model']}: {missing}, not {expected}"
+
+
 def scene_of(artifact: Artifact, body: dict[str, Any]) -> Scene:
     """The scene of a request, in the classes of a model."""
     words = artifact.vocabulary
@@ -72,43 +96,12 @@ def rounded(number: float) -> float:
     return float(f"{number:.6g}")
 
 
-# ------------------------------------------------------------------------------ broken versions
-
-
-def truncated(version: Path) -> None:
-    weights = version / "model.safetensors"
-    data = weights.read_bytes()
-    weights.chmod(0o644)
-    weights.write_bytes(data[: len(data) // 2])
-
-
-def flipped(version: Path) -> None:
-    weights = version / "model.safetensors"
-    data = bytearray(weights.read_bytes())
-    data[len(data) // 2] ^= 1
-    weights.chmod(0o644)
-    weights.write_bytes(bytes(data))
-
-
-def with_a_stranger(version: Path) -> None:
-    (version / "notes.txt").write_text("not part of an artifact")
-
-
-SPOILERS: tuple[Callable[[Path], None], ...] = (
-    truncated,
-    flipped,
-    with_a_stranger,
-)
-
-
 def put_broken(store: Path, number: int) -> Path:
     """A version that must be refused, made beside the store and moved in at once."""
-    made = store.parent / "made"
-    shutil.copytree(store / "home" / "1.2.0", made)
-    SPOILERS[number % len(SPOILERS)](made)
-    place = store / "home" / f"9.{number}.0"
-    made.rename(place)
-    return place
+    beside = store.parent / "beside"
+    shutil.copytree(store / "home" / "1.2.0", beside / "home" / "1.2.0")
+    corrupt(beside, "home", "1.2.0")
+    return (beside / "home" / "1.2.0").rename(store / "home" / f"9.{number}.0")
 
 
 # -------------------------------------------------------------------------------------- tests
@@ -150,27 +143,11 @@ def service(store: Path, tmp_path: Path) -> Iterator[LiveService]:
 
 
 def test_no_answer_is_lost_or_mixed_and_no_memory_kept(service: LiveService, store: Path) -> None:
-    known: dict[str, Answers] = {}
-    for version in VERSIONS:
-        artifact = Store(store).load("home", version)
-        known[artifact.digest] = offline(artifact)
-    seen: set[str] = set()
-
-    def judge(number: int, status: int, answer: Any) -> str | None:
-        if status != 200:
-            return f"status {status}: {answer}"
-        digest = answer["model"]["digest"]
-        seen.add(digest)
-        given = [(m["label"], m["probability"], m["log_odds"]) for m in answer["missing"]]
-        if given != known[digest][number]:
-            return f"{answer['model']} says {given}, not {known[digest][number]}"
-        return None
-
+    judge = Judge(Store(store), VERSIONS)
     before = service.control()
-    requests = [prepared("/missing", body) for body in SCENES]
     faults: list[str] = []
     readings: list[int] = []
-    with ConstantLoad(service.port, requests, judge, connections=4) as load:
+    with ConstantLoad(service.port, REQUESTS, judge, connections=4) as load:
         for number in range(SWAPS):
             faults += swap(service, store, number)
             if number >= SWAPS // 5:
@@ -178,7 +155,7 @@ def test_no_answer_is_lost_or_mixed_and_no_memory_kept(service: LiveService, sto
     assert faults == []
     assert load.tally.faults == []
     assert sum(load.tally.statuses.values()) == load.tally.sent
-    assert seen == set(known)
+    assert judge.seen == set(judge.expected)
     alias = {"model": "home@1.0.0"}
     assert service.client.put("/models/aliases/default", json=alias, headers=ADMIN).is_success
     assert service.control() == before

@@ -28,30 +28,17 @@ from tests.services import ADMIN_KEY, LiveService, launch
 every_client = pytest.mark.parametrize("caller", EVERY, indirect=True)
 
 BEDROOM = REQUESTS["relations"]["relations"].value
-_POSES = REQUESTS["relations"]["poses"].value
-POSED: dict[str, Any] = {**_POSES, "objects": _POSES["objects"][:2]}
 QUESTIONS: list[tuple[str, dict[str, Any]]] = [
-    ("relations", {"objects": ["bed", "lamp", "chair", "chair"], "top_k": 5}),
-    ("relations", {**BEDROOM, "include_opposites": True, "min_probability": 0.1}),
-    (
-        "relations",
-        {"objects": ["bed", "lamp"], "pairs": [{"subject": "bed", "object": "lamp"}]},
-    ),
-    ("missing", {**BEDROOM, "top_k": 3}),
-    ("missing", {"objects": ["desk"], "at": {"relation": "on-top", "object": "desk"}}),
-    ("missing", {"objects": ["desk", "bed"], "candidates": ["lamp", "TV"], "model": "plain"}),
-    ("missing", {"objects": ["desk", "unheard-of"], "unknown_labels": "ignore"}),
-    ("missing", {"objects": ["desk", "big lamp"], "coverage": 0.9, "unknown_labels": "nearest"}),
-    ("missing", POSED),
-    ("outliers", {**BEDROOM, "threshold": 0.25}),
-    ("outliers", {**BEDROOM, "sensitivity": "high"}),
-    ("outliers", {"objects": ["bed"], "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}),
-    ("generate", {"objects": ["bed"], "count": 3, "seed": 7, "temperature": 0.5}),
-    ("generate", {"objects": [], "room_type": "office", "seed": 1, "steps": 5, "model": "deep"}),
     *[
-        (question.name, next(iter(question.examples.values())).value)
+        (question.name, case.value | ({"seed": 7} if question.name == "generate" else {}))
         for question in questions.QUESTIONS
+        for case in question.examples.values()
+        if case.problem is None
     ],
+    ("relations", {**BEDROOM, "include_opposites": True, "min_probability": 0.1}),
+    ("missing", {"objects": ["desk", "big lamp"], "coverage": 0.9, "unknown_labels": "nearest"}),
+    ("missing", {"objects": ["desk", "bed"], "candidates": ["lamp", "TV"], "model": "plain"}),
+    ("outliers", {**BEDROOM, "sensitivity": "high", "stamp": {"sec": 1, "nanosec": 2}}),
 ]
 
 

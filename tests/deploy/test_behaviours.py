@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,8 +13,8 @@ import py_trees
 import pytest
 from py_trees.common import Status
 
-from scene_client import Client, UnreachableError
-from scene_client.vision_msgs import SceneFields, from_message
+from scene_client import Client
+from scene_client.vision_msgs import SceneFields
 from tests.deploy.ros import load_package
 from tests.services import LiveService
 
@@ -25,11 +23,6 @@ from tests.services import LiveService
 def client(live: LiveService) -> Iterator[Client]:
     with Client(f"http://127.0.0.1:{live.port}", timeout=20.0) as client:
         yield client
-
-
-@pytest.fixture
-def scene(repository: Path) -> SceneFields:
-    return from_message(json.loads((repository / "clients/ros2/detections.json").read_text()))
 
 
 @pytest.fixture
@@ -81,22 +74,6 @@ def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
         assert (highest.label in condition.feedback_message) is (expected is Status.FAILURE)
 
 
-def test_the_question_can_be_narrowed(
-    behaviours: Any, client: Client, scene: SceneFields, plant: Plant
-) -> None:
-    condition = behaviours.SceneComplete(
-        "lit",
-        client,
-        lambda: scene,
-        timeout=30.0,
-        log_odds=-1e3,
-        candidates=["lamp"],
-        at={"relation": "on-top", "object": "desk"},
-    )
-    assert settle(plant(condition)) is Status.FAILURE
-    assert condition.feedback_message == "missing: lamp"
-
-
 @pytest.mark.parametrize("thing", ["toilet_1", "toilet"])
 def test_a_thing_belongs_unless_it_is_an_outlier(
     behaviours: Any, client: Client, scene: SceneFields, plant: Plant, thing: str
@@ -115,21 +92,41 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
         assert condition.feedback_message.startswith("toilet_1: an outlier with probability 0.")
 
 
-def test_an_unseen_object_does_not_belong(
-    behaviours: Any, client: Client, scene: SceneFields, plant: Plant
-) -> None:
-    condition = behaviours.ObjectBelongs("belongs", client, lambda: scene, "sofa", timeout=30.0)
-    assert settle(plant(condition)) is Status.FAILURE
-    assert condition.feedback_message == "no sofa was seen"
+LAMP = {"candidates": ["lamp"], "at": {"relation": "on-top", "object": "desk"}, "log_odds": -1e3}
 
 
-@pytest.mark.parametrize("fields", [None, {"objects": []}])
-def test_nothing_seen_is_no_complete_scene(
-    behaviours: Any, client: Client, plant: Plant, fields: Any
+@pytest.mark.parametrize(
+    ("kind", "arguments", "options", "message"),
+    [
+        ("SceneComplete", [lambda: None], {}, "nothing was seen"),
+        ("SceneComplete", [lambda: {"objects": []}], {}, "nothing was seen"),
+        ("SceneComplete", [], LAMP, "missing: lamp"),
+        ("ObjectBelongs", [None, "sofa"], {}, "no sofa was seen"),
+    ],
+)
+def test_a_condition_fails_with_a_reason(
+    behaviours: Any,
+    client: Client,
+    scene: SceneFields,
+    plant: Plant,
+    kind: str,
+    arguments: list[Any],
+    options: dict[str, Any],
+    message: str,
 ) -> None:
-    condition = behaviours.SceneComplete("complete", client, lambda: fields, timeout=30.0)
+    source, *others = arguments or [None]
+    condition = getattr(behaviours, kind)(
+        "condition", client, source or (lambda: scene), *others, timeout=30.0, **options
+    )
     assert settle(plant(condition)) is Status.FAILURE
-    assert condition.feedback_message == "nothing was seen"
+    assert condition.feedback_message == message
+
+
+def test_a_service_that_is_not_there_fails_the_condition(behaviours: Any, plant: Plant) -> None:
+    with Client("http://127.0.0.1:9") as client:
+        condition = behaviours.SceneComplete("complete", client, lambda: {"objects": ["bed"]})
+        assert settle(plant(condition)) is Status.FAILURE
+    assert condition.feedback_message.startswith("UnreachableError: ")
 
 
 class Slow:
@@ -178,13 +175,3 @@ def test_the_next_time_it_asks_about_the_scene_of_that_time(behaviours: Any, pla
     client.answering.set()
     assert settle(tree) is Status.SUCCESS
     assert client.scenes == [["bed"], ["lamp"]]
-
-
-def test_a_service_that_is_not_there_fails_the_condition(behaviours: Any, plant: Plant) -> None:
-    class Gone:
-        def missing(self, **fields: Any) -> Any:
-            raise UnreachableError("gone")
-
-    condition = behaviours.SceneComplete("complete", Gone(), lambda: {"objects": ["bed"]})
-    assert settle(plant(condition)) is Status.FAILURE
-    assert condition.feedback_message == "UnreachableError: gone"

@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import socket
 import subprocess
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from scene_client import Client
-from scene_client.vision_msgs import SceneFields, from_message
+from scene_client.vision_msgs import SceneFields
 from tests.client import callers
 from tests.services import LiveService
 
@@ -54,11 +53,6 @@ def tick(program: Path, url: str, kind: str, *ports: Any, timeout: float = 20.0)
 @pytest.fixture
 def url(live: LiveService) -> str:
     return f"http://127.0.0.1:{live.port}"
-
-
-@pytest.fixture
-def scene(repository: Path) -> SceneFields:
-    return from_message(json.loads((repository / "clients/ros2/detections.json").read_text()))
 
 
 def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
@@ -139,16 +133,10 @@ def test_after_a_halt_the_next_scene_is_asked_about(program: Path, url: str) -> 
     assert found["because"].startswith("bed ")
 
 
-@contextmanager
-def silent() -> Iterator[str]:
-    """A server that takes connections and says nothing."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        yield f"http://127.0.0.1:{server.getsockname()[1]}"
-
-
 def test_a_service_that_does_not_answer_fails_the_condition(program: Path) -> None:
     scene = {"scene": '{"objects": ["bed"]}'}
-    with silent() as url:
+    with socket.create_server(("127.0.0.1", 0)) as server:  # accepts and never answers
+        url = f"http://127.0.0.1:{server.getsockname()[1]}"
         (late,) = tick(program, url, "SceneComplete", scene, timeout=0.2)
     assert (late["status"], late["waited"]) == ("FAILURE", True)
     assert late["because"] == f"{url}/missing did not answer within 0.2 s"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.client.ros_messages import blank, to_json
-from tests.deploy.ros import STORE, from_json
+from tests.deploy.ros import STORE
 from tests.services import LiveService, wait_until
 
 pytest.importorskip("cyclonedds", reason="there is no wheel for this processor")
@@ -25,12 +25,6 @@ from scene_client import Client
 over_dds = import_module("over_dds")  # benchmarks.dds adds its folder to the path
 
 ARRAY = "vision_msgs/msg/Detection3DArray"
-
-
-@pytest.fixture
-def recorded(repository: Path) -> Any:
-    envelope = json.loads((repository / "clients/ros2/detections.json").read_text())
-    return from_json(ARRAY, envelope["msg"])
 
 
 def written(message: Any) -> bytes:

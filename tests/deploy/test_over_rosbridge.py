@@ -63,10 +63,9 @@ def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
 
 @pytest.mark.parametrize("questions", [["missing"], ["missing", "outliers"]])
 def test_a_published_message_is_answered(
-    repository: Path, live: LiveService, questions: list[str]
+    repository: Path, live: LiveService, envelope: Any, questions: list[str]
 ) -> None:
-    recorded = json.loads((repository / "clients/ros2/detections.json").read_text())
-    with bridge({"op": "status", "level": "info"}, recorded) as (url, heard):
+    with bridge({"op": "status", "level": "info"}, envelope) as (url, heard):
         (answer,), errors = run(
             repository, url, "/detections_3d", "--service", live.url, "--questions", *questions
         )

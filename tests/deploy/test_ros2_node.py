@@ -19,18 +19,12 @@ import yaml
 from scene_client import Client, UnreachableError
 from scene_client.vision_msgs import SceneFields
 from tests.client.ros_messages import blank
-from tests.deploy.ros import PACKAGE, STORE, Ros, from_json, load_package
+from tests.deploy.ros import PACKAGE, STORE, Ros, load_package
 from tests.services import LiveService, launch, wait_until
 
 
-@pytest.fixture
-def recorded(repository: Path) -> Any:
-    envelope = json.loads((repository / "clients/ros2/detections.json").read_text())
-    return from_json("vision_msgs/msg/Detection3DArray", envelope["msg"])
-
-
 class Running:
-    """The node in a process of its own making: what it hears, and what it says."""
+    """The node in a process of its own making: what it hears, and what it publishes."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **parameters: Any) -> None:
         self.ros = Ros(parameters)
@@ -46,18 +40,27 @@ class Running:
         ((_, callback),) = self.ros.timers
         callback()
 
-    def tick_until(self, done: Callable[[], Any]) -> None:
-        def ticked() -> Any:
-            self.tick()
-            return done()
-
-        wait_until(ticked)
-
-    def said(self, topic: str) -> list[Any]:
+    def published(self, topic: str) -> list[Any]:
         return self.ros.publishers[topic].sent
 
+    def wait_for(self, topic: str, count: int = 1) -> Any:
+        """Tick until so many messages are published, and return the last one."""
+
+        def ticked() -> bool:
+            self.tick()
+            return len(self.published(topic)) == count
+
+        wait_until(ticked)
+        return self.published(topic)[-1]
+
+    def answer(self, message: Any) -> Any:
+        """The answer to detections."""
+        count = len(self.published("~/answers")) + 1
+        self.hear("detections", message)
+        return json.loads(self.wait_for("~/answers", count).data)
+
     def status(self) -> Any:
-        (status,) = self.said("/diagnostics")[-1].status
+        (status,) = self.published("/diagnostics")[-1].status
         return status
 
 
@@ -82,10 +85,7 @@ def test_detections_become_answers_markers_and_a_diagnosis(
     run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
     running = run(url=live.url, timeout=20.0)
-    running.hear("detections", recorded)
-    running.tick_until(lambda: running.said("~/answers"))
-    (published,) = running.said("~/answers")
-    answer = json.loads(published.data)
+    answer = running.answer(recorded)
     assert answer["frame_id"] == "base_link"
     assert answer["stamp"] == {"sec": 1751450412, "nanosec": 183000000}
     # The machine of this test knows five of the eight things.
@@ -94,9 +94,9 @@ def test_detections_become_answers_markers_and_a_diagnosis(
     assert set(answer["missing"]["ignored"]) == {"track_4", "mouse_1", "cup_1"}
     assert answer["missing"]["observed_relations"]
     assert [note["reason"] for note in answer["notes"]] == ["no-hypothesis"]
-    (status,) = running.said("/diagnostics")[0].status
+    (status,) = running.published("/diagnostics")[0].status
     assert (status.level, status.message) == (0, "answered")
-    clear, *shown = running.said("~/ghosts")[0].markers
+    clear, *shown = running.published("~/ghosts")[0].markers
     assert clear.action == 3
     texts = [marker.text for marker in shown if marker.text]
     best = answer["missing"]["missing"][0]
@@ -114,8 +114,8 @@ def test_the_api_key_comes_from_a_file(
         for file, topic in ((str(tmp_path / "key"), "~/answers"), ("", "/diagnostics")):
             running = run(url=service.url, timeout=20.0, api_key_file=file)
             running.hear("detections", recorded)
-            running.tick_until(lambda running=running, topic=topic: running.said(topic))
-            assert bool(running.said("~/answers")) is bool(file)
+            running.wait_for(topic)
+            assert bool(running.published("~/answers")) is bool(file)
 
 
 class Slow:
@@ -144,15 +144,15 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
         running.tick()  # returns though nobody answers
         if second == 0:
             assert client.started.acquire(timeout=30)
-    assert running.said("/diagnostics") == []
+    assert running.published("/diagnostics") == []
     client.answering.set()
-    running.tick_until(lambda: len(running.said("/diagnostics")) == 2)
+    running.wait_for("/diagnostics", 2)
     assert client.asked == [0, 3]
-    first, second_one = (report.status[0] for report in running.said("/diagnostics"))
+    first, second_one = (report.status[0] for report in running.published("/diagnostics"))
     assert first.level == second_one.level == 2
     assert first.message == "UnreachableError: gone"
     assert [entry.value for entry in first.values] == ["2"]
-    assert running.said("~/answers") == []
+    assert running.published("~/answers") == []
 
 
 def test_a_service_that_is_not_there_is_diagnosed_and_its_return_noticed(
@@ -160,21 +160,18 @@ def test_a_service_that_is_not_there_is_diagnosed_and_its_return_noticed(
 ) -> None:
     running = run(url="http://127.0.0.1:9", timeout=0.5)
     running.hear("detections", recorded)
-    running.tick_until(lambda: running.said("/diagnostics"))
+    running.wait_for("/diagnostics")
     assert running.status().level == 2
     assert running.status().message.startswith(("UnreachableError", "DeadlineError"))
     with Client(live.url, timeout=20.0) as client:
         running.node.advisor.client = client
-        running.hear("detections", recorded)
-        running.tick_until(lambda: running.said("~/answers"))
+        running.answer(recorded)
     assert running.status().level == 0
 
 
 def test_a_view_of_nothing_asks_nothing(run: Callable[..., Running]) -> None:
     running = run(url="http://127.0.0.1:9")
-    running.hear("detections", blank(STORE, "vision_msgs/msg/Detection3DArray"))
-    running.tick_until(lambda: running.said("~/answers"))
-    assert json.loads(running.said("~/answers")[0].data)["notes"] == []
+    assert running.answer(blank(STORE, "vision_msgs/msg/Detection3DArray"))["notes"] == []
     assert (running.status().level, running.status().message) == (1, "nothing was seen")
 
 
@@ -188,16 +185,14 @@ def test_numbers_wait_for_their_labels(
             result.hypothesis.class_id = numbers.get(name, "9")
     running = run(url=live.url, timeout=20.0)
     running.hear("detections", recorded)
-    running.tick_until(lambda: running.said("/diagnostics"))
+    running.wait_for("/diagnostics")
     assert running.status().message.startswith("MessageError: the class ids are numbers")
     classes = [
         blank(STORE, "vision_msgs/msg/VisionClass", class_id=int(number), class_name=name)
         for name, number in numbers.items()
     ]
     running.hear("label_info", blank(STORE, "vision_msgs/msg/LabelInfo", class_map=classes))
-    running.hear("detections", recorded)
-    running.tick_until(lambda: running.said("~/answers"))
-    answer = json.loads(running.said("~/answers")[0].data)
+    answer = running.answer(recorded)
     assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}
 
 
@@ -213,37 +208,26 @@ def test_labels_and_a_viewpoint_may_stand_in_the_parameters(run: Callable[..., R
 def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
     run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
-    def horizontal(answer: Any) -> set[str]:
-        found = json.loads(answer.data)["missing"]["observed_relations"]
-        return {entry["relation"] for entry in found} & {"left", "front"}
+    def horizontal() -> list[dict[str, str]]:
+        relations = running.answer(recorded)["missing"]["observed_relations"]
+        return [entry for entry in relations if entry["relation"] in {"left", "front"}]
 
     running = run(url=live.url, timeout=20.0)
     for message in (recorded, *recorded.detections):
         message.header.frame_id = "map"
-    running.hear("detections", recorded)
-    running.tick_until(lambda: len(running.said("~/answers")) == 1)
-    assert horizontal(running.said("~/answers")[0]) == set()
+    assert horizontal() == []
 
     pose = blank(STORE, "geometry_msgs/msg/PoseWithCovarianceStamped")
     pose.header.frame_id = "map"
     pose.pose.pose.position.x = 5.0
     pose.pose.pose.orientation.z, pose.pose.pose.orientation.w = 1.0, 0.0
     running.hear("pose", pose)
-    running.hear("detections", recorded)
-    running.tick_until(lambda: len(running.said("~/answers")) == 2)
-    (relation,) = [
-        entry
-        for entry in json.loads(running.said("~/answers")[1].data)["missing"]["observed_relations"]
-        if {entry["subject"], entry["object"]} == {"track_3", "track_7"}
-    ]
     # From the other side of the desk the chair stands behind it.
-    assert relation == {"subject": "track_3", "relation": "front", "object": "track_7"}
+    assert {"subject": "track_3", "relation": "front", "object": "track_7"} in horizontal()
 
     pose.header.frame_id = "odom"
     running.hear("pose", pose)
-    running.hear("detections", recorded)
-    running.tick_until(lambda: len(running.said("~/answers")) == 3)
-    assert horizontal(running.said("~/answers")[2]) == set()
+    assert horizontal() == []
 
 
 def test_images_are_heard_where_the_parameters_say_so(
@@ -262,9 +246,7 @@ def test_images_are_heard_where_the_parameters_say_so(
         detection.bbox.size_x = detection.bbox.size_y = 50.0
         detections.append(detection)
     array = blank(STORE, "vision_msgs/msg/Detection2DArray", detections=detections)
-    running.hear("detections", array)
-    running.tick_until(lambda: running.said("~/answers"))
-    answer = json.loads(running.said("~/answers")[0].data)
+    answer = running.answer(array)
     assert [
         (entry["subject"], entry["relation"], entry["object"])
         for entry in answer["outliers"]["misplaced"]

@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
 
-from app.registry import (
-    Calibration,
-    Counts,
-    DataSource,
-    Description,
-    Example,
-    Metric,
-    Offsets,
-    Store,
-    VocabularyEntry,
-)
+from app.registry import Calibration, Counts, Offsets, Store, VocabularyEntry
 from app.scene.relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
-from tests.registry.small_artifacts import JUDGING
+from tests.registry.small_artifacts import JUDGING, description
 from training.machines import BoltzmannMachine, MachineSpec, build
 
 VOCABULARY = Vocabulary(
@@ -65,17 +54,8 @@ def random_machine(variant: str, seed: int = 0, classes: int = V) -> BoltzmannMa
     return machine.requires_grad_(False)
 
 
-EXAMPLES = (
-    Example.model_validate(
-        {
-            "name": "A bedroom",
-            "scene": {
-                "room_type": "bedroom",
-                "objects": ["bed", {"label": "lamp", "position": {"x": 1, "y": 0.5, "z": 1}}],
-            },
-        }
-    ),
-)
+LAMP = {"label": "lamp", "position": {"x": 1, "y": 0.5, "z": 1}}
+EXAMPLES = [{"name": "A bedroom", "scene": {"room_type": "bedroom", "objects": ["bed", LAMP]}}]
 
 
 def publish(
@@ -95,30 +75,12 @@ def publish(
     machine = random_machine(variant, seed, classes)
     vocabulary = Vocabulary(VOCABULARY.objects[:classes], VOCABULARY.room_types)
     Store(root).publish(
-        Description(
-            name=name,
-            version=version,
-            created=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
+        description(
+            name,
+            version,
             spec=machine.spec.to_dict(),
             vocabulary=VocabularyEntry.of(vocabulary),
             calibration=Calibration.neutral(A).model_copy(update=JUDGING if judges else {}),
-            training={"objective": "none: random weights", "seed": seed},
-            data=(
-                DataSource(
-                    source="made up",
-                    scenes=0,
-                    digest="0" * 64,
-                    terms="none",
-                    research_only=False,
-                ),
-            ),
-            metrics=(
-                Metric(
-                    task="T2", source="made up", metric="MRR", value=0.5, low=0.4, high=0.6, n=10
-                ),
-            ),
-            terms="public domain",
-            libraries={"torch": torch.__version__},
             examples=EXAMPLES if classes == V else (),
         ),
         machine.state_dict()

@@ -6,7 +6,6 @@ import asyncio
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,44 +13,36 @@ import httpx
 import pytest
 
 from tests.http.test_problems import problem
-from tests.services import Replace, launch, serve, wait_until
+from tests.services import Hold, Replace, launch, serve, wait_until
 
 SCENE = {"objects": ["bed", "chair", "lamp"]}
 
 
-@pytest.fixture
-def hold(replace: Replace) -> Iterator[Callable[[], threading.Event]]:
-    """From the call on, drawing waits for the event that it returns, in the worker thread."""
-    release = threading.Event()
-
-    def slow(generate: Any, *args: Any, **parameters: Any) -> Any:
-        release.wait(30)
-        return generate(*args, **{**parameters, "count": 1, "steps": 1})
-
-    def begin() -> threading.Event:
-        replace("generate", slow)
-        return release
-
-    yield begin
-    release.set()
-
-
 @pytest.mark.anyio
-@pytest.mark.parametrize("given", ["0", "-1", "1.5", "60001", "", "soon"])
-async def test_a_deadline_that_is_none_is_refused(client: httpx.AsyncClient, given: str) -> None:
-    headers = {"X-Request-Timeout-Ms": given}
-    response = await client.post("/relations", json=SCENE, headers=headers)
-    problem(response, 400, "bad-request")
-    # Health answers whatever it is asked with.
-    assert (await client.get("/health/ready", headers=headers)).is_success
+async def test_a_deadline_is_a_whole_number_within_the_limit(shared_store: Path) -> None:
+    async with serve(shared_store, max_request_timeout_ms=20_000) as client:
+        for value in ("0", "-1", "1.5", "", "soon", "NaN", b"\xff", "9" * 400, "20001", "20000"):
+            headers: Any = {"X-Request-Timeout-Ms": value}
+            for path, body in (("/relations", SCENE), ("/missing/batch", {"scenes": [SCENE]})):
+                response = await client.post(path, json=body, headers=headers)
+                if value == "20000":
+                    assert response.status_code == 200
+                else:
+                    document = problem(response, 400, "bad-request")
+                    assert "from 1 to 20000" in document["detail"]
+            # Health checks ignore the header.
+            assert (await client.get("/health/ready", headers=headers)).is_success
+        document = (await client.get("/openapi.json")).json()
+    parameters = document["paths"]["/missing"]["post"]["parameters"]
+    assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [20_000]
 
 
 @pytest.mark.anyio
 async def test_drawing_past_the_deadline_is_a_504_and_delays_nobody(
-    shared_store: Path, hold: Callable[[], threading.Event]
+    shared_store: Path, hold: Hold
 ) -> None:
     async with serve(shared_store) as client:
-        release = hold()
+        release = hold("generate").release
         began = time.monotonic()
         drawing = asyncio.ensure_future(
             client.post("/generate", json=SCENE, headers={"X-Request-Timeout-Ms": "300"})
@@ -67,19 +58,17 @@ async def test_drawing_past_the_deadline_is_a_504_and_delays_nobody(
 
 @pytest.mark.anyio
 async def test_the_service_s_own_deadline_holds_without_a_header(
-    shared_store: Path, hold: Callable[[], threading.Event]
+    shared_store: Path, hold: Hold
 ) -> None:
     async with serve(shared_store, request_timeout_ms=200) as client:
-        hold()
+        hold("generate")
         problem(await client.post("/generate", json=SCENE), 504, "deadline-passed")
 
 
 @pytest.mark.anyio
-async def test_rows_that_no_queue_has_room_for_are_a_429(
-    shared_store: Path, hold: Callable[[], threading.Event]
-) -> None:
+async def test_rows_that_no_queue_has_room_for_are_a_429(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store, queue_rows=256) as client:
-        release = hold()
+        release = hold("generate").release
         drawing = [
             asyncio.ensure_future(
                 client.post(
@@ -117,9 +106,7 @@ async def test_batches_give_their_rows_back(shared_store: Path) -> None:
 
 
 @pytest.mark.anyio
-async def test_nothing_is_told_to_wait_once_it_has_ended(
-    shared_store: Path, hold: Callable[[], threading.Event]
-) -> None:
+async def test_nothing_is_told_to_wait_once_it_has_ended(shared_store: Path, hold: Hold) -> None:
     """After a batch, and after work that was given up, the gauge is back at 0."""
     async with serve(shared_store) as client:
 
@@ -130,7 +117,7 @@ async def test_nothing_is_told_to_wait_once_it_has_ended(
 
         await client.post("/missing/batch", json={"scenes": [SCENE] * 5})
         assert await pending() == {0.0}
-        hold()
+        hold("generate")
         drawing = asyncio.ensure_future(
             client.post("/generate", json=SCENE, headers={"X-Request-Timeout-Ms": "400"})
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import pytest
 from tests.chaos.wire import BODY, Answer, Wire, exchange
 from tests.http.stores import make_store
 from tests.http.test_problems import problem
-from tests.services import LiveService, launch, wait_until
+from tests.services import LiveService, launch, live_service, wait_until
 
 pytestmark = pytest.mark.system
 
@@ -25,12 +24,7 @@ HEAD = (
 LIVE = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    """A service of little patience."""
-    folder = tmp_path_factory.mktemp("connections")
-    with launch(make_store(folder / "store"), folder / "log", SCENE_CLIENT_TIMEOUT="1") as service:
-        yield service
+service = live_service(SCENE_CLIENT_TIMEOUT="1", logs_errors=True)
 
 
 def connect(service: LiveService) -> socket.socket:

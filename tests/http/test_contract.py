@@ -9,8 +9,7 @@ import requests
 import schemathesis
 
 from tests.http.contract import call, documented
-from tests.http.stores import make_store
-from tests.services import CHAOS, LiveService, launch
+from tests.services import CHAOS, LiveService, live_service
 
 pytestmark = pytest.mark.system
 
@@ -21,14 +20,8 @@ if CHAOS:
     api = documented(examples=60)
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    """A service of its own: the administration's routes change its store."""
-    folder = tmp_path_factory.mktemp("contract")
-    with launch(make_store(folder / "store"), folder / "log") as service:
-        yield service
-        service.control()
-        assert "Traceback" not in service.log.read_text()
+# A service of its own: the administration's routes change its store.
+service = live_service()
 
 
 @pytest.fixture(scope="module")

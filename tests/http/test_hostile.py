@@ -5,15 +5,12 @@ Then the service must not grow by the 20,000 requests of the last round.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
 from tests.chaos import corpus
 from tests.chaos.attack import attack, faults_of_answer
 from tests.chaos.wire import exchange, framing, wires
-from tests.http.stores import make_store
-from tests.services import CHAOS, LiveService, launch
+from tests.services import CHAOS, LiveService, live_service
 
 pytestmark = pytest.mark.system
 
@@ -23,16 +20,12 @@ MAX_GROWTH = 8 * 2**20
 """Bytes that the last round may add to what the largest requests left with the allocator."""
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    folder = tmp_path_factory.mktemp("hostile")
-    with launch(make_store(folder / "store"), folder / "log", SCENE_CLIENT_TIMEOUT="5") as service:
-        yield service
+service = live_service(SCENE_CLIENT_TIMEOUT="5")
 
 
 def test_requests_of_the_corpus_are_refused_in_order(service: LiveService) -> None:
     before = service.control()
-    requests = list(corpus.everything())[::EVERY]
+    requests = list(corpus.requests())[::EVERY]
     # The first round takes some eighty megabytes, the later ones next to nothing.
     for _ in range(2 if CHAOS else 0):
         attack(service.port, requests)
@@ -44,9 +37,7 @@ def test_requests_of_the_corpus_are_refused_in_order(service: LiveService) -> No
     assert service.control() == before
     assert not CHAOS or service.memory - resident < MAX_GROWTH
     assert service.descriptors <= files + 8
-    log = service.log.read_text()
-    assert "Traceback" not in log
-    assert corpus.MARKER.split()[0] not in log
+    assert corpus.MARKER.split()[0] not in service.log.read_text()
 
 
 def test_bodies_are_read_without_a_proxy_too(service: LiveService) -> None:
@@ -68,7 +59,6 @@ def test_requests_below_http_break_nothing(service: LiveService) -> None:
         answers, _ = exchange(service.port, wire, patience=6)
         assert all(answer.status < 500 for answer in answers), wire.name
     assert service.control() == before
-    assert "Traceback" not in service.log.read_text()
     assert '"smuggled"' not in service.log.read_text()
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.http.test_documentation import operations
 from tests.http.test_problems import problem
-from tests.services import ADMIN_KEY, serve
+from tests.services import ADMIN_KEY, client_of_service, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -32,11 +32,8 @@ PAGES = [
 SCENE = {"objects": ["bed", "lamp"]}
 
 
-@pytest.fixture(scope="module")
-async def guarded(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
-    """A client, without a key, of a service that asks for one."""
-    async with serve(shared_store, api_key=API_KEY) as client:
-        yield client
+# A service that needs a key; the client sends none.
+guarded = client_of_service(api_key=API_KEY)
 
 
 @pytest.fixture(scope="module")

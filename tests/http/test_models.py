@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import errno
 import gc
 import json
@@ -22,7 +21,7 @@ from app.registry import Store, StoreError
 from app.scene.relations import CANONICAL
 from tests.http.stores import VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import ADMIN_KEY, Replace, defect, serve
+from tests.services import ADMIN_KEY, Hold, Replace, defect, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -61,8 +60,8 @@ async def test_a_version_tells_everything(client: httpx.AsyncClient) -> None:
     assert version["status"] == "ready"
     assert version["aliases"] == ["default"]
     assert version["metrics"][0] | {"low": 0.4, "high": 0.6} == version["metrics"][0]
-    assert version["data"][0]["source"] == "made up"
-    assert version["terms"] == "public domain"
+    assert version["data"][0]["source"] == "generated"
+    assert version["terms"] == "Apache-2.0"
     assert version["card"].startswith("#")
     assert version["parameters"] > 0
     answer = await client.post("/relations", json={"objects": ["bed"], "model": "home@1.0.0"})
@@ -162,38 +161,30 @@ async def test_a_broken_new_version_changes_nothing(store: Path, admin: dict[str
         assert (await client.get("/health/ready")).status_code == 200
 
 
+@pytest.mark.parametrize("log_odds", [None, math.inf], ids=["raises", "not finite"])
 async def test_a_version_that_cannot_answer_is_refused(
-    store: Path, admin: dict[str, str], replace: Replace
+    store: Path,
+    admin: dict[str, str],
+    replace: Replace,
+    caplog: pytest.LogCaptureFixture,
+    log_odds: float | None,
 ) -> None:
-    def fails(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
-        if artifact.manifest.version == "2.0.0":
-            defect()
-        return outliers(artifact, scene, **parameters)
+    def fails(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
+        entries = missing(artifact, *args, **parameters)
+        if artifact.manifest.version != "2.0.0":
+            return entries
+        return [entry._replace(log_odds=log_odds) for entry in entries] if log_odds else defect()
 
-    replace("outliers", fails)
+    replace("missing", fails)
     async with serve(store) as client:
         publish(store, "home", "2.0.0", seed=2, alias="default")
         response = await client.post("/models/refresh", headers=admin)
         document = problem(response, 409, "refresh-refused")
         reasons = {failure["subject"]: failure["reason"] for failure in document["failures"]}
         assert reasons == {"home@2.0.0": "warm_up_failed", "default": "warm_up_failed"}
+        assert ("not finite" in caplog.text) == (log_odds is not None)
         assert "secret" not in response.text
         assert await default(client) == "home@1.0.0"
-
-
-async def test_a_model_whose_answers_are_not_finite_is_refused(
-    store: Path, admin: dict[str, str], replace: Replace
-) -> None:
-    def not_finite(missing: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
-        found = missing(artifact, scene, **parameters)
-        if artifact.manifest.version != "2.0.0":
-            return found
-        return tuple(dataclasses.replace(entry, log_odds=math.inf) for entry in found)
-
-    replace("missing", not_finite)
-    async with serve(store) as client:
-        publish(store, "home", "2.0.0", seed=2)
-        problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
 
 
 async def test_requests_are_answered_while_the_store_is_read(
@@ -221,25 +212,17 @@ async def test_requests_are_answered_while_the_store_is_read(
 
 
 async def test_a_request_keeps_the_models_it_started_with(
-    store: Path, admin: dict[str, str], replace: Replace
+    store: Path, admin: dict[str, str], hold: Hold
 ) -> None:
-    started, go_on = threading.Event(), threading.Event()
-
-    def slow(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-        if artifact.manifest.version == "1.0.0":
-            started.set()
-            assert go_on.wait(30)
-        return missing(artifact, *args, **parameters)
-
     async with serve(store) as client:
-        replace("missing", slow)
+        held = hold("missing", lambda manifest: manifest.version == "1.0.0")
         batch = {"scenes": [{"objects": ["bed"]}] * 3}
         asking = asyncio.create_task(client.post("/missing/batch", json=batch))
-        assert await asyncio.to_thread(started.wait, 30)
+        assert await asyncio.to_thread(held.started.wait, 30)
         publish(store, "home", "2.0.0", seed=2, alias="default")
         assert (await client.post("/models/refresh", headers=admin)).status_code == 200
         assert await default(client) == "home@2.0.0"
-        go_on.set()
+        held.release.set()
         results = (await asking).json()["results"]
         assert [entry["result"]["model"]["version"] for entry in results] == ["1.0.0"] * 3
 

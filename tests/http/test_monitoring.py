@@ -6,7 +6,6 @@ import asyncio
 import json
 import re
 import shutil
-import threading
 import time
 import uuid
 from pathlib import Path
@@ -19,7 +18,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.conftest import REPOSITORY
 from tests.http.stores import corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import LiveService, Replace, defect, serve
+from tests.services import Hold, LiveService, Replace, defect, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -212,16 +211,8 @@ async def test_models_are_told_with_every_alias(store: Path, admin: dict[str, st
 
 
 async def test_series_of_a_removed_model_go_away_and_stay_away(
-    store: Path, admin: dict[str, str], replace: Replace
+    store: Path, admin: dict[str, str], hold: Hold
 ) -> None:
-    started, go_on = threading.Event(), threading.Event()
-
-    def slow(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-        if artifact.manifest.name == "plain":
-            started.set()
-            assert go_on.wait(30)
-        return missing(artifact, *args, **parameters)
-
     async with serve(store) as client:
 
         async def names(of: str) -> set[str]:
@@ -236,14 +227,14 @@ async def test_series_of_a_removed_model_go_away_and_stay_away(
         assert {"scene_pending_rows", "scene_batch_rows_sum", "scene_model_info"} <= everything
         assert await names("plain") == everything
         # A request that still holds the old snapshot reports late.
-        replace("missing", slow)
+        held = hold("missing", lambda manifest: manifest.name == "plain")
         late = asyncio.ensure_future(ask("plain", 9))  # unmeasured, so on a thread
-        assert await asyncio.to_thread(started.wait, 30)
+        assert await asyncio.to_thread(held.started.wait, 30)
         shutil.rmtree(store / "plain")
         await client.post("/models/refresh", headers=admin)
         assert await names("plain") == set()
         assert await names("home") == everything
-        go_on.set()
+        held.release.set()
         assert await late == 200
         assert await names("plain") == set()
         publish(store, "plain", "1.0.0", variant="rbm")

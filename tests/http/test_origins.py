@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import httpx
 import pytest
 
 from tests.http.test_problems import problem
-from tests.services import Replace, defect, serve
+from tests.services import Replace, client_of_service, defect, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -18,11 +17,7 @@ API_KEY = "incorrect-zebra-capacitor-nail"
 SCENE = {"objects": ["bed", "lamp"]}
 
 
-@pytest.fixture(scope="module")
-async def shared(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
-    """A client of a service that two origins may ask."""
-    async with serve(shared_store, cors_origins=[LISTED, SECOND], max_body_bytes=2048) as client:
-        yield client
+shared = client_of_service(cors_origins=[LISTED, SECOND], max_body_bytes=2048)
 
 
 async def preflight(

@@ -300,7 +300,10 @@ LENGTHS = st.floats(1e-300, 1e4, allow_nan=False)
                 "label": st.sampled_from(["bed", "lamp", "chair", "book"]),
                 "position": st.builds(at, COORDINATES, COORDINATES, COORDINATES),
             },
-            optional={"size": st.builds(at, LENGTHS, LENGTHS, LENGTHS)},
+            optional={
+                "size": st.builds(at, LENGTHS, LENGTHS, LENGTHS),
+                "confidence": st.floats(0, 1, exclude_min=True),
+            },
         ),
         min_size=1,
         max_size=6,

@@ -8,7 +8,6 @@ Run as a module. It reads one JSON request a line from standard input and answer
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import sys
@@ -22,14 +21,6 @@ from tests.registry.small_artifacts import description, state
 
 WEIGHTS = state()
 KILLED = 9
-
-
-def publish_for_ever(root: str) -> None:
-    """Publish version after version, moving the alias each time."""
-    store = Store(root)
-    first = int(store.versions("tiny")[-1].split(".")[0]) + 1
-    for major in itertools.count(first):
-        store.publish(description(version=f"{major}.0.0"), WEIGHTS, alias="default")
 
 
 def publish_until(root: str, steps: int) -> None:
@@ -74,7 +65,7 @@ def race(root: str, results: str, versions: int) -> None:
     Path(results).write_text(json.dumps(won))
 
 
-TASKS = {"publish_for_ever": publish_for_ever, "publish_until": publish_until, "race": race}
+TASKS = {"publish_until": publish_until, "race": race}
 
 
 def _fork(request: dict[str, Any]) -> int:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import random
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -21,9 +18,6 @@ from tests.registry.publishers import KILLED
 from tests.registry.small_artifacts import description, state
 
 pytestmark = pytest.mark.system
-
-KILLS = 10
-PUBLICATIONS = 3  # a kill waits for 0 to 3 of them, and for a part of one more
 
 
 class Publishers:
@@ -91,43 +85,6 @@ def check_next_publication(root: Path) -> None:
     store.publish(description(version=version), state(), alias="default")
     assert not leftovers(root)
     assert load_model_set(store).resolve("default").manifest.version == version
-
-
-def seconds_per_publication(root: Path) -> float:
-    """How long one takes on this machine and disk."""
-    store = Store(root)
-    start = time.monotonic()
-    for major in range(5):
-        store.publish(description(version=f"{major}.0.0"), state(), alias="default")
-    return (time.monotonic() - start) / 5
-
-
-def wait_for(root: Path, publications: int) -> None:
-    """Wait until the store has so many more versions than its first one."""
-    deadline = time.monotonic() + 60
-    while sum(1 for _ in root.glob("tiny/*.0.0")) <= publications:
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-
-
-def test_kill_at_random_moments(publishers: Publishers, published: Path, tmp_path: Path) -> None:
-    generator = random.Random(0)
-    span = seconds_per_publication(tmp_path / "timed")
-    interrupted = completed = 0
-    for number in range(KILLS):
-        root = tmp_path / str(number)
-        shutil.copytree(published, root)
-        child = publishers.start("publish_for_ever", root=str(root))
-        wait_for(root, number % (PUBLICATIONS + 1))
-        time.sleep(span * generator.random())
-        os.kill(child, signal.SIGKILL)
-        assert publishers.wait(child) == {"code": None, "signal": signal.SIGKILL}
-        interrupted += bool(leftovers(root))
-        completed += len(check_survivor(root).versions["tiny"]) - 1
-        check_next_publication(root)
-    # The kills must have met publications, some half done and some done, or nothing was shown.
-    assert interrupted >= KILLS // 10
-    assert completed >= KILLS // 10
 
 
 def test_die_before_every_single_step(

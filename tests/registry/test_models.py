@@ -85,9 +85,16 @@ def test_whatever_stands_in_a_versions_place_is_reported(store: Store) -> None:
     (store.root / "tiny" / "3.0.0").mkdir()
     (store.root / "tiny" / "3.0.0" / "manifest.json").mkdir()
     (store.root / "tiny" / "4.0.0").write_text("not a directory")
-    shutil.copytree(store.root / "other" / "1.0.0", store.root / "tiny" / "5.0.0")
-    codes = {version: f.code for (_, version), f in load_model_set(store).failures.items()}
-    assert codes == {"3.0.0": "unreadable", "4.0.0": "unreadable", "5.0.0": "wrong_place"}
+    (store.root / "tiny" / "5.0.0").symlink_to(store.root / "tiny" / "1.0.0")
+    # Copies with another version or another name than their manifest.
+    shutil.copytree(store.root / "tiny" / "1.0.0", store.root / "tiny" / "6.0.0")
+    shutil.copytree(store.root / "tiny" / "1.0.0", store.root / "copy" / "1.0.0")
+    failures = {f"{name}@{version}": f.code
+                for (name, version), f in load_model_set(store).failures.items()}  # fmt: skip
+    assert failures == {
+        **{f"tiny@{major}.0.0": "unreadable" for major in (3, 4, 5)},
+        **dict.fromkeys(("tiny@6.0.0", "copy@1.0.0"), "wrong_place"),
+    }
 
 
 def test_reuses_what_did_not_change(store: Store) -> None:

@@ -6,15 +6,13 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from app.registry import AliasTarget, Store
-from benchmarks.load.connections import prepared
 from scene_client import Client
 from tests.chaos.load import ConstantLoad
-from tests.chaos.test_swaps import SCENES, offline
+from tests.chaos.test_swaps import REQUESTS, Judge
 from tests.http.stores import make_store
 from tests.services import LiveService, is_ready, launch, wait_until
 from tests.system.conftest import StartProxy
@@ -87,19 +85,8 @@ def port(fleet: Fleet, haproxy: StartProxy, configuration: Path) -> Iterator[int
 @pytest.fixture
 def load(fleet: Fleet, port: int) -> ConstantLoad:
     """Requests whose answers must be exactly those of the version that they name."""
-    known = {}
-    for version in ("1.0.0", "1.1.0"):
-        artifact = fleet.store.load("home", version)
-        known[artifact.digest] = offline(artifact)
-
-    def judge(number: int, status: int, answer: Any) -> str | None:
-        if status != 200:
-            return f"status {status}: {answer}"
-        given = [(m["label"], m["probability"], m["log_odds"]) for m in answer["missing"]]
-        return None if given == known[answer["model"]["digest"]][number] else f"mixed: {answer}"
-
-    requests = [prepared("/missing", body) for body in SCENES]
-    return ConstantLoad(port, requests, judge, connections=4)
+    judge = Judge(fleet.store, ("1.0.0", "1.1.0"))
+    return ConstantLoad(port, REQUESTS, judge, connections=4)
 
 
 def test_promotions_under_load_lose_and_mix_nothing(fleet: Fleet, load: ConstantLoad) -> None:

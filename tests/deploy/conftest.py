@@ -1,0 +1,30 @@
+"""The recorded detections: as JSON, as a ROS message, and as the fields of a scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scene_client.vision_msgs import SceneFields, from_message
+from tests.deploy.ros import from_json
+
+
+@pytest.fixture
+def envelope(repository: Path) -> Any:
+    """The message as rosbridge sends it."""
+    return json.loads((repository / "clients/ros2/detections.json").read_text())
+
+
+@pytest.fixture
+def recorded(envelope: Any) -> Any:
+    """The message as a node receives it."""
+    return from_json("vision_msgs/msg/Detection3DArray", envelope["msg"])
+
+
+@pytest.fixture
+def scene(envelope: Any) -> SceneFields:
+    """The scene of the message."""
+    return from_message(envelope)
