@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.questions import generate, missing, outliers, relations
 from app.registry import Store
 from app.registry.references import AliasTarget
 from app.scene import Scene, SceneObject
+from tests.questions.answers import generate, missing, outliers, relations
 from tests.registry.small_artifacts import description, state
 from tests.training.commands import invoke, small_config, write_config
 from training.fit.checkpoint import RunError

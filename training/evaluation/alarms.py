@@ -88,7 +88,7 @@ def untouched_alarms(
 
 
 def _raises(artifact: Artifact, scene: Scene, complete: bool, sensitivity: Sensitivity) -> bool:
-    found = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
-    return any(one.is_misplaced for one in found.misplaced) or (
-        complete and any(one.is_outlier for one in found.outliers)
+    answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
+    return any(entry["is_misplaced"] for entry in answer["misplaced"]) or (
+        complete and any(entry["is_outlier"] for entry in answer["outliers"])
     )

@@ -7,9 +7,9 @@ memorised scenes. Splits by group keep near-duplicates of test scenes out of tra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from app import questions
 from app.questions import Sensitivity
 from app.registry import Artifact
-from app.scene import CANONICAL, Scene, SceneObject
+from app.scene import CANONICAL, Scene, SceneObject, canonicalise
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats
 from training.datasets.cases import scene_of
@@ -103,6 +103,20 @@ def things(scene: Scene, structure: Flags) -> Flags:
     return found
 
 
+def index_of_ids(scene: Scene) -> dict[str, int]:
+    """Return the index of each object of a scene by its id."""
+    return {thing.id: index for index, thing in enumerate(scene.objects)}
+
+
+def canonical_triple(scene: Scene, entry: Mapping[str, Any]) -> tuple[int, int, int]:
+    """Return (canonical relation, subject, object) of a relation in an answer about a scene."""
+    index = index_of_ids(scene)
+    relation, subject, other = canonicalise(
+        index[entry["subject"]], entry["relation"], index[entry["object"]]
+    )
+    return relation, subject, other
+
+
 def missing_probabilities(
     artifact: Artifact,
     scene: Scene,
@@ -120,10 +134,11 @@ def missing_probabilities(
     """
     vocabulary = artifact.vocabulary
     found = np.full(len(vocabulary), -np.inf)
-    for answer in questions.missing(
+    answer = questions.missing(
         artifact, scene, top_k=len(vocabulary), coverage=coverage, at=at, details=False
-    ):
-        found[vocabulary.index(answer.label)] = answer.probability
+    )
+    for entry in answer["missing"]:
+        found[vocabulary.index(entry["label"])] = entry["probability"]
     return found
 
 
@@ -134,9 +149,11 @@ def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium")
     the rest of the scene, and 1 if the service reports the object as an outlier.
     """
     columns = np.zeros((len(scene.objects), 3))
-    found = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False).outliers
-    for answer in found:
-        columns[answer.object] = answer.probability, answer.log_odds, answer.is_outlier
+    answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
+    index = index_of_ids(scene)
+    for entry in answer["outliers"]:
+        values = entry["probability"], entry["log_odds"], entry["is_outlier"]
+        columns[index[entry["object"]]] = values
     return columns
 
 
@@ -153,6 +170,7 @@ def relation_probabilities(
     n = len(scene.objects)
     found = np.zeros((len(CANONICAL), n, n))
     most = max(1, len(CANONICAL) * n * n)
-    for answer in questions.relations(artifact, scene, top_k=most, pairs=pairs)[0]:
-        found[CANONICAL.index(answer.relation), answer.subject, answer.object] = answer.probability
+    answer = questions.relations(artifact, scene, top_k=most, pairs=pairs)
+    for entry in answer["relations"]:
+        found[canonical_triple(scene, entry)] = entry["probability"]
     return found

@@ -41,7 +41,12 @@ from training.datasets.cases import (
     taken_away,
     told_pairs,
 )
-from training.evaluation.asking import labels_alone, with_intruder
+from training.evaluation.asking import (
+    canonical_triple,
+    index_of_ids,
+    labels_alone,
+    with_intruder,
+)
 from training.evaluation.intruders import kinds_of_intruders
 from training.evaluation.metrics import Items, Metric
 from training.evaluation.missing_tasks import SHARES, shown_classes
@@ -113,10 +118,10 @@ def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Fla
     The shape of ``judged`` is (relations, objects, objects).
     """
     found: Answered = []
-    for answer in relations(artifact, scene)[0]:
-        triple = CANONICAL.index(answer.relation), answer.subject, answer.object
+    for entry in relations(artifact, scene)["relations"]:
+        triple = canonical_triple(scene, entry)
         if judged[triple]:
-            found.append((answer.probability, bool(encoded.instance_holds[triple])))
+            found.append((entry["probability"], bool(encoded.instance_holds[triple])))
     return found
 
 
@@ -137,11 +142,13 @@ def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answe
     gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
     known = known_relations(encoded)
     found: Answered = []
-    for answer in missing(artifact, labels_alone(encoded, kept), candidates=[target]):
-        for place in answer.placements:
-            triple = canonicalise(gone, place.relation, kept[place.object])
+    scene = labels_alone(encoded, kept)
+    index = index_of_ids(scene)
+    for entry in missing(artifact, scene, candidates=[target])["missing"]:
+        for place in entry["placements"]:
+            triple = canonicalise(gone, place["relation"], kept[index[place["object"]]])
             if known[triple]:
-                found.append((place.probability, bool(encoded.instance_holds[triple])))
+                found.append((place["probability"], bool(encoded.instance_holds[triple])))
     return found
 
 
@@ -152,8 +159,8 @@ def ask_missing(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered
         return None
     labels = {artifact.vocabulary.labels[index] for index in hidden}
     kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden)).tolist()
-    found = missing(artifact, labels_alone(encoded, kept), details=False)
-    return [(answer.probability, answer.label in labels) for answer in found]
+    entries = missing(artifact, labels_alone(encoded, kept), details=False)["missing"]
+    return [(entry["probability"], entry["label"] in labels) for entry in entries]
 
 
 def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
@@ -174,8 +181,9 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered 
     there = set(labels[encoded.instance_holds[relation, :, anchor] & is_hidden])
     unknown = set(labels[~known_relations(encoded)[relation, :, anchor] & is_hidden]) - there
     at = CANONICAL[relation], kept.index(anchor)
-    found = missing(artifact, labels_alone(encoded, kept), at=at, details=False)
-    return [(a.probability, a.label in there) for a in found if a.label not in unknown]
+    entries = missing(artifact, labels_alone(encoded, kept), at=at, details=False)["missing"]
+    judged = [entry for entry in entries if entry["label"] not in unknown]
+    return [(entry["probability"], entry["label"] in there) for entry in judged]
 
 
 def _hidden(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Ints | None:
@@ -215,9 +223,13 @@ def ask_outliers(
     if rng.random() < 0.5:
         intruder = len(scene.objects)
         scene = with_intruder(artifact, scene, int(rng.choice(choice)))
-    found = outliers(artifact, scene, details=False).outliers
+    index = index_of_ids(scene)
     usable = [not structure[thing.class_index] for thing in scene.objects]
-    return [(a.probability, a.object == intruder) for a in found if usable[a.object]] or None
+    return [
+        (entry["probability"], index[entry["object"]] == intruder)
+        for entry in outliers(artifact, scene, details=False)["outliers"]
+        if usable[index[entry["object"]]]
+    ] or None
 
 
 def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
@@ -226,9 +238,9 @@ def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answer
     if case is None:
         return None
     scene, false = case
-    found = misplaced(artifact, replace(scene, room_type=None))
     return [
-        (a.probability, (CANONICAL.index(a.relation), a.subject, a.object) == false) for a in found
+        (entry["probability"], canonical_triple(scene, entry) == false)
+        for entry in misplaced(artifact, replace(scene, room_type=None))
     ] or None
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.questions.posterior import posterior
+from app.questions.posterior import posterior_of
 from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES, Scene
 from training.datasets.batches import Batch, SceneTensors
@@ -89,7 +89,7 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
                 for a, x, y in sorted(told)
             ]
             scene = Scene(scene.objects, tuple(triples) or None)
-            values = posterior(artifact, scene).relation_log_odds()
+            values = posterior_of(artifact, scene).relation_log_odds()
             found[row, : len(values), :n, :n] = torch.from_numpy(values)
         return found
 

@@ -21,8 +21,7 @@ from typing import Final
 
 import numpy as np
 
-from app import questions
-from app.questions.counts import LIKELY
+from app.questions.counts import LIKELY, more
 from app.registry import Artifact
 from app.registry.counts import Counts
 from training.datasets import EncodedScene
@@ -97,8 +96,8 @@ def _asked(
     labels = artifact.vocabulary.labels
     pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
     known = {labels[index]: (index, number) for index, number in pairs}
-    found = questions.more(artifact, listed, top_k=len(wanted), candidates=wanted)
-    return [(*known[answer.label], *answer[1:]) for answer in found]
+    entries = more(artifact, listed, top_k=len(wanted), candidates=wanted)
+    return [(*known[entry.pop("label")], *entry.values()) for entry in entries]
 
 
 def _means(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from app import questions
+from app.questions.answer import Fields
 from app.registry import Artifact
 from app.scene import Scene, SceneObject, opposite
 from training.datasets.files import DATA
@@ -136,37 +137,35 @@ def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
 def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
     """Return the probability of each of the eight relations of the subject to the other object."""
     scene = _scene(artifact, [subject, other])
-    names = [thing.id for thing in scene.objects]
-    if not names:
-        return {}
-    found, _ = questions.relations(artifact, scene, top_k=_RELATIONS, include_opposites=True)
+    answer = questions.relations(artifact, scene, top_k=_RELATIONS, include_opposites=True)
     p: dict[str, float] = {}
-    for answer in found:
-        mine = names[answer.subject] == subject
-        name = answer.relation if mine else opposite(answer.relation)
-        p[name] = max(p.get(name, 0.0), answer.probability)
+    for entry in answer["relations"]:
+        name = entry["relation"]
+        name = name if entry["subject"] == subject else opposite(name)
+        p[name] = max(p.get(name, 0.0), entry["probability"])
     return p
 
 
 def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Lines:
     hits = []
     for fact in facts:
-        found = {answer.label for answer in _five(artifact, fact)}
+        found = {entry["label"] for entry in _five(artifact, fact)}
         hits.append((int(bool(found & set(fact["expected"]))), 1))
     return {f"{name}: an expected object is among five": hits}
 
 
-def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[questions.MissingAnswer, ...]:
-    """Return the first five answers, or an empty tuple if the service would reject the request."""
+def _five(artifact: Artifact, fact: dict[str, Any]) -> list[Fields]:
+    """Return the first five answers, or an empty list if the service would reject the request."""
     scene = _scene(artifact, fact["objects"])
     at = None
     if "at" in fact:
         if (anchor := _place(artifact, scene, fact["at"]["object"])) is None:
-            return ()
+            return []
         at = fact["at"]["relation"], anchor
     if not scene.objects:
-        return ()
-    return questions.missing(artifact, scene, top_k=_LISTED, at=at)
+        return []
+    entries: list[Fields] = questions.missing(artifact, scene, top_k=_LISTED, at=at)["missing"]
+    return entries
 
 
 def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
@@ -183,18 +182,18 @@ def _outliers(
     first, caught, alarms = [], [], []
     for fact in intruders:
         found = _judged(artifact, [*fact["objects"], fact["intruder"]])
-        first.append((int(bool(found) and found[0].label == fact["intruder"]), 1))
-        flagged = any(a.label == fact["intruder"] and a.is_outlier for a in found)
+        first.append((int(bool(found) and found[0]["label"] == fact["intruder"]), 1))
+        flagged = any(a["label"] == fact["intruder"] and a["is_outlier"] for a in found)
         caught.append((int(flagged), 1))
     for fact in plain:
-        loud = any(answer.is_outlier for answer in _judged(artifact, fact["objects"]))
+        loud = any(entry["is_outlier"] for entry in _judged(artifact, fact["objects"]))
         alarms.append((int(loud), 1))
     return dict(zip(LINES[5:8], (first, caught, alarms), strict=True))
 
 
-def _judged(artifact: Artifact, labels: Sequence[str]) -> tuple[questions.OutlierAnswer, ...]:
-    scene = _scene(artifact, labels)
-    return questions.outliers(artifact, scene).outliers
+def _judged(artifact: Artifact, labels: Sequence[str]) -> list[Fields]:
+    entries: list[Fields] = questions.outliers(artifact, _scene(artifact, labels))["outliers"]
+    return entries
 
 
 def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -> Lines:
@@ -213,5 +212,5 @@ def _drawn(
         index = artifact.vocabulary.room_index(room["room"])
         given = replace(Scene(()), room_type=index)
         for seed in seeds:
-            found = questions.generate(artifact, given, count=_DRAWN, seed=seed)
-            yield room, [set(scene.objects) for scene in found]
+            answer = questions.generate(artifact, given, count=_DRAWN, seed=seed)
+            yield room, [set(scene["objects"]) for scene in answer["scenes"]]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from app.questions import Sensitivity
+from app.questions.calibration import calibrated
 from app.registry import Artifact, Calibration
 from app.scene import Scene
 from training.datasets import EncodedScene
@@ -66,7 +67,7 @@ def calibrated_alarm(calibration: Calibration) -> Alarm | None:
     def suspicion(scores: IntruderScores) -> Floats:
         if len(popularity):
             scores = scores.with_prior(calibration.popularity_weight * popularity)
-        return np.asarray(1 / (1 + np.exp(-entry.log_odds(scores.log_odds, scores.size))))
+        return np.asarray(1 / (1 + np.exp(-calibrated(entry, scores.log_odds, scores.size))))
 
     short = tuple(limits.medium for limits in calibration.short_list_thresholds)
     return Alarm(suspicion, presets.medium, short)

@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from app.questions.missing import PLACES
 from app.questions.outliers import stated_log_odds
-from app.questions.posterior import posterior
+from app.questions.placements import PLACES
+from app.questions.posterior import posterior_of
 from app.registry import Artifact, Calibration, PairSlope, Slope
 from app.scene import Scene
 from training.datasets import EncodedScene
@@ -151,7 +151,7 @@ def _asked_pairs(
             if not told:
                 continue
         scene = replace(scene_of(encoded, range(len(asked)), told), room_type=None)
-        values = posterior(artifact, scene).relation_log_odds()
+        values = posterior_of(artifact, scene).relation_log_odds()
         structure = artifact.vocabulary.structure
         source = sources.index(encoded.source)
         blocks.append(_instance_pairs(number, source, encoded, values, structure, asked))
@@ -179,7 +179,7 @@ def fit_placements(
             continue
         target, kept = taken
         gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
-        given = posterior(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
+        given = posterior_of(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
         present = given.present
         anchors = np.flatnonzero(~structure[present.classes])
         both = given.placement_log_odds(np.array([target]), anchors)
@@ -414,5 +414,5 @@ def fit_misplaced(
 
 def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
     """Return the log-odds of each stated relation given the rest of the scene."""
-    triples, log_odds = stated_log_odds(artifact, posterior(artifact, scene), scene)
+    triples, log_odds = stated_log_odds(artifact, posterior_of(artifact, scene), scene)
     return dict(zip(map(tuple, triples.T.tolist()), log_odds.tolist(), strict=True))

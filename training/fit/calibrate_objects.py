@@ -27,8 +27,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from app.questions.calibration import calibrated
 from app.questions.generate import room_fit
-from app.questions.posterior import posterior
+from app.questions.posterior import posterior_of
 from app.registry import NEVER, Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
 from app.scene import Scene
 from training.datasets.array_types import Flags, Floats, Rng
@@ -274,7 +275,7 @@ def _shown(
         for k, v, hidden in zip(cases.scene, cases.v.numpy(), cases.hidden.numpy(), strict=True):
             classes = np.flatnonzero(v)
             absent = np.flatnonzero((v == 0) & ~structure.numpy())
-            given = posterior(whole, of_classes(classes.tolist()))
+            given = posterior_of(whole, of_classes(classes.tolist()))
             partial = {}
             if whole.completions is not None:
                 partial = {
@@ -422,7 +423,7 @@ def limit_of(untouched: Scored, entry: CountSlope, rng: Rng, share: float) -> fl
     """
     logits = [
         alarm_threshold(
-            entry.log_odds(scores.log_odds, scores.size).astype(np.float64),
+            calibrated(entry, scores.log_odds, scores.size).astype(np.float64),
             *(scores, scenes, rng, share),
         )
         for scores, scenes in untouched
@@ -504,7 +505,7 @@ def least_of_the_best(scores: dict[float, float]) -> float:
 
 
 def _rank(artifact: Artifact, scene: Scene, target: int, structure: Flags) -> int:
-    given = posterior(artifact, scene)
+    given = posterior_of(artifact, scene)
     absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
     z = given.absent_posterior(absent, artifact.calibration.coverage)
     return 1 + int((z > z[absent == target]).sum())

@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from app.questions import missing, relations
 from app.registry import CountSlope
+from tests.questions.answers import missing, relations
 from tests.questions.artifacts import LARGER, artifact_of, calibration
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from app.questions import relations
 from app.registry import Store, load_model_set
 from app.scene import Scene, SceneObject, opposite
+from tests.questions.answers import relations
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from training.evaluation import everyday_task as everyday
 from training.evaluation.everyday_task import (

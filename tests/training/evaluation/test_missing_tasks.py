@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from app.questions import missing as ask_missing
 from app.registry import CountSlope, PairSlope
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
+from tests.questions.answers import missing as ask_missing
 from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import (
