@@ -172,7 +172,8 @@ def places(value: Any, at: Place = ()) -> Iterator[Place]:
 
 def replaced(value: Any, place: Place, text: bytes) -> bytes:
     """A JSON value as text, with other text at one place."""
-    whole, path = {"": copy.deepcopy(value)}, ("", *place)
+    whole: Any = {"": copy.deepcopy(value)}
+    path = ("", *place)
     reduce(getitem, path[:-1], whole)[path[-1]] = _SENTINEL
     return json.dumps(whole[""]).encode().replace(f'"{_SENTINEL}"'.encode(), text)
 
