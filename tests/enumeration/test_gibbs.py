@@ -149,7 +149,7 @@ def test_a_fully_related_object_can_leave_the_chain():
 
 
 def test_tempering_scales_the_energy_in_the_seed_form():
-    machine = small_machine("triway-seed-two-layers")
+    machine = small_machine("triway")
     joint = enumerate_joint(machine)
     cold = machine.scaled(0.5)
     energy = cold.energy(joint.v, joint.r, joint.h1, joint.h2, joint.edges)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from app.questions.calibration import calibrated
 from app.questions.posterior import posterior_of
 from app.registry import Calibration, CountSlope
 from tests.questions.answers import outliers
@@ -217,7 +218,7 @@ def test_thresholds_keep_their_share_of_untouched_scenes(model, fitted):
     scenes = complete_scenes(rooms(300, 1))
     scores = intruder_scores(scenes, STRUCTURE, MachineScore(machine_of(model.weights)))
     own = scores.with_prior(fitted.popularity_weight * np.array(fitted.popularity))
-    p = 1 / (1 + np.exp(-fitted.outlier.log_odds(own.log_odds, own.size)))
+    p = 1 / (1 + np.exp(-calibrated(fitted.outlier, own.log_odds, own.size)))
     for name, share in ALARMS.items():
         found = own.false_alarms(p >= getattr(fitted.outlier_thresholds, name)).value
         assert 0 < found <= share + 0.01
