@@ -70,7 +70,8 @@ class AsyncClient:
         **fields: Unpack[schemas.RelationsFields],
     ) -> schemas.RelationsAnswer:
         """Return the likely spatial relations between the objects."""
-        call = calls.ask(calls.RELATIONS, objects, fields, self.options.model)
+        forms = schemas.RelationsRequest, schemas.RelationsAnswer
+        call = calls.ask("/relations", *forms, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def missing(
@@ -81,7 +82,8 @@ class AsyncClient:
         **fields: Unpack[schemas.MissingFields],
     ) -> schemas.MissingAnswer:
         """Return classes that are probably missing from the scene, and their likely places."""
-        call = calls.ask(calls.MISSING, objects, fields, self.options.model)
+        forms = schemas.MissingRequest, schemas.MissingAnswer
+        call = calls.ask("/missing", *forms, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def outliers(
@@ -92,7 +94,8 @@ class AsyncClient:
         **fields: Unpack[schemas.OutliersFields],
     ) -> schemas.OutliersAnswer:
         """Return how well each object fits the scene, and the relations that are probably false."""
-        call = calls.ask(calls.OUTLIERS, objects, fields, self.options.model)
+        forms = schemas.OutliersRequest, schemas.OutliersAnswer
+        call = calls.ask("/outliers", *forms, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def generate(
@@ -103,7 +106,8 @@ class AsyncClient:
         **fields: Unpack[schemas.GenerateFields],
     ) -> schemas.GenerateAnswer:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
-        call = calls.ask(calls.GENERATE, objects, fields, self.options.model)
+        forms = schemas.GenerateRequest, schemas.GenerateAnswer
+        call = calls.ask("/generate", *forms, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     # -------------------------------------------------------------------------------- batches
@@ -112,21 +116,24 @@ class AsyncClient:
         self, scenes: Iterable[Scene[schemas.RelationsRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.RelationsAnswer]:
         """Ask `relations` about up to 256 scenes. Each scene has its own answer or problem."""
-        call = calls.ask_each(calls.RELATIONS, scenes, self.options.model)
+        forms = schemas.RelationsRequest, schemas.RelationsAnswer
+        call = calls.ask_each("/relations", *forms, scenes, self.options.model)
         return await self._call(call, timeout)
 
     async def missing_batch(
         self, scenes: Iterable[Scene[schemas.MissingRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.MissingAnswer]:
         """Ask `missing` about up to 256 scenes. Each scene has its own answer or problem."""
-        call = calls.ask_each(calls.MISSING, scenes, self.options.model)
+        forms = schemas.MissingRequest, schemas.MissingAnswer
+        call = calls.ask_each("/missing", *forms, scenes, self.options.model)
         return await self._call(call, timeout)
 
     async def outliers_batch(
         self, scenes: Iterable[Scene[schemas.OutliersRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.OutliersAnswer]:
         """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
-        call = calls.ask_each(calls.OUTLIERS, scenes, self.options.model)
+        forms = schemas.OutliersRequest, schemas.OutliersAnswer
+        call = calls.ask_each("/outliers", *forms, scenes, self.options.model)
         return await self._call(call, timeout)
 
     # --------------------------------------------------------------------------------- models

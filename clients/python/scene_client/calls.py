@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from random import random
-from typing import Any, Final, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Final, Generic, TypeAlias, TypeVar
 from urllib.parse import quote
 
 import httpx
@@ -115,22 +115,10 @@ def segment(name: str) -> str:
 # -------------------------------------------------------------------------------------- questions
 
 
-class Question(NamedTuple, Generic[RequestT, AnswerT]):
-    """One of the four questions: the path of its route, and the classes of request and answer."""
-
-    path: str
-    form: type[RequestT]
-    answer: type[AnswerT]
-
-
-RELATIONS: Final = Question("/relations", schemas.RelationsRequest, schemas.RelationsAnswer)
-MISSING: Final = Question("/missing", schemas.MissingRequest, schemas.MissingAnswer)
-OUTLIERS: Final = Question("/outliers", schemas.OutliersRequest, schemas.OutliersAnswer)
-GENERATE: Final = Question("/generate", schemas.GenerateRequest, schemas.GenerateAnswer)
-
-
 def ask(
-    question: Question[RequestT, AnswerT],
+    path: str,
+    form: type[RequestT],
+    answer: type[AnswerT],
     scene: Any,
     fields: Mapping[str, Any],
     model: str | None = None,
@@ -138,7 +126,8 @@ def ask(
     """Build one question about one scene.
 
     Args:
-        question: the question.
+        path: path of the question's route.
+        form, answer: classes of request and answer.
         scene: list of objects, or a whole request as a ``form`` or a dictionary.
         fields: other fields of the request, if ``scene`` is a list of objects.
         model: model for requests without the field ``model``.
@@ -146,12 +135,15 @@ def ask(
     Raises:
         InvalidRequestError: the request is invalid.
     """
-    body = _json(_request(question.form, scene, fields, model))
-    return Call("POST", question.path, question.answer, body)
+    return Call("POST", path, answer, _json(_request(form, scene, fields, model)))
 
 
 def ask_each(
-    question: Question[RequestT, AnswerT], scenes: Iterable[Any], model: str | None = None
+    path: str,
+    form: type[RequestT],
+    answer: type[AnswerT],
+    scenes: Iterable[Any],
+    model: str | None = None,
 ) -> Call[schemas.BatchAnswer[AnswerT]]:
     """Build a batch request: one question about many scenes. `ask` describes the arguments.
 
@@ -159,15 +151,15 @@ def ask_each(
         InvalidRequestError: the batch or the request about one of its scenes is invalid.
     """
     requests = [
-        _json(_request(question.form, scene, {}, model, ("scenes", place)))
+        _json(_request(form, scene, {}, model, ("scenes", place)))
         for place, scene in enumerate(scenes)
     ]
     if not 1 <= len(requests) <= schemas.MAX_BATCH:
         message = f"a batch must contain from 1 to {schemas.MAX_BATCH} scenes"
         raise InvalidRequestError.about(message, "#/scenes")
     body = f'{{"scenes":[{",".join(requests)}]}}'
-    answer = schemas.BatchAnswer[question.answer]  # type: ignore[name-defined]
-    return Call("POST", f"{question.path}/batch", answer, body)
+    answers = schemas.BatchAnswer[answer]  # type: ignore[valid-type]
+    return Call("POST", f"{path}/batch", answers, body)
 
 
 def promote(alias: str, fields: Mapping[str, Any]) -> Call[schemas.AliasAnswer]:

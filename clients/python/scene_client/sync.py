@@ -71,7 +71,8 @@ class Client:
         **fields: Unpack[schemas.RelationsFields],
     ) -> schemas.RelationsAnswer:
         """Return the likely spatial relations between the objects."""
-        call = calls.ask(calls.RELATIONS, objects, fields, self.options.model)
+        forms = schemas.RelationsRequest, schemas.RelationsAnswer
+        call = calls.ask("/relations", *forms, objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def missing(
@@ -82,7 +83,8 @@ class Client:
         **fields: Unpack[schemas.MissingFields],
     ) -> schemas.MissingAnswer:
         """Return classes that are probably missing from the scene, and their likely places."""
-        call = calls.ask(calls.MISSING, objects, fields, self.options.model)
+        forms = schemas.MissingRequest, schemas.MissingAnswer
+        call = calls.ask("/missing", *forms, objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def outliers(
@@ -93,7 +95,8 @@ class Client:
         **fields: Unpack[schemas.OutliersFields],
     ) -> schemas.OutliersAnswer:
         """Return how well each object fits the scene, and the relations that are probably false."""
-        call = calls.ask(calls.OUTLIERS, objects, fields, self.options.model)
+        forms = schemas.OutliersRequest, schemas.OutliersAnswer
+        call = calls.ask("/outliers", *forms, objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def generate(
@@ -104,7 +107,8 @@ class Client:
         **fields: Unpack[schemas.GenerateFields],
     ) -> schemas.GenerateAnswer:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
-        call = calls.ask(calls.GENERATE, objects, fields, self.options.model)
+        forms = schemas.GenerateRequest, schemas.GenerateAnswer
+        call = calls.ask("/generate", *forms, objects, fields, self.options.model)
         return self._call(call, timeout)
 
     # -------------------------------------------------------------------------------- batches
@@ -113,21 +117,24 @@ class Client:
         self, scenes: Iterable[Scene[schemas.RelationsRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.RelationsAnswer]:
         """Ask `relations` about up to 256 scenes. Each scene has its own answer or problem."""
-        call = calls.ask_each(calls.RELATIONS, scenes, self.options.model)
+        forms = schemas.RelationsRequest, schemas.RelationsAnswer
+        call = calls.ask_each("/relations", *forms, scenes, self.options.model)
         return self._call(call, timeout)
 
     def missing_batch(
         self, scenes: Iterable[Scene[schemas.MissingRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.MissingAnswer]:
         """Ask `missing` about up to 256 scenes. Each scene has its own answer or problem."""
-        call = calls.ask_each(calls.MISSING, scenes, self.options.model)
+        forms = schemas.MissingRequest, schemas.MissingAnswer
+        call = calls.ask_each("/missing", *forms, scenes, self.options.model)
         return self._call(call, timeout)
 
     def outliers_batch(
         self, scenes: Iterable[Scene[schemas.OutliersRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.OutliersAnswer]:
         """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
-        call = calls.ask_each(calls.OUTLIERS, scenes, self.options.model)
+        forms = schemas.OutliersRequest, schemas.OutliersAnswer
+        call = calls.ask_each("/outliers", *forms, scenes, self.options.model)
         return self._call(call, timeout)
 
     # --------------------------------------------------------------------------------- models
