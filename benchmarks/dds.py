@@ -133,15 +133,15 @@ def room(labels: list[str], objects: int) -> list[dict[str, Any]]:
 def detections(things: list[dict[str, Any]], number: int) -> ros.Detection3DArray:
     """Return a message with these objects. Its number is the time in the header."""
     header = ros.Header(ros.Time(number, 0), "base_link")
-    found = []
+    entries = []
     for thing in things:
         pose = ros.Pose(ros.Point(**thing["position"]), ros.Quaternion(0.0, 0.0, 0.0, 1.0))
         hypothesis = ros.ObjectHypothesisWithPose(
             ros.ObjectHypothesis(thing["label"], 0.9), ros.PoseWithCovariance(pose, [0.0] * 36)
         )
         box = ros.BoundingBox3D(pose, ros.Vector3(**thing["size"]))
-        found.append(ros.Detection3D(header, [hypothesis], box, thing["id"]))
-    return ros.Detection3DArray(header, found)
+        entries.append(ros.Detection3D(header, [hypothesis], box, thing["id"]))
+    return ros.Detection3DArray(header, entries)
 
 
 def measure(robot: Robot, client: Client, count: int, objects: int) -> dict[str, list[float]]:
@@ -186,16 +186,16 @@ def main(
         stack.enter_context(bridge(topic, url))
         robot, client = Robot(topic), stack.enter_context(Client(url, timeout=_PATIENCE))
         measure(robot, client, 50, objects)
-        found = measure(robot, client, messages, objects)
-    both = zip(found["over DDS"], found["over HTTP"], strict=True)
-    found["difference (bridge and DDS)"] = [dds - http for dds, http in both]
+        seconds = measure(robot, client, messages, objects)
+    both = zip(seconds["over DDS"], seconds["over HTTP"], strict=True)
+    seconds["difference (bridge and DDS)"] = [dds - http for dds, http in both]
     table = Table(title=f"{messages} messages, {objects} objects, 2 questions (milliseconds)")
     for column in ("", *(f"p{100 * q:g}" for q in _QUANTILES)):
         table.add_column(column, justify="left" if not column else "right")
-    for name, values in found.items():
+    for name, values in seconds.items():
         table.add_row(name, *(f"{1e3 * value:.2f}" for value in np.quantile(values, _QUANTILES)))
     console.print(table)
-    own = float(np.quantile(found["over DDS"], 0.99))
+    own = float(np.quantile(seconds["over DDS"], 0.99))
     verdict = "met" if own < AIM else "MISSED"
     console.print(
         f"none lost; p99 over DDS: {1e3 * own:.2f} ms; below {1e3 * AIM:.0f} ms: {verdict}"

@@ -61,18 +61,18 @@ def main(
         bodies = requests(_KIND, _ROUTE, [e["label"] for e in entries if not e["structure"]])
         names = (_KIND, _ROUTE, f"{connections} connections")
         load = concurrency(connections)
-        found = compare((ports[0], ports[1]), bodies, load, names, seconds=seconds)
+        comparison = compare((ports[0], ports[1]), bodies, load, names, seconds=seconds)
     print(f"{_ROUTE}, {_KIND}, {connections} connections, {replicas} replicas")
-    for name, window in (("Ray Serve", found.service), ("plain processes", found.plain)):
+    for name, window in (("Ray Serve", comparison.service), ("plain processes", comparison.plain)):
         p50, p99 = (1e3 * window.quantile(q) for q in (0.5, 0.99))
         print(
             f"{name}: {window.rate:,.0f} req/s, p50 {p50:.1f} ms, p99 {p99:.1f} ms, "
             f"{window.errors} errors"
         )
-    steady = "" if found.steady else " (not steady)"
-    verdict = "met" if found.rate_ratio >= AIM else "MISSED"
-    ratios = " ".join(f"{ratio:.2f}" for ratio in found.ratios)
-    print(f"ratio {found.rate_ratio:.2f}{steady}, windows {ratios}; aim {AIM}: {verdict}")
+    steady = "" if comparison.steady else " (not steady)"
+    verdict = "met" if comparison.rate_ratio >= AIM else "MISSED"
+    ratios = " ".join(f"{ratio:.2f}" for ratio in comparison.ratios)
+    print(f"ratio {comparison.rate_ratio:.2f}{steady}, windows {ratios}; aim {AIM}: {verdict}")
 
 
 @contextmanager

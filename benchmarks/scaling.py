@@ -109,8 +109,8 @@ def _questions(scene: Scene) -> Mapping[str, Question]:
 
 def _scene(V: int, objects: int) -> Scene:
     """Draw a scene of objects from the first V classes. Frequent classes are more probable."""
-    drawn = random_scenes(1, V, objects, torch.Generator().manual_seed(1))[0].tolist()
-    return Scene(tuple(SceneObject(_label(i), _label(i), i) for i in drawn))
+    classes = random_scenes(1, V, objects, torch.Generator().manual_seed(1))[0].tolist()
+    return Scene(tuple(SceneObject(_label(i), _label(i), i) for i in classes))
 
 
 def _label(number: int) -> str:

@@ -76,7 +76,7 @@ def judge(output: str, trouble: str, required: set[str]) -> Outcome:
     except (ValueError, KeyError, TypeError):
         last = trouble.strip().splitlines()[-1:] or ["no answer"]
         return Outcome(Verdict.NOT_RUN, (last[0][:200],))
-    found = sorted(
+    flaws = sorted(
         f"{entry['name']} {entry['version']}: {flaw['id']}"
         + (f", fixed in {', '.join(flaw['fix_versions'])}" if flaw["fix_versions"] else "")
         for entry in entries
@@ -84,8 +84,8 @@ def judge(output: str, trouble: str, required: set[str]) -> Outcome:
     )
     looked_at = {entry["name"] for entry in entries if "vulns" in entry}
     unknown = sorted(required - looked_at)
-    if found:
-        return Outcome(Verdict.FOUND, tuple(found))
+    if flaws:
+        return Outcome(Verdict.FOUND, tuple(flaws))
     if unknown:
         return Outcome(Verdict.NOT_RUN, (f"no answer about the packages {', '.join(unknown)}",))
     return Outcome(Verdict.OK, (f"no known vulnerability in {len(looked_at)} packages",))
@@ -121,11 +121,11 @@ def advisories() -> Outcome:
     """Check all packages of the lock files for known vulnerabilities."""
     reasons = []
     for service in SERVICES:
-        known = knows_advisories(service)
-        if known.verdict is Verdict.FOUND:
+        outcome = knows_advisories(service)
+        if outcome.verdict is Verdict.FOUND:
             files = [f"--requirement={lock}" for lock in LOCKS]
             return judge(*ask(service, *files), set().union(*map(pinned, LOCKS)))
-        reasons.append(f"{service}: {known.lines[0]}")
+        reasons.append(f"{service}: {outcome.lines[0]}")
     return Outcome(Verdict.NOT_RUN, ("all vulnerability databases failed", *reasons))
 
 

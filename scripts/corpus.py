@@ -25,7 +25,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,7 +42,19 @@ MODELS: Final = (
 )  # fmt: skip
 RELATIONS: Final = ("left", "right", "front", "behind", "on-top", "under", "above", "below")
 HEADERS: Final = ("content-type", "retry-after", "www-authenticate", "allow", "location")
-JSON: Final = {"content-type": "application/json"}
+NONSENSE: Final[tuple[dict[str, Json], ...]] = (
+    {"objects": [f"nonsuch {k}" for k in range(256)]},
+    {"objects": [f"nonsuch {k}" for k in range(256)], "unknown_labels": "ignore"},
+    {"objects": ["bed"] * 257},
+    {"objects": [{"id": "a", "label": "bed"}] * 2},
+    {"objects": ["bed"], "model": "../../etc/passwd"},
+    {"objects": ["bed", "lamp"], "relations": [["bed", "left", "lamp"], ["bed", "right", "lamp"]]},
+    {"objects": ["bed", "lamp"], "relations": [["bed", "front", "bed"]]},
+    {"objects": ["bed", "lamp"], "relations": [["nobody", "left", "nobody"]] * 1000},
+    {"objects": ["bed", "lamp"], "relations_complete": True},
+    {"objects": [{"label": "bed", "position": [1e8, -1e8, 1e8], "size": [5e-324, 1e4, 5e-324]}]},
+)
+"""Requests of the right form that make no sense."""
 # Deadline of each request. It is long, so that requests also finish on a busy machine.
 PATIENCE: Final = {"x-request-timeout-ms": "60000"}
 # Fields that are not compared, because they differ between answers or processes.
@@ -77,13 +89,13 @@ class Scenes:
     def classes(self) -> list[str]:
         """Return 1 to 24 random labels. Labels can occur more than once."""
         rng = self.rng
-        found = list(rng.choice(self.likely)) if rng.random() < 0.6 else []
-        found += rng.sample(self.labels, rng.choice([0, 1, 1, 2, 4, 12]))
-        found = found or [rng.choice(self.labels)]
+        labels = list(rng.choice(self.likely)) if rng.random() < 0.6 else []
+        labels += rng.sample(self.labels, rng.choice([0, 1, 1, 2, 4, 12]))
+        labels = labels or [rng.choice(self.labels)]
         if rng.random() < 0.2:
-            found += rng.choices(found, k=2)
-        rng.shuffle(found)
-        return found[:24]
+            labels += rng.choices(labels, k=2)
+        rng.shuffle(labels)
+        return labels[:24]
 
     def scene(self) -> dict[str, Json]:
         """Return random values for the request fields that all questions have."""
@@ -117,21 +129,26 @@ class Scenes:
 
     def detection(self, number: int, label: str) -> dict[str, Json]:
         rng = self.rng
-        found: dict[str, Json] = {"id": f"{label[:20]}#{number}", "label": label}
+        detection: dict[str, Json] = {"id": f"{label[:20]}#{number}", "label": label}
         if rng.random() < 0.95:
             far = 3000.0 if rng.random() < 0.01 else 3.0
-            found["position"] = {
+            detection["position"] = {
                 "x": round(rng.uniform(0, far), 3), "y": round(rng.uniform(-far, far), 3),
                 "z": round(rng.uniform(0, 1.5), 3),
             }  # fmt: skip
         if rng.random() < 0.6:
-            found["size"] = {k: round(rng.uniform(0.1, 1.5), 3) for k in "xyz"}
+            detection["size"] = {k: round(rng.uniform(0.1, 1.5), 3) for k in "xyz"}
         if rng.random() < 0.3:
             angle = rng.uniform(-math.pi, math.pi)
-            found["orientation"] = {"x": 0.0, "y": 0.0, "z": math.sin(angle), "w": math.cos(angle)}
+            detection["orientation"] = {
+                "x": 0.0,
+                "y": 0.0,
+                "z": math.sin(angle),
+                "w": math.cos(angle),
+            }
         if rng.random() < 0.3:
-            found["confidence"] = round(rng.uniform(0.05, 1), 2)
-        return found
+            detection["confidence"] = round(rng.uniform(0.05, 1), 2)
+        return detection
 
     def relations(self, labels: list[str]) -> list[dict[str, str]]:
         rng = self.rng
@@ -145,40 +162,40 @@ class Scenes:
         """Return random values for the request fields that only the given question has."""
         rng = self.rng
         names = [o if isinstance(o, str) else o.get("id", o["label"]) for o in body["objects"]]
-        found: dict[str, Json] = {}
+        fields: dict[str, Json] = {}
         if rng.random() < 0.5 and question != "outliers":
-            found["top_k"] = rng.choice([1, 3, 10, 50])
+            fields["top_k"] = rng.choice([1, 3, 10, 50])
         match question:
             case "relations":
                 if rng.random() < 0.3:
-                    found["include_opposites"] = True
+                    fields["include_opposites"] = True
                 if rng.random() < 0.3:
-                    found["min_probability"] = rng.choice([0.01, 0.2, 0.9])
+                    fields["min_probability"] = rng.choice([0.01, 0.2, 0.9])
                 if rng.random() < 0.3:
-                    found["pairs"] = [
+                    fields["pairs"] = [
                         {"subject": rng.choice(names), "object": rng.choice(names)}
                         for _ in range(rng.choice([1, 4]))
                     ]
             case "missing":
                 if rng.random() < 0.4:
-                    found["coverage"] = rng.choice([0.0, 0.25, 0.5, 0.9, 1.0])
+                    fields["coverage"] = rng.choice([0.0, 0.25, 0.5, 0.9, 1.0])
                 if rng.random() < 0.3:
-                    found["candidates"] = rng.sample(self.labels, 5)
+                    fields["candidates"] = rng.sample(self.labels, 5)
                 if rng.random() < 0.4:
-                    found["at"] = {"relation": rng.choice(RELATIONS), "object": rng.choice(names)}
+                    fields["at"] = {"relation": rng.choice(RELATIONS), "object": rng.choice(names)}
             case "outliers":
                 if rng.random() < 0.5:
-                    found["sensitivity"] = rng.choice(["low", "medium", "high"])
+                    fields["sensitivity"] = rng.choice(["low", "medium", "high"])
                 if rng.random() < 0.2:
-                    found["threshold"] = rng.choice([0.0, 0.3, 0.7, 1.0])
-        return found
+                    fields["threshold"] = rng.choice([0.0, 0.3, 0.7, 1.0])
+        return fields
 
 
 def post(path: str, body: Json, **headers: str) -> dict[str, Json]:
     """Return a POST request in the format of the record file."""
     return {
         "method": "POST", "path": path,
-        "headers": {**JSON, **PATIENCE, **headers},
+        "headers": {"content-type": "application/json", **PATIENCE, **headers},
         "body": base64.b64encode(json.dumps(body).encode()).decode(),
     }  # fmt: skip
 
@@ -224,19 +241,23 @@ def drawn(client: httpx.Client) -> Iterator[dict[str, Json]]:
 
 def errors() -> Iterator[dict[str, Json]]:
     """Generate invalid requests of every kind."""
-    for entry in list(hostile.requests())[::15]:
-        if len(entry.body) <= 200_000 and entry.path != hostile.ALIAS:
-            yield {
-                "method": entry.method, "path": entry.path, "headers": dict(JSON),
-                "body": base64.b64encode(entry.body).decode(),
-            }  # fmt: skip
-    scene = {"objects": ["bed"]}
-    for kind in ("text/plain", "application/json; charset=latin-1", "application/ld+json"):
-        yield post("/missing", scene, **{"content-type": kind})
-    for method, path in product(("GET", "PUT", "DELETE", "PATCH"), ("/missing", "/models", "/")):
-        yield post(path, scene) | {"method": method}
-    for given in ("0", "-1", "x", "600001", "1.5", "600000"):
-        yield post("/missing", {"objects": ["bed"]}, **{"x-request-timeout-ms": given})
+    for entry in list(hostile.requests())[::23]:
+        if len(entry.body) > 200_000 or entry.path == hostile.ALIAS:
+            continue
+        headers = {"content-type": "application/json"}
+        yield {
+            "method": entry.method, "path": entry.path, "headers": headers,
+            "body": base64.b64encode(entry.body).decode(),
+        }  # fmt: skip
+    for question in (*QUESTIONS, "generate"):
+        for body in NONSENSE:
+            yield post(f"/{question}", body)
+        for kind in ("", "text/plain", "application/json; charset=latin-1"):
+            yield post(f"/{question}", {"objects": ["bed"]}, **{"content-type": kind})
+        for method in ("GET", "PUT", "DELETE", "PROPFIND"):
+            yield post(f"/{question}", {}) | {"method": method}
+    for deadline in ("0", "-1", "x", "600001", "1.5", "600000"):
+        yield post("/missing", {"objects": ["bed"]}, **{"x-request-timeout-ms": deadline})
     yield post("/missing", {"objects": ["bed"]}, **{"x-request-id": "corpus-1"})
 
 
@@ -283,15 +304,15 @@ def ask(client: httpx.Client, request: dict[str, Json], key: str) -> dict[str, J
     headers = {k: v.replace("KEY", key) if v == "KEY" else v for k, v in request["headers"].items()}
     body = base64.b64decode(request["body"])
     answer = client.request(request["method"], request["path"], headers=headers, content=body)
-    found: dict[str, Json] = {
+    record: dict[str, Json] = {
         "status": answer.status_code,
         "headers": {k: _in_order(answer.headers[k]) for k in HEADERS if k in answer.headers},
     }
     if "json" in answer.headers.get("content-type", ""):
-        found["json"] = answer.json()
+        record["json"] = answer.json()
     else:
-        found["sha256"] = hashlib.sha256(answer.content).hexdigest()
-    return found
+        record["sha256"] = hashlib.sha256(answer.content).hexdigest()
+    return record
 
 
 def _in_order(header: str) -> str:
@@ -410,10 +431,10 @@ def record(url: str, file: Path, key: str) -> int:
     """Send all requests, and write the requests and answers to a file. Return exit status 0."""
     rng = random.Random(SEED)
     with httpx.Client(base_url=url, timeout=60) as client, gzip.open(file, "wt") as out:
-        asked: Counter[str] = Counter()
+        counts: Counter[str] = Counter()
 
         def keep(kind: str, request: Json, answer: Json) -> None:
-            asked[kind] += 1
+            counts[kind] += 1
             out.write(json.dumps({"kind": kind, "request": request, "answer": answer}) + "\n")
 
         for kind, requests in (
@@ -422,7 +443,7 @@ def record(url: str, file: Path, key: str) -> int:
         ):  # fmt: skip
             for request in requests:
                 keep(kind, request, ask(client, request, key))
-    sys.stdout.write(f"{sum(asked.values())} recorded: {dict(asked)}\n")
+    sys.stdout.write(f"{sum(counts.values())} recorded: {dict(counts)}\n")
     return 0
 
 
@@ -449,16 +470,16 @@ def compare(url: str, file: Path, key: str) -> int:
                 skipped += 1
                 continue
             if entry["kind"] == "drawn" and old["status"] == new["status"] == 200:
-                found = list(shares(old, new, tests))
+                changes = list(shares(old, new, tests))
             elif request["path"] == "/generate":
-                found = list(differences(undrawn(old), undrawn(new)))
+                changes = list(differences(undrawn(old), undrawn(new)))
             else:
-                found = list(differences(old, new))
-            if found:
+                changes = list(differences(old, new))
+            if changes:
                 differing += 1
                 body = base64.b64decode(request["body"])[:300].decode("latin-1")
                 sys.stdout.write(f"{request['method']} {request['path']} {body}\n")
-                sys.stdout.writelines(f"    {line}\n" for line in found[:6])
+                sys.stdout.writelines(f"    {line}\n" for line in changes[:6])
     sys.stdout.write(f"{differing} of {len(entries) - skipped} answers differ\n")
     if skipped:
         sys.stdout.write(f"{skipped} requests skipped: the service no longer has their model\n")

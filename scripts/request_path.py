@@ -53,14 +53,14 @@ async def ask(app: Any, path: str, body: bytes) -> int:
 
 
 @contextmanager
-def compiled_calls(found: set[tuple[str, str]]) -> Iterator[None]:
-    """Record calls of compiled functions in `found`. A Python profiler does not see these calls."""
+def compiled_calls(calls: set[tuple[str, str]]) -> Iterator[None]:
+    """Record calls of compiled functions in `calls`. A Python profiler does not see these calls."""
     replaced: list[tuple[Any, str, Any]] = []
     for module in [m for name, m in sys.modules.items() if name.startswith("app.")]:
         for name, value in list(vars(module).items()):
             if isinstance(value, Dispatcher):
                 replaced.append((module, name, value))
-                setattr(module, name, noted(value, found))
+                setattr(module, name, recorded(value, calls))
     try:
         yield
     finally:
@@ -68,18 +68,18 @@ def compiled_calls(found: set[tuple[str, str]]) -> Iterator[None]:
             setattr(module, name, value)
 
 
-def noted(loop: Any, found: set[tuple[str, str]]) -> Callable[..., Any]:
+def recorded(loop: Any, calls: set[tuple[str, str]]) -> Callable[..., Any]:
     code = loop.py_func.__code__
 
     @wraps(loop.py_func)
     def call(*args: Any) -> Any:
-        found.add((str(Path(code.co_filename).relative_to(ROOT)), code.co_name))
+        calls.add((str(Path(code.co_filename).relative_to(ROOT)), code.co_name))
         return loop(*args)
 
     return call
 
 
-async def passed(path: str, body: bytes, requests: int = 20) -> set[tuple[str, str]]:
+async def called_functions(path: str, body: bytes, requests: int = 20) -> set[tuple[str, str]]:
     """Return (file, function) of all project functions that one request calls.
 
     Args:
@@ -88,10 +88,10 @@ async def passed(path: str, body: bytes, requests: int = 20) -> set[tuple[str, s
         requests: number of warm-up requests.
     """
     app = create_app(Settings())
-    found: set[tuple[str, str]] = set()
+    calls: set[tuple[str, str]] = set()
     is_counting = False
 
-    def note(frame: FrameType, event: str, _: object) -> None:
+    def record(frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
         if (
             is_counting
@@ -99,31 +99,31 @@ async def passed(path: str, body: bytes, requests: int = 20) -> set[tuple[str, s
             and code.co_filename.startswith(OURS)
             and code.co_name not in INSIDE
         ):
-            found.add((str(Path(code.co_filename).relative_to(ROOT)), code.co_qualname))
+            calls.add((str(Path(code.co_filename).relative_to(ROOT)), code.co_qualname))
 
     # Also profile new threads, because a thread computes the answer on a busy machine.
-    threading.setprofile(note)
+    threading.setprofile(record)
     async with app.router.lifespan_context(app):
         for _ in range(requests):
             assert await ask(app, path, body) == 200
-        with compiled_calls(found):
+        with compiled_calls(calls):
             is_counting = True
-            sys.setprofile(note)
+            sys.setprofile(record)
             await ask(app, path, body)
             sys.setprofile(None)
-    return found
+    return calls
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("path", nargs="?", default="/missing")
     path = parser.parse_args().path
-    found = sorted(asyncio.run(passed(path, json.dumps(SCENE).encode())))
-    files = sorted({file for file, _ in found})
+    calls = sorted(asyncio.run(called_functions(path, json.dumps(SCENE).encode())))
+    files = sorted({file for file, _ in calls})
     for file in files:
-        names = ", ".join(name for other, name in found if other == file)
+        names = ", ".join(name for other, name in calls if other == file)
         sys.stdout.write(f"{file}: {names}\n")
-    sys.stdout.write(f"one {path}: {len(files)} files, {len(found)} functions\n")
+    sys.stdout.write(f"one {path}: {len(files)} files, {len(calls)} functions\n")
 
 
 if __name__ == "__main__":

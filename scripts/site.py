@@ -161,12 +161,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return posixpath.relpath(f"{SOURCES}/{path}.md", posixpath.dirname(uri) or ".")
 
     def show(match: re.Match[str]) -> str:
-        found = excerpt(match["module"], match["name"])
+        code = excerpt(match["module"], match["name"])
         tests = ", ".join(f"[`{test}`]({source_page(path)})" for path, test in checks(match))
-        links = f"[`{found.path}`]({source_page(found.path)}), line {found.first}"
+        links = f"[`{code.path}`]({source_page(code.path)}), line {code.first}"
         if tests:
             links += f"; checked by {tests}"
-        return f"~~~~ python\n{found.text}\n~~~~\n\n<small>{links}</small>\n"
+        return f"~~~~ python\n{code.text}\n~~~~\n\n<small>{links}</small>\n"
 
     def lead(match: re.Match[str]) -> str:
         path = _outside(uri, match["target"])

@@ -252,13 +252,13 @@ class Walk:
         started = time.monotonic()
         try:
             with urllib.request.urlopen(request, timeout=30) as response:
-                found, content = response.status, response.read()
+                code, content = response.status, response.read()
         except urllib.error.HTTPError as error:
-            found, content = error.code, error.read()
+            code, content = error.code, error.read()
         answer: dict[str, Any] = json.loads(content)
         shown = json.dumps(answer, indent=1, ensure_ascii=False)
         self._record.block(f"POST /{path} {text}", shown, time.monotonic() - started)
-        require(found == status, f"/{path} has status {found}: {shown}")
+        require(code == status, f"/{path} has status {code}: {shown}")
         return answer
 
     def _served(self) -> str:

@@ -58,7 +58,7 @@ def main(
     console = Console(width=140)
     for key, value in describe_machine().items():
         console.print(f"{key}: {value}", highlight=False)
-    found: list[Comparison] = []
+    comparisons: list[Comparison] = []
     facts: dict[str, float] = {}
     with ExitStack() as stack:
         own = os.sched_getaffinity(0)
@@ -69,25 +69,25 @@ def main(
         facts["start to ready, s"] = service.seconds
         labels = _labels(service.port)
         for comparison in _all(service.port, plain.port, kind or KINDS, labels, seconds):
-            found.append(comparison)
+            comparisons.append(comparison)
             console.print(_line(comparison), highlight=False)
-        drawn = uvloop.run(at_concurrency(service.port, drawings(labels, _DRAWN), 1, 4 * seconds))
-        facts[f"/generate of {_DRAWN} scenes, p99 at one connection, ms"] = 1e3 * drawn.quantile(
+        window = uvloop.run(at_concurrency(service.port, drawings(labels, _DRAWN), 1, 4 * seconds))
+        facts[f"/generate of {_DRAWN} scenes, p99 at one connection, ms"] = 1e3 * window.quantile(
             0.99
         )
         facts["resident memory, MB"] = service.memory / 1e6
-    console.print(_table(found))
+    console.print(_table(comparisons))
     for name, value in facts.items():
         console.print(f"{name}: {value:.3g}", highlight=False)
     if json_path is not None:
         document = {
             "machine": describe_machine(),
             "facts": facts,
-            "results": [_record(comparison) for comparison in found],
+            "results": [_record(comparison) for comparison in comparisons],
         }
         json_path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     if plot is not None:
-        _plot(found, plot)
+        _plot(comparisons, plot)
 
 
 def _labels(port: int) -> list[str]:
@@ -136,14 +136,14 @@ def _line(c: Comparison) -> str:
     return f"{c.kind}, {c.route}, {c.load}: {c.rate_ratio:.2f} of the plain app's rate{steady}"
 
 
-def _table(found: Sequence[Comparison]) -> Table:
+def _table(comparisons: Sequence[Comparison]) -> Table:
     table = Table(
         title="The service compared with a plain FastAPI app (service / plain app; milliseconds)"
     )
     for column in ("request", "load", "req/s", "ratio", "p50", "p90", "p99", "p99.9", "errors"):
         table.add_column(column, justify="left" if column in ("request", "load") else "right")
     table.add_column("aim")
-    for c in found:
+    for c in comparisons:
         latencies = [
             f"{c.service.quantile(q) * 1e3:.2f} / {c.plain.quantile(q) * 1e3:.2f}"
             for q in _QUANTILES
@@ -184,11 +184,11 @@ def _record(c: Comparison) -> dict[str, Any]:
     return record
 
 
-def _plot(found: Sequence[Comparison], path: Path) -> None:
+def _plot(comparisons: Sequence[Comparison], path: Path) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    shown = [c for c in found if c.load == f"{_MANY} connections"]
+    shown = [c for c in comparisons if c.load == f"{_MANY} connections"]
     figure, axes = plt.subplots(
         len(shown) // len(ROUTES) or 1, len(ROUTES), figsize=(12, 9), squeeze=False, sharey=True
     )

@@ -84,16 +84,16 @@ def compare(
         names: kind of request, route, and description of the load.
         seconds: length of one window.
     """
-    found: tuple[list[Window], list[Window]] = ([], [])
+    series: tuple[list[Window], list[Window]] = ([], [])
     for port in ports:
         uvloop.run(load(port, requests, seconds / 3))
     steady = False
-    while not steady and len(found[0]) < _MOST:
-        for port, windows in zip(ports, found, strict=True):
+    while not steady and len(series[0]) < _MOST:
+        for port, windows in zip(ports, series, strict=True):
             windows.append(uvloop.run(load(port, requests, seconds)))
-        steady = len(found[0]) >= _FEWEST and all(map(is_steady, found))
-    service, plain = (joined(windows) for windows in found)
-    pairs = zip(*found, strict=True)
+        steady = len(series[0]) >= _FEWEST and all(map(is_steady, series))
+    service, plain = (joined(windows) for windows in series)
+    pairs = zip(*series, strict=True)
     ratios = tuple(ours.rate / theirs.rate for ours, theirs in pairs)
     return Comparison(*names, service, plain, ratios, steady)
 

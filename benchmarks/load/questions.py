@@ -58,14 +58,14 @@ def _body(kind: str, labels: Sequence[str], rng: np.random.Generator) -> dict[st
     if kind == "12 labels":
         return {"objects": chosen}
     if kind == "12 poses":
-        places = np.c_[rng.uniform(0, 3, (_OBJECTS, 2)), rng.uniform(0, 1, _OBJECTS)].round(3)
+        positions = np.c_[rng.uniform(0, 3, (_OBJECTS, 2)), rng.uniform(0, 1, _OBJECTS)].round(3)
         size = {"x": 0.5, "y": 0.5, "z": 0.5}
         return {
             "frame_id": "base_link",
             "objects": [
-                {"id": f"o{k}", "label": label, "position": dict(zip("xyz", place, strict=True)),
+                {"id": f"o{k}", "label": label, "position": dict(zip("xyz", position, strict=True)),
                  "size": size}
-                for k, (label, place) in enumerate(zip(chosen, places.tolist(), strict=True))
+                for k, (label, position) in enumerate(zip(chosen, positions.tolist(), strict=True))
             ],
         }  # fmt: skip
     if kind == "20 relations":

@@ -7,9 +7,10 @@ import json
 import re
 import shlex
 import zlib
+from collections.abc import Callable
 from typing import Any
 
-from playwright.sync_api import Locator, Page, expect
+from playwright.sync_api import Locator, Page, Route, expect
 
 
 class Board:
@@ -28,19 +29,49 @@ class Board:
 
     # ------------------------------------------------------------------------------ doing
 
+    def click(self, button: str) -> None:
+        """Click the button with this name."""
+        self.page.get_by_role("button", name=button).click()
+        self.settle()
+
+    def press(self, thing: str, *keys: str) -> None:
+        """Press keys while an object of the board has the focus."""
+        self.thing(thing).focus()
+        for key in keys:
+            self.page.keyboard.press(key)
+        self.settle()
+
     def put(self, text: str) -> None:
         """Import a scene."""
-        self.page.get_by_role("button", name="Import, export").click()
+        self.click("Import, export")
         self.page.get_by_label("Scene, JSON").fill(text)
-        self.page.get_by_role("button", name="Put on the board").click()
-        self.settle()
+        self.click("Put on the board")
 
     def exported(self) -> dict[str, Any]:
         """The scene as the dialog shows it."""
-        self.page.get_by_role("button", name="Import, export").click()
-        found: dict[str, Any] = json.loads(self.page.get_by_label("Scene, JSON").input_value())
-        self.page.get_by_role("button", name="Close").click()
-        return found
+        self.click("Import, export")
+        scene: dict[str, Any] = json.loads(self.page.get_by_label("Scene, JSON").input_value())
+        self.click("Close")
+        return scene
+
+    def use_positions(self) -> None:
+        """Let positions count as evidence."""
+        self.page.get_by_label("Positions count as evidence").check()
+        self.settle()
+
+    def compare_with(self, model: str) -> None:
+        """Ask a second model too."""
+        self.page.get_by_label("compare with").select_option(model)
+        self.settle()
+
+    def alter(self, question: str, change: Callable[[Any], Any]) -> None:
+        """Let the page receive changed answers to a question."""
+
+        def altered(route: Route) -> None:
+            response = route.fetch()
+            route.fulfill(response=response, json=change(response.json()))
+
+        self.page.route(f"**/{question}", altered)
 
     def add(self, text: str) -> None:
         """Search for an object and take the first that fits."""
@@ -122,6 +153,9 @@ class Board:
     def body(self, question: str, number: int = 0) -> dict[str, Any]:
         """The request of that command."""
         return body_of(self.curl(question, number))
+
+
+OpenBoard = Callable[..., Board]
 
 
 def link_to(scene: dict[str, Any]) -> str:

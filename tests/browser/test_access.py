@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 
 import httpx
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
-from tests.browser.driving import Board
+from tests.browser.driving import Board, OpenBoard
 
 pytestmark = pytest.mark.system
-
-OpenBoard = Callable[..., Board]
 
 
 def focus(board: Board) -> str:
@@ -40,8 +37,7 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     (second,) = [name for name in references if name.startswith("indoor-rbm@")]
     page.get_by_label("compare with").select_option(second)
     page.locator("#list .name").first.click()
-    page.get_by_label("Positions count as evidence").check()
-    board.settle()
+    board.use_positions()
     board.column("missing").get_by_text("Send this request from a program").click()
     found["two models, form, calls"] = complaints(board)
     page.get_by_role("button", name="Actions for bed").click()
@@ -50,8 +46,7 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     for tab in ("Wrong", "Relations", "Generate"):
         board.tab(tab)
         found[tab] = complaints(board)
-    page.get_by_role("button", name="Generate a scene").click()
-    board.settle()
+    board.click("Generate a scene")
     found["drawn"] = complaints(board)
     page.get_by_role("button", name="Discard").click()
     page.get_by_role("combobox", name="Add an object").fill("la")
@@ -74,7 +69,7 @@ def test_the_api_page_has_enough_contrast(
 ) -> None:
     board = open_board(color_scheme=scheme)
     board.page.goto(f"{api.base_url}/docs")
-    board.page.get_by_role("button", name="POST /missing What").click()
+    board.click("POST /missing What")
     board.page.get_by_role("tab", name="Schema").first.click()
     expect(board.page.get_by_role("button", name="Execute")).to_be_visible()
     assert [one for one in complaints(board) if one.startswith("color-contrast")] == []
@@ -166,7 +161,7 @@ def test_answers_and_movements_are_announced(open_board: OpenBoard, api: httpx.C
 
 def test_the_dialog_keeps_the_focus_and_gives_it_back(open_board: OpenBoard) -> None:
     board = open_board()
-    board.page.get_by_role("button", name="Import, export").click()
+    board.click("Import, export")
     assert board.page.evaluate("document.activeElement.id") == "json"
     board.page.keyboard.press("Escape")
     expect(board.page.locator("#file")).to_be_hidden()

@@ -13,13 +13,12 @@ from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Route, expect
+from playwright.sync_api import expect
 
-from tests.browser.driving import Board, percent
+from tests.browser.driving import Board, OpenBoard, percent
 
 pytestmark = pytest.mark.system
 
-OpenBoard = Callable[..., Board]
 SPOKEN = {
     "left": "left of",
     "right": "right of",
@@ -115,7 +114,7 @@ def test_a_ghost_becomes_an_object_where_it_was_drawn(bedroom: Board) -> None:
 def test_the_menu_of_an_object_asks_what_is_missing_there(
     bedroom: Board, api: httpx.Client
 ) -> None:
-    bedroom.page.get_by_role("button", name="Actions for nightstand").click()
+    bedroom.click("Actions for nightstand")
     bedroom.page.get_by_role("menuitem", name="What is missing on top of it?").click()
     bedroom.settle()
     at = {"relation": "on-top", "object": "nightstand"}
@@ -129,8 +128,7 @@ def test_the_menu_of_an_object_asks_what_is_missing_there(
         ghost.get_attribute("aria-label") for ghost in bedroom.page.locator("#board .ghost").all()
     ]
     assert all("on top of nightstand" in str(name) for name in names)
-    bedroom.page.get_by_role("button", name="Anywhere").click()
-    bedroom.settle()
+    bedroom.click("Anywhere")
     assert "at" not in bedroom.body("missing")
 
 
@@ -162,16 +160,9 @@ def test_only_misplaced_relations_are_in_the_wrong_place(bedroom: Board) -> None
     said = {"subject": "lamp", "relation": "on-top", "object": "bed"}
     amiss = {**said, "probability": 0.75, "is_misplaced": True}
     fine = amiss | {"object": "nightstand", "probability": 0.1, "is_misplaced": False}
-
-    def misplaced(route: Route) -> None:
-        response = route.fetch()
-        route.fulfill(
-            response=response, json=response.json() | {"outliers": [], "misplaced": [amiss, fine]}
-        )
-
-    bedroom.page.route("**/outliers", misplaced)
-    bedroom.page.get_by_label("Positions count as evidence").check()
-    bedroom.settle()
+    answer = {"outliers": [], "misplaced": [amiss, fine]}
+    bedroom.alter("outliers", lambda other: other | answer)
+    bedroom.use_positions()
     bedroom.tab("Wrong")
     assert bedroom.rows("outliers") == ["lamp on top of bed in the wrong place 75 %"]
     assert bedroom.edges == [("misplaced", "on top of?")]
@@ -232,8 +223,7 @@ def test_every_symbol_is_in_the_legend(bedroom: Board) -> None:
     bedroom.tab("Relations")
     assert {kind for kind, _ in bedroom.edges} < symbols()
     bedroom.tab("Generate")
-    page.get_by_role("button", name="Generate a scene").click()
-    bedroom.settle()
+    bedroom.click("Generate a scene")
     assert symbols() == {"robot", "fresh"}
     assert all(legend.all_text_contents())
 
@@ -256,19 +246,15 @@ def test_words_on_the_board_cover_no_others(bedroom: Board) -> None:
 
 
 def test_disagreements_are_drawn_where_an_answer_has_them(bedroom: Board) -> None:
-    def disagreeing(route: Route) -> None:
-        response = route.fetch()
-        odd = {
-            "subject": "nightstand",
-            "object": "bed",
-            "observed": ["left"],
-            "expected": "right",
-            "probability": 0.7,
-            "observed_probability": 0.1,
-        }
-        route.fulfill(response=response, json=response.json() | {"disagreements": [odd]})
-
-    bedroom.page.route("**/relations", disagreeing)
+    odd = {
+        "subject": "nightstand",
+        "object": "bed",
+        "observed": ["left"],
+        "expected": "right",
+        "probability": 0.7,
+        "observed_probability": 0.1,
+    }
+    bedroom.alter("relations", lambda answer: answer | {"disagreements": [odd]})
     bedroom.tab("Relations")
     bedroom.add("mug")
     assert ("disagrees", "right of? 70 %") in bedroom.edges
@@ -284,8 +270,7 @@ def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> No
     expected = ["", *aliases, *(one for one in references if one not in aliases.values())]
     assert [option.get_attribute("value") for option in shown.all()] == expected
     (second,) = [name for name in references if name.startswith("indoor-rbm@")]
-    bedroom.page.get_by_label("compare with").select_option(second)
-    bedroom.settle()
+    bedroom.compare_with(second)
     for number, model in enumerate(("default", second)):
         answer = ask(api, "missing", bedroom.scene, top_k=5, model=model)
         rows = bedroom.rows("missing", number)
@@ -301,8 +286,7 @@ def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> No
     bedroom.settle()
     answer = ask(api, "missing", bedroom.scene, top_k=5, model=second)
     assert set(bedroom.ghosts) <= {one["label"] for one in answer["missing"]}
-    bedroom.page.get_by_label("compare with").select_option("")
-    bedroom.settle()
+    bedroom.compare_with("")
     expect(bedroom.column("missing", 1)).to_be_hidden()
 
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 
 import httpx
 import pytest
 from playwright.sync_api import expect
 
-from tests.browser.driving import Board
+from tests.browser.driving import Board, OpenBoard
 
 pytestmark = pytest.mark.system
 
-OpenBoard = Callable[..., Board]
 SWITCH = "Positions count as evidence"
 
 
@@ -31,8 +29,7 @@ def test_positions_count_only_when_switched_on(open_board: OpenBoard, api: httpx
     alone = api.post("/missing", json=labels | {"room_type": "bedroom", "top_k": 5}).json()
     rows = [row for row in board.rows("missing") if not row.startswith("another ")]
     assert [row.split(" ")[0] for row in rows] == [one["label"] for one in alone["missing"]]
-    board.page.get_by_label(SWITCH).check()
-    board.settle()
+    board.use_positions()
     assert placed(board) == board.things
     expect(says).to_contain_text("positions of 5 of 5 objects")
     assert api.post("/relations", json=board.scene).json()["observed_relations"]
@@ -50,9 +47,7 @@ def test_positions_that_the_page_chose_do_not_count(open_board: OpenBoard) -> No
     expect(board.page.locator("#properties")).to_contain_text("Centre, metres (not given)")
     expect(board.page.locator("#evidence")).to_contain_text("positions of 2 of 4 objects")
     expect(board.page.locator("#list li").nth(2)).to_contain_text("position not given")
-    board.thing("monitor").focus()
-    board.page.keyboard.press("ArrowUp")
-    board.settle()
+    board.press("monitor", "ArrowUp")
     assert placed(board) == ["desk", "chair", "monitor"]
 
 
@@ -63,12 +58,10 @@ def test_stated_relations_are_evidence_in_place_of_positions(open_board: OpenBoa
     assert not board.page.get_by_label(SWITCH).is_checked()
     assert board.scene["relations"] == given
     expect(board.page.locator("#evidence")).to_contain_text("labels and 1 stated relation only")
-    board.page.get_by_label(SWITCH).check()
-    board.settle()
+    board.use_positions()
     assert "relations" not in board.scene
     assert placed(board) == ["desk", "chair"]
-    board.page.get_by_role("button", name="Undo").click()
-    board.settle()
+    board.click("Undo")
     assert board.scene["relations"] == given
 
 
@@ -76,11 +69,9 @@ def test_clear_empties_the_board_and_the_room(open_board: OpenBoard) -> None:
     board = open_board(scene=None)
     room = board.page.get_by_label("Room")
     expect(room).to_have_value("bedroom")
-    board.page.get_by_role("button", name="Clear").click()
-    board.settle()
+    board.click("Clear")
     expect(room).to_have_value("")
     assert board.things == []
-    board.page.get_by_role("button", name="Undo").click()
-    board.settle()
+    board.click("Undo")
     expect(room).to_have_value("bedroom")
     assert len(board.things) == 5

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import httpx
 import pytest
 from playwright.sync_api import Route, expect
 
-from tests.browser.driving import Board, body_of
+from tests.browser.driving import Board, OpenBoard, body_of
 
 pytestmark = pytest.mark.system
 
-OpenBoard = Callable[..., Board]
-
 
 def draw(board: Board) -> None:
-    board.page.get_by_role("button", name="Generate a scene").click()
+    board.click("Generate a scene")
     expect(board.page.locator("#draft")).to_be_visible()
     board.settle()
 
@@ -60,14 +57,12 @@ def test_a_drawn_scene_can_be_kept_and_reads_as_it_was_drawn(
     board.tab("Generate")
     draw(board)
     (scene,) = api.post("/generate", json=request(board)).json()["scenes"]
-    board.page.get_by_role("button", name="Keep").click()
-    board.settle()
+    board.click("Keep")
     assert board.things == scene["objects"]
     assert board.scene["room_type"] == "bedroom"
     # The page placed these objects, so their positions do not count.
     assert not any("position" in thing for thing in board.scene["objects"])
-    board.page.get_by_role("button", name="Undo").click()
-    board.settle()
+    board.click("Undo")
     assert board.things == ["desk", "chair"]
 
 
@@ -81,8 +76,7 @@ def test_stated_relations_do_not_hold_for_generated_objects(open_board: OpenBoar
         draw(board)
         if {"bed", "lamp"} <= set(chips(board)):
             break
-    board.page.get_by_role("button", name="Keep").click()
-    board.settle()
+    board.click("Keep")
     assert {"bed", "lamp"} <= set(board.things)
     assert "relations" not in board.scene
 
@@ -98,8 +92,7 @@ def test_objects_of_the_board_stay_in_the_drawn_scene(
     assert {"desk", "chair"} <= set(chips(board))
     assert [thing["id"] for thing in request(board)["objects"]] == ["desk", "chair"]
     expect(board.page.locator("#board .object:not(.new)")).to_have_count(2)
-    board.page.get_by_role("button", name="Discard").click()
-    board.settle()
+    board.click("Discard")
     expect(board.page.locator("#board .object")).to_have_count(2)
 
 

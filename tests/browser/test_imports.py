@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,10 @@ import pytest
 from playwright.sync_api import expect
 
 from scene_client.vision_msgs import from_message
-from tests.browser.driving import Board
+from tests.browser.driving import OpenBoard
 from tests.client.test_command import NOT_FINITE
 
 pytestmark = pytest.mark.system
-
-OpenBoard = Callable[..., Board]
 
 
 def rounded(value: Any) -> Any:
@@ -37,8 +34,7 @@ def test_detections_are_read_as_the_client_reads_them(
     page.get_by_role("button", name="Import, export").click()
     page.get_by_label("Open a file").set_input_files(file)
     expect(page.get_by_label("Scene, JSON")).to_have_value(file.read_text("utf-8"))
-    page.get_by_role("button", name="Put on the board").click()
-    board.settle()
+    board.click("Put on the board")
     shown = {thing["id"]: thing for thing in board.scene["objects"]}
     assert list(shown) == [thing["id"] for thing in fields["objects"]]
     for thing in fields["objects"]:
@@ -109,12 +105,11 @@ def test_one_of_several_scenes_is_chosen(open_board: OpenBoard) -> None:
     board = open_board()
     board.put(lines)
     assert board.things == ["desk", "monitor"]
-    board.page.get_by_role("button", name="Import, export").click()
+    board.click("Import, export")
     board.page.get_by_label("Scene, JSON").fill(lines)
     expect(board.page.locator("#scenes")).to_have_text("of 2")
     board.page.locator("#which").fill("2")
-    board.page.get_by_role("button", name="Put on the board").click()
-    board.settle()
+    board.click("Put on the board")
     # The mug has no position, so the relations count and the positions only place the table.
     assert board.scene["objects"] == [{"id": label, "label": label} for label in ("table", "mug")]
     assert board.scene["relations"] == [{"subject": "mug", "relation": "on-top", "object": "table"}]

@@ -5,17 +5,14 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Callable
 
 import httpx
 import pytest
 from playwright.sync_api import expect
 
-from tests.browser.driving import Board
+from tests.browser.driving import Board, OpenBoard
 
 pytestmark = pytest.mark.system
-
-OpenBoard = Callable[..., Board]
 
 
 def place(board: Board, name: str, question: str = "missing") -> tuple[float, float, float]:
@@ -72,9 +69,7 @@ def test_objects_on_a_support_move_with_it(open_board: OpenBoard) -> None:
     lamp = {"id": "lamp", "label": "lamp", "position": {"x": 2, "y": 0.5, "z": 0.94}}
     board.put(json.dumps({"objects": [*board.exported()["objects"], lamp]}))
     before, desk = place(board, "lamp"), place(board, "desk")
-    board.thing("desk").focus()
-    board.page.keyboard.press("Shift+ArrowRight")
-    board.settle()
+    board.press("desk", "Shift+ArrowRight")
     assert place(board, "desk")[1] == pytest.approx(desk[1] - 0.5)
     assert place(board, "lamp") == pytest.approx((before[0], before[1] - 0.5, before[2]))
 
@@ -89,8 +84,7 @@ def test_dragging_moves_and_snaps_and_can_be_undone(open_board: OpenBoard) -> No
     assert snapped[0] < before[0]
     assert snapped[1] < before[1]
     assert all(round(20 * value) == pytest.approx(20 * value) for value in snapped[:2])
-    board.page.get_by_role("button", name="Undo").click()
-    board.settle()
+    board.click("Undo")
     assert place(board, "chair", "outliers") == before
 
 
@@ -129,9 +123,7 @@ def test_missing_sizes_are_the_models(open_board: OpenBoard, api: httpx.Client) 
     board.add("laptop")
     words = api.get("/models/default/vocabulary").json()["objects"]
     (typical,) = [entry["size"] for entry in words if entry["label"] == "laptop"]
-    board.thing("laptop").focus()
-    board.page.keyboard.press("ArrowUp")
-    board.settle()
+    board.press("laptop", "ArrowUp")
     assert board.body("missing")["objects"][-1]["size"] == typical
     expect(board.page.locator("#size-source")).to_have_text("(typical)")
     shown = board.page.locator("#properties").get_by_label("along x").input_value()
@@ -225,8 +217,8 @@ def test_invalid_scenes_are_refused_with_a_reason(open_board: OpenBoard) -> None
 def test_a_link_holds_the_scene(open_board: OpenBoard) -> None:
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
     scene = board.exported()
-    board.page.get_by_role("button", name="Import, export").click()
-    board.page.get_by_role("button", name="Copy a link").click()
+    board.click("Import, export")
+    board.click("Copy a link")
     expect(board.page.locator("#share-done")).to_contain_text("copied")
     link = board.page.evaluate("navigator.clipboard.readText()")
     assert "#scene=" in link

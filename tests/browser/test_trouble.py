@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import httpx
 import pytest
 from playwright.sync_api import Route, expect
 
-from tests.browser.driving import Board
+from tests.browser.driving import OpenBoard
 from tests.services import launch
 
 pytestmark = pytest.mark.system
-
-OpenBoard = Callable[..., Board]
 
 
 def crowd(api: httpx.Client, count: int) -> dict[str, object]:

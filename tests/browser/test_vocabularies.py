@@ -10,12 +10,10 @@ import httpx
 import pytest
 from playwright.sync_api import expect
 
-from tests.browser.driving import Board
+from tests.browser.driving import Board, OpenBoard
 from tests.services import LiveService, launch
 
 pytestmark = pytest.mark.system
-
-OpenBoard = Callable[..., Board]
 
 
 def notes(board: Board, place: int) -> str:
@@ -78,7 +76,7 @@ def test_unknown_names_are_mapped_or_left_out_visibly(open_board: OpenBoard) -> 
     assert board.rows("missing")
     expect(board.column("missing")).to_contain_text("fridgee → fridge? flux capacitor not known")
     board.page.locator("#room").select_option("bedroom")
-    board.page.get_by_role("button", name="Remove flux capacitor").click()
+    board.click("Remove flux capacitor")
     board.page.get_by_role("button", name="Rename fridgee to fridge").press("Enter")
     board.settle()
     assert board.things == ["bed", "fridge"]
@@ -94,9 +92,8 @@ def test_a_renamed_object_keeps_its_id_and_relations(open_board: OpenBoard) -> N
         "relations": [["fridgee", "left", "7"]],
     }
     board = open_board(scene, allow=("422",))
-    board.page.get_by_role("button", name="Rename fridgee to fridge").click()
-    board.page.get_by_role("button", name="Rename tabel to table").click()
-    board.settle()
+    board.click("Rename fridgee to fridge")
+    board.click("Rename tabel to table")
     found = [(one["id"], one["label"]) for one in board.scene["objects"]]
     assert found == [("fridge_2", "fridge"), ("7", "table"), ("fridge", "fridge")]
     stated = {"subject": "fridge_2", "relation": "left", "object": "7"}
@@ -132,8 +129,7 @@ def test_two_models_answer_about_their_common_classes(
 
 
 def compares_on_common_classes(board: Board, api: httpx.Client, second: str) -> None:
-    board.page.get_by_label("compare with").select_option(second)
-    board.settle()
+    board.compare_with(second)
     assert notes(board, 2) == f"{second}: pillow not known, left out"
     labels = [[thing["label"] for thing in board.body("missing", n)["objects"]] for n in (0, 1)]
     assert labels == [["bed", "lamp", "pillow"], ["bed", "lamp"]]

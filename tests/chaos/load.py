@@ -6,8 +6,7 @@ import asyncio
 import json
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from types import TracebackType
@@ -95,47 +94,3 @@ class ConstantLoad:
         await finished.wait()
         for connection in pool:
             connection.close()
-
-
-class Pulse:
-    """Asks one cheap question again and again, on a connection and in a thread of its own.
-
-    Attributes:
-        seconds: how long each answer took.
-        statuses: of the answers.
-    """
-
-    def __init__(self, port: int, path: str, pause: float = 0.02) -> None:
-        self.seconds: list[float] = []
-        self.statuses: Counter[int] = Counter()
-        self._port, self._pause = port, pause
-        self._request = f"GET {path} HTTP/1.1\r\nhost: x\r\n\r\n".encode()
-        self._ending = threading.Event()
-
-    async def _run(self) -> None:
-        answered = asyncio.Event()
-
-        def on_answer(_: Connection, status: int, __: bytes) -> None:
-            self.statuses[status] += 1
-            answered.set()
-
-        (connection,) = await connect(self._port, 1, on_answer)
-        while not self._ending.is_set():
-            answered.clear()
-            began = perf_counter()
-            connection.send(self._request)
-            await answered.wait()
-            self.seconds.append(perf_counter() - began)
-            await asyncio.sleep(self._pause)
-        connection.close()
-
-    @contextmanager
-    def beating(self) -> Iterator[Pulse]:
-        """While the body runs."""
-        thread = threading.Thread(target=lambda: asyncio.run(self._run()))
-        thread.start()
-        try:
-            yield self
-        finally:
-            self._ending.set()
-            thread.join(timeout=60)

@@ -54,30 +54,19 @@ EVERY = (*OVER_HTTP, "offline")
 @pytest.fixture
 def open_caller(request: pytest.FixtureRequest) -> Callable[..., AbstractContextManager[Caller]]:
     """Opens a client of the kind that the test is parametrised with, at a URL."""
-    match request.param:
-        case "sync":
-            return callers.sync_caller
-        case "async":
-            return callers.async_caller
-        case "cpp":
-            return partial(callers.cpp_caller, request.getfixturevalue("bridge"))
-        case other:
-            raise AssertionError(other)
+    return opener(request)
+
+
+def opener(request: pytest.FixtureRequest) -> Callable[..., AbstractContextManager[Caller]]:
+    if request.param == "cpp":
+        return partial(callers.cpp_caller, request.getfixturevalue("bridge"))
+    return {"sync": callers.sync_caller, "async": callers.async_caller}[request.param]
 
 
 @pytest.fixture(scope="session")
-def caller(request: pytest.FixtureRequest, url: str) -> Iterator[Caller]:
+def caller(request: pytest.FixtureRequest, url: str, shared_store: Path) -> Iterator[Caller]:
     """A client of the kind that the test is parametrised with, of the live service."""
-    match request.param:
-        case "sync":
-            opened: AbstractContextManager[Caller] = callers.sync_caller(url)
-        case "async":
-            opened = callers.async_caller(url)
-        case "offline":
-            opened = callers.offline_caller(request.getfixturevalue("shared_store"))
-        case "cpp":
-            opened = callers.cpp_caller(request.getfixturevalue("bridge"), url)
-        case other:
-            raise AssertionError(other)
-    with opened as found:
-        yield found
+    is_offline = request.param == "offline"
+    opened = callers.offline_caller(shared_store) if is_offline else opener(request)(url)
+    with opened as caller:
+        yield caller

@@ -6,10 +6,9 @@ import os
 import re
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -19,6 +18,7 @@ from playwright.sync_api import sync_playwright
 from scripts.site import DIRECTIVE, checks
 from tests.conftest import REPOSITORY
 from tests.docs.conftest import Workplace
+from tests.services import http_server
 
 pytestmark = pytest.mark.slow
 
@@ -121,13 +121,8 @@ def served(site: Path) -> Iterator[str]:
         def log_message(self, *arguments: object) -> None:
             pass
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=site))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_address[1]}"
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with http_server(partial(Quiet, directory=site)) as url:
+        yield url
 
 
 @pytest.mark.system

@@ -24,8 +24,6 @@ LISTED = [[], [0], [2, 5], [0, 1, 3, 6]]
 MANY, TOLERANCE = 1 << 14, 0.015
 
 
-# Of 16 completions from 512 samples: three standard errors of 16 independent draws of a probability
-# whose standard deviation over contexts is .2.
 def machine_of(samples, rooms=(None,), seed=0):
     """A float32 machine whose stored samples are drawn exactly, as many under each room type."""
     generator = torch.Generator().manual_seed(seed)
@@ -64,11 +62,6 @@ def exactly(machine, listed, coverage, room=None):
 def prepared(machine, structure, *count):
     weights = weights_of(machine)
     return Completions(weights, structure, ContextScorer(weights["W"]), *count)
-
-
-def estimated(machine, listed, coverage, room=None, count=16, structure=NOTHING):
-    completions = prepared(machine, structure, count)
-    return ask(completions, machine, listed, coverage, room)
 
 
 def ask(completions, machine, listed, coverage, room=None):
@@ -118,7 +111,7 @@ def test_rooms_of_very_different_strength_give_finite_odds():
 
 def test_the_same_scene_gets_the_same_bits():
     machine = machine_of(64)
-    first = estimated(machine, [1, 4], 0.5)
+    first = ask(prepared(machine, NOTHING), machine, [1, 4], 0.5)
     again = prepared(machine, NOTHING)
     ask(again, machine, [0], 0.3)
     np.testing.assert_array_equal(ask(again, machine, [1, 4], 0.5), first)

@@ -163,18 +163,6 @@ def test_conditionals_of_every_block(name):
                 assert float(hidden[n, k]) == pytest.approx(exact, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", [n for n, s in SMALL.items() if s.variant == "triway"])
-def test_no_relation_of_an_absent_object_can_be_on(name):
-    machine = small_machine(name)
-    edges = full_frame(machine)
-    for v, r in itertools.product(binary(machine.spec.V), binary(edges.shape[-1])):
-        zeros = torch.zeros(1, machine.spec.H1).double(), torch.zeros(1, machine.spec.H2).double()
-        energy = machine.energy(v[None], r[None], *zeros, edges)
-        on = {int(edges.subject[0, e]) for e in r.nonzero().flatten()}
-        on |= {int(edges.object[0, e]) for e in r.nonzero().flatten()}
-        assert bool(torch.isinf(energy)) == any(v[i] == 0 for i in on)
-
-
 @pytest.mark.parametrize("name", SMALL)
 def test_hidden_input_is_the_sum_of_rows(name):
     machine = small_machine(name)

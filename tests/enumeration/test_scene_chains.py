@@ -122,31 +122,6 @@ def test_chains_are_stationary_under_conditions(name, r):
     check_stationary(name, conditions([0, 1], [(0, 0, 1, r)], [1]), given)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_observed_relations_tell_of_the_context(name):
-    """Every relation between two classes seen, some on: h1 from 8,000 chains of 20 sweeps
-    that start anywhere, against the joint; the yardstick as above, with .02 for the start."""
-    count = 8_000
-    single, double = rounded(name)
-    joint = enumerate_joint(double)
-    spec = double.spec
-    seen = [(a, i, j, (a + i) % 2) for a in range(spec.A) for i in (0, 1) for j in (0, 1)]
-    where = (joint.v[:, :2] > 0).all(1)
-    for a, i, j, r in seen:
-        if (on := unit(joint, a, i, j)) is not None:
-            where &= on == (r > 0)
-    p = torch.where(where, joint.p, 0.0)
-    contexts = joint.h1.long() @ (1 << torch.arange(spec.H1))
-    expected = torch.zeros(2**spec.H1).double().scatter_add(0, contexts, p / p.sum())
-    chains = SceneChains(weights_of(single)).given(conditions([0, 1], seen))
-    found = np.zeros(2**spec.H1)
-    for chain in range(count):
-        found[(1 << chains.draw(20, random_stream(2, chain)).h1).sum()] += 1 / count
-    slack = math.sqrt(9 * math.log(10) / (2 * count))
-    assert 0.5 * np.abs(found - expected.numpy()).sum() < 0.02 + slack
-
-
 # -- beside the tensors ------------------------------------------------------------------------
 
 WIDE = MachineSpec("triway", V=40, A=4, H1=70, K=6, T=900, C=3, G=3, N=24, form="local")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 
 from training.machines import MachineSpec, build
@@ -25,20 +26,18 @@ def logits(counts):
     return machine.relation_logits(machine.edges(CLASSES, counts), v, h1).view(2, 2)
 
 
-def expected(subject, object_):
-    return torch.tensor([[0.5 * i + 2.0 * j for j in object_] for i in subject]).double()
-
-
-def test_logits_see_the_log_of_both_counts():
-    logs = [math.log(3), math.log(5)]
-    assert torch.allclose(logits(torch.tensor([[3, 5]])), expected(logs, logs))
-
-
-def test_the_usual_count_stands_in_where_nobody_counted():
-    logs = [0.1, math.log(5)]
-    assert torch.allclose(logits(torch.tensor([[0, 5]])), expected(logs, logs))
-    logs = [0.1, 0.7]
-    assert torch.allclose(logits(torch.tensor([[0, 0]])), expected(logs, logs))
+@pytest.mark.parametrize(
+    ("counts", "logs"),
+    [
+        ([3, 5], [math.log(3), math.log(5)]),
+        # Without a count, the usual count of the class.
+        ([0, 5], [0.1, math.log(5)]),
+        ([0, 0], [0.1, 0.7]),
+    ],
+)
+def test_logits_have_the_logs_of_both_counts(counts, logs):
+    expected = torch.tensor([[0.5 * i + 2.0 * j for j in logs] for i in logs]).double()
+    assert torch.allclose(logits(torch.tensor([counts])), expected)
 
 
 def test_omitted_counts_are_one_each():

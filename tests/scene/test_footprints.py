@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene.footprints import overlap_and_gap
-from tests.scene.pose_rules import border_distance, common_area
+from tests.scene.pose_rules import Box, common_area, distance_of
 
 Rectangle = tuple[float, float, float, float, float]
-Polygon = list[tuple[float, float]]
 
 coordinates = st.floats(-2, 2, width=32)
 sides = st.floats(0.0625, 3, width=32)
@@ -23,16 +22,9 @@ turns = st.one_of(
 rectangles = st.tuples(coordinates, coordinates, sides, sides, turns)
 
 
-def polygon(rectangle: Rectangle) -> Polygon:
+def corners(rectangle: Rectangle) -> list[tuple[float, float]]:
     x, y, width, depth, yaw = rectangle
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return [
-        (
-            x + cos * u * width / 2 - sin * v * depth / 2,
-            y + sin * u * width / 2 + cos * v * depth / 2,
-        )
-        for u, v in ((1, 1), (-1, 1), (-1, -1), (1, -1))
-    ]
+    return Box((x, y, 0.0), (width, depth, 1.0), yaw).corners
 
 
 def measure(a: Rectangle, b: Rectangle) -> tuple[float, float]:
@@ -45,14 +37,9 @@ def measure(a: Rectangle, b: Rectangle) -> tuple[float, float]:
 @given(rectangles, rectangles)
 def test_overlap_and_gap_agree_with_polygon_clipping(a: Rectangle, b: Rectangle) -> None:
     share, gap = measure(a, b)
-    area = common_area(polygon(a), polygon(b))
+    area = common_area(corners(a), corners(b))
     assert share * min(a[2] * a[3], b[2] * b[3]) == pytest.approx(area, abs=1e-5)
-    expected = (
-        0.0
-        if area > 1e-9
-        else min(border_distance(polygon(a), polygon(b)), border_distance(polygon(b), polygon(a)))
-    )
-    assert gap == pytest.approx(expected, abs=1e-5)
+    assert gap == pytest.approx(distance_of(corners(a), corners(b)), abs=1e-5)
 
 
 def test_a_footprint_too_small_for_its_area_is_a_point() -> None:

@@ -53,13 +53,6 @@ def test_optical_axes() -> None:
 
 
 @given(st.floats(-3, 3))
-def test_yaw_of_an_upright_box(angle: float) -> None:
-    _, size, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), about((0, 0, 1), angle))
-    assert size == (1.0, 2.0, 3.0)
-    assert same_turn(yaw, angle)
-
-
-@given(st.floats(-3, 3))
 def test_yaw_in_an_optical_frame(angle: float) -> None:
     # y points down: a turn about it is a turn the other way about the vertical.
     _, size, yaw = body_pose(

@@ -8,7 +8,7 @@ import math
 import threading
 import weakref
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from itertools import pairwise
 from time import monotonic, sleep, thread_time
 from typing import Any
@@ -33,6 +33,13 @@ pytestmark = pytest.mark.anyio
 ENDLESS = Ticket(math.inf)
 
 
+def work(seconds: float) -> None:
+    """Use so much processor time."""
+    end = thread_time() + seconds
+    while thread_time() < end:
+        pass
+
+
 @pytest.fixture
 def threads() -> Iterator[Threads]:
     threads = Threads()
@@ -44,13 +51,8 @@ def threads() -> Iterator[Threads]:
 async def queue(threads: Threads) -> WorkQueue:
     queue = WorkQueue(8, threads, Backlog(8))
 
-    def busy() -> None:
-        end = thread_time() + 10 * CHEAP
-        while thread_time() < end:
-            pass
-
-    # From now on these kinds are known.
-    await queue.run(busy, ENDLESS, kind="costly", size=1)
+    # From now on the cost of these kinds is measured.
+    await queue.run(lambda: work(10 * CHEAP), ENDLESS, kind="costly", size=1)
     for kind in ("cheap", *map(str, range(40))):
         await queue.run(lambda: None, ENDLESS, kind=kind, size=1)
     return queue
@@ -309,45 +311,45 @@ async def enter(
 FULL, LATE = "QueueFullError", "DeadlinePassedError"
 
 
+async def in_ticks(
+    requests: Iterable[Coroutine[Any, Any, str]], count: Callable[[], int]
+) -> tuple[list[str], list[int]]:
+    """What becomes of requests of one moment, and the change of a count in each tick."""
+    running = asyncio.gather(*requests)
+    counts = [count()]
+    while not running.done():
+        await asyncio.sleep(0)
+        counts.append(count())
+    return await running, [after - before for before, after in pairwise(counts)]
+
+
 async def test_requests_of_one_moment_begin_a_few_in_a_tick_and_in_order() -> None:
     backlog = Backlog(1000)
     begun: list[str] = []
-    ticks: list[int] = []
-
-    async def clock() -> None:
-        while len(begun) < 300:
-            ticks.append(len(begun))
-            await asyncio.sleep(0)
-
     names = [f"/{number}" for number in range(300)]
-    *outcomes, _ = await asyncio.gather(*(enter(backlog, begun, name) for name in names), clock())
+    requests = (enter(backlog, begun, name) for name in names)
+    outcomes, steps = await in_ticks(requests, lambda: len(begun))
     assert outcomes == ["begun"] * 300
     assert begun == names
-    steps = [after - before for before, after in pairwise(ticks)]
     assert max(steps) <= PACE
     # Without others a request begins at once.
     assert await enter(backlog, begun) == "begun"
+
+
+async def slowly(request: Coroutine[Any, Any, str]) -> str:
+    """A request whose start takes 1 ms."""
+    outcome = await request
+    work(1e-3)
+    return outcome
 
 
 async def test_slow_requests_begin_fewer_in_a_tick() -> None:
     """At 1 ms each, eight requests fill a tick once their time has been measured."""
     backlog = Backlog(1000)
     begun: list[str] = []
-    ticks: list[int] = []
-
-    async def request() -> None:
-        await enter(backlog, begun)
-        end = thread_time() + 1e-3
-        while thread_time() < end:
-            pass
-
-    async def clock() -> None:
-        while len(begun) < 300:
-            ticks.append(len(begun))
-            await asyncio.sleep(0)
-
-    await asyncio.gather(*(request() for _ in range(300)), clock())
-    steps = [after - before for before, after in pairwise(ticks)]
+    requests = (slowly(enter(backlog, begun)) for _ in range(300))
+    _, steps = await in_ticks(requests, lambda: len(begun))
+    assert len(begun) == 300
     # A busy machine makes requests slower, never faster.
     assert max(steps[len(steps) // 2 :]) <= TICK / 1e-3 + 1
 
@@ -356,16 +358,8 @@ async def test_slow_requests_begin_beside_work_of_another_model() -> None:
     """Eight requests fill a tick here, and as many questions are pending already."""
     backlog = Backlog(1000)
     backlog.pending = int(TICK / 1e-3)
-
-    async def request() -> str:
-        outcome = await enter(backlog, [])
-        end = thread_time() + 1e-3
-        while thread_time() < end:
-            pass
-        return outcome
-
     for _ in range(3):
-        requests = (request() for _ in range(20))
+        requests = (slowly(enter(backlog, [])) for _ in range(20))
         assert await asyncio.wait_for(asyncio.gather(*requests), 5) == ["begun"] * 20
 
 
@@ -429,20 +423,15 @@ async def test_the_measured_pace_decides_how_long_the_backlog_gets() -> None:
 
 async def test_refusals_hold_up_no_tick_either() -> None:
     backlog = Backlog(1)
-    outcomes: list[str] = []
-    ticks: list[int] = []
+    refused: list[str] = []
 
-    async def call() -> None:
-        outcomes.append(await enter(backlog, []))
+    async def call() -> str:
+        outcome = await enter(backlog, [])
+        refused.extend([outcome] if outcome == FULL else [])
+        return outcome
 
-    async def clock() -> None:
-        while len(outcomes) < PACE + 200:
-            ticks.append(outcomes.count(FULL))
-            await asyncio.sleep(0)
-
-    await asyncio.gather(*(call() for _ in range(PACE + 200)), clock())
+    outcomes, steps = await in_ticks((call() for _ in range(PACE + 200)), lambda: len(refused))
     assert Counter(outcomes) == {"begun": PACE + 1, FULL: 199}
-    steps = [after - before for before, after in pairwise(ticks)]
     assert max(steps) == REFUSALS
 
 

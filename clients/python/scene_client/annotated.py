@@ -32,8 +32,8 @@ def from_annotated(scene: Mapping[str, Any]) -> dict[str, Any]:
     }
     if len(set(ids.values())) < len(objects):
         raise ValueError("two objects have the same id")
-    found: dict[str, Any] = {"objects": [_detection(ids[thing["id"]], thing) for thing in objects]}
-    if not all("position" in thing for thing in found["objects"]):
+    fields: dict[str, Any] = {"objects": [_detection(ids[thing["id"]], thing) for thing in objects]}
+    if not all("position" in thing for thing in fields["objects"]):
         supports = [
             [thing["id"], "on-top", thing["supported_by"]]
             for thing in objects
@@ -44,22 +44,22 @@ def from_annotated(scene: Mapping[str, Any]) -> dict[str, Any]:
             {"subject": ids[subject], "relation": relation, "object": ids[other]}
             for subject, relation, other in stated
         ]
-        found |= {"relations": relations} if relations else {}
+        fields |= {"relations": relations} if relations else {}
     if not scene.get("viewer_frame"):
-        found["frame_id"] = "map"
+        fields["frame_id"] = "map"
     if scene.get("room_type") is not None:
-        found["room_type"] = scene["room_type"]
-    return found
+        fields["room_type"] = scene["room_type"]
+    return fields
 
 
 def _detection(name: str, thing: Mapping[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {"id": name, "label": thing["label"]}
+    detection: dict[str, Any] = {"id": name, "label": thing["label"]}
     if thing.get("position") is not None:
         half = thing.get("yaw", 0.0) / 2
-        found["position"] = _metres(thing["position"])
-        found["orientation"] = {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)}
-        found |= {"size": _metres(thing["size"])} if thing.get("size") is not None else {}
-    return found
+        detection["position"] = _metres(thing["position"])
+        detection["orientation"] = {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)}
+        detection |= {"size": _metres(thing["size"])} if thing.get("size") is not None else {}
+    return detection
 
 
 def _metres(vector: list[float] | dict[str, float]) -> dict[str, float]:

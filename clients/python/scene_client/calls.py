@@ -151,8 +151,8 @@ def ask_each(
         InvalidRequestError: the batch or the request about one of its scenes is invalid.
     """
     requests = [
-        _json(_request(form, scene, {}, model, ("scenes", place)))
-        for place, scene in enumerate(scenes)
+        _json(_request(form, scene, {}, model, ("scenes", index)))
+        for index, scene in enumerate(scenes)
     ]
     if not 1 <= len(requests) <= schemas.MAX_BATCH:
         message = f"a batch must contain from 1 to {schemas.MAX_BATCH} scenes"
@@ -196,12 +196,12 @@ def _request(
             names = ", ".join(fields)
             message = f"these fields must be members of the whole request: {names}"
             raise InvalidRequestError.about(message)
-        given = _plain(scene)
+        members = _plain(scene)
     else:
-        given = {"objects": scene, **fields}
+        members = {"objects": scene, **fields}
     if model is not None:
-        given.setdefault("model", model)
-    return validated(kind, {name: _listed(value) for name, value in given.items()}, at)
+        members.setdefault("model", model)
+    return validated(kind, {name: _listed(value) for name, value in members.items()}, at)
 
 
 def _listed(value: Any) -> Any:
@@ -217,18 +217,18 @@ def _plain(value: Any) -> Any:
     return dict(value) if isinstance(value, Mapping) else value
 
 
-def validated(kind: type[FormT], given: dict[str, Any], at: tuple[str | int, ...] = ()) -> FormT:
-    """Return the request, or a part of it, that the dictionary ``given`` describes.
+def validated(kind: type[FormT], fields: dict[str, Any], at: tuple[str | int, ...] = ()) -> FormT:
+    """Return the request, or a part of it, that the dictionary ``fields`` describes.
 
     Args:
         kind: class of the request.
-        given: fields of the request.
-        at: location of ``given`` in the body.
+        fields: fields of the request.
+        at: location of ``fields`` in the body.
 
     Raises:
         InvalidRequestError: the request is invalid.
     """
     try:
-        return kind.model_validate(given)
+        return kind.model_validate(fields)
     except ValidationError as error:
-        raise InvalidRequestError(field_errors(error, given, kind, at=at)) from None
+        raise InvalidRequestError(field_errors(error, fields, kind, at=at)) from None

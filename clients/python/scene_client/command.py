@@ -57,12 +57,12 @@ class _Group(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Move the general options before the subcommand, then parse all arguments."""
         own, others = [], []
-        given = iter(args)
-        for word in given:
+        words = iter(args)
+        for word in words:
             if word == "--":
-                others += [word, *given]
+                others += [word, *words]
             elif word in _FLAGS or word.partition("=")[0] in _VALUED:
-                own += [word, *islice(given, word in _VALUED)]
+                own += [word, *islice(words, word in _VALUED)]
             else:
                 others.append(word)
         parsed: list[str] = super().parse_args(ctx, own + others)
@@ -84,7 +84,7 @@ app = typer.Typer(
 
 
 @dataclass(frozen=True)
-class Asked:
+class Options:
     """The general options, which apply to every question."""
 
     url: str
@@ -117,10 +117,10 @@ def _show(
         table: function that returns the table.
         request: body of the request, for the messages of errors.
     """
-    asked: Asked = context.obj
-    with _failing(request), asked.client() as client:
+    options: Options = context.obj
+    with _failing(request), options.client() as client:
         answer = question(client)
-    if asked.as_json:
+    if options.as_json:
         print(answer.model_dump_json(exclude_unset=True))
         return answer
     console = Console(markup=False, highlight=False, emoji=False)
@@ -165,7 +165,7 @@ def main(
     ] = False,
 ) -> None:
     """Store the general options for the subcommand."""
-    context.obj = Asked(url, model, offline, timeout, json)
+    context.obj = Options(url, model, offline, timeout, json)
 
 
 # ---------------------------------------------------------------------------------- questions
@@ -351,8 +351,8 @@ def contexts(context: typer.Context) -> None:
 @app.command()
 def ready(context: typer.Context) -> None:
     """Check that the service is ready. The only output is the exit status."""
-    asked: Asked = context.obj
-    with _failing(None), asked.client() as client:
+    options: Options = context.obj
+    with _failing(None), options.client() as client:
         client.check_ready()
 
 
@@ -520,12 +520,12 @@ def _anchor(text: str) -> dict[str, str]:
 def _relation(text: str) -> dict[str, str]:
     # Labels may contain spaces. The first name of a relation separates the two labels.
     words = text.split()
-    place = next((n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS), None)
-    if place is None:
+    middle = next((n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS), None)
+    if middle is None:
         wanted = '--relations must be a subject, a relation and an object, as in "lamp on-top desk"'
         _fail(f"{wanted}; {_relations_for(words[1:-1])}", MEANINGLESS)
-    subject, object = " ".join(words[:place]), " ".join(words[place + 1 :])
-    return {"subject": subject, "relation": words[place], "object": object}
+    subject, object = " ".join(words[:middle]), " ".join(words[middle + 1 :])
+    return {"subject": subject, "relation": words[middle], "object": object}
 
 
 def _relations_for(words: Iterable[str]) -> str:
@@ -546,8 +546,8 @@ def _failing(request: Any) -> Iterator[None]:
         _fail(str(error), MEANINGLESS)
     except ProblemError as problem:
         errors = [_quoted(error, request) for error in problem.errors]
-        known = (problem.type, problem.status, problem.title, problem.detail)
-        _fail(str(ProblemError(*known, errors=errors)), _status(problem))
+        parts = (problem.type, problem.status, problem.title, problem.detail)
+        _fail(str(ProblemError(*parts, errors=errors)), _status(problem))
     except UnreachableError as error:
         _fail(f"the service cannot be reached: {error}", UNREACHABLE)
     except DeadlineError as error:

@@ -53,7 +53,7 @@ def left_pairs(boxes: Sequence[Box | None], order: Sequence[int]) -> list[tuple[
         boxes: box of each object, or None for an object without a box.
         order: indices of ``boxes``, for example by descending confidence.
     """
-    found = []
+    pairs = []
     for rank, i in enumerate(order):
         for j in order[:rank]:
             first, second = boxes[i], boxes[j]
@@ -61,10 +61,10 @@ def left_pairs(boxes: Sequence[Box | None], order: Sequence[int]) -> list[tuple[
                 continue
             relation = relation_between(first, second)
             if relation == "left":
-                found.append((i, j))
+                pairs.append((i, j))
             elif relation == "right":
-                found.append((j, i))
-    return found
+                pairs.append((j, i))
+    return pairs
 
 
 def upright_box(centre: tuple[float, float], size: tuple[float, float], theta: float) -> Box:

@@ -45,21 +45,21 @@ def draw(answer: GenerateAnswer, path: Path) -> None:
         ValueError: matplotlib does not support the file format.
         OSError: the file cannot be written.
     """
-    boxes = [arrange(scene.objects, scene.relations) for scene in answer.scenes]
-    columns = ceil(sqrt(len(boxes)))
-    extents = [extent(found) for found in boxes]
+    layouts = [arrange(scene.objects, scene.relations) for scene in answer.scenes]
+    columns = ceil(sqrt(len(layouts)))
+    extents = [extent(layout) for layout in layouts]
     widths = [max(w for w, _ in extents[n::columns]) + _MARGIN for n in range(columns)]
     heights = [
         max(h for _, h in extents[start : start + columns]) + _MARGIN
-        for start in range(0, len(boxes), columns)
+        for start in range(0, len(layouts), columns)
     ]
     size = (sum(widths) * _UNIT, sum(heights) * _UNIT)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.add_gridspec(len(heights), columns, width_ratios=widths, height_ratios=heights)
-    for place, (scene, found) in enumerate(zip(answer.scenes, boxes, strict=True)):
-        axes = figure.add_subplot(grid[place // columns, place % columns])
-        axes.set_title(f"scene {place + 1} of seed {answer.seed}", fontsize=_POINTS + 2)
-        _draw(axes, scene, found)
+    for index, (scene, layout) in enumerate(zip(answer.scenes, layouts, strict=True)):
+        axes = figure.add_subplot(grid[index // columns, index % columns])
+        axes.set_title(f"scene {index + 1} of seed {answer.seed}", fontsize=_POINTS + 2)
+        _draw(axes, scene, layout)
     figure.savefig(path, dpi=min(150.0, _MAX_PIXELS / max(size)))
 
 
@@ -186,9 +186,9 @@ def arrange(objects: Sequence[str], relations: Iterable[Relation]) -> list[Box]:
     cells: dict[tuple[int, int], list[list[Box]]] = {}
     for name in roots:
         cells.setdefault((column[name], row[name]), []).append(piles[name])
-    shelved = {place: _shelved(members) for place, members in cells.items()}
-    lefts = _offsets({place[0]: extent(boxes)[0] for place, boxes in _widest(shelved, 0)})
-    floors = _offsets({place[1]: extent(boxes)[1] for place, boxes in _widest(shelved, 1)})
+    shelved = {cell: _shelved(members) for cell, members in cells.items()}
+    lefts = _offsets({cell[0]: extent(boxes)[0] for cell, boxes in _widest(shelved, 0)})
+    floors = _offsets({cell[1]: extent(boxes)[1] for cell, boxes in _widest(shelved, 1)})
     return [
         box
         for (at_column, at_row), boxes in shelved.items()

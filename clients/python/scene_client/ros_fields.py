@@ -164,8 +164,8 @@ def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
         return {}
     if isinstance(label_map, str):
         if label_map not in WELL_KNOWN:
-            known = ", ".join(sorted(WELL_KNOWN))
-            raise MessageError(f"no label map has the name {label_map!r}; known names: {known}")
+            names = ", ".join(sorted(WELL_KNOWN))
+            raise MessageError(f"no label map has the name {label_map!r}; known names: {names}")
         label_map = WELL_KNOWN[label_map]
     elif (classes := take(label_map, "class_map")) is not None:
         label_map = {

@@ -65,9 +65,9 @@ def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> Rend
         )
         for entry in answer.missing
     ]
-    found = _table("missing", "probability", "log-odds", "where", "because", rows=rows)
+    table = _table("missing", "probability", "log-odds", "where", "because", rows=rows)
     if not answer.more:
-        return found if rows else "No object is missing."
+        return table if rows else "No object is missing."
     further = [
         (
             entry.label,
@@ -78,7 +78,7 @@ def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> Rend
         for entry in answer.more
     ]
     counts = _table("more of", "listed", "expected", "probability", rows=further)
-    return Group(found, counts) if rows else counts
+    return Group(table, counts) if rows else counts
 
 
 def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
@@ -96,9 +96,9 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
         for entry in answer.outliers
     ]
     heads = ("object", "label", "probability", "log-odds", "", "because", "usually with")
-    found = _table(*heads, rows=rows)
+    table = _table(*heads, rows=rows)
     if not answer.misplaced:
-        return found
+        return table
     wrong = [
         (*_relation(entry), "misplaced" if entry.is_misplaced else "")
         for entry in answer.misplaced[:MOST_MISPLACED]
@@ -107,7 +107,7 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
     title = "relations as given"
     if len(wrong) < len(answer.misplaced):
         title += f": the {len(wrong)} likeliest to be wrong of {len(answer.misplaced)}"
-    return Group(found, _table(*columns, rows=wrong, title=title))
+    return Group(table, _table(*columns, rows=wrong, title=title))
 
 
 def notes(answer: BaseModel) -> list[str]:
@@ -156,11 +156,11 @@ def models(answer: schemas.ModelList) -> RenderableType:
         for model in answer.models
         for version in model.versions
     ]
-    found = _table("model", "variant", "aliases", "status", rows=rows)
+    table = _table("model", "variant", "aliases", "status", rows=rows)
     failures = [(failure.subject, failure.reason, failure.detail) for failure in answer.failures]
     if not failures:
-        return found
-    return Group(found, _table("failed", "reason", "detail", rows=failures))
+        return table
+    return Group(table, _table("failed", "reason", "detail", rows=failures))
 
 
 def contexts(answer: schemas.ContextsAnswer) -> RenderableType:
@@ -208,16 +208,16 @@ def _share(probability: float) -> str:
 
 
 def _placement(placement: schemas.Placement) -> str:
-    told = f"{placement.relation} {placement.object} {_share(placement.probability)}"
+    text = f"{placement.relation} {placement.object} {_share(placement.probability)}"
     # A model has no offsets if its training scenes have no positions.
     offset = placement.offset
     if offset is None:
-        return told
+        return text
     axes = (
         f"{axis} {getattr(offset.mean, axis):+.2f}±{getattr(offset.std, axis):.2f}"
         for axis in ("x", "y", "z")
     )
-    return f"{told} ({', '.join(axes)} m)"
+    return f"{text} ({', '.join(axes)} m)"
 
 
 def _reasons(because: Iterable[schemas.Because]) -> str:

@@ -75,25 +75,25 @@ def field_errors(
         form: the schema that ``body`` does not match.
         at: location of ``body`` in the request.
     """
-    found = []
+    errors = []
     for fault in _first_errors(error, body, form):
         message, suggestions = _worded(fault, form)
         where = pointer(at) + pointer(fault["loc"], body)[1:]
-        found.append(FieldError(pointer=where, message=message, suggestions=suggestions))
-    return found
+        errors.append(FieldError(pointer=where, message=message, suggestions=suggestions))
+    return errors
 
 
 def _first_errors(error: ValidationError, body: Any, form: type[Request]) -> list[ErrorDetails]:
     errors = later = error.errors(include_url=False)
     while len(errors) < MAX_ERRORS:
         # Only errors of entries have a location of more than one step.
-        place: Any = next(
+        index: Any = next(
             (one["loc"][1] for one in later if one["loc"][1:] and _is_object(one)), None
         )
-        if place is None:
+        if index is None:
             break
         objects = [*body["objects"]]
-        objects[place] = "valid"
+        objects[index] = "valid"
         body = {**body, "objects": objects}
         try:
             form.model_validate(body)
@@ -153,13 +153,13 @@ def _worded(fault: ErrorDetails, form: type[Request]) -> tuple[str, list[str]]:
         choices = re.findall(r"'([^']*)'", fault["ctx"]["expected"])
         return f"must be {listed(choices, 'or')}", _like(value, choices)
     if (wanted := _WRONG_TYPES.get(kind)) is not None:
-        found = _KINDS.get(type(value)) or f"a {type(value).__name__}"
+        actual = _KINDS.get(type(value)) or f"a {type(value).__name__}"
         if kind == "model_type":
             members = _members(fault["loc"], form)
             if isinstance(value, list) and members.endswith("values"):
-                found += f" of {len(value)}"
-            return f"{wanted}{members}, not {found}", []
-        return f"{wanted}, not {found}", []
+                actual += f" of {len(value)}"
+            return f"{wanted}{members}, not {actual}", []
+        return f"{wanted}, not {actual}", []
     if (template := _MESSAGES.get(kind)) is not None:
         context = fault.get("ctx", {})
         return template.format(**{name: _plainly(bound) for name, bound in context.items()}), []

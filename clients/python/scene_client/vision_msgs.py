@@ -186,7 +186,7 @@ def is_message(value: Any) -> bool:
 class _Sighting:
     """A detection that becomes an object of the request."""
 
-    place: int
+    index: int
     detection: Any
     label: str
     confidence: float
@@ -208,8 +208,8 @@ class _Reader:
             raise MessageError("min_score must be a finite number")
         sightings = [
             seen
-            for place, detection in enumerate(self.detections)
-            if (seen := self._sight(place, detection, min_score)) is not None
+            for index, detection in enumerate(self.detections)
+            if (seen := self._sight(index, detection, min_score)) is not None
         ]
         if not sightings and label_map is None and self._only_numbers():
             raise MessageError(
@@ -221,10 +221,10 @@ class _Reader:
         self.ids = self._ids()
         self.frame = self._frame()
 
-    def note(self, place: int | None, reason: Reason, detail: str) -> None:
-        self.notes.append(Note(place, reason, detail))
+    def note(self, index: int | None, reason: Reason, detail: str) -> None:
+        self.notes.append(Note(index, reason, detail))
 
-    def _sight(self, place: int, detection: Any, min_score: float) -> _Sighting | None:
+    def _sight(self, index: int, detection: Any, min_score: float) -> _Sighting | None:
         best, class_id, score = None, "", -math.inf
         for result in items(take(detection, "results"), "results"):
             hypothesis = take(result, "hypothesis") or result
@@ -233,25 +233,25 @@ class _Reader:
                 best, score = result, rated
                 class_id = text(take(hypothesis, "class_id")) or text(take(hypothesis, "id"))
         if best is None:
-            self.note(place, "no-hypothesis", "the detection has no hypothesis with a score")
+            self.note(index, "no-hypothesis", "the detection has no hypothesis with a score")
             return None
         if not score > 0 or score < min_score:
             self.note(
-                place, "low-score", f"the score {score:g} is not positive or is below min_score"
+                index, "low-score", f"the score {score:g} is not positive or is below min_score"
             )
             return None
         label = self.labels.get(class_id, class_id)
         if label is None:
-            self.note(place, "unwanted", f"the label map excludes class {class_id!r}")
+            self.note(index, "unwanted", f"the label map excludes class {class_id!r}")
             return None
         if _is_number(label) or not is_plain(label.strip(), _MAX_LABEL):
-            self.note(place, "no-label", f"class {class_id[:_MAX_LABEL]!r} has no label")
+            self.note(index, "no-label", f"class {class_id[:_MAX_LABEL]!r} has no label")
             return None
         if score > 1:
-            self.note(place, "high-score", f"the score {score:g} is above 1 and counts as 1")
+            self.note(index, "high-score", f"the score {score:g} is above 1 and counts as 1")
         pose = take(best, "pose")
         return _Sighting(
-            place, detection, label.strip(), min(score, 1.0), take(pose, "pose") or pose
+            index, detection, label.strip(), min(score, 1.0), take(pose, "pose") or pose
         )
 
     def _only_numbers(self) -> bool:
@@ -268,8 +268,8 @@ class _Reader:
         ranked = sorted(sightings, key=lambda seen: -seen.confidence)
         for seen in ranked[MAX_OBJECTS:]:
             why = f"{MAX_OBJECTS} other detections have equal or higher scores"
-            self.note(seen.place, "too-many", why)
-        return sorted(ranked[:MAX_OBJECTS], key=lambda seen: seen.place)
+            self.note(seen.index, "too-many", why)
+        return sorted(ranked[:MAX_OBJECTS], key=lambda seen: seen.index)
 
     def _ids(self) -> dict[int, str]:
         """Return a dictionary from the index of each detection to an id.
@@ -283,19 +283,19 @@ class _Reader:
             if not name:
                 continue
             if not is_plain(name, _MAX_ID):
-                self.note(seen.place, "renamed", "the id is not plain text")
+                self.note(seen.index, "renamed", "the id is not plain text")
             elif name in own:
-                self.note(seen.place, "renamed", f"detection {own[name]} has the same id")
+                self.note(seen.index, "renamed", f"detection {own[name]} has the same id")
             else:
-                own[name] = seen.place
-                ids[seen.place] = name
+                own[name] = seen.index
+                ids[seen.index] = name
         last: dict[str, int] = {}
         for seen in self.sightings:
-            while seen.place not in ids:
+            while seen.index not in ids:
                 last[seen.label] = last.get(seen.label, 0) + 1
                 name = f"{seen.label}_{last[seen.label]}"
                 if name not in own:
-                    ids[seen.place] = name
+                    ids[seen.index] = name
         return ids
 
     def _frame(self) -> str | None:
@@ -311,12 +311,12 @@ class _Reader:
         return frame_of(take(seen.detection, "header")) not in ("", self.frame)
 
     def object(self, seen: _Sighting) -> dict[str, Any]:
-        return {"id": self.ids[seen.place], "label": seen.label, "confidence": seen.confidence}
+        return {"id": self.ids[seen.index], "label": seen.label, "confidence": seen.confidence}
 
     def pose(self, seen: _Sighting, boxes: bool) -> dict[str, Any]:
         """Return the fields position, size and orientation of a detection, as far as known."""
         if self._is_elsewhere(seen):
-            self.note(seen.place, "no-position", "the detection has another frame than the message")
+            self.note(seen.index, "no-position", "the detection has another frame than the message")
             return {}
         box = take(seen.detection, "bbox") if boxes else None
         pose, size = take(box, "center"), numbers(take(box, "size"), "xyz")
@@ -324,38 +324,40 @@ class _Reader:
         if not sized and _is_unset(pose):
             pose = seen.pose
             if _is_unset(pose):
-                self.note(seen.place, "no-position", "the box and the pose are unset")
+                self.note(seen.index, "no-position", "the box and the pose are unset")
                 return {}
         position = numbers(take(pose, "position"), "xyz")
         if position is None or any(abs(value) > _MAX_METRES for value in position):
-            self.note(seen.place, "no-position", "the position is not finite or out of range")
+            self.note(seen.index, "no-position", "the position is not finite or out of range")
             return {}
-        found: dict[str, Any] = {"position": dict(zip("xyz", position, strict=True))}
+        pose_fields: dict[str, Any] = {"position": dict(zip("xyz", position, strict=True))}
         if size is not None and sized:
-            found["size"] = dict(zip("xyz", size, strict=True))
+            pose_fields["size"] = dict(zip("xyz", size, strict=True))
         turn = numbers(take(pose, "orientation"), "xyzw")
         length = math.hypot(*turn) if turn else 0.0
         if turn and _MIN_NORM < length < math.inf:
-            found["orientation"] = dict(zip("xyzw", (side / length for side in turn), strict=True))
-        return found
+            pose_fields["orientation"] = dict(
+                zip("xyzw", (side / length for side in turn), strict=True)
+            )
+        return pose_fields
 
     def image_relations(self, ids: list[str]) -> list[dict[str, str]]:
         """Return the relations left between neighbouring boxes in the image."""
         boxes = [self._image_box(seen) for seen in self.sightings]
         # If there are too many relations, the request contains those of the most confident objects.
         order = sorted(range(len(ids)), key=lambda i: -self.sightings[i].confidence)
-        found = left_pairs(boxes, order)
-        if (extra := len(found) - MAX_RELATIONS) > 0:
+        pairs = left_pairs(boxes, order)
+        if (extra := len(pairs) - MAX_RELATIONS) > 0:
             self.note(None, "too-many", f"the request leaves out {extra} relations")
         return [
             {"subject": ids[i], "relation": "left", "object": ids[j]}
-            for i, j in sorted(found[:MAX_RELATIONS])
+            for i, j in sorted(pairs[:MAX_RELATIONS])
         ]
 
     def _image_box(self, seen: _Sighting) -> Box | None:
         """Return the smallest upright box around the box of a detection, which may be rotated."""
         if self._is_elsewhere(seen):
-            self.note(seen.place, "no-box", "the detection has another frame than the message")
+            self.note(seen.index, "no-box", "the detection has another frame than the message")
             return None
         box = take(seen.detection, "bbox")
         centre = take(box, "center")
@@ -363,10 +365,10 @@ class _Reader:
         theta = number(take(centre, "theta"))
         width, height = number(take(box, "size_x")), number(take(box, "size_y"))
         if middle is None or not (width is not None and height is not None):
-            self.note(seen.place, "no-box", "the box is not finite")
+            self.note(seen.index, "no-box", "the box is not finite")
             return None
         if not (width > 0 and height > 0):
-            self.note(seen.place, "no-box", "the box must have a positive width and height")
+            self.note(seen.index, "no-box", "the box must have a positive width and height")
             return None
         return upright_box((middle[0], middle[1]), (width, height), theta or 0.0)
 
@@ -413,10 +415,10 @@ def _is_unset(pose: Any) -> bool:
 
 
 def _viewpoint(viewpoint: Viewpoint) -> dict[str, float]:
-    given: Any = viewpoint
-    if isinstance(given, list | tuple):
-        given = dict(zip(("x", "y", "yaw"), given, strict=False)) if len(given) == 3 else None
-    x, y, yaw = (number(take(given, name)) for name in ("x", "y", "yaw"))
+    values: Any = viewpoint
+    if isinstance(values, list | tuple):
+        values = dict(zip(("x", "y", "yaw"), values, strict=False)) if len(values) == 3 else None
+    x, y, yaw = (number(take(values, name)) for name in ("x", "y", "yaw"))
     if x is None or y is None or yaw is None:
         raise MessageError("viewpoint must be three finite numbers: x, y, yaw")
     if max(abs(x), abs(y)) > _MAX_METRES or abs(yaw) > _MAX_YAW:
