@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from app.scene import Vocabulary
 from training.datasets import EncodedScene
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges
@@ -172,6 +173,7 @@ class TrainingData:
         digest: digest of the scenes, their vocabulary and split. A run resumes only if the digest
             is unchanged.
         words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
+        vocabulary: the object classes and room types; None if the classes have no names.
     """
 
     train: SceneTensors
@@ -182,6 +184,23 @@ class TrainingData:
     room_types: int
     digest: str = ""
     words: Tensor | None = None
+    vocabulary: Vocabulary | None = None
+
+    @property
+    def classes(self) -> Vocabulary:
+        """The object classes and room types.
+
+        Raises:
+            ValueError: the classes have no names.
+        """
+        if self.vocabulary is None:
+            raise ValueError("the classes of the training scenes have no names")
+        return self.vocabulary
+
+    @property
+    def related(self) -> bool:
+        """True if training and validation scenes contain annotated relations."""
+        return has_relations(self.train) and has_relations(self.validation)
 
 
 def has_relations(scenes: SceneTensors) -> bool:

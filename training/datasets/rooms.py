@@ -34,7 +34,7 @@ _CLEARANCE = 0.02  # minimum distance in metres between pieces of furniture
 # Extents of an object in metres, in the order: along the wall, away from the wall, upwards.
 Size = tuple[float, float, float]
 Where = Literal["wall", "centre", "hung", "ceiling"]
-Side = Literal["left", "right", "front", "around"]
+Candidate = Literal["left", "right", "front", "around"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Beside:
     """
 
     piece: Piece
-    side: Side
+    side: Candidate
 
 
 @dataclass(frozen=True, slots=True)

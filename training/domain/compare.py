@@ -22,11 +22,11 @@ from training.datasets import DatasetError, annotated_classes, encode
 from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
 from training.datasets.files import DATA
+from training.domain.candidates import BASELINES, Candidate, HeldOut, Say, find, held_out
 from training.domain.init_command import fail
-from training.domain.sides import BASELINE_SIDE, HeldOut, Rival, Say, Side, find, held_out
 from training.domain.translation import BEYOND, Translation, same_classes
 from training.evaluation.missing_tasks import leave_one_out
-from training.evaluation.model import ObjectScore
+from training.evaluation.model import Model, ObjectScore
 from training.evaluation.report import Progress, SourceReport, digest, run, silent
 from training.evaluation.results import Difference, Results, only, summarise
 from training.evaluation.setting import Setting
@@ -128,8 +128,8 @@ def compare_command(
     old: Annotated[
         str | None,
         typer.Argument(
-            help=f"second model, or {BASELINE_SIDE}. By default the model with the alias "
-            f"`default`; if the store has no such alias, {BASELINE_SIDE}"
+            help=f"second model, or {BASELINES}. By default the model with the alias "
+            f"`default`; if the store has no such alias, {BASELINES}"
         ),
     ] = None,
     data: Annotated[
@@ -153,7 +153,7 @@ def compare_command(
             say: Say = status.update
             models = Store(store)
             a = find(new, models, data, say)
-            served = "default" if "default" in models.aliases() else BASELINE_SIDE
+            served = "default" if "default" in models.aliases() else BASELINES
             b = find(old or served, models, data, say)
             comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
@@ -164,7 +164,7 @@ def compare_command(
     show(comparison, console)
 
 
-def _root(given: Path | None, *sides: Side) -> Path:
+def _root(given: Path | None, *sides: Candidate) -> Path:
     known = (side.data for side in sides)
     return given or next((path for path in known if path is not None), DATA)
 
@@ -217,7 +217,7 @@ def show(comparison: Comparison, console: Console) -> None:
 
 
 def compare(
-    a: Side, b: Side, root: Path, *, limit: int | None, examples: int, say: Say
+    a: Candidate, b: Candidate, root: Path, *, limit: int | None, examples: int, say: Say
 ) -> Comparison:
     """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
 
@@ -240,10 +240,10 @@ def compare(
     encoded = encode(held.scenes, a.vocabulary)
     annotated = annotated_classes(encoded, a.vocabulary)
     scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), limit)
-    rivals = (a.rival(a.vocabulary, data, say), b.rival(a.vocabulary, data, say))
+    models = (a.model(a.vocabulary, data, say), b.model(a.vocabulary, data, say))
     try:
         titles = a.title, b.title if b.title != a.title else f"{b.title} (second)"
-        results = side_by_side(titles, rivals, scenes, data.structure, progress=say)
+        results = side_by_side(titles, models, scenes, data.structure, progress=say)
     except ValueError as error:
         raise ConfigError(f"{a.title} and {b.title} cannot be compared: {error}") from error
     if not results.differences:
@@ -253,7 +253,7 @@ def compare(
         )
     groups = len({scene.group for scene in scenes.scenes})
     say("looking for examples")
-    first, second = (rival("T2 missing").objects for rival in rivals)
+    first, second = (model.missing for model in models)
     found: list[Example] = []
     if first is not None and second is not None:
         found = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
@@ -271,7 +271,7 @@ def compare(
 
 def side_by_side(
     titles: tuple[str, str],
-    rivals: tuple[Rival, Rival],
+    models: tuple[Model, Model],
     scenes: SceneTensors,
     structure: Tensor,
     *,
@@ -295,17 +295,16 @@ def side_by_side(
     if not tasks:
         raise ValueError("the scenes belong to one group, but intervals need at least two groups")
     reports = {}
-    for title, rival in zip(titles, rivals, strict=True):
+    for title, model in zip(titles, models, strict=True):
         report = SourceReport("held out", digest(setting))
-        for task in tasks:
-            for _ in run(rival(task), setting, report, tasks=[task], progress=progress):
-                pass
+        for _ in run(model, setting, report, tasks=tasks, progress=progress):
+            pass
         reports[title, 0] = {"held out": only(report, COMPARED)}
     progress("resampling groups")
     return summarise(reports, titles[0], groups=groups)
 
 
-def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
+def unmeasured(rows: Sequence[Difference], other: Candidate) -> tuple[str, ...]:
     """Return the relation tasks that only the other card measures; () if `rows` measure any."""
     if other.artifact is None or any(row.task in RELATIONAL for row in rows):
         return ()
@@ -313,7 +312,7 @@ def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
     return tuple(task for task in RELATIONAL if task in measured)
 
 
-def _notes(a: Side, b: Side, held: HeldOut, limit: int | None) -> Iterator[str]:
+def _notes(a: Candidate, b: Candidate, held: HeldOut, limit: int | None) -> Iterator[str]:
     """Generate remarks on the results, for the user."""
     yield from held.notes
     asked, other = a.vocabulary, b.vocabulary
@@ -324,7 +323,7 @@ def _notes(a: Side, b: Side, held: HeldOut, limit: int | None) -> Iterator[str]:
 
 
 def _classes_note(
-    a: Side, b: Side, asked: Vocabulary, other: Vocabulary, held: HeldOut
+    a: Candidate, b: Candidate, asked: Vocabulary, other: Vocabulary, held: HeldOut
 ) -> Iterator[str]:
     """Generate a note on the classes of the first model that the second model lacks, if any."""
     own = Translation.between(asked, other).own

@@ -20,8 +20,8 @@ from app.registry import Artifact, ArtifactError, Store, StoreError
 from app.registry.references import AliasTarget
 from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
+from training.domain.candidates import Candidate, Say, stored_candidate
 from training.domain.compare import Comparison, compare
-from training.domain.sides import Say, Side, stored_side
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
 from training.evaluation.missing_tasks import MachineScore, leave_one_out
@@ -118,15 +118,17 @@ def measure_usefulness(
     if len(set(groups)) < FEWEST_GROUPS:
         return Usefulness(*size)
 
-    def mrr(score: ObjectScore) -> Ratio:
+    def mrr(score: ObjectScore | None) -> Ratio:
+        if score is None:
+            raise ValueError("the model has no score of missing objects")
         return leave_one_out(scenes, data.structure, score).mrr()
 
     ours = mrr(MachineScore(machine_of(artifact.weights)))
     theirs = {}
     for baseline in (POPULARITY, EASE):
         say(f"fitting {baseline.name}")
-        fitted = baseline.fit(data.train, data.validation, data.structure)
-        theirs[baseline.name] = mrr(fitted.score)
+        model = baseline.fit(data.train, data.validation, data.structure)
+        theirs[baseline.name] = mrr(model.missing)
     return Usefulness(
         *(*size, ours.value),
         {name: other.value for name, other in theirs.items()},
@@ -146,7 +148,7 @@ class Seat:
 
     alias: str
     target: AliasTarget | None
-    holder: Side | None
+    holder: Candidate | None
     note: str
 
 
@@ -160,7 +162,7 @@ def seat(store: Store, alias: str) -> Seat:
     if target is None:
         return Seat(alias, None, None, f"{alias} is a new alias, so there is no older version")
     try:
-        return Seat(alias, target, stored_side(alias, store), "")
+        return Seat(alias, target, stored_candidate(alias, store), "")
     except (ArtifactError, StoreError) as error:
         note = f"no comparison: the model served as {alias} cannot be read ({error})"
         return Seat(alias, target, None, note)
@@ -170,14 +172,14 @@ def compare_with_served(
     run: FinishedRun,
     scenes: SplitScenes,
     artifact: Artifact,
-    holder: Side,
+    holder: Candidate,
     root: Path,
     *,
     limit: int | None,
     say: Say,
 ) -> Comparison:
     """Compare a new version with the served version before publication."""
-    new = Side(NEW, run.config, scenes.digests, artifact, root)
+    new = Candidate(NEW, run.config, scenes.digests, artifact, root)
     return compare(new, holder, root, limit=limit, examples=3, say=say)
 
 

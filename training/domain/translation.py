@@ -16,7 +16,7 @@ from torch import Tensor
 
 from app.scene import Vocabulary
 from training.datasets.batches import Batch
-from training.evaluation.model import Contender, ObjectScore, PlacedScore, Places, RelationScore
+from training.evaluation.model import Model, ObjectScore, PlacedScore, Places, RelationScore
 
 Score = TypeVar("Score")
 
@@ -51,24 +51,20 @@ class Translation:
             own.append(next((index for index in named if index is not None), -1))
         return cls(torch.tensor(own, dtype=torch.int64), len(model))
 
-    def contender(self, model: Contender, task: str) -> Contender:
-        """Return scores of the model that take scenes and return values in the scene classes.
+    def model(self, model: Model) -> Model:
+        """Return the model with scores that take scenes and return values in the scene classes.
 
-        Args:
-            task: name of the task. In T3 (outliers) and T3b (false relations), the lowest score
-                ranks first. In other tasks, the highest score ranks first.
+        In T3 (outliers) and T3b (false relations), the lowest score ranks first. In other tasks,
+        the highest score ranks first. Unknown classes rank last in every task.
         """
-        if task.startswith("T3"):
-            return replace(self, unknown=BEYOND)._contender(model)
-        return self._contender(model)
-
-    def _contender(self, model: Contender) -> Contender:
-        return Contender(
-            objects=_maybe(self._objects, model.objects),
+        reverse = replace(self, unknown=BEYOND)
+        return Model(
+            missing=_maybe(self._objects, model.missing),
+            outliers=_maybe(reverse._objects, model.outliers),
             relations=_maybe(self._relations, model.relations),
             completion=_maybe(self._relations, model.completion),
-            placed=_maybe(self._placed, model.placed),
-            placement=_maybe(self._relations, model.placement),
+            at_place=_maybe(self._placed, model.at_place),
+            false_relations=_maybe(reverse._relations, model.false_relations),
             parameters=model.parameters,
         )
 

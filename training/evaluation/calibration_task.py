@@ -50,7 +50,7 @@ from training.evaluation.asking import (
 from training.evaluation.intruders import kinds_of_intruders
 from training.evaluation.metrics import Items, Metric
 from training.evaluation.missing_tasks import SHARES, shown_classes
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 
 # Number of removed objects per scene in `ask_placements`. A removed object gives only 3 answers,
@@ -255,9 +255,9 @@ QUESTIONS: dict[str, Ask] = {
 }
 
 
-def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
+def calibration_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure the calibration of each `QUESTIONS` entry, with and without the calibration maps."""
-    if contender.artifact is None:
+    if model.artifact is None:
         return None
     related = setting.some(related=True, share=3)
     complete = setting.complete.some(share=3)
@@ -265,7 +265,7 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
     of_objects = {"missing": complete, "outliers": complete, "missing at a place": at_place}
     metrics: dict[str, Metric] = {}
     skipped = 0
-    published, plain = contender.artifact, uncalibrated(contender.artifact)
+    published, plain = model.artifact, uncalibrated(model.artifact)
     for name, ask in _questions(complete, setting).items():
         asked = of_objects.get(name, related)
         found = collect(published, asked, ask, setting.seed)

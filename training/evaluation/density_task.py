@@ -35,7 +35,7 @@ from torch.nn.functional import logsigmoid, softplus
 from training.datasets.array_types import Floats, Rng
 from training.datasets.batches import SceneTensors
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Contender, ObjectDensity
+from training.evaluation.model import Model, ObjectDensity
 from training.evaluation.setting import Outcome, Setting
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.bernoulli import log_odds_of
@@ -180,12 +180,12 @@ def _log_odds(train: SceneTensors) -> Tensor:
     return log_odds_of(train.v.sum(0), torch.tensor(float(len(train))))
 
 
-def density_task(contender: Contender, setting: Setting) -> Outcome | None:
+def density_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure the log-likelihood of the objects in nats, with the lower and upper log Z."""
-    if contender.density is None or setting.train is None:
+    density = model.density(setting) if model.density else None
+    if density is None or setting.train is None:
         return None
     scenes = setting.some()
-    density = contender.density()
     log_sum = density.log_unnormalised(scenes.v).double().numpy()
     base = independent_density(setting.train).log_unnormalised(scenes.v).double().numpy()
     metrics: dict[str, Metric] = {

@@ -22,7 +22,7 @@ from app.registry import Artifact
 from app.scene import Scene, SceneObject, opposite
 from training.datasets.files import DATA
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 
 EVERYDAY = DATA.parent / "everyday"
@@ -71,9 +71,9 @@ def facts_digest(folder: Path) -> str:
     return "" if path is None else sha256(path.read_bytes()).hexdigest()
 
 
-def everyday_task(contender: Contender, setting: Setting) -> Outcome | None:
+def everyday_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure the everyday facts. Each fact counts as one scene. `setting.scenes` is not used."""
-    artifact, folder = contender.artifact, setting.everyday
+    artifact, folder = model.artifact, setting.everyday
     if artifact is None or folder is None or facts_file(folder) is None:
         return None
     metrics: dict[str, Metric] = {}

@@ -40,7 +40,7 @@ from training.evaluation.asking import (
 )
 from training.evaluation.intruders import draw_intruders
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.outlier_tasks import share_of_first
 from training.evaluation.relation_tasks import expected_hits
 from training.evaluation.setting import Outcome, Setting
@@ -162,7 +162,7 @@ def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
     return float((1.0 / np.arange(above + 1, above + ties + 1)).mean())
 
 
-def missing_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
+def missing_evidence_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T2 (missing objects) with labels only and with additional evidence."""
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
@@ -170,14 +170,14 @@ def missing_evidence_task(contender: Contender, setting: Setting) -> Outcome | N
 
     return _changes(
         "MRR",
-        contender,
+        model,
         setting,
         lambda _, scenes, kind: removals(scenes, setting.structure.numpy(), kind, setting.seed),
         value,
     )
 
 
-def outliers_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
+def outliers_evidence_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T3 (outliers) with labels only and with additional evidence."""
     structure = setting.structure.numpy()
 
@@ -189,10 +189,10 @@ def outliers_evidence_task(contender: Contender, setting: Setting) -> Outcome | 
         p = np.where(things(scene, structure), judge(artifact, scene)[:, 0], -np.inf)
         return share_of_first(p, case.target)
 
-    return _changes("hit@1", contender, setting, cases, value)
+    return _changes("hit@1", model, setting, cases, value)
 
 
-def relations_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
+def relations_evidence_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T1 (relations) with labels only and with additional evidence."""
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
@@ -201,7 +201,7 @@ def relations_evidence_task(contender: Contender, setting: Setting) -> Outcome |
 
     return _changes(
         "R-precision",
-        contender,
+        model,
         setting,
         lambda _, scenes, kind: halves(scenes, setting.structure.numpy(), kind, setting.seed),
         value,
@@ -211,7 +211,7 @@ def relations_evidence_task(contender: Contender, setting: Setting) -> Outcome |
 
 def _changes(
     metric: str,
-    contender: Contender,
+    model: Model,
     setting: Setting,
     cases_of: Callable[[Artifact, SceneTensors, str], Iterator[Case]],
     value: Callable[[Artifact, Scene, Case], float],
@@ -224,7 +224,7 @@ def _changes(
         value: function that takes a model, one of the two scenes of a question, and the question.
             It returns the metric of the answer, summed over the items of the question.
     """
-    artifact = contender.artifact
+    artifact = model.artifact
     if artifact is None:
         return None
     scenes = setting.some(related=True)

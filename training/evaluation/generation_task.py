@@ -34,7 +34,7 @@ from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.contradictions import Contradictions
 from training.evaluation.metrics import Metric, Ratio, Resampled
-from training.evaluation.model import Contender, Drawn, Sampler
+from training.evaluation.model import Drawn, Model, Sampler
 from training.evaluation.setting import Outcome, Setting
 from training.machines import BoltzmannMachine
 from training.machines.chain_samples import ChainSamples
@@ -283,7 +283,7 @@ def generation_metrics(
     return metrics
 
 
-def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
+def generation_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T4: compare generated scenes with the first half of the held-out scenes.
 
     The number of generated scenes is the number of scenes in the second half. The scenes are
@@ -293,7 +293,8 @@ def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
     first half is therefore weighted by its number of classes. A perfect sampler then has no
     discrepancy.
     """
-    if contender.sampler is None or setting.train is None:
+    sampler = model.generate(setting) if model.generate else None
+    if sampler is None or setting.train is None:
         return None
     first, second = held_out_halves(setting)
     asked = first.annotated_classes[first.source].any(0) & ~setting.structure
@@ -314,7 +315,7 @@ def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
     }
     metrics: dict[str, Metric] = {}
     for name, (given, room, emphasis) in conditions.items():
-        drawn = contender.sampler(given, room, setting.seed)
+        drawn = sampler(given, room, setting.seed)
         found = generation_metrics(drawn, first.v, setting.train.v, asked, bandwidth, emphasis)
         metrics |= {f"{metric}, {name}": value for metric, value in found.items()}
     notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}

@@ -34,7 +34,7 @@ from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
 from training.evaluation.asking import ask_rows, missing_probabilities, of_classes
 from training.evaluation.metrics import Macro, Metric, Ratio
-from training.evaluation.model import Contender, ObjectScore, PlacedScore, Places, RoomScore
+from training.evaluation.model import Model, ObjectScore, PlacedScore, Places, RoomScore
 from training.evaluation.relation_tasks import expected_hits
 from training.evaluation.setting import Outcome, Setting
 from training.machines import BoltzmannMachine
@@ -297,12 +297,12 @@ def leave_one_out_at(
 # ------------------------------------------------------------------------------------------ tasks
 
 
-def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
+def missing_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T2."""
-    if contender.objects is None:
+    if model.missing is None:
         return None
     scenes = setting.scenes
-    found = leave_one_out(scenes, setting.structure, contender.objects)
+    found = leave_one_out(scenes, setting.structure, model.missing)
     if not len(found.target):
         return None
     unknown = np.array([len(scene.unknown) for scene in scenes.scenes], dtype=np.int64)
@@ -310,27 +310,25 @@ def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(scenes), found.skipped)
 
 
-def missing_in_room_task(contender: Contender, setting: Setting) -> Outcome | None:
+def missing_in_room_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T2 on scenes with a known room type, with and without the room type as evidence."""
     setting = setting.at((setting.scenes.room >= 0).nonzero().squeeze(1))
-    scenes, structure, score = setting.scenes, setting.structure, contender.objects_in_rooms
+    scenes, structure, score = setting.scenes, setting.structure, model.missing_in_room
     if score is None or not len(scenes):
         return None
     found = leave_one_out(scenes, structure, score, told_room=True)
     if not len(found.target):
         return None
     metrics = found.metrics()
-    if contender.objects is not None:
-        metrics["MRR, room type withheld"] = leave_one_out(
-            scenes, structure, contender.objects
-        ).mrr()
+    if model.missing is not None:
+        metrics["MRR, room type withheld"] = leave_one_out(scenes, structure, model.missing).mrr()
     return Outcome(metrics, len(scenes), found.skipped)
 
 
-def partial_task(contender: Contender, setting: Setting) -> Outcome | None:
+def partial_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T2 partial. A published model is also measured with unlisted objects as absent."""
-    artifact = contender.artifact
-    score = contender.objects if artifact is None else partial_score(artifact)
+    artifact = model.artifact
+    score = model.missing if artifact is None else partial_score(artifact)
     if score is None:
         return None
     scenes = setting.some()
@@ -354,19 +352,19 @@ def partial_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(scenes), skipped)
 
 
-def placed_task(contender: Contender, setting: Setting) -> Outcome | None:
+def placed_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T2-at. Also measure the same removed classes in requests without the place."""
-    if contender.placed is None:
+    if model.at_place is None:
         return None
     scenes, structure = setting.some(related=True, share=3), setting.structure
-    found, relation = leave_one_out_at(scenes, structure, contender.placed, seed=setting.seed)
+    found, relation = leave_one_out_at(scenes, structure, model.at_place, seed=setting.seed)
     if not len(relation):
         return None
     metrics: dict[str, Metric] = {"MRR": found.mrr()}
     for a, name in enumerate(CANONICAL):
         if (relation == a).any():
             metrics[f"MRR, {name}"] = found.mrr(relation == a)
-    if (objects := contender.objects) is not None:
+    if (objects := model.missing) is not None:
         blind, _ = leave_one_out_at(
             scenes, structure, lambda places: objects(places.v), seed=setting.seed
         )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from torch import Tensor
@@ -14,6 +14,7 @@ from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import Batch
 from training.evaluation.contradictions import Contradictions
 from training.evaluation.intruders import IntruderScores
+from training.evaluation.setting import Setting
 from training.machines import BoltzmannMachine
 
 # Function that takes presence (scenes, classes) and returns log-odds (scenes, classes).
@@ -119,36 +120,61 @@ class Sampler(Protocol):
     def __call__(self, given: Tensor, room: Tensor, seed: int) -> Drawn: ...
 
 
-@dataclass(frozen=True, eq=False)
-class Contender:
-    """A model or baseline that the evaluation compares; it fills one row of the result tables.
+Parameters: TypeAlias = Mapping[str, float | int | str]
 
-    The attribute of a task is None if the model or baseline does not support the task.
+
+@dataclass(frozen=True)
+class Trial:
+    """The result of one point of a hyperparameter grid.
 
     Attributes:
-        objects: score of T2 and T3.
-        relations: score of T1a.
-        completion: score of T1b; the batch observes the given triples.
-        placed: score of T2-at.
-        placement: score of T3b; the batch observes all triples, one of them false.
-        sampler: sampler of T4.
-        density: density, computed at its first use.
-        alarm: alarm of T3.
-        artifact: model for Calibration and for all questions to the service.
-        objects_in_rooms: score of T2 with the room type as evidence.
-        machine: machine for the seed protocol.
-        parameters: number of trained weights, or None if this number is not meaningful.
+        seconds: wall time of fit and evaluation in seconds. Work that was already done for earlier
+            grid points is not included.
     """
 
-    objects: ObjectScore | None = None
+    parameters: Parameters
+    validation: float
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A trained machine, a baseline or a reference, as the tasks of the evaluation ask it.
+
+    Each attribute answers the questions of one task. It is None if the model does not answer them.
+
+    Attributes:
+        missing: score of T2, missing objects.
+        missing_in_room: score of T2 with the room type as evidence.
+        at_place: score of T2-at, missing objects at a place.
+        outliers: score of T3, intruders. By default it is `missing`.
+        relations: score of T1a, relations of a scene.
+        completion: score of T1b; the batch observes the given triples.
+        false_relations: score of T3b; the batch observes all triples, one of them false.
+        generate: function that takes the setting and returns the sampler of T4, or None.
+        density: function that takes the setting and returns the density of objects, or None.
+        alarm: alarm of T3.
+        artifact: model for Calibration and for all questions to the service.
+        machine: machine for the seed protocol.
+        parameters: number of trained weights, or None if this number is not meaningful.
+        trials: all settings that the tuning of a baseline tried, in order.
+    """
+
+    missing: ObjectScore | None = None
+    missing_in_room: RoomScore | None = None
+    at_place: PlacedScore | None = None
+    outliers: ObjectScore | None = None
     relations: RelationScore | None = None
     completion: RelationScore | None = None
-    placed: PlacedScore | None = None
-    placement: RelationScore | None = None
-    sampler: Sampler | None = None
-    density: Callable[[], ObjectDensity] | None = None
+    false_relations: RelationScore | None = None
+    generate: Callable[[Setting], Sampler | None] | None = None
+    density: Callable[[Setting], ObjectDensity | None] | None = None
     alarm: Alarm | None = None
     artifact: Artifact | None = None
-    objects_in_rooms: RoomScore | None = None
     machine: BoltzmannMachine | None = None
     parameters: int | None = None
+    trials: tuple[Trial, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.outliers is None:
+            object.__setattr__(self, "outliers", self.missing)

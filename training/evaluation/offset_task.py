@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from app.scene import CANONICAL
 from training.datasets.offsets import seen_offsets
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 
 SHARE: Final = 0.8
@@ -34,12 +34,12 @@ METRICS: Final = (
 )
 
 
-def offsets_task(contender: Contender, setting: Setting) -> Outcome | None:
+def offsets_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure the share of covered offsets for each relation, and the distances for all relations.
 
     Return None if the model has no offsets, or if no scene has related objects with poses.
     """
-    if contender.artifact is None or (offsets := contender.artifact.offsets) is None:
+    if model.artifact is None or (offsets := model.artifact.offsets) is None:
         return None
     scenes = setting.scenes.scenes
     every = seen_offsets(scenes)

@@ -46,7 +46,7 @@ from training.evaluation.intruders import (
     intruder_scores,
 )
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Alarm, Contender, ObjectScore
+from training.evaluation.model import Alarm, Model, ObjectScore
 from training.evaluation.setting import Outcome, Setting
 
 _RESAMPLES = 200
@@ -166,14 +166,14 @@ def _bound(worst: Floats, group: NDArray[np.str_], rng: Rng, share: float) -> fl
 _SHORT_LISTS = (1, 2, 4, 6)
 
 
-def outliers_task(contender: Contender, setting: Setting, law: Law | None = None) -> Outcome | None:
+def outliers_task(model: Model, setting: Setting, law: Law | None = None) -> Outcome | None:
     """Measure T3 with an object score, for intruders of a law, or uniform ones without a law."""
-    if contender.objects is None or (law is not None and setting.train is None):
+    if model.outliers is None or (law is not None and setting.train is None):
         return None
     scenes = setting.some()
     weights = None if law is None or setting.train is None else law(scenes, setting.train)
     scores = intruder_scores(
-        scenes, setting.structure, contender.objects, weights=weights, seed=setting.seed
+        scenes, setting.structure, model.outliers, weights=weights, seed=setting.seed
     )
     if not len(scores.scene):
         return None
@@ -182,14 +182,14 @@ def outliers_task(contender: Contender, setting: Setting, law: Law | None = None
         "AUROC": scores.dirty.metric("AUROC"),
         "average precision": scores.dirty.metric("average precision"),
     }
-    if contender.alarm is not None:
-        loud = contender.alarm.raised(scores)
+    if model.alarm is not None:
+        loud = model.alarm.raised(scores)
         metrics["alarms in untouched scenes"] = scores.false_alarms(loud)
         metrics["intruders caught"] = scores.caught(loud)
     return Outcome(metrics, len(scenes), scores.skipped)
 
 
-def signature_task(contender: Contender, setting: Setting) -> Outcome | None:
+def signature_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T3 signature; a baseline ranks by log-odds only."""
     if setting.train is None:
         return None
@@ -201,20 +201,20 @@ def signature_task(contender: Contender, setting: Setting) -> Outcome | None:
         return None
     scenes = setting.at(index).some()
     own = by_signature(scenes, setting.train)
-    if contender.artifact is not None:
+    if model.artifact is not None:
         intruders = draw_intruders(scenes, structure, own, seed)
-        metrics = judge_intruders(contender.artifact, scenes, structure, intruders)
-    elif contender.objects is not None:
-        scores = intruder_scores(scenes, structure, contender.objects, weights=own, seed=seed)
+        metrics = judge_intruders(model.artifact, scenes, structure, intruders)
+    elif model.outliers is not None:
+        scores = intruder_scores(scenes, structure, model.outliers, weights=own, seed=seed)
         metrics = dict.fromkeys(("hit@1", "hit@1, log-odds alone"), scores.hit_at_1())
     else:
         return None
     return Outcome(metrics, len(scenes), 0)
 
 
-def sensitivity_task(contender: Contender, setting: Setting) -> Outcome | None:
+def sensitivity_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure alarms in clean scenes and detected intruders at each sensitivity."""
-    artifact = contender.artifact
+    artifact = model.artifact
     if artifact is None:
         return None
     scenes, structure = setting.some(), setting.structure

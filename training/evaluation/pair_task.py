@@ -27,7 +27,7 @@ from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, seen_triples
 from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Contender, RelationScore
+from training.evaluation.model import Model, RelationScore
 from training.evaluation.relation_tasks import telling
 from training.evaluation.setting import Outcome, Setting
 
@@ -167,7 +167,7 @@ def answer_pairs(asked: list[ScenePairs], score: PairScore, scenes: int) -> Pair
     )
 
 
-def pairs_task(contender: Contender, setting: Setting) -> Outcome | None:
+def pairs_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T1 pairs; the primary metric is the accuracy over all pairs."""
     related = {one.place for one in vertical_pairs(setting.scenes, setting.structure)}
     if not related:
@@ -175,10 +175,10 @@ def pairs_task(contender: Contender, setting: Setting) -> Outcome | None:
     index = torch.tensor(sorted(related), dtype=torch.int64)
     scenes = setting.at(index).some()
     asked = vertical_pairs(scenes, setting.structure)
-    if contender.artifact is not None:
-        score = service_score(contender.artifact)
-    elif contender.relations is not None:
-        score = baseline_score(scenes, contender.relations)
+    if model.artifact is not None:
+        score = service_score(model.artifact)
+    elif model.relations is not None:
+        score = baseline_score(scenes, model.relations)
     else:
         return None
     answers = answer_pairs(asked, score, len(scenes))
@@ -200,7 +200,7 @@ def _little_known(classes: Ints, setting: Setting) -> dict[str, Flags]:
 
     "unseen pairs": training lists no relation of the two classes. "rare classes": training relates
     one of the two classes to at most `RARE` classes. Training here means all data that the
-    contender may have learnt from, not only the scenes of one source.
+    model may have learnt from, not only the scenes of one source.
     """
     V = setting.scenes.v.shape[1]
     triples = setting.seen

@@ -33,7 +33,7 @@ from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.batches import Batch, SceneTensors
 from training.datasets.cases import Triple, scene_rng
 from training.evaluation.metrics import Items, Metric, Ratio
-from training.evaluation.model import Contender, RelationScore
+from training.evaluation.model import Model, RelationScore
 from training.evaluation.setting import Outcome, Setting
 from training.machines import BoltzmannMachine
 from training.machines.edges import triple_keys
@@ -291,11 +291,11 @@ def placement_scores(
 # ------------------------------------------------------------------------------------------ tasks
 
 
-def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
+def relations_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T1a."""
-    if contender.relations is None:
+    if model.relations is None:
         return None
-    scenes, structure, score = setting.scenes, setting.structure, contender.relations
+    scenes, structure, score = setting.scenes, setting.structure, model.relations
     with_counts = score_scenes(scenes, structure, score)
     plain = score_scenes(scenes, structure, score, counts=False)
     if not _any_true(plain):
@@ -311,12 +311,12 @@ def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(scenes), ranking.skipped)
 
 
-def completion_task(contender: Contender, setting: Setting) -> Outcome | None:
+def completion_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T1b. Also score the same candidates without given triples."""
-    if contender.completion is None:
+    if model.completion is None:
         return None
     scenes, structure, seed = setting.scenes, setting.structure, setting.seed
-    given = complete_scenes(scenes, structure, contender.completion, seed=seed)
+    given = complete_scenes(scenes, structure, model.completion, seed=seed)
     if not _any_true(given):
         return None
     ranking = rank(given, len(scenes))
@@ -325,8 +325,8 @@ def completion_task(contender: Contender, setting: Setting) -> Outcome | None:
         "R-precision, mean over scenes": ranking.per_scene(),
     }
     metrics |= _parts(given, setting, _RECALLS)
-    if contender.relations is not None:
-        blind = complete_scenes(scenes, structure, contender.relations, seed=seed)
+    if model.relations is not None:
+        blind = complete_scenes(scenes, structure, model.relations, seed=seed)
         metrics["R-precision, nothing given"] = rank(blind, len(scenes)).pooled()
     return Outcome(metrics, len(scenes), ranking.skipped)
 
@@ -352,12 +352,12 @@ def _parts(scored: list[Candidates], setting: Setting, first: Sequence[int]) -> 
     return metrics
 
 
-def placement_task(contender: Contender, setting: Setting) -> Outcome | None:
+def placement_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T3b."""
-    if contender.placement is None:
+    if model.false_relations is None:
         return None
     scenes = setting.some(related=True)
-    scores = placement_scores(scenes, setting.structure, contender.placement, seed=setting.seed)
+    scores = placement_scores(scenes, setting.structure, model.false_relations, seed=setting.seed)
     if not len(scores.scene):
         return None
     metrics: dict[str, Metric] = {"hit@1": scores.hit_at_1(), "AUROC": scores.metric("AUROC")}

@@ -23,10 +23,10 @@ from torch import Tensor
 from app.registry import Artifact
 from app.registry import Metric as CardMetric
 from training.datasets.batches import SceneTensors, subset
-from training.evaluation.contenders import artifact_contender
+from training.evaluation.artifact_model import artifact_model
 from training.evaluation.everyday_task import SOURCE, facts_digest
 from training.evaluation.metrics import Macro, Metric, Ratio, Resampled, Scored
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET, Task
 
@@ -120,7 +120,7 @@ def digest(setting: Setting) -> str:
 
 
 def run(
-    contender: Contender,
+    model: Model,
     setting: Setting,
     report: SourceReport,
     *,
@@ -148,14 +148,14 @@ def run(
             continue
         progress(f"{report.source}: {task}")
         began = time.perf_counter()
-        report.outcomes[task] = known[task](contender, setting)
+        report.outcomes[task] = known[task](model, setting)
         report.seconds[task] = time.perf_counter() - began
         yield task
 
 
 def measure(
     path: Path,
-    contender: Contender,
+    model: Model,
     setting: Setting,
     source: str,
     *,
@@ -167,7 +167,7 @@ def measure(
     report = SourceReport(source, digest(setting))
     if path.exists():
         report = SourceReport.read(path)
-    for _ in run(contender, setting, report, tasks=tasks, known=known, progress=progress):
+    for _ in run(model, setting, report, tasks=tasks, known=known, progress=progress):
         write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
     return report
 
@@ -220,7 +220,7 @@ def evaluate(
     """
     if limit is None:
         limit = _LIMIT if artifact.oracle is None else _LIMIT_OF_DRAWS
-    contender = artifact_contender(artifact, train)
+    model = artifact_model(artifact, train)
     wanted = [
         task for task, one in EVERY_TASK.items() if one.card and (tasks is None or task in tasks)
     ]
@@ -230,25 +230,25 @@ def evaluate(
     rows: list[CardMetric] = []
     for source, some in sources:
         setting = Setting(some, structure, training.get(source), limit=limit)
-        rows += _published(contender, setting, source, single, progress)
+        rows += _published(model, setting, source, single, progress)
     together = sources[0][0] if len(sources) == 1 else "pooled"
     setting = Setting(scenes, structure, train, limit=limit)
     whole = [task for task in wanted if task in WHOLE_SET and task not in ONCE]
-    rows += _published(contender, setting, together, whole, progress)
+    rows += _published(model, setting, together, whole, progress)
     setting = Setting(scenes, structure, limit=limit, everyday=everyday)
     once = [task for task in wanted if task in ONCE]
-    return rows + _published(contender, setting, SOURCE, once, progress)
+    return rows + _published(model, setting, SOURCE, once, progress)
 
 
 def _published(
-    contender: Contender,
+    model: Model,
     setting: Setting,
     source: str,
     tasks: Iterable[str],
     progress: Progress,
 ) -> list[CardMetric]:
     report = SourceReport(source, digest(setting))
-    for _ in run(contender, setting, report, tasks=tasks, progress=progress):
+    for _ in run(model, setting, report, tasks=tasks, progress=progress):
         pass
     return [
         CardMetric(task=task, source=source, metric=name, **asdict(outcome.metrics[name].figure()))

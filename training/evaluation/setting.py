@@ -1,4 +1,4 @@
-"""Inputs and results of an evaluation task: contender, setting and outcome."""
+"""Inputs and results of an evaluation task: model, setting and outcome."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Setting:
         scenes: held-out scenes.
         structure: (V,) bool, True for structure classes.
         train: training scenes of the same sources. If None, tasks that need them are left out.
-        seen: (T, 3) triples that the contender may have learnt from.
+        seen: (T, 3) triples that the model may have learnt from.
         limit: maximum number of scenes for slow tasks, which are all but T1a, T1b and T2. The
             slowest tasks, T2-at and Calibration, use a third of the limit.
         seed: random seed of the questions.

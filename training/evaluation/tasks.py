@@ -30,13 +30,13 @@ from training.evaluation.missing_tasks import (
     partial_task,
     placed_task,
 )
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.outlier_tasks import outliers_task, sensitivity_task, signature_task
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
 from training.evaluation.setting import Outcome, Setting
 
-Ask = Callable[[Contender, Setting], Outcome | None]
+Ask = Callable[[Model, Setting], Outcome | None]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Task:
 
     Attributes:
         words: name of the task in the tables of the command line.
-        ask: function that takes the model (`Contender`) and the questions (`Setting`), and returns
+        ask: function that takes the model (`Model`) and the questions (`Setting`), and returns
             the metrics.
         shown: names of the metrics in Markdown tables. JSON files contain all metrics.
         card: names of the metrics in a model card.
@@ -58,13 +58,13 @@ class Task:
     card: tuple[str, ...] = ()
     of_objects: bool = False
 
-    def __call__(self, contender: Contender, setting: Setting) -> Outcome | None:
+    def __call__(self, model: Model, setting: Setting) -> Outcome | None:
         """Return the metrics, or None if the task cannot be measured."""
         if self.of_objects:
             setting = setting.complete
             if not len(setting.scenes):
                 return None
-        return self.ask(contender, setting)
+        return self.ask(model, setting)
 
 
 def _objects(words: str, ask: Ask, shown: tuple[str, ...], card: tuple[str, ...] = ()) -> Task:

@@ -16,8 +16,8 @@ from training.evaluation.results import grid, only, summarise, write
 from training.evaluation.setting import Setting
 from training.fit.checkpoint import RunError
 from training.fit.settings import Config, ConfigError, first_error
+from training.research.entries import machine_entry
 from training.research.measure import Plan, Reports, measure_rows, place_of, resumable, shown
-from training.research.rows import Material, machine_row
 from training.research.settings import own_or_shipped
 from training.runs.config import data_folder, load_config, read_toml, with_settings
 from training.runs.folder import load_run
@@ -67,12 +67,11 @@ def ablate(
         configs = _configs(configuration, rows, row, limit, epochs)
         place = folder / configs[0].name
         with console.status("reading and encoding scenes"):
-            material = Material.of(
-                prepare(configs[0], data_folder(configuration, configs[0], data))
-            )
-        plan = Plan(place, material, _settings(material.data, asked), tasks=tuple(PRIMARY))
+            root = data_folder(configuration, configs[0], data)
+            scenes = prepare(configs[0], root).complete_data()
+        plan = Plan(place, scenes, _settings(scenes, asked), tasks=tuple(PRIMARY))
         entries = [
-            machine_row(with_settings(config, {"training.seed": seed}))
+            machine_entry(with_settings(config, {"training.seed": seed}))
             for config in configs
             for seed in range(seeds)
         ]

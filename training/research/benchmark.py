@@ -27,6 +27,7 @@ from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
 from training.fit.settings import Config, ConfigError, DataConfig
 from training.research.baselines import BASELINES
+from training.research.entries import Entry, baseline_entries, machine_entry, reference_entries
 from training.research.measure import (
     POOLED,
     Plan,
@@ -38,7 +39,6 @@ from training.research.measure import (
     slug,
 )
 from training.research.plots import write_plots
-from training.research.rows import Material, Row, baseline_rows, machine_row, reference_rows
 from training.runs.config import data_folder, load_config, with_settings
 from training.runs.pipeline import SplitScenes, prepare
 from training.seed.protocol import PAPER, SEED_TASKS
@@ -291,17 +291,17 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
     domain.require_groups()
     scenes = options.scenes(domain)
     plan = _plan(folder, scenes, options, options.tasks)
-    rows: list[Row] = []
+    entries: list[Entry] = []
     for seed in range(options.seeds):
-        rows += [machine_row(config) for config in options.configs(domain, seed)]
-        rows += baseline_rows(seed, options.baselines, related=plan.material.related)
-    rows += reference_rows()
-    reports = _measured(plan, rows, options, domain.name)
-    results = summarise(reports, domain.configs[0].name, parameters(folder, rows))
+        entries += [machine_entry(config) for config in options.configs(domain, seed)]
+        entries += baseline_entries(seed, options.baselines, related=plan.data.related)
+    entries += reference_entries()
+    reports = _measured(plan, entries, options, domain.name)
+    results = summarise(reports, domain.configs[0].name, parameters(folder, entries))
     _write(folder, scenes, results.to_dict(), f"# {domain.name}\n\n{results.markdown()}")
     console.print(*results.tables())
     names = {config.name for config in domain.configs}
-    write_plots(plan, [row for row in rows if row.name in names], reports, results)
+    write_plots(plan, [entry for entry in entries if entry.name in names], reports, results)
     return results
 
 
@@ -309,12 +309,12 @@ def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> 
     """Measure each machine, trained once on a random split, by the seed protocol."""
     scenes = options.scenes(domain, split="random")
     plan = replace(_plan(folder, scenes, options, tuple(SEED_TASKS)), known_tasks=SEED_TASKS)
-    rows = [
-        machine_row(with_settings(config, {"data.split": "random"}), calibrated=False)
+    entries = [
+        machine_entry(with_settings(config, {"data.split": "random"}), calibrated=False)
         for config in options.configs(domain, 0)
     ]
-    reports = _measured(plan, rows, options, f"{domain.name}, seed protocol")
-    found = summarise(reports, domain.configs[0].name, parameters(folder, rows))
+    reports = _measured(plan, entries, options, f"{domain.name}, seed protocol")
+    found = summarise(reports, domain.configs[0].name, parameters(folder, entries))
     # The seed protocol does not rank the machines, so the results contain no paired differences.
     results = replace(found, differences=())
     _write(folder, scenes, results.to_dict() | {"paper": PAPER}, _protocol_text(results))
@@ -338,7 +338,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
     scenes = real.shuffled(seed=0)
     asked = shuffled_tasks(options.tasks)
     plan = _plan(folder, scenes, options, asked, asked_by=real)
-    if not plan.material.related:
+    if not plan.data.related:
         asked = tuple(task for task in asked if task not in _RELATION_TASKS)
         if not asked:
             raise ValueError(
@@ -346,15 +346,15 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
                 "relations: select other tasks"
             )
         plan = replace(plan, tasks=asked)
-    rows = [machine_row(config, calibrated=False) for config in options.configs(domain, 0)]
+    entries = [machine_entry(config, calibrated=False) for config in options.configs(domain, 0)]
     # A baseline that supports several of the tasks is fitted once.
-    names = [name for name, one in BASELINES.items() if one.scores in (("objects",), RELATIONS)]
+    names = [name for name, one in BASELINES.items() if one.scores in (("missing",), RELATIONS)]
     if options.baselines is not None:
         yardsticks = {YARDSTICKS[task][0] for task in asked}
         names = [name for name in names if name in yardsticks | set(options.baselines)]
-    rows += baseline_rows(0, names, related=plan.material.related, whole=False)
-    reports = _measured(plan, rows, options, f"{domain.name}, shuffled")
-    weights = parameters(folder, rows)
+    entries += baseline_entries(0, names, related=plan.data.related, whole=False)
+    reports = _measured(plan, entries, options, f"{domain.name}, shuffled")
+    weights = parameters(folder, entries)
     results = {}
     for task in asked:
         yardstick, metric = YARDSTICKS[task]
@@ -384,21 +384,20 @@ def _plan(
         asked_by: scenes whose training part determines the questions, for example the classes that
             are typical of a room type. None means `scenes`.
     """
-    material = Material.of(scenes)
-    data = material.data
+    data = scenes.complete_data()
     train = data.train if asked_by is None else asked_by.training_data().train
     seen = seen_triples(data.train.scenes, data.train.v.shape[1])
     limit = options.limit
     settings = dict(settings_by_source(data.test, data.structure, train, seen, limit=limit))
     facts = EVERYDAY if facts_file() else None
     settings[POOLED] = Setting(data.test, data.structure, train, seen, limit, everyday=facts)
-    return Plan(folder, material, settings, tasks)
+    return Plan(folder, data, settings, tasks)
 
 
-def _measured(plan: Plan, rows: Sequence[Row], options: Options, title: str) -> Reports:
-    with shown(console, title, len(rows) * len(plan.settings)) as progress:
+def _measured(plan: Plan, entries: Sequence[Entry], options: Options, title: str) -> Reports:
+    with shown(console, title, len(entries) * len(plan.settings)) as progress:
         reports, _ = measure_rows(
-            *(plan, rows, progress),
+            *(plan, entries, progress),
             workers=options.workers,
             fresh=options.fresh,
         )

@@ -1,14 +1,14 @@
 """Measure models on every data source, and reuse finished reports on disk.
 
-A row is one model of an experiment: a machine, a baseline or a reference.
+An entry is one model of an experiment: a machine, a baseline or a reference.
 
-<folder>/<row>/seed-<n>/row.json          settings, training scenes (as digest), number of weights
+<folder>/<name>/seed-<n>/row.json         settings, training scenes (as digest), number of weights
                         trials.jsonl      all settings that the tuning of a baseline tried
                         run/              training run of a machine, and its calibration
                         <source>.json     report on one data source
                         pooled.json       report on all data sources together (tasks of `WHOLE_SET`)
 
-Several processes fill these files in parallel. One process with one thread measures each row.
+Several processes fill these files in parallel. One process with one thread measures each entry.
 """
 
 from __future__ import annotations
@@ -37,17 +37,19 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
 from training.datasets import DatasetError
+from training.datasets.batches import TrainingData
+from training.evaluation.model import Model
 from training.evaluation.report import SourceReport, digest, measure, pooled, write_whole
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, WHOLE_SET, Task
 from training.fit.checkpoint import RunError
 from training.fit.settings import ConfigError
-from training.research.rows import Material, Rival, Row
+from training.research.entries import Entry
 
 # A progress function receives the row, the source, and a note on the current step.
 Progress: TypeAlias = Callable[[str, str, str], None]
-# Measures a row; returns the error of a row that failed.
-Work: TypeAlias = Callable[[Row, Progress], Exception | None]
+# Measures an entry; returns the error of an entry that failed.
+Work: TypeAlias = Callable[[Entry, Progress], Exception | None]
 
 # Seconds between two checks for messages of the processes.
 _TICK = 0.2
@@ -89,24 +91,24 @@ def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The questions of an experiment. All rows get the same questions.
+    """The questions of an experiment. All entries get the same questions.
 
     Attributes:
         folder: folder of the reports.
-        material: scenes for training, validation and test.
+        data: scenes for training, validation and test.
         settings: evaluation setting by data source. The key `POOLED` is the union of all sources.
         tasks: names of the tasks to measure, which are keys of `known_tasks`.
     """
 
     folder: Path
-    material: Material
+    data: TrainingData
     settings: Mapping[str, Setting]
     tasks: Sequence[str]
     known_tasks: Mapping[str, Task] = field(default_factory=lambda: EVERY_TASK)
 
-    def place(self, row: Row) -> Path:
-        """Return the folder of a row and its training seed."""
-        return place_of(self.folder, row.name, row.seed)
+    def place(self, entry: Entry) -> Path:
+        """Return the folder of an entry and its training seed."""
+        return place_of(self.folder, entry.name, entry.seed)
 
     def asked(self, source: str) -> list[str]:
         """Return the names of the tasks to measure on a data source, or on `POOLED`."""
@@ -114,17 +116,17 @@ class Plan:
             return [task for task in self.tasks if task in WHOLE_SET]
         return [task for task in self.tasks if task not in ONCE]
 
-    def known(self, row: Row) -> dict[str, SourceReport]:
-        """Return the finished reports of a row, by data source.
+    def known(self, entry: Entry) -> dict[str, SourceReport]:
+        """Return the finished reports of an entry, by data source.
 
         Raises:
             BenchmarkError: the folder holds reports of other test scenes, other training scenes, or
-                another configuration of the row.
+                another configuration of the entry.
         """
-        claim(self.place(row), row, self.material.digest)
+        claim(self.place(entry), entry, self.data.digest)
         found = {}
         for source, setting in self.settings.items():
-            path = self.place(row) / f"{source}.json"
+            path = self.place(entry) / f"{source}.json"
             if not self.asked(source):
                 found[source] = SourceReport(source, digest(setting))
             elif path.exists():
@@ -133,37 +135,36 @@ class Plan:
                     found[source] = report
         return found
 
-    def measure(self, row: Row, progress: Progress) -> None:
-        """Measure a row on every data source that lacks a finished report.
+    def measure(self, entry: Entry, progress: Progress) -> None:
+        """Measure an entry on every data source that lacks a finished report.
 
         The model is trained only if a report is missing. On KeyboardInterrupt, the results of
         finished tasks are already on disk.
         """
-        known = self.known(row)
-        rival: Rival | None = None
+        known = self.known(entry)
+        model: Model | None = None
         for source, setting in self.settings.items():
             if source in known:
-                progress(row.name, source, KNOWN)
+                progress(entry.name, source, KNOWN)
                 continue
-            say = partial(progress, row.name, source)
-            place = self.place(row)
-            if rival is None:
+            say = partial(progress, entry.name, source)
+            place = self.place(entry)
+            if model is None:
                 say("training")
-                rival = row.make(self.material, place, say)
-            contender = rival(setting)
-            _note_parameters(place, contender.parameters)
+                model = entry.make(self.data, place, say)
+            _note_parameters(place, model.parameters)
             path = place / f"{source}.json"
             measure(
-                *(path, contender, setting, source),
+                *(path, model, setting, source),
                 tasks=self.asked(source),
                 known=self.known_tasks,
                 progress=say,
             )
             say(DONE)
 
-    def report(self, row: Row) -> dict[str, SourceReport]:
-        """Return the reports of a measured row, by data source. The pooled report has all tasks."""
-        found = self.known(row)
+    def report(self, entry: Entry) -> dict[str, SourceReport]:
+        """Return the reports of an entry, by data source. The pooled report has all tasks."""
+        found = self.known(entry)
         sources = [found[source] for source in self.settings if source != POOLED]
         if POOLED in self.settings:
             whole = found[POOLED]
@@ -175,71 +176,73 @@ class Plan:
 
 def measure_rows(
     plan: Plan,
-    rows: Sequence[Row],
+    entries: Sequence[Entry],
     progress: Progress,
     *,
     workers: int = 1,
     fresh: bool = False,
     failures: tuple[type[Exception], ...] = (),
 ) -> tuple[Reports, dict[str, str]]:
-    """Measure all rows, and skip finished reports.
+    """Measure all entries, and skip finished reports.
 
     KeyboardInterrupt stops the processes. The results of finished tasks are then already on
     disk.
 
     Args:
         workers: number of processes with one thread each. 1 measures in this process.
-        fresh: delete earlier reports of these rows.
-        failures: exception types that end only the row in which they occur.
+        fresh: delete earlier reports of these entries.
+        failures: exception types that end only the entry in which they occur.
 
     Returns:
-        The reports by (row name, seed), and the error messages of failed rows by row name.
+        The reports by (name, seed), and the error messages of failed entries by name.
 
     Raises:
         BrokenProcessPool: a worker process died.
     """
     if fresh:
-        for row in rows:
-            shutil.rmtree(plan.place(row), ignore_errors=True)
+        for entry in entries:
+            shutil.rmtree(plan.place(entry), ignore_errors=True)
     failed: dict[tuple[str, int], Exception] = {}
-    missing = [row for row in rows if len(plan.known(row)) < len(plan.settings)]
-    for row in rows:
-        if row not in missing:
-            plan.measure(row, progress)
+    missing = [entry for entry in entries if len(plan.known(entry)) < len(plan.settings)]
+    for entry in entries:
+        if entry not in missing:
+            plan.measure(entry, progress)
     work = partial(_failure, plan, failures)
     if missing and workers > 1:
         failed = _measure_in_processes(work, missing, progress, min(workers, len(missing)))
     else:
-        for row in missing:
-            if error := work(row, progress):
-                failed[row.name, row.seed] = error
+        for entry in missing:
+            if error := work(entry, progress):
+                failed[entry.name, entry.seed] = error
     reasons = {name: f"seed {seed}: {error}" for (name, seed), error in failed.items()}
-    kept = [row for row in rows if row.name not in reasons]
-    return {(row.name, row.seed): plan.report(row) for row in kept}, reasons
+    kept = [entry for entry in entries if entry.name not in reasons]
+    return {(entry.name, entry.seed): plan.report(entry) for entry in kept}, reasons
 
 
 def _failure(
-    plan: Plan, failures: tuple[type[Exception], ...], row: Row, progress: Progress
+    plan: Plan, failures: tuple[type[Exception], ...], entry: Entry, progress: Progress
 ) -> Exception | None:
     try:
-        plan.measure(row, progress)
+        plan.measure(entry, progress)
     except failures as error:
         return error
     return None
 
 
 def _measure_in_processes(
-    work: Work, rows: Sequence[Row], progress: Progress, workers: int
+    work: Work, entries: Sequence[Entry], progress: Progress, workers: int
 ) -> dict[tuple[str, int], Exception]:
-    """Measure rows in processes; return the errors of failed rows by (name, seed)."""
+    """Measure entries in processes; return the errors of failed entries by (name, seed)."""
     context = multiprocessing.get_context("spawn")
-    # SimpleQueue has no sending thread, so all messages of a finished row are already in the queue.
+    # SimpleQueue has no sending thread, so the queue has all messages of a finished entry.
     messages: SimpleQueue[tuple[str, str, str]] = context.SimpleQueue()
     # Pickling avoids the shared memory of torch, which is small in containers.
     begin = (pickle.dumps(work), messages)
     with _one_thread(), ProcessPoolExecutor(workers, context, _begin, begin) as pool:
         try:
-            futures = {pool.submit(_measure_here, row): (row.name, row.seed) for row in rows}
+            futures = {
+                pool.submit(_measure_here, entry): (entry.name, entry.seed) for entry in entries
+            }
             while True:
                 done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
                 while not messages.empty():
@@ -283,8 +286,8 @@ def _begin(material: bytes, messages: SimpleQueue[tuple[str, str, str]]) -> None
     _progress = lambda *message: messages.put(message)  # noqa: E731
 
 
-def _measure_here(row: Row) -> Exception | None:
-    return _work(row, _progress)
+def _measure_here(entry: Entry) -> Exception | None:
+    return _work(entry, _progress)
 
 
 @contextmanager
@@ -309,7 +312,7 @@ def shown(console: Console, title: str, total: int) -> Iterator[Progress]:
 
 
 def place_of(folder: Path, name: str, seed: int) -> Path:
-    """Return the folder of a row and its training seed."""
+    """Return the folder of an entry and its training seed."""
     return folder / slug(name) / f"seed-{seed}"
 
 
@@ -318,29 +321,29 @@ def slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
-def parameters(folder: Path, rows: Sequence[Row]) -> dict[str, int]:
-    """Return the number of trained weights by row name, for rows that record this number."""
+def parameters(folder: Path, entries: Sequence[Entry]) -> dict[str, int]:
+    """Return the number of trained weights by name, for entries that record this number."""
     found = {}
-    for row in rows:
-        path = place_of(folder, row.name, row.seed) / "row.json"
+    for entry in entries:
+        path = place_of(folder, entry.name, entry.seed) / "row.json"
         count = json.loads(path.read_text(encoding="utf-8")).get("parameters")
         if count is not None:
-            found[row.name] = int(count)
+            found[entry.name] = int(count)
     return found
 
 
-def claim(place: Path, row: Row, material: str) -> None:
-    """Reserve a folder for a row, or check that the folder already belongs to the row.
+def claim(place: Path, entry: Entry, material: str) -> None:
+    """Reserve a folder for an entry, or check that the folder already belongs to it.
 
     Raises:
-        BenchmarkError: the folder belongs to a row with other settings or other scenes.
+        BenchmarkError: the folder belongs to an entry with other settings or other scenes.
     """
     path = place / "row.json"
     if path.exists():
         known = json.loads(path.read_text(encoding="utf-8"))
-        if known["identity"] != row.identity:
+        if known["identity"] != entry.identity:
             raise BenchmarkError(
-                f"{place} holds reports of another configuration of {row.name}: use --fresh or "
+                f"{place} holds reports of another configuration of {entry.name}: use --fresh or "
                 "another folder"
             )
         if known.get("material") != material:
@@ -350,7 +353,7 @@ def claim(place: Path, row: Row, material: str) -> None:
                 "or another folder"
             )
         return
-    values = {"name": row.name, "seed": row.seed, "identity": row.identity}
+    values = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
     write_whole(path, json.dumps(values | {"material": material}))
 
 

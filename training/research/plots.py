@@ -20,8 +20,8 @@ from training.evaluation.metrics import Scored
 from training.evaluation.report import SourceReport
 from training.evaluation.results import Results
 from training.evaluation.setting import Outcome
+from training.research.entries import Entry
 from training.research.measure import POOLED, Plan, slug
-from training.research.rows import Row
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
 
@@ -38,7 +38,7 @@ _RECALL = {
 
 
 def write_plots(
-    plan: Plan, machines: Sequence[Row], reports: Reports, results: Results
+    plan: Plan, machines: Sequence[Entry], reports: Reports, results: Results
 ) -> list[Path]:
     """Write all plots that have data, and return the paths of the files.
 

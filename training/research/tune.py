@@ -33,7 +33,7 @@ from rich.table import Table
 from training.datasets.batches import TrainingData
 from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.missing_tasks import MachineScore
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.relation_tasks import machine_score
 from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
 from training.evaluation.tasks import in_words
@@ -306,12 +306,12 @@ class Search:
 
     def _judge(self, trainer: Trainer, place: Path) -> dict[str, Metric]:
         machine = trainer.machine
-        contender = Contender(objects=MachineScore(machine), relations=machine_score(machine))
+        model = Model(missing=MachineScore(machine), relations=machine_score(machine))
         tasks = [task for task, _ in FIGURES.values()]
         for source, setting in settings_by_source(
             self.data.validation, self.data.structure, self.data.train, seen=None
         ):
-            measure(place / f"{source}.json", contender, setting, source, tasks=tasks)
+            measure(place / f"{source}.json", model, setting, source, tasks=tasks)
         return self.metrics(place)
 
     def metrics(self, place: Path) -> dict[str, Metric]:

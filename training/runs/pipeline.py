@@ -98,7 +98,21 @@ class SplitScenes:
             room_types=len(self.vocabulary.room_types),
             digest=self.digest,
             words=self.words,
+            vocabulary=self.vocabulary,
         )
+
+    def complete_data(self) -> TrainingData:
+        """Return the tensors for an experiment, which needs all three parts.
+
+        Raises:
+            ConfigError: the training, validation or test part contains no scenes.
+        """
+        for part, scenes in self.parts.items():
+            if not scenes:
+                raise ConfigError(
+                    f"the {part} part contains no scenes: provide more scenes or more groups"
+                )
+        return self.training_data()
 
     def shuffled(self, seed: int) -> SplitScenes:
         """Return a copy in which objects are permuted between scenes, except in test scenes."""

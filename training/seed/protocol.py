@@ -33,7 +33,7 @@ from training.datasets.batches import Batch, SceneTensors, relation_units
 from training.datasets.cases import scene_rng
 from training.evaluation.intruders import draw_intruders
 from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 from training.evaluation.tasks import Task
 from training.machines import BoltzmannMachine
@@ -55,16 +55,16 @@ PAPER: dict[str, dict[str, float]] = {
 _BLOCK = 32
 
 
-def relations_switched_on(contender: Contender, setting: Setting) -> Outcome | None:
+def relations_switched_on(model: Model, setting: Setting) -> Outcome | None:
     """Measure T1: all relations are unobserved, and each relation is sampled once."""
-    if contender.machine is None:
+    if model.machine is None:
         return None
     scenes = setting.some(related=True)
     if not len(scenes):
         return None
     on, labelled, hit = (np.zeros(len(scenes)) for _ in range(3))
     for index, batch, generator in _blocks(scenes, setting.seed):
-        total, grid = draw_relations(contender.machine, batch, generator)
+        total, grid = draw_relations(model.machine, batch, generator)
         place = index.numpy()
         on[place] = total.double().numpy()
         labelled[place] = batch.holds.sum((1, 2, 3)).double().numpy()
@@ -77,9 +77,9 @@ def relations_switched_on(contender: Contender, setting: Setting) -> Outcome | N
     return Outcome(metrics, len(scenes), 0)
 
 
-def removed_switched_on(contender: Contender, setting: Setting) -> Outcome | None:
+def removed_switched_on(model: Model, setting: Setting) -> Outcome | None:
     """Measure T2: remove one random class from each scene, and sample the unit of this class."""
-    if contender.machine is None:
+    if model.machine is None:
         return None
     scenes = setting.some(related=True)
     targets = _targets(scenes, setting.structure, setting.seed)
@@ -94,7 +94,7 @@ def removed_switched_on(contender: Contender, setting: Setting) -> Outcome | Non
             if len(some):
                 chosen = targets[index[some]]
                 p = switch_on_probability(
-                    contender.machine, batch.rows(some), chosen, left_on, generator
+                    model.machine, batch.rows(some), chosen, left_on, generator
                 )
                 drawn[index[some]] = bernoulli(p, generator)
         metrics[f"removed objects switched on, {name}"] = Ratio(
@@ -103,11 +103,11 @@ def removed_switched_on(contender: Contender, setting: Setting) -> Outcome | Non
     return Outcome(metrics, len(scenes), int((~asked).sum()))
 
 
-def reconstruction_after_addition(contender: Contender, setting: Setting) -> Outcome | None:
+def reconstruction_after_addition(model: Model, setting: Setting) -> Outcome | None:
     """Measure T3: add an absent class to each scene, and sample all objects once."""
-    if contender.machine is None:
+    if model.machine is None:
         return None
-    machine, scenes = contender.machine, setting.some()
+    machine, scenes = model.machine, setting.some()
     added = draw_intruders(scenes, setting.structure, seed=setting.seed)
     asked = (added >= 0).double().numpy()
     if not asked.any():

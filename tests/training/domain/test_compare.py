@@ -10,13 +10,13 @@ from rich.console import Console
 
 from app.scene import Vocabulary
 from tests.training.research.baselines.furnished import STRUCTURE, furnished, tensors
+from training.domain.candidates import Candidate, held_out
 from training.domain.compare import COMPARED, compare, show, side_by_side
-from training.domain.sides import Side, held_out
-from training.evaluation.model import Contender
+from training.evaluation.baselines import EASE, FREQUENCY_TABLE, POPULARITY
+from training.evaluation.model import Model
 from training.evaluation.tasks import in_words
 from training.fit.settings import Config, ConfigError
 from training.fit.trainer import new_machine
-from training.research.baselines import BASELINES
 from training.runs.config import with_settings
 from training.runs.pipeline import prepare, read_sources
 from training.runs.publish import as_stored, draft_artifact
@@ -36,15 +36,13 @@ def test_scenes_with_incomplete_lists_are_compared_on_relations_alone() -> None:
     train, validation, test = (furnished(60, seed=seed) for seed in range(3))
     scenes = tensors([replace(scene, complete=k % 2 == 0) for k, scene in enumerate(test.scenes)])
     fitted = [
-        Contender(
-            objects=BASELINES[objects].fit(train, validation, STRUCTURE).score,
-            relations=BASELINES["frequency table"].fit(train, validation, STRUCTURE).score,
+        Model(
+            missing=baseline.fit(train, validation, STRUCTURE).missing,
+            relations=FREQUENCY_TABLE.fit(train, validation, STRUCTURE).relations,
         )
-        for objects in ("EASE", "popularity")
+        for baseline in (EASE, POPULARITY)
     ]
-    results = side_by_side(
-        ("a", "b"), (lambda _: fitted[0], lambda _: fitted[1]), scenes, STRUCTURE
-    )
+    results = side_by_side(("a", "b"), (fitted[0], fitted[1]), scenes, STRUCTURE)
     scenes_of = {asked.task: asked.scenes for asked in results.asked if asked.row == "a"}
     assert scenes_of["T1a relations"] == 60
     assert scenes_of["T2 missing"] == 30
@@ -61,7 +59,7 @@ def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacki
     machine = new_machine(CONFIG, scenes.training_data(), torch.Generator().manual_seed(0))
     other = Vocabulary(classes, scenes.vocabulary.room_types)
     a, b = (
-        Side(title, CONFIG, scenes.digests, draft_artifact(as_stored(machine), vocabulary))
+        Candidate(title, CONFIG, scenes.digests, draft_artifact(as_stored(machine), vocabulary))
         for title, vocabulary in (("new", scenes.vocabulary), ("old", other))
     )
     found = compare(a, b, Path(), limit=None, examples=0, say=lambda _: None)
@@ -80,6 +78,6 @@ def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacki
 
 
 def test_a_model_of_all_scenes_has_no_test_scenes() -> None:
-    side = Side("new", with_settings(CONFIG, {"data.split": "final"}), {}, None)
+    candidate = Candidate("new", with_settings(CONFIG, {"data.split": "final"}), {}, None)
     with pytest.raises(ConfigError, match="trained with --final"):
-        held_out(side, side, read_sources(side.config.data, Path()), Path())
+        held_out(candidate, candidate, read_sources(candidate.config.data, Path()), Path())

@@ -11,9 +11,9 @@ import torch
 from app.registry import Store
 from tests.http.stores import corrupt, make_store
 from training.datasets.batches import subset
+from training.domain.candidates import Candidate
 from training.domain.compare import RELATIONAL, Comparison, unmeasured
 from training.domain.gate import Usefulness, losses, measure_usefulness, seat
-from training.domain.sides import Side
 from training.evaluation.metrics import Figure
 from training.evaluation.results import Difference, Results
 from training.fit.settings import Config
@@ -74,7 +74,7 @@ def test_a_model_without_relation_metrics_replaces_no_model_with_them(
     measured, task, expected
 ) -> None:
     manifest = SimpleNamespace(metrics=[SimpleNamespace(task=name) for name in measured])
-    holder = Side("old", None, {}, SimpleNamespace(manifest=manifest))  # type: ignore[arg-type]
+    holder = Candidate("old", None, {}, SimpleNamespace(manifest=manifest))  # type: ignore[arg-type]
     names = unmeasured([difference(task, "MRR", -0.1, 0.1)], holder)
     assert len(names) == expected
     assert set(names) < set(RELATIONAL)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from training.datasets import generate_rooms, split, stable_part
-from training.domain.sides import BASELINE_SIDE, Side, held_out
+from training.domain.candidates import BASELINES, Candidate, held_out
 from training.fit.settings import Config, ConfigError
 from training.runs.pipeline import digest_of
 
 SCENES = {"rooms": generate_rooms(500, 0)}
-BASELINES = Side(BASELINE_SIDE, None, {}, None)
+REFERENCE = Candidate(BASELINES, None, {}, None)
 LEARNT = {"rooms": digest_of(SCENES["rooms"])}
 
 
@@ -25,9 +25,9 @@ def config(**data) -> Config:
     )
 
 
-def side(title: str, learnt=LEARNT, **data) -> Side:
+def candidate(title: str, learnt=LEARNT, **data) -> Candidate:
     # Whatever is not None stands for a model here: only its split is looked at.
-    return Side(title, config(**data), learnt, artifact="a model")  # type: ignore[arg-type]
+    return Candidate(title, config(**data), learnt, artifact="a model")  # type: ignore[arg-type]
 
 
 def ids(scenes) -> set[str]:
@@ -41,7 +41,7 @@ def learnt_groups(seed: int, protocol) -> set[str]:
 
 @pytest.mark.parametrize("protocol", ["group", "stable"])
 def test_of_one_split_all_test_scenes_are_asked_about(tmp_path, protocol) -> None:
-    a, b = side("a", split=protocol), side("b", split=protocol)
+    a, b = candidate("a", split=protocol), candidate("b", split=protocol)
     found = held_out(a, b, SCENES, tmp_path)
     test = split(SCENES["rooms"], seed=0, protocol=protocol)["test"]
     assert ids(found.scenes) == ids(test)
@@ -53,7 +53,7 @@ def test_of_one_split_all_test_scenes_are_asked_about(tmp_path, protocol) -> Non
     "protocols", [("stable", "stable"), ("stable", "group"), ("group", "group")]
 )
 def test_of_two_splits_what_either_learnt_is_left_out(tmp_path, protocols) -> None:
-    a, b = side("a", split=protocols[0]), side("b", split=protocols[1], split_seed=1)
+    a, b = candidate("a", split=protocols[0]), candidate("b", split=protocols[1], split_seed=1)
     found = held_out(a, b, SCENES, tmp_path)
     groups = {scene.group for scene in found.scenes}
     assert groups
@@ -65,7 +65,7 @@ def test_of_two_splits_what_either_learnt_is_left_out(tmp_path, protocols) -> No
 
 
 def test_a_random_split_leaves_no_group_untouched_that_it_learnt_from(tmp_path) -> None:
-    a, b = side("a", split="stable"), side("b", split="random")
+    a, b = candidate("a", split="stable"), candidate("b", split="random")
     parts = split(SCENES["rooms"], seed=0, protocol="random")
     learnt = {scene.group for part in ("train", "validation") for scene in parts[part]}
     try:
@@ -77,31 +77,31 @@ def test_a_random_split_leaves_no_group_untouched_that_it_learnt_from(tmp_path) 
 
 
 def test_an_earlier_version_of_the_data_is_no_matter_where_the_split_is_stable(tmp_path) -> None:
-    before = side("before", {"rooms": "0" * 64}, split="stable")
-    found = held_out(side("now", split="stable"), before, SCENES, tmp_path)
+    before = candidate("before", {"rooms": "0" * 64}, split="stable")
+    found = held_out(candidate("now", split="stable"), before, SCENES, tmp_path)
     assert found.certain
     assert {stable_part(scene.group, 0) for scene in found.scenes} == {"test"}
 
 
 def test_another_version_of_the_data_without_a_stable_split_is_uncertain(tmp_path) -> None:
-    before = side("before", {"rooms": "0" * 64}, split="group")
-    found = held_out(side("now", split="stable"), before, SCENES, tmp_path)
+    before = candidate("before", {"rooms": "0" * 64}, split="group")
+    found = held_out(candidate("now", split="stable"), before, SCENES, tmp_path)
     assert not found.certain
     assert any("may have learnt from these" in note for note in found.notes)
 
 
 def test_a_model_of_other_sources_has_seen_nothing(tmp_path) -> None:
     found = held_out(
-        side("a", split="stable"),
-        side("b", {"kitchens": "1" * 64}, split="group"),
+        candidate("a", split="stable"),
+        candidate("b", {"kitchens": "1" * 64}, split="group"),
         SCENES,
         tmp_path,
     )
     assert found.certain
     assert any("other data sources (kitchens)" in note for note in found.notes)
-    assert held_out(side("a"), BASELINES, SCENES, tmp_path).certain
+    assert held_out(candidate("a"), REFERENCE, SCENES, tmp_path).certain
 
 
 def test_the_first_side_must_record_its_split(tmp_path) -> None:
     with pytest.raises(ConfigError, match="does not record the split of its scenes"):
-        held_out(BASELINES, side("b"), SCENES, tmp_path)
+        held_out(REFERENCE, candidate("b"), SCENES, tmp_path)

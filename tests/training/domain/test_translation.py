@@ -8,7 +8,7 @@ import torch
 from app.scene import ObjectClass, Vocabulary
 from training.datasets.batches import Batch
 from training.domain.translation import BEYOND, Translation, same_classes
-from training.evaluation.contenders import artifact_contender
+from training.evaluation.artifact_model import artifact_model
 from training.evaluation.model import Places
 from training.machines import MachineSpec, build
 from training.runs.publish import draft_artifact
@@ -23,14 +23,14 @@ V, A = len(MODEL), 4
 
 
 @pytest.fixture(scope="module")
-def contender():
+def model():
     machine = build(MachineSpec("triway", V=V, A=A, H1=5, K=3, form="local"))
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
     artifact = draft_artifact(machine.requires_grad_(False).eval(), MODEL)
-    return artifact_contender(artifact, None)  # type: ignore[arg-type]
+    return artifact_model(artifact, None)  # type: ignore[arg-type]
 
 
 def batch(classes: list[int], size: int, told: tuple[int, int, int] | None = None) -> Batch:
@@ -46,60 +46,58 @@ def batch(classes: list[int], size: int, told: tuple[int, int, int] | None = Non
     )  # fmt: skip
 
 
-def test_the_same_classes_in_another_order_get_the_same_answers(contender) -> None:
+def test_the_same_classes_in_another_order_get_the_same_answers(model) -> None:
     order = [3, 1, 4, 0, 2]
     shuffled = vocabulary(*(MODEL.labels[k] for k in order))
     assert not same_classes(shuffled, MODEL)
     assert same_classes(MODEL, vocabulary(*MODEL.labels))
-    asked = Translation.between(shuffled, MODEL).contender(contender, "T2 missing")
+    asked = Translation.between(shuffled, MODEL).model(model)
     v = torch.tensor([[1.0, 0.0, 1.0, 0.0, 0.0], [0.0, 1.0, 1.0, 1.0, 0.0]])
     own = torch.zeros_like(v)
     own[:, order] = v
-    torch.testing.assert_close(asked.objects(v), contender.objects(own)[:, order])
+    torch.testing.assert_close(asked.missing(v), model.missing(own)[:, order])
     # A scene of classes 0, 1, 3 there is one of 3, 1, 0 here.
-    for name in ("relations", "completion", "placement"):
+    for name in ("relations", "completion", "false_relations"):
         theirs = getattr(asked, name)(batch([0, 1, 3], V, (1, 0, 2)))
-        ours = getattr(contender, name)(batch([0, 1, 3], V, (1, 2, 0)))
+        ours = getattr(model, name)(batch([0, 1, 3], V, (1, 2, 0)))
         turned = ours[:, :, [2, 1, 0]][:, :, :, [2, 1, 0]]
         apart = ~torch.eye(3, dtype=torch.bool)
         torch.testing.assert_close(theirs[..., apart], turned[..., apart])
     there = Places(v[:1], v[:1], *(torch.tensor([x]) for x in (2, 0)), torch.tensor([True]))
     here = Places(own[:1], own[:1], *(torch.tensor([x]) for x in (2, 3)), torch.tensor([True]))
     absent = v[0] == 0
-    theirs = asked.placed(there)[:, absent]
-    torch.testing.assert_close(theirs, contender.placed(here)[:, order][:, absent])
+    theirs = asked.at_place(there)[:, absent]
+    torch.testing.assert_close(theirs, model.at_place(here)[:, order][:, absent])
 
 
-def test_aliases_are_understood_and_the_unknown_comes_last(contender) -> None:
+def test_aliases_are_understood_and_the_unknown_comes_last(model) -> None:
     scenes = vocabulary("mug", "bed", "unicorn")
     translation = Translation.between(scenes, MODEL)
     assert translation.own.tolist() == [1, 0, -1]
     v = torch.tensor([[0.0, 1.0, 1.0]])
-    proposed = translation.contender(contender, "T2 missing").objects(v)
-    shown = contender.objects(torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0]]))
+    proposed = translation.model(model).missing(v)
+    shown = model.missing(torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0]]))
     assert proposed[0, 0] == shown[0, 1]
     assert proposed[0, 2] == -BEYOND
     # What it does not know it cannot suspect either.
-    assert translation.contender(contender, "T3 outliers, uniform").objects(v)[0, 2] == BEYOND
+    assert translation.model(model).outliers(v)[0, 2] == BEYOND
     assert (
-        translation.contender(contender, "T3b placement").placement(batch([0, 1, 2], 3, (0, 0, 2)))[
-            0, 0, 0, 2
-        ]
+        translation.model(model).false_relations(batch([0, 1, 2], 3, (0, 0, 2)))[0, 0, 0, 2]
         == BEYOND
     )
 
 
-def test_an_unknown_anchor_says_nothing(contender) -> None:
+def test_an_unknown_anchor_says_nothing(model) -> None:
     scenes = vocabulary("cup", "unicorn", "bed")
-    asked = Translation.between(scenes, MODEL).contender(contender, "T2-at missing at a place")
+    asked = Translation.between(scenes, MODEL).model(model)
     v = torch.tensor([[0.0, 1.0, 0.0]])
     places = Places(v, v, torch.tensor([0]), torch.tensor([1]), torch.tensor([True]))
-    assert bool((asked.placed(places) == -BEYOND).all())
+    assert bool((asked.at_place(places) == -BEYOND).all())
 
 
-def test_two_things_under_one_name_have_no_relation(contender) -> None:
+def test_two_things_under_one_name_have_no_relation(model) -> None:
     scenes = vocabulary("cup", "mug", "bed")
-    asked = Translation.between(scenes, MODEL).contender(contender, "T1a relations")
+    asked = Translation.between(scenes, MODEL).model(model)
     values = asked.relations(batch([0, 1, 2], 3))
     assert bool((values[0, :, 0, 1] == -BEYOND).all())
     assert bool((values[0, :, 0, 2] > -BEYOND).all())

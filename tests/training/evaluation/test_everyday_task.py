@@ -22,7 +22,7 @@ from training.evaluation.everyday_task import (
     facts_digest,
     facts_file,
 )
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.report import SourceReport, digest, evaluate, run
 from training.evaluation.setting import Setting
 
@@ -121,19 +121,19 @@ def test_a_fact_and_its_mirror_image_are_the_same_fact(tmp_path):
 
 def test_the_task_has_a_metric_for_each_line(folder):
     setting = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
-    contender = Contender(artifact=room_model())
-    outcome = everyday_task(contender, setting)
+    model = Model(artifact=room_model())
+    outcome = everyday_task(model, setting)
     assert tuple(outcome.metrics) == LINES
     for line, (hits, asked) in ask_everyday(room_model(), folder).items():
         assert outcome.metrics[line].value == pytest.approx(hits / asked)
         assert outcome.metrics[line].n == asked
-    assert everyday_task(Contender(), setting) is None
+    assert everyday_task(Model(), setting) is None
 
 
 def test_an_absent_folder_leaves_the_task_out(tmp_path):
-    contender = Contender(artifact=room_model())
+    model = Model(artifact=room_model())
     for place in (None, tmp_path / "nowhere"):
-        assert everyday_task(contender, Setting(rooms(5, 1), STRUCTURE, everyday=place)) is None
+        assert everyday_task(model, Setting(rooms(5, 1), STRUCTURE, everyday=place)) is None
     with pytest.raises(FileNotFoundError, match=r"no facts\.json"):
         ask_everyday(room_model(), tmp_path)
     assert facts_digest(tmp_path) == ""
@@ -142,10 +142,10 @@ def test_an_absent_folder_leaves_the_task_out(tmp_path):
 def test_other_facts_are_other_questions(folder):
     before = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
     report = SourceReport("pooled", digest(before))
-    assert list(run(Contender(), before, report, tasks=("Everyday",))) == ["Everyday"]
+    assert list(run(Model(), before, report, tasks=("Everyday",))) == ["Everyday"]
     (folder / "facts.json").write_text(json.dumps(FACTS | {"seeds": [7]}))
     with pytest.raises(ValueError, match="other scenes or tasks"):
-        list(run(Contender(), before, report, tasks=("T2 missing",)))
+        list(run(Model(), before, report, tasks=("T2 missing",)))
 
 
 def test_a_card_has_the_lines_once(folder):

@@ -22,7 +22,7 @@ from training.evaluation.evidence_tasks import (
     removals,
     told,
 )
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.setting import Setting
 
 DATA = rooms(20, 3)
@@ -102,7 +102,7 @@ def test_reciprocal_ranks_by_hand(monkeypatch):
 
 @pytest.mark.parametrize("metric", TASKS)
 def test_a_change_is_the_difference_of_both_sides(metric):
-    outcome = TASKS[metric](Contender(artifact=room_model()), Setting(DATA, STRUCTURE, limit=8))
+    outcome = TASKS[metric](Model(artifact=room_model()), Setting(DATA, STRUCTURE, limit=8))
     kinds = ("relations", "poses") if metric == "R-precision" else evidence.KINDS
     for kind in kinds:
         change, given, without = (
@@ -122,16 +122,14 @@ def test_a_change_is_the_difference_of_both_sides(metric):
 @pytest.mark.parametrize("metric", TASKS)
 def test_scenes_without_relations_ask_nothing(metric):
     silent = tensors([scene([0, 1, 2], room=0) for _ in range(3)], len(VOCABULARY))
-    assert TASKS[metric](Contender(artifact=room_model()), Setting(silent, STRUCTURE)) is None
-    assert TASKS[metric](Contender(), Setting(DATA, STRUCTURE)) is None
+    assert TASKS[metric](Model(artifact=room_model()), Setting(silent, STRUCTURE)) is None
+    assert TASKS[metric](Model(), Setting(DATA, STRUCTURE)) is None
 
 
 def test_a_source_without_positions_has_no_poses():
     flat = [replace(one, instance_positions=None, room_type=-1) for one in DATA.scenes]
     data = replace(DATA, scenes=flat)
-    outcome = missing_evidence_task(
-        Contender(artifact=room_model()), Setting(data, STRUCTURE, limit=5)
-    )
+    outcome = missing_evidence_task(Model(artifact=room_model()), Setting(data, STRUCTURE, limit=5))
     assert {name.split(", ")[1].split()[0] for name in outcome.metrics} == {"relations"}
 
 
@@ -147,4 +145,4 @@ def test_a_planted_cheater_is_caught(monkeypatch):
     monkeypatch.setattr(evidence, "missing_probabilities", cheat)
     setting = Setting(DATA, STRUCTURE, limit=None)
     with pytest.raises(LeakError, match="leaks information"):
-        missing_evidence_task(Contender(artifact=room_model()), setting)
+        missing_evidence_task(Model(artifact=room_model()), setting)

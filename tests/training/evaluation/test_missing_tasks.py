@@ -22,8 +22,8 @@ from tests.training.evaluation.scenes import (
 )
 from training.evaluation import asking
 from training.evaluation import missing_tasks as missing
+from training.evaluation.artifact_model import placed_score
 from training.evaluation.asking import LeakError
-from training.evaluation.contenders import placed_score
 from training.evaluation.missing_tasks import (
     SHARES,
     hide,
@@ -34,7 +34,7 @@ from training.evaluation.missing_tasks import (
     rank_hidden,
     removed_places,
 )
-from training.evaluation.model import Contender, Places
+from training.evaluation.model import Model, Places
 from training.evaluation.setting import Setting
 
 DATA = tensors(random_scenes(20), WIDE)
@@ -199,12 +199,12 @@ def test_a_model_that_knows_what_is_hidden_is_caught(monkeypatch):
 
     monkeypatch.setattr(missing, "missing_probabilities", cheat)
     with pytest.raises(LeakError, match="leaks information"):
-        partial_task(Contender(artifact=room_model()), Setting(data, STRUCTURE))
+        partial_task(Model(artifact=room_model()), Setting(data, STRUCTURE))
 
 
 def test_a_published_model_is_compared_with_itself():
     setting = Setting(rooms(30, 1), STRUCTURE, limit=10)
-    outcome = partial_task(Contender(artifact=room_model()), setting)
+    outcome = partial_task(Model(artifact=room_model()), setting)
     assert outcome.scenes == 10
     for share in SHARES:
         names = f"MRR, {share}", f"MRR, {share}, unlisted absent", f"change of MRR, {share}"
@@ -213,7 +213,7 @@ def test_a_published_model_is_compared_with_itself():
         assert 0 < found <= 1
     assert next(iter(outcome.metrics)) == "MRR, 50 %"
     baseline = partial_task(
-        Contender(objects=fixed), Setting(tensors([scene([0, 1, 3])]), NO_STRUCTURE)
+        Model(missing=fixed), Setting(tensors([scene([0, 1, 3])]), NO_STRUCTURE)
     )
     assert set(baseline.metrics) == {f"{m}, {s}" for m in ("MRR", "precision@5") for s in SHARES}
 

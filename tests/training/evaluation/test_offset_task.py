@@ -13,7 +13,7 @@ from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
 from tests.training.fit.test_offset_statistics import MEAN, STD, apart, draws
 from training.datasets import encode, generate_rooms, rooms_vocabulary
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.offset_task import METRICS, offsets_task
 from training.evaluation.report import evaluate
 from training.evaluation.setting import Setting
@@ -23,13 +23,13 @@ V = LARGER["triway-local"].V
 NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
 
 
-def contender(train):
+def model(train):
     artifact = larger_artifact("triway-local")
-    return Contender(artifact=replace(artifact, offsets=fit_offsets(train, V)))
+    return Model(artifact=replace(artifact, offsets=fit_offsets(train, V)))
 
 
 def outcome(train, test):
-    return offsets_task(contender(train), Setting(tensors(test, V), NO_STRUCTURE))
+    return offsets_task(model(train), Setting(tensors(test, V), NO_STRUCTURE))
 
 
 def values(found):
@@ -80,7 +80,7 @@ def test_models_and_sources_without_poses_have_no_figures():
     plain = [scene([0, 1], [(LEFT, 0, 1)])]
     assert outcome(draws(MEAN, STD, 20, 0), plain) is None
     assert outcome(plain, draws(MEAN, STD, 5, 1)) is None
-    assert offsets_task(Contender(), Setting(tensors(plain, V), NO_STRUCTURE)) is None
+    assert offsets_task(Model(), Setting(tensors(plain, V), NO_STRUCTURE)) is None
 
 
 def test_the_card_s_figures_are_those_of_each_source():
@@ -95,7 +95,7 @@ def test_the_card_s_figures_are_those_of_each_source():
         tensors([replace(one, source="rooms") for one in test], len(vocabulary)),
         torch.from_numpy(vocabulary.structure.copy()),
     )
-    found = offsets_task(Contender(artifact=known), setting)
+    found = offsets_task(Model(artifact=known), setting)
     assert set(found.metrics) <= set(METRICS)
     shares = {name: value for name, value in values(found).items() if name.startswith("in the")}
     assert len(shares) == 8
@@ -106,7 +106,7 @@ def test_the_card_s_figures_are_those_of_each_source():
 
 def test_a_published_model_has_the_offsets_of_each_source():
     train = draws(MEAN, STD, 40, 0)
-    artifact = contender(train).artifact
+    artifact = model(train).artifact
     test = draws(MEAN, STD, 6, 1, source="a") + draws(MEAN, STD, 6, 2, source="b")
     rows = evaluate(artifact, tensors(test, V), NO_STRUCTURE, tensors(train, V), limit=4)
     offsets = [(row.source, row.metric, row.n) for row in rows if row.task == "Offsets"]

@@ -32,7 +32,7 @@ from training.evaluation.intruders import (
     intruder_scores,
     signatures,
 )
-from training.evaluation.model import Alarm, Contender
+from training.evaluation.model import Alarm, Model
 from training.evaluation.outlier_tasks import (
     alarm_threshold,
     calibrated_alarm,
@@ -220,7 +220,7 @@ def test_intruders_are_judged_by_probability_and_by_log_odds(monkeypatch):
 
 
 def test_a_published_model_is_judged_as_the_service_ranks():
-    outcome = signature_task(Contender(artifact=room_model()), Setting(DATA, STRUCTURE, TRAIN))
+    outcome = signature_task(Model(artifact=room_model()), Setting(DATA, STRUCTURE, TRAIN))
     assert all(f"caught, {name}" in outcome.metrics for name in SENSITIVITIES)
     drawn = draw_intruders(DATA, STRUCTURE, by_signature(DATA, TRAIN))
     k = int((drawn >= 0).nonzero()[0])
@@ -233,8 +233,8 @@ def test_a_published_model_is_judged_as_the_service_ranks():
 
 def test_a_baseline_ranks_by_log_odds():
     popular = TRAIN.v.mean(0).clamp(1e-3, 1 - 1e-3).logit()
-    contender = Contender(objects=lambda v: popular.expand_as(v))
-    metrics = signature_task(contender, Setting(DATA, STRUCTURE, TRAIN)).metrics
+    model = Model(missing=lambda v: popular.expand_as(v))
+    metrics = signature_task(model, Setting(DATA, STRUCTURE, TRAIN)).metrics
     assert set(metrics) == {"hit@1", "hit@1, log-odds alone"}
     drawn = draw_intruders(DATA, STRUCTURE, by_signature(DATA, TRAIN))
     hits = []
@@ -248,28 +248,28 @@ def test_a_baseline_ranks_by_log_odds():
 
 def test_every_sensitivity_has_alarms_and_catches():
     setting = Setting(DATA, STRUCTURE, TRAIN, limit=12)
-    outcome = sensitivity_task(Contender(artifact=room_model()), setting)
+    outcome = sensitivity_task(Model(artifact=room_model()), setting)
     names = [f"alarms, medium, {listed} listed" for listed in (1, 2)]
     for figure in ("alarms", "caught, uniform", "caught, by popularity"):
         names += [f"{figure}, {name}" for name in SENSITIVITIES]
     assert all(0 <= outcome.metrics[name].value <= 1 for name in names)
     assert outcome.scenes == 12
-    assert sensitivity_task(Contender(), setting) is None
+    assert sensitivity_task(Model(), setting) is None
 
 
 def test_no_room_type_no_question():
-    contender = Contender(objects=torch.zeros_like)
+    model = Model(missing=torch.zeros_like)
     unknown = Setting(tensors([scene([0, 1, 2])]), NO_STRUCTURE, TOY)
-    assert signature_task(contender, unknown) is None
-    assert signature_task(contender, Setting(DATA, STRUCTURE)) is None
-    assert signature_task(Contender(), Setting(DATA, STRUCTURE, TRAIN)) is None
+    assert signature_task(model, unknown) is None
+    assert signature_task(model, Setting(DATA, STRUCTURE)) is None
+    assert signature_task(Model(), Setting(DATA, STRUCTURE, TRAIN)) is None
 
 
 def test_scenes_with_the_first_class_as_intruder_count():
     """Class 0, of room 0, is the only candidate in the first scene; the second has none."""
     data = tensors([scene([1, 2, 3], room=1), scene([0, 1, 2, 3], room=1)])
-    contender = Contender(objects=lambda v: torch.tensor([-1.0, 1, 1, 1, 1]).expand_as(v))
-    outcome = signature_task(contender, Setting(data, NO_STRUCTURE, TOY))
+    model = Model(missing=lambda v: torch.tensor([-1.0, 1, 1, 1, 1]).expand_as(v))
+    outcome = signature_task(model, Setting(data, NO_STRUCTURE, TOY))
     assert outcome.scenes == 1
     assert outcome.metrics["hit@1"].value == 1.0
 
@@ -286,7 +286,7 @@ def test_a_planted_cheater_is_caught(monkeypatch):
 
     monkeypatch.setattr(outliers, "judge", cheat)
     with pytest.raises(LeakError, match="leaks information"):
-        signature_task(Contender(artifact=room_model()), Setting(DATA, STRUCTURE, TRAIN))
+        signature_task(Model(artifact=room_model()), Setting(DATA, STRUCTURE, TRAIN))
     with pytest.raises(FloatingPointError, match="NaN"):
         ask_every(lambda _: np.array([np.nan]), [1, 2])
 

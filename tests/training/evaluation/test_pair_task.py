@@ -22,7 +22,7 @@ from tests.training.evaluation.scenes import (
 from training.datasets.batches import seen_triples
 from training.evaluation import pair_task as pairs
 from training.evaluation.asking import LeakError, labels_alone, relation_probabilities
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.pair_task import RARE, pairs_task, service_score, vertical_pairs
 from training.evaluation.setting import Setting
 
@@ -79,15 +79,15 @@ SEVERAL = [scene([0, 1], [(ON, 1, 0), (LEFT, 0, 1)])]
 )
 def test_accuracy_and_log_loss_by_hand(scenes, p, accuracy, log_loss):
     setting = Setting(tensors(scenes), NO_STRUCTURE)
-    metrics = pairs_task(Contender(relations=log_odds(p)), setting).metrics
+    metrics = pairs_task(Model(relations=log_odds(p)), setting).metrics
     assert metrics["accuracy"].value == metrics["accuracy, vertical"].value == accuracy
     assert metrics["log-loss"].value == pytest.approx(log_loss, rel=1e-4)
 
 
 def test_perfect_and_ignorant_scores():
     setting = Setting(DATA, WIDE_STRUCTURE)
-    assert pairs_task(Contender(relations=knowing(DATA)), setting).metrics["accuracy"].value == 1
-    ignorant = pairs_task(Contender(relations=flat), setting).metrics
+    assert pairs_task(Model(relations=knowing(DATA)), setting).metrics["accuracy"].value == 1
+    ignorant = pairs_task(Model(relations=flat), setting).metrics
     listed = np.concatenate([one.listed for one in vertical_pairs(DATA, WIDE_STRUCTURE)])
     assert ignorant["accuracy"].value == pytest.approx(listed.mean())
     assert ignorant["log-loss"].value == pytest.approx(-np.log(listed.mean(1)).mean())
@@ -99,7 +99,7 @@ def test_pairs_without_a_possible_relation_count_as_a_guess():
     def never(batch):
         return torch.full(batch.holds.shape, -torch.inf)
 
-    metrics = pairs_task(Contender(relations=never), Setting(data, NO_STRUCTURE)).metrics
+    metrics = pairs_task(Model(relations=never), Setting(data, NO_STRUCTURE)).metrics
     assert metrics["log-loss"].value == pytest.approx(np.log(8))
     assert metrics["accuracy"].value == pytest.approx(1 / 8)
 
@@ -110,9 +110,9 @@ def test_unseen_pairs_are_those_that_no_training_relation_joins():
     train = tensors([scene([0, 1, 2], [(LEFT, 1, 0)])])
     for seen in (None, seen_triples(train.scenes, 5)):
         setting = Setting(data, NO_STRUCTURE, train, seen)
-        metrics = pairs_task(Contender(relations=flat), setting).metrics
+        metrics = pairs_task(Model(relations=flat), setting).metrics
         assert (metrics["accuracy"].n, metrics["accuracy, unseen pairs"].n) == (2, 1)
-    unknown = pairs_task(Contender(relations=flat), Setting(data, NO_STRUCTURE)).metrics
+    unknown = pairs_task(Model(relations=flat), Setting(data, NO_STRUCTURE)).metrics
     assert "accuracy, unseen pairs" not in unknown
 
 
@@ -123,11 +123,11 @@ def test_rare_classes_are_those_that_training_relates_to_few():
     none = torch.zeros(V, dtype=torch.bool)
     for classes, rare in (([0, 1], 1), ([0, V - 1], 1)):
         data = tensors([scene(classes, [(ON, classes[1], 0)])], V)
-        metrics = pairs_task(Contender(relations=flat), Setting(data, none, train)).metrics
+        metrics = pairs_task(Model(relations=flat), Setting(data, none, train)).metrics
         assert metrics["accuracy, rare classes"].n == rare
     often = [scene([a, b], [(ON, a, b)]) for a in range(V) for b in range(a)]
     train = tensors(often, V)
-    metrics = pairs_task(Contender(relations=flat), Setting(data, none, train)).metrics
+    metrics = pairs_task(Model(relations=flat), Setting(data, none, train)).metrics
     assert "accuracy, rare classes" not in metrics
 
 
@@ -138,7 +138,7 @@ def test_no_relation_is_shown():
         shown.append(bool(batch.observed.any() or batch.holds.any()))
         return torch.zeros(batch.holds.shape)
 
-    pairs_task(Contender(relations=spy), Setting(DATA, WIDE_STRUCTURE))
+    pairs_task(Model(relations=spy), Setting(DATA, WIDE_STRUCTURE))
     assert shown
     assert not any(shown)
 
@@ -156,7 +156,7 @@ def test_a_score_that_follows_the_order_is_caught():
         return values
 
     with pytest.raises(LeakError, match="leaks information"):
-        pairs_task(Contender(relations=cheat), Setting(DATA, WIDE_STRUCTURE))
+        pairs_task(Model(relations=cheat), Setting(DATA, WIDE_STRUCTURE))
 
 
 def test_the_service_is_asked_about_its_first_instances():
@@ -174,7 +174,7 @@ def test_the_limit_counts_scenes_with_such_a_pair():
     silent = [scene([0, 1], [(LEFT, 0, 1)], name=f"s{k}") for k in range(20)]
     data = tensors([*silent, *(scene([0, 1], [(ON, 1, 0)], name=f"t{k}") for k in range(3))])
     setting = Setting(data, NO_STRUCTURE, limit=2)
-    assert pairs_task(Contender(relations=flat), setting).scenes == 2
-    assert pairs_task(Contender(relations=flat), replace(setting, scenes=tensors(silent))) is None
-    assert pairs_task(Contender(), setting) is None
+    assert pairs_task(Model(relations=flat), setting).scenes == 2
+    assert pairs_task(Model(relations=flat), replace(setting, scenes=tensors(silent))) is None
+    assert pairs_task(Model(), setting) is None
     assert pairs.VERTICAL == (ON, ABOVE)

@@ -25,7 +25,7 @@ from tests.training.evaluation.scenes import (
 )
 from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.datasets.batches import seen_triples
-from training.evaluation.contenders import relation_score
+from training.evaluation.artifact_model import relation_score
 from training.evaluation.relation_tasks import (
     alter,
     complete_scenes,

@@ -1,4 +1,4 @@
-"""Every task for one contender, stored, resumed, pooled and published."""
+"""Every task for one model, stored, resumed, pooled and published."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from tests.training.evaluation.scenes import (
 )
 from training.datasets.batches import seen_triples
 from training.datasets.cases import some_scenes
-from training.evaluation.calibration_task import QUESTIONS
-from training.evaluation.contenders import (
-    artifact_contender,
-    floor_contender,
-    independent_contender,
+from training.evaluation.artifact_model import (
+    artifact_model,
+    floor_model,
+    independent_model,
 )
+from training.evaluation.calibration_task import QUESTIONS
 from training.evaluation.density_task import DensitySettings
 from training.evaluation.generation_task import held_out_halves
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.report import (
     SourceReport,
     digest,
@@ -50,13 +50,13 @@ SEEN = seen_triples(TRAIN.scenes, V)
 SETTING = Setting(DATA, NO_STRUCTURE, TRAIN, SEEN)
 EFFORT = DensitySettings(chains=8, temperatures=10, burn_in=5, draws=8)
 ARTIFACT = artifact_of(larger_machine("triway-local"))
-CONTENDER = artifact_contender(ARTIFACT, TRAIN, EFFORT)
+MODEL = artifact_model(ARTIFACT, TRAIN, EFFORT)
 OF_OBJECTS = {name for name, task in TASKS.items() if task.of_objects}
 
 
-def report_of(contender, setting, tasks=tuple(TASKS)):
+def report_of(model, setting, tasks=tuple(TASKS)):
     report = SourceReport("toy", digest(setting))
-    assert list(run(contender, setting, report, tasks=tasks)) == list(tasks)
+    assert list(run(model, setting, report, tasks=tasks)) == list(tasks)
     return report
 
 
@@ -75,7 +75,7 @@ def two_sources(scenes):
 
 
 def test_every_task_has_an_outcome():
-    report = report_of(CONTENDER, SETTING)
+    report = report_of(MODEL, SETTING)
     # Thirty training scenes say nothing of what is typical, and the setting names no facts.
     nothing = {task for task, outcome in report.outcomes.items() if outcome is None}
     assert nothing == {"T3 signature", "Everyday"}
@@ -93,14 +93,14 @@ def test_the_tasks_about_objects():
 def test_reports_are_stored_and_resumed(tmp_path):
     path = tmp_path / "model" / "seed-0" / "toy.json"
     some = ("T2 missing", "T3b placement")
-    first = measure(path, CONTENDER, SETTING, "toy", tasks=some)
+    first = measure(path, MODEL, SETTING, "toy", tasks=some)
     assert tuple(first.outcomes) == some
     asked = []
     every = (*some, "T4 generate", "T3 outliers, uniform")
-    whole = measure(path, CONTENDER, SETTING, "toy", tasks=every, progress=asked.append)
+    whole = measure(path, MODEL, SETTING, "toy", tasks=every, progress=asked.append)
     assert asked == ["toy: T4 generate", "toy: T3 outliers, uniform"]
-    # A finished file needs no contender.
-    again = measure(path, Contender(), SETTING, "toy", tasks=every)
+    # A finished file needs no model.
+    again = measure(path, Model(), SETTING, "toy", tasks=every)
     assert values_of(again) == pytest.approx(values_of(whole))
     assert again.outcomes["T4 generate"].notes == whole.outcomes["T4 generate"].notes
     assert not list(path.parent.glob("*.part"))
@@ -108,27 +108,27 @@ def test_reports_are_stored_and_resumed(tmp_path):
     assert written["figure"] == asdict(whole.outcomes["T2 missing"].metrics["MRR"].figure())
     for other in (replace(SETTING, seed=1), replace(SETTING, limit=3)):
         with pytest.raises(ValueError, match="other scenes or tasks"):
-            measure(path, CONTENDER, other, "toy")
+            measure(path, MODEL, other, "toy")
     with pytest.raises(ValueError, match="unknown tasks"):
-        measure(path, CONTENDER, SETTING, "toy", tasks=("T9",))
+        measure(path, MODEL, SETTING, "toy", tasks=("T9",))
 
 
 @pytest.mark.parametrize("name", LARGER)
 def test_every_machine_can_be_evaluated(name):
     """Scenes without relations, of one class: nothing is asked, nothing fails."""
     machine = artifact_of(larger_machine(name))
-    contender = artifact_contender(machine, TRAIN, EFFORT, calibrated=False)
+    model = artifact_model(machine, TRAIN, EFFORT, calibrated=False)
     some = ("T1a relations", "T1b completion", "T2 missing", "T3 outliers, uniform")
-    found = values_of(report_of(contender, SETTING, some))
+    found = values_of(report_of(model, SETTING, some))
     assert {task for task, _ in found} == set(some)
     assert all(np.isfinite(list(found.values())))
     asked = [task for task in TASKS if task.startswith(("T1", "T2", "T3"))]
     silent = Setting(tensors([scene([k]) for k in range(3)], V), NO_STRUCTURE, TRAIN, SEEN)
-    assert set(report_of(contender, silent, asked).outcomes.values()) == {None}
+    assert set(report_of(model, silent, asked).outcomes.values()) == {None}
 
 
 def test_a_contender_without_scores_has_no_outcome():
-    assert set(report_of(Contender(), SETTING).outcomes.values()) == {None}
+    assert set(report_of(Model(), SETTING).outcomes.values()) == {None}
 
 
 def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
@@ -136,7 +136,7 @@ def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
     cut = [replace(one, complete=False, source="captions") for one in random_scenes(9, V, seed=2)]
     mixed = Setting(tensors([*DATA.scenes, *cut], V), NO_STRUCTURE, TRAIN, SEEN)
     asked = sorted(OF_OBJECTS | {"T1b completion"})
-    whole, more = (report_of(CONTENDER, setting, asked) for setting in (SETTING, mixed))
+    whole, more = (report_of(MODEL, setting, asked) for setting in (SETTING, mixed))
     assert more.outcomes["T1b completion"].scenes == len(DATA) + 9
     values = [
         {key: value for key, value in values_of(report).items() if key[0] in OF_OBJECTS}
@@ -145,7 +145,7 @@ def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
     assert values[1] == pytest.approx(values[0])
     # A source of such scenes is asked for relations alone.
     captions = Setting(tensors(cut, V), NO_STRUCTURE, tensors(cut, V), SEEN)
-    report = report_of(CONTENDER, captions, [task for task in TASKS if task != "Everyday"])
+    report = report_of(MODEL, captions, [task for task in TASKS if task != "Everyday"])
     assert {task for task, found in report.outcomes.items() if found is None} == OF_OBJECTS
     names = set(report.outcomes["Calibration"].metrics)
     assert "ECE, relations" in names
@@ -156,18 +156,18 @@ def test_pooled_sources_are_their_union():
     union, train = two_sources(DATA), two_sources(TRAIN)
     tasks = ("T1a relations", "T3 outliers, uniform")
     settings = settings_by_source(union, NO_STRUCTURE, train, SEEN)
-    together = pooled([report_of(CONTENDER, setting, tasks) for _, setting in settings])
-    whole = report_of(CONTENDER, Setting(union, NO_STRUCTURE, train, SEEN), tasks)
+    together = pooled([report_of(MODEL, setting, tasks) for _, setting in settings])
+    whole = report_of(MODEL, Setting(union, NO_STRUCTURE, train, SEEN), tasks)
     assert values_of(together) == pytest.approx(values_of(whole))
 
 
 def test_references_stand_on_either_side():
     """Independent classes gain nothing over themselves; the floor is the other half as it is."""
     tasks = ("T4 generate", "Density")
-    independent = values_of(report_of(independent_contender(SETTING), SETTING, tasks))
+    independent = values_of(report_of(independent_model(V), SETTING, tasks))
     gain = independent["Density", "gain over independent classes, upper log Z"]
     assert gain == pytest.approx(0.0)
-    floor = values_of(report_of(floor_contender(SETTING), SETTING, tasks))
+    floor = values_of(report_of(floor_model(), SETTING, tasks))
     sizes = held_out_halves(SETTING)[1].v.sum(1).mean()
     assert floor["T4 generate", "classes per scene, free"] == pytest.approx(float(sizes))
 
@@ -210,7 +210,7 @@ def test_published_figures_are_those_of_the_calibrated_artifact():
 def test_completion_has_the_metrics_of_relations():
     """R@k and zero-shot R-precision, of the half that is asked for."""
     completion = TASKS["T1b completion"]
-    knows, ignorant = Contender(completion=knowing(DATA)), Contender(completion=flat)
+    knows, ignorant = Model(completion=knowing(DATA)), Model(completion=flat)
     new = replace(SETTING, seen=SEEN[:0])
     metrics = completion(knows, new).metrics
     assert metrics["R@100"].value == 1.0
@@ -228,7 +228,7 @@ def test_completion_has_the_metrics_of_relations():
 def test_a_skill_that_is_undefined_is_left_out(tmp_path, monkeypatch):
     """No answer was true: the calibration error stands, and the report can be written."""
     monkeypatch.setitem(QUESTIONS, "missing", lambda *_: [(0.25, False), (0.5, False)])
-    report = measure(tmp_path / "toy.json", CONTENDER, SETTING, "toy", tasks=("Calibration",))
+    report = measure(tmp_path / "toy.json", MODEL, SETTING, "toy", tasks=("Calibration",))
     metrics = report.outcomes["Calibration"].metrics
     assert metrics["ECE, missing"].value == pytest.approx(0.375)
     assert "Brier skill, missing" not in metrics

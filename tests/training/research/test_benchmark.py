@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 from tests.training.commands import invoke, small_config, write_config
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.evaluation.metrics import Figure, Ratio
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.report import SourceReport
 from training.evaluation.results import Cell, Difference, Results, summarise
 from training.evaluation.setting import Outcome, Setting
@@ -26,9 +27,9 @@ from training.research.benchmark import (
     read_domains,
     shuffled_text,
 )
+from training.research.entries import Entry, baseline_entries
 from training.research.measure import BenchmarkError, Plan, measure_rows
 from training.research.plots import read_curve, recall_points
-from training.research.rows import Material, Row, baseline_rows
 from training.runs.folder import load_run
 
 pytestmark = pytest.mark.slow
@@ -260,8 +261,8 @@ def test_the_default_domain_begins_with_its_triway_machine():
 
 
 def test_baselines_that_no_seed_changes_are_trained_once():
-    every = {entry.name for entry in baseline_rows(0)}
-    again = {entry.name for entry in baseline_rows(1)}
+    every = {entry.name for entry in baseline_entries(0)}
+    again = {entry.name for entry in baseline_entries(1)}
     assert again == {
         "scikit-learn BernoulliRBM", "masked transformer", "denoising autoencoder",
         "autoencoder, heavily masked", "ComplEx",
@@ -304,12 +305,12 @@ def test_interrupting_keeps_what_is_finished(tmp_path):
             made.append(name)
             if name == "second" and made.count(name) == 1:
                 raise KeyboardInterrupt
-            return lambda _: Contender()
+            return Model()
 
         return maker
 
     plan = _plan(tmp_path)
-    entries = [Row(name, 0, name, make(name)) for name in ("first", "second")]
+    entries = [Entry(name, 0, name, make(name)) for name in ("first", "second")]
     with pytest.raises(KeyboardInterrupt):
         measure_rows(plan, entries, print)
     assert set(measure_rows(plan, entries, print)[0]) == {("first", 0), ("second", 0)}
@@ -318,12 +319,12 @@ def test_interrupting_keeps_what_is_finished(tmp_path):
 
 def _plan(folder, material="these scenes"):
     settings = {"none": Setting(tensors([scene([0], name="one")]), NO_STRUCTURE)}
-    return Plan(folder, Material(None, None, material), settings, ["T2 missing"])
+    return Plan(folder, SimpleNamespace(digest=material), settings, ["T2 missing"])
 
 
 def test_a_folder_of_another_row_or_other_scenes_is_refused(tmp_path):
     def row(identity):
-        return Row("row", 0, identity, lambda *_: lambda _: Contender())
+        return Entry("row", 0, identity, lambda *_: Model())
 
     measure_rows(_plan(tmp_path), [row("1")], print)
     with pytest.raises(BenchmarkError, match="another configuration of row"):

@@ -12,7 +12,7 @@ import pytest
 from tests.training.commands import invoke, small_config, write_config
 from training.fit.settings import ConfigError, DataConfig
 from training.research.benchmark import Options, compare_on_shuffled, read_domains
-from training.research.rows import Material, baseline_rows
+from training.research.entries import baseline_entries
 from training.runs.pipeline import read_sources, split_and_encode
 
 LABELS = ["bed", "sink", "lamp", "oven", "sofa", "desk", "shelf", "towel", "plant", "chair"]
@@ -62,7 +62,7 @@ def test_all_that_decides_what_is_learnt_is_in_the_digest(tmp_path):
     write_scenes(tmp_path, "flats", seed=1)
     others.append(material(tmp_path))
     assert len({scenes.digest, *(other.digest for other in others)}) == len(others) + 1
-    assert Material.of(scenes).digest == scenes.digest
+    assert scenes.complete_data().digest == scenes.digest
 
 
 def test_every_part_needs_scenes(tmp_path):
@@ -70,18 +70,18 @@ def test_every_part_needs_scenes(tmp_path):
     scenes = material(tmp_path)
     for part in scenes.parts:
         with pytest.raises(ConfigError, match=f"the {part} part contains no scenes"):
-            Material.of(replace(scenes, parts=scenes.parts | {part: []}))
+            replace(scenes, parts=scenes.parts | {part: []}).complete_data()
 
 
 def test_relations_are_needed_to_learn_from_and_to_tune_on(tmp_path):
     write_scenes(tmp_path, "flats", relations=True)
-    found = Material.of(material(tmp_path))
+    found = material(tmp_path).complete_data()
     assert found.related
     write_scenes(tmp_path, "flats")
-    bare = Material.of(material(tmp_path))
+    bare = material(tmp_path).complete_data()
     assert not bare.related
     for part in ("train", "validation"):
-        assert not replace(found, data=replace(found.data, **{part: bare.data.train})).related
+        assert not replace(found, **{part: bare.train}).related
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +123,8 @@ def test_a_control_of_relations_alone_needs_some(unrelated, tmp_path):
 
 def test_every_trial_stands_once_when_a_row_is_made_again(tmp_path):
     write_scenes(tmp_path, "flats", relations=True)
-    some = Material.of(material(tmp_path))
-    (entry,) = baseline_rows(0, ["EASE"])
+    some = material(tmp_path).complete_data()
+    (entry,) = baseline_entries(0, ["EASE"])
     kept = []
     for _ in range(2):
         entry.make(some, tmp_path / "row", lambda _: None)

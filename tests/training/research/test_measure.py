@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.setting import Setting
+from training.research.entries import Entry
 from training.research.measure import Plan, measure_rows, place_of
-from training.research.rows import Material, Row
 
 
 def answers(*_):
-    return lambda _: Contender()
+    return Model()
 
 
 def diverges(*_):
@@ -21,14 +23,14 @@ def diverges(*_):
 
 def plan(folder):
     settings = {"none": Setting(tensors([scene([0], name="one")]), NO_STRUCTURE)}
-    return Plan(folder, Material(None, None, "these scenes"), settings, ["T2 missing"])
+    return Plan(folder, SimpleNamespace(digest="these scenes"), settings, ["T2 missing"])
 
 
 @pytest.mark.slow
 def test_a_row_that_fails_stops_no_other(tmp_path):
     """Processes take the failing rows and go on to the rest."""
     makers = {"first": diverges, "second": answers, "third": diverges, "fourth": answers}
-    entries = [Row(name, 3, name, make) for name, make in makers.items()]
+    entries = [Entry(name, 3, name, make) for name, make in makers.items()]
     said = []
     reports, failed = measure_rows(
         plan(tmp_path), entries, lambda row, _, note: said.append((row, note)), workers=2,
@@ -45,6 +47,6 @@ def test_a_row_that_fails_stops_no_other(tmp_path):
 
 @pytest.mark.slow
 def test_errors_other_than_failures_of_a_row_are_raised(tmp_path):
-    entries = [Row("first", 0, "first", diverges), Row("second", 0, "second", answers)]
+    entries = [Entry("first", 0, "first", diverges), Entry("second", 0, "second", answers)]
     with pytest.raises(FloatingPointError, match="loss is nan"):
         measure_rows(plan(tmp_path), entries, print, workers=2)

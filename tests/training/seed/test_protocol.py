@@ -11,7 +11,7 @@ import torch
 from tests.questions.artifacts import LARGER
 from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
 from training.datasets.batches import relation_units
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.evaluation.setting import Setting
 from training.machines.bernoulli import bernoulli
 from training.machines.mean_field import Evidence, mean_field
@@ -31,8 +31,8 @@ SETTING = Setting(DATA, NO_STRUCTURE)
 MACHINES = pytest.mark.parametrize("name", list(LARGER))
 
 
-def contender(name: str) -> Contender:
-    return Contender(machine=larger_machine(name))
+def model(name: str) -> Model:
+    return Model(machine=larger_machine(name))
 
 
 def rng() -> torch.Generator:
@@ -42,15 +42,15 @@ def rng() -> torch.Generator:
 @MACHINES
 def test_every_machine_is_asked_every_question(name):
     for task in SEED_TASKS.values():
-        outcome = task(contender(name), SETTING)
+        outcome = task(model(name), SETTING)
         assert all(np.isfinite(metric.value) for metric in outcome.metrics.values())
-        again = task(contender(name), SETTING)
+        again = task(model(name), SETTING)
         for metric, value in outcome.metrics.items():
             assert again.metrics[metric].value == value.value
 
 
 def test_a_contender_without_a_machine_has_no_outcome():
-    assert [task(Contender(), SETTING) for task in SEED_TASKS.values()] == [None] * 3
+    assert [task(Model(), SETTING) for task in SEED_TASKS.values()] == [None] * 3
 
 
 @MACHINES
@@ -60,7 +60,7 @@ def test_shares_are_what_was_drawn(name):
     shares = {}
     for bias in (-1e4, 1e4):
         machine.get_parameter("d").data.fill_(bias)
-        outcome = relations_switched_on(Contender(machine=machine), SETTING)
+        outcome = relations_switched_on(Model(machine=machine), SETTING)
         shares[bias] = outcome.metrics["labelled relations switched on"].value
         on = outcome.metrics["relations switched on per scene"].value
         assert (on > 0) is (bias > 0)
@@ -134,7 +134,7 @@ def test_removed_objects_come_back_as_often_as_they_must():
     machine = larger_machine("rbm")
     for bias, share in ((80.0, 1.0), (-80.0, 0.0)):
         machine.b.data.fill_(bias)
-        outcome = removed_switched_on(Contender(machine=machine), SETTING)
+        outcome = removed_switched_on(Model(machine=machine), SETTING)
         assert {metric.value for metric in outcome.metrics.values()} == {share}
 
 
@@ -142,7 +142,7 @@ def test_the_error_measure_counts_wrong_units():
     """All on: every absent class is wrong. Doing nothing: one class of V."""
     machine = larger_machine("rbm")
     machine.b.data.fill_(1e3)
-    outcome = reconstruction_after_addition(Contender(machine=machine), SETTING)
+    outcome = reconstruction_after_addition(Model(machine=machine), SETTING)
     asked = DATA.v[DATA.v.sum(1) >= 3]
     assert outcome.metrics["error measure"].value == pytest.approx(float(1 - asked.mean()))
     assert outcome.metrics["error measure, doing nothing"].value == pytest.approx(1 / V)

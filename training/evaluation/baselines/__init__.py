@@ -14,26 +14,31 @@ structure classes such as walls, (classes,) bool.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 from training.evaluation.baselines import classes, fitting, triples
 from training.evaluation.baselines.fitting import Baseline
-from training.evaluation.model import ObjectScore, PlacedScore, RelationScore
+from training.evaluation.model import Model
 
-RELATIONS: Final = ("relations", "placement")
-"""Fields of `Contender` for relation scores that use no observed relations."""
+RELATIONS: Final = ("relations", "false_relations")
+"""Fields of `Model` for relation scores that use no observed relations."""
 
-POPULARITY: Final[Baseline[ObjectScore]] = Baseline("popularity", classes.popularity)
-EASE: Final[Baseline[ObjectScore]] = Baseline("EASE", classes.ease)
-FREQUENCY_TABLE: Final[Baseline[RelationScore]] = Baseline(
+POPULARITY: Final = Baseline("popularity", classes.popularity)
+EASE: Final = Baseline("EASE", classes.ease)
+FREQUENCY_TABLE: Final = Baseline(
     "frequency table", triples.frequency_table, fitting.r_precision, RELATIONS
 )
-PLACED: Final[Baseline[PlacedScore]] = Baseline(
-    "frequency table p(i | a, j)", triples.placed_table, fitting.placed_mrr, ("placed",)
+PLACED: Final = Baseline(
+    "frequency table p(i | a, j)", triples.placed_table, fitting.placed_mrr, ("at_place",)
 )
 
 
-def placed_product(name: str, score: Any, table: Any) -> Baseline[PlacedScore]:
-    """Return the baseline of T2-at whose score is the product of a fitted score and `PLACED`."""
-    propose = triples.times(score, table)
-    return Baseline(f"{PLACED.name} × {name}", propose, fitting.placed_mrr, ("placed",))
+def placed_product(name: str, objects: Model, table: Model) -> Baseline:
+    """Return the baseline of T2-at whose score is the product of two fitted scores.
+
+    Args:
+        objects: a model with a score of missing objects.
+        table: the fitted `PLACED`.
+    """
+    propose = triples.times(objects.missing, table.at_place)
+    return Baseline(f"{PLACED.name} × {name}", propose, fitting.placed_mrr, ("at_place",))

@@ -4,52 +4,34 @@ A baseline is a generator function. It fits a model on the training scenes for e
 hyperparameter grid, and yields pairs (parameters, score). A neural network yields a pair for each
 candidate number of epochs. `Baseline.fit` evaluates each score on the validation scenes of all data
 sources together, by the primary metric of the task. The generator function never sees the
-validation scenes. `Fitted` contains the results of all grid points.
+validation scenes.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from torch import Tensor
 
 from training.datasets.batches import SceneTensors
 from training.evaluation.missing_tasks import hide, leave_one_out, leave_one_out_at, rank_hidden
-from training.evaluation.model import ObjectDensity, ObjectScore, PlacedScore, RelationScore
+from training.evaluation.model import (
+    Model,
+    ObjectDensity,
+    ObjectScore,
+    Parameters,
+    PlacedScore,
+    RelationScore,
+    Trial,
+)
 from training.evaluation.relation_tasks import complete_scenes, rank, rank_relations
 
 Score = TypeVar("Score")
-Parameters: TypeAlias = Mapping[str, float | int | str]
 Proposals: TypeAlias = Iterator[tuple[Parameters, Score]]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """The result of one point of a hyperparameter grid.
-
-    Attributes:
-        seconds: wall time of fit and evaluation in seconds. Work that was already done for earlier
-            grid points is not included.
-    """
-
-    parameters: Parameters
-    validation: float
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Fitted(Generic[Score]):
-    """The score of the best grid point, and the trials of all grid points in order.
-
-    If two grid points have the same metric, the first is the best.
-    """
-
-    score: Score
-    trials: tuple[Trial, ...]
 
 
 def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
@@ -83,7 +65,7 @@ def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDens
 
 
 @dataclass(frozen=True)
-class Baseline(Generic[Score]):
+class Baseline:
     """One baseline, shown as one row of a result table.
 
     Attributes:
@@ -92,20 +74,20 @@ class Baseline(Generic[Score]):
             seed.
         judge: function that returns the metric of a score; higher is better. Its arguments are the
             validation scenes, the mask of structure classes and the score.
-        scores: fields of `Contender` for which the score is used.
+        scores: fields of `Model` for which the score is used.
         stochastic: True if the fit depends on the seed.
     """
 
     name: str
-    propose: Callable[[SceneTensors, Tensor, int], Proposals[Score]]
+    propose: Callable[[SceneTensors, Tensor, int], Proposals[Any]]
     judge: Callable[[SceneTensors, Tensor, Any], float] = missing_mrr
-    scores: tuple[str, ...] = ("objects",)
+    scores: tuple[str, ...] = ("missing",)
     stochastic: bool = False
 
     @property
     def learns_relations(self) -> bool:
         """True if the baseline needs scenes with annotated relations."""
-        return self.scores not in (("objects",), ("density",))
+        return self.scores not in (("missing",), ("density",))
 
     def fit(
         self,
@@ -115,8 +97,10 @@ class Baseline(Generic[Score]):
         *,
         seed: int = 0,
         progress: Callable[[str], None] = lambda _: None,
-    ) -> Fitted[Score]:
+    ) -> Model:
         """Fit on training scenes, and select the best grid point on validation scenes.
+
+        If two grid points have the same metric, the first is the best.
 
         Raises:
             ValueError: the numbers of classes differ, or scenes needed for fit or metric are
@@ -135,7 +119,7 @@ class Baseline(Generic[Score]):
                 f"the {len(train)} training scenes contain no objects; a baseline needs objects"
             )
         trials: list[Trial] = []
-        chosen: list[Score] = []
+        chosen: list[Any] = []
         highest = -math.inf
         start = time.perf_counter()
         for parameters, score in self.propose(train, structure, seed):
@@ -152,4 +136,9 @@ class Baseline(Generic[Score]):
             shown = ", ".join(f"{key} {value}" for key, value in parameters.items())
             progress(f"{self.name} {shown}: {figure:.4f}")
             start = now
-        return Fitted(chosen[0], tuple(trials))
+        best = chosen[0]
+        answers = dict.fromkeys(self.scores, best)
+        if "density" in answers:
+            answers["density"] = lambda _: best
+        count = getattr(best, "parameter_count", None) if "missing" in answers else None
+        return Model(**answers, parameters=count, trials=tuple(trials))

@@ -162,7 +162,7 @@ class PlacedProduct:
     """
 
     objects: ObjectScore
-    table: PlacedTable
+    table: PlacedScore
     log_popularity: Tensor
     weight: float
     correction: float
@@ -204,9 +204,15 @@ def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposal
 
 
 def times(
-    objects: ObjectScore, table: PlacedTable
+    objects: ObjectScore | None, table: PlacedScore | None
 ) -> Callable[[SceneTensors, Tensor, int], Proposals[PlacedScore]]:
-    """Return a generator function for the product of a fitted object score and a fitted table."""
+    """Return a generator function for the product of a fitted object score and a fitted table.
+
+    Raises:
+        ValueError: a score is missing.
+    """
+    if objects is None or table is None:
+        raise ValueError("the product needs an object score and a table of places")
 
     def placed_table(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
         log_popularity = frequency(train.v).log()

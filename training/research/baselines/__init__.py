@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 from training.evaluation.baselines import (
     EASE,
@@ -16,7 +16,7 @@ from training.evaluation.baselines import (
 from training.evaluation.baselines.fitting import Baseline
 from training.research.baselines import networks, object_models, relation_models
 
-_EVERY: tuple[Baseline[Any], ...] = (
+_EVERY: tuple[Baseline, ...] = (
     POPULARITY,
     Baseline("co-occurrence naive Bayes", object_models.naive_bayes),
     Baseline("kNN over scenes", object_models.nearest),
@@ -60,5 +60,5 @@ _EVERY: tuple[Baseline[Any], ...] = (
     ),
 )
 
-BASELINES: Final[dict[str, Baseline[Any]]] = {entry.name: entry for entry in _EVERY}
+BASELINES: Final[dict[str, Baseline]] = {entry.name: entry for entry in _EVERY}
 """Maps the row name of each baseline in the result tables to the baseline."""

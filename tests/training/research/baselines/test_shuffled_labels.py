@@ -31,7 +31,7 @@ from training.research.baselines import BASELINES
 pytestmark = pytest.mark.slow
 
 TOLERANCE = 0.1
-POPULARITY, *OBJECTS = (b for b in BASELINES.values() if b.scores == ("objects",))
+POPULARITY, *OBJECTS = (b for b in BASELINES.values() if b.scores == ("missing",))
 RELATION_POPULARITY, *OF_RELATIONS = (b for b in BASELINES.values() if b.scores == RELATIONS)
 
 
@@ -69,29 +69,29 @@ def precision(score: RelationScore) -> float:
 
 @cache
 def popular() -> float:
-    return mrr(POPULARITY.fit(*parts(shuffled=True), STRUCTURE).score)
+    return mrr(POPULARITY.fit(*parts(shuffled=True), STRUCTURE).missing)
 
 
 @cache
 def partly_popular() -> float:
-    return partial(POPULARITY.fit(*parts(shuffled=True), STRUCTURE).score)
+    return partial(POPULARITY.fit(*parts(shuffled=True), STRUCTURE).missing)
 
 
 @cache
 def relation_popular() -> float:
-    return precision(RELATION_POPULARITY.fit(*parts(shuffled=True), STRUCTURE).score)
+    return precision(RELATION_POPULARITY.fit(*parts(shuffled=True), STRUCTURE).relations)
 
 
 def test_popularity_is_what_it_was():
     """Shuffling takes nothing from it: the figures that others fall to are those of real scenes."""
     real = parts(shuffled=False)
-    assert popular() == mrr(POPULARITY.fit(*real, STRUCTURE).score)
-    assert relation_popular() == precision(RELATION_POPULARITY.fit(*real, STRUCTURE).score)
+    assert popular() == mrr(POPULARITY.fit(*real, STRUCTURE).missing)
+    assert relation_popular() == precision(RELATION_POPULARITY.fit(*real, STRUCTURE).relations)
 
 
 @pytest.mark.parametrize("baseline", OBJECTS, ids=lambda baseline: baseline.name)
 def test_objects_fall_to_popularity(baseline):
-    real, shuffled = (baseline.fit(*parts(labels), STRUCTURE).score for labels in (False, True))
+    real, shuffled = (baseline.fit(*parts(labels), STRUCTURE).missing for labels in (False, True))
     for figure, level in ((mrr, popular()), (partial, partly_popular())):
         assert figure(real) > level + 2 * TOLERANCE
         assert figure(shuffled) <= level + TOLERANCE
@@ -100,7 +100,7 @@ def test_objects_fall_to_popularity(baseline):
 @pytest.mark.parametrize("baseline", OF_RELATIONS, ids=lambda baseline: baseline.name)
 def test_relations_fall_to_popularity(baseline):
     real, shuffled = (
-        precision(baseline.fit(*parts(labels), STRUCTURE).score) for labels in (False, True)
+        precision(baseline.fit(*parts(labels), STRUCTURE).relations) for labels in (False, True)
     )
     assert real > relation_popular() + 2 * TOLERANCE
     assert shuffled <= relation_popular() + TOLERANCE

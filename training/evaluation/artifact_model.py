@@ -1,6 +1,6 @@
-"""Build contenders, the models that an evaluation compares.
+"""Build models, the models that an evaluation compares.
 
-A contender is a trained model or one of two references: held-out scenes and independent classes.
+A model is a trained model or one of two references: held-out scenes and independent classes.
 """
 
 from __future__ import annotations
@@ -24,40 +24,46 @@ from training.evaluation.generation_task import (
     scene_sampler,
 )
 from training.evaluation.missing_tasks import MachineScore
-from training.evaluation.model import Contender, PlacedScore, Places, RelationScore
+from training.evaluation.model import (
+    Model,
+    ObjectDensity,
+    PlacedScore,
+    Places,
+    RelationScore,
+    Sampler,
+)
 from training.evaluation.outlier_tasks import calibrated_alarm
 from training.evaluation.setting import Setting
 from training.machines.arrays import machine_of
 
 
-def artifact_contender(
+def artifact_model(
     artifact: Artifact,
     train: SceneTensors,
     settings: DensitySettings = DensitySettings(),  # noqa: B008
     seed: int = 0,
     *,
     calibrated: bool = True,
-) -> Contender:
-    """Build the contender of a model.
+) -> Model:
+    """Build the model of a model.
 
     Args:
         calibrated: True includes the calibrated probabilities and the outlier alarm. False includes
             only the uncalibrated scores of the machine.
     """
     machine = machine_of(artifact.weights)
-    objects, completion = MachineScore(machine), relation_score(artifact, given=True)
-    density = None
-    if not machine.relations_act:
-        density = cache(partial(machine_density, machine, train, settings, seed))
-    return Contender(
-        objects=objects,
+    missing, completion = MachineScore(machine), relation_score(artifact, given=True)
+    sampler = machine_sampler(machine)
+    density = cache(partial(machine_density, machine, train, settings, seed))
+    return Model(
+        missing=missing,
+        missing_in_room=missing if machine.spec.C else None,
+        at_place=placed_score(artifact),
         relations=relation_score(artifact, given=False),
         completion=completion,
-        placed=placed_score(artifact),
-        placement=completion,
-        sampler=machine_sampler(machine),
-        density=density,
-        objects_in_rooms=objects if machine.spec.C else None,
+        false_relations=completion,
+        generate=lambda _: sampler,
+        density=None if machine.relations_act else lambda _: density(),
         machine=machine,
         parameters=machine.parameter_count,
         alarm=calibrated_alarm(artifact.calibration) if calibrated else None,
@@ -125,19 +131,23 @@ def _instances(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
     return of_classes(classes.repeat_interleave(each).tolist()), each.cumsum(0) - each
 
 
-def floor_contender(setting: Setting) -> Contender:
-    """Return a contender whose samples are held-out scenes: the best possible value of T4."""
-    _, second = held_out_halves(setting.complete)
-    return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
+def floor_model() -> Model:
+    """Return a model whose samples are held-out scenes: the best possible value of T4."""
+
+    def sampler(setting: Setting) -> Sampler | None:
+        _, second = held_out_halves(setting)
+        return scene_sampler(second) if len(second) else None
+
+    return Model(generate=sampler)
 
 
-def independent_contender(setting: Setting) -> Contender:
-    """Return a contender that samples classes independently at their training frequencies."""
-    train = setting.complete.train
-    if train is None:
-        return Contender()
-    return Contender(
-        sampler=independent_sampler(train),
-        density=lambda: independent_density(train),
-        parameters=train.v.shape[1],
-    )
+def independent_model(classes: int) -> Model:
+    """Return a model that samples classes independently at their training frequencies."""
+
+    def sampler(setting: Setting) -> Sampler | None:
+        return None if setting.train is None else independent_sampler(setting.train)
+
+    def density(setting: Setting) -> ObjectDensity | None:
+        return None if setting.train is None else independent_density(setting.train)
+
+    return Model(generate=sampler, density=density, parameters=classes)

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -18,29 +17,27 @@ from training.datasets import AnnotatedScene, DatasetError, split, stable_part
 from training.datasets.batches import TrainingData, has_relations
 from training.datasets.files import DATA
 from training.domain.translation import Translation, same_classes
+from training.evaluation.artifact_model import artifact_model
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, placed_product
 from training.evaluation.baselines.fitting import Baseline
-from training.evaluation.contenders import artifact_contender
-from training.evaluation.model import Contender
+from training.evaluation.model import Model
 from training.fit.checkpoint import RunError
 from training.fit.settings import Config, ConfigError, DataConfig, source_name
 from training.runs.folder import load_run
 from training.runs.pipeline import digest_of, prepare, read_sources
 from training.runs.publish import calibrated_draft
 
-BASELINE_SIDE = "baselines"
+BASELINES = "baselines"
 """Name of the side of baselines: EASE for objects, and a frequency table for relations.
 
 Objects at a place are scored by the product of EASE and a frequency table of places.
 """
 
 Say = Callable[[str], None]
-# Function that takes a task name and returns the scores of a side.
-Rival = Callable[[str], Contender]
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class Candidate:
     """One of the two compared models.
 
     Attributes:
@@ -61,24 +58,21 @@ class Side:
         """Classes of the model. None for the baselines, which use the classes of the other side."""
         return None if self.artifact is None else self.artifact.vocabulary
 
-    def rival(self, scenes: Vocabulary, data: TrainingData, say: Say) -> Rival:
-        """Return a function that returns the scores of this side for a task.
+    def model(self, scenes: Vocabulary, data: TrainingData, say: Say) -> Model:
+        """Return the scores of this candidate, which take and return values in the scene classes.
 
         Args:
-            scenes: vocabulary of the test scenes. If the model has other classes, the questions are
-                translated into the classes of the model.
+            scenes: vocabulary of the test scenes.
         """
         if self.artifact is None:
-            fitted = _baselines(data, say)
-            return lambda _: fitted
-        own = artifact_contender(self.artifact, data.train)
+            return _baselines(data, say)
+        own = artifact_model(self.artifact, data.train)
         if same_classes(scenes, self.artifact.vocabulary):
-            return lambda _: own
-        translation = Translation.between(scenes, self.artifact.vocabulary)
-        return lambda task: translation.contender(own, task)
+            return own
+        return Translation.between(scenes, self.artifact.vocabulary).model(own)
 
 
-def run_side(folder: Path, data: Path | None, say: Say) -> Side:
+def run_candidate(folder: Path, data: Path | None, say: Say) -> Candidate:
     """Load a finished run as a side, and calibrate its model as for publication.
 
     Args:
@@ -95,10 +89,10 @@ def run_side(folder: Path, data: Path | None, say: Say) -> Side:
     run.require(scenes.digest)
     say(f"calibrating {folder}")
     artifact = calibrated_draft(run, scenes.vocabulary, scenes.training_data())
-    return Side(str(folder), run.config, scenes.digests, artifact, root)
+    return Candidate(str(folder), run.config, scenes.digests, artifact, root)
 
 
-def stored_side(reference: str, store: Store) -> Side:
+def stored_candidate(reference: str, store: Store) -> Candidate:
     """Load a published model as a side.
 
     Raises:
@@ -112,27 +106,27 @@ def stored_side(reference: str, store: Store) -> Side:
     except ValidationError:
         config = None
     learnt = {source.source: source.digest for source in manifest.data}
-    return Side(f"{name}@{version}", config, learnt, artifact)
+    return Candidate(f"{name}@{version}", config, learnt, artifact)
 
 
-def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
+def find(reference: str, store: Store, data: Path | None, say: Say) -> Candidate:
     """Return the side that a reference names.
 
     Args:
-        reference: folder of a run, `BASELINE_SIDE`, or a published model.
+        reference: folder of a run, `BASELINES`, or a published model.
 
     Raises:
         ConfigError: the reference names neither a run nor the baselines nor a published model.
-        RunError: the folder holds no finished run. See also `run_side` and `stored_side`.
+        RunError: the folder holds no finished run. See also `run_candidate` and `stored_candidate`.
     """
-    if reference == BASELINE_SIDE:
+    if reference == BASELINES:
         # The baselines are fitted later, on the training scenes of the other side.
-        return Side(BASELINE_SIDE, None, {}, None)
+        return Candidate(BASELINES, None, {}, None)
     folder = Path(reference)
     if (folder / "config.json").is_file():
-        return run_side(folder, data, say)
+        return run_candidate(folder, data, say)
     try:
-        return stored_side(reference, store)
+        return stored_candidate(reference, store)
     except StoreError as error:
         if folder.is_dir():
             raise RunError(f"the folder {reference} contains no finished run") from error
@@ -142,17 +136,23 @@ def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
         ) from error
 
 
-def _baselines(data: TrainingData, say: Say) -> Contender:
-    def fit(baseline: Baseline[Any]) -> Any:
+def _baselines(data: TrainingData, say: Say) -> Model:
+    def fit(baseline: Baseline) -> Model:
         say(f"fitting {baseline.name}")
-        return baseline.fit(data.train, data.validation, data.structure, progress=say).score
+        return baseline.fit(data.train, data.validation, data.structure, progress=say)
 
     objects = fit(EASE)
     if not has_relations(data.validation):
-        return Contender(objects=objects)
-    relations = fit(FREQUENCY_TABLE)
+        return Model(missing=objects.missing)
+    relations = fit(FREQUENCY_TABLE).relations
     placed = fit(placed_product(EASE.name, objects, fit(PLACED)))
-    return Contender(objects, relations, relations, placed, relations)
+    return Model(
+        missing=objects.missing,
+        at_place=placed.at_place,
+        relations=relations,
+        completion=relations,
+        false_relations=relations,
+    )
 
 
 # --------------------------------------------------------------------------------- held-out scenes
@@ -179,7 +179,7 @@ class HeldOut:
 
 
 def held_out(
-    a: Side, b: Side, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
+    a: Candidate, b: Candidate, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
 ) -> HeldOut:
     """Return the first model's test scenes without scenes that the second model learnt from.
 
@@ -228,7 +228,7 @@ def held_out(
 
 
 def _kept(
-    side: Side, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
+    side: Candidate, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
 ) -> tuple[Kept, str, bool]:
     """Return a filter of the held-out scenes, a note or "", and whether the filter is certain."""
     if side.artifact is None:
