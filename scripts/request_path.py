@@ -1,6 +1,6 @@
 """``python -m scripts.request_path``: list the functions of this project that a request calls.
 
-The script sends a request to an application in this process, after 20 warm-up requests. It lists
+The script sends a scene with poses to an application in this process, after 20 warm-up requests. It lists
 the Python functions and compiled kernels of `app` and `scene_client` that the request calls. A
 comprehension or lambda counts as part of the function that contains it.
 """
@@ -28,9 +28,11 @@ ROOT = Path(__file__).resolve().parent.parent
 OURS = (f"{ROOT / 'app'}/", f"{ROOT / 'clients'}/")
 INSIDE = {"<listcomp>", "<genexpr>", "<setcomp>", "<dictcomp>", "<lambda>"}
 SCENE = {
-    "objects": ["bed", "lamp", "chair", "desk", "pillow", "book", "sofa", "table", "sink",
-                "toilet", "cabinet", "window"]
-}  # fmt: skip
+    "objects": [
+        {"label": label, "position": [2.0 + 0.1 * k, 0.3 * k, 0.5], "size": [0.5, 0.5, 1.0]}
+        for k, label in enumerate(("bed", "lamp", "chair", "desk", "pillow", "book", "sofa"))
+    ]
+}
 
 
 async def ask(app: Any, path: str, body: bytes) -> int:

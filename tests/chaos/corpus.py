@@ -16,10 +16,13 @@ from functools import reduce
 from operator import getitem
 from typing import Any, Final
 
+from app.questions import QUESTIONS, Question
+from scene_client.schemas import SceneRequest
+
 MARKER: Final = "Zq7 märker"
 NUMBER: Final = "73550861"
 
-BATCHES: Final = ("/relations/batch", "/missing/batch", "/outliers/batch")
+BATCHES: Final = tuple(f"/{question.name}/batch" for question in QUESTIONS if not question.samples)
 ALIAS: Final = "/models/aliases/candidate"
 
 _REFUSED: Final = frozenset({400, 404, 409, 413, 415, 422})
@@ -76,24 +79,24 @@ SCENE: Final[dict[str, Any]] = {
     "group": "home",
     "viewer_frame": True,
 }
+
+
+# Values in place of those in the examples: few steps, and labels of the tests' vocabulary.
+_VALUES: Final[dict[str, Any]] = {"candidates": ["chair", "table"], "count": 1, "steps": 2}
+
+
+def own_fields(question: Question[Any]) -> dict[str, Any]:
+    """The fields of a question beyond those of every scene, from its valid examples."""
+    valid = [example.value for example in question.examples.values() if example.problem is None]
+    return {
+        name: _VALUES.get(name) or next(value[name] for value in valid if name in value)
+        for name in question.request.model_fields
+        if name not in SceneRequest.model_fields
+    }
+
+
 VALID: Final[dict[str, dict[str, Any]]] = {
-    "/relations": SCENE
-    | {
-        "top_k": 5,
-        "min_probability": 0.1,
-        "pairs": [{"subject": "bed", "object": "lamp_1"}, ["desk_1", "bed"]],
-        "include_opposites": True,
-    },
-    "/missing": SCENE
-    | {
-        "coverage": 0.5,
-        "top_k": 3,
-        "candidates": ["chair", "pillow"],
-        "at": {"relation": "on-top", "object": "desk_1"},
-        "detail": "scores",
-    },
-    "/outliers": SCENE | {"sensitivity": "high", "threshold": 0.5, "detail": "full"},
-    "/generate": SCENE | {"count": 1, "steps": 2, "temperature": 1.0, "context": {"h1": [0, 1]}},
+    **{f"/{question.name}": SCENE | own_fields(question) for question in QUESTIONS},
     ALIAS: {"model": "home@1.1.0", "expected": "home@1.1.0"},
 }
 """One request of each kind with every field that it may have."""
