@@ -50,7 +50,7 @@ def some_of(names: Iterable[str]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class LocatedError:
     """One error in a request.
 
     Attributes:
@@ -137,7 +137,7 @@ class RequestError(ServiceError):
     """The request does not match the schema or the model, or is contradictory.
 
     Args:
-        faults: errors in the request. `locate` converts them to `errors`.
+        located: errors in the request. `locate` converts them to `errors`.
         errors: further errors in the request, with pointers.
         detail: cause of this error. The default is the number of errors.
     """
@@ -145,16 +145,20 @@ class RequestError(ServiceError):
     _hint: ClassVar[str] = ""
 
     def __init__(
-        self, faults: Sequence[Fault] = (), *, errors: Sequence[FieldError] = (), detail: str = ""
+        self,
+        located: Sequence[LocatedError] = (),
+        *,
+        errors: Sequence[FieldError] = (),
+        detail: str = "",
     ) -> None:
-        self.faults = faults[:MAX_ERRORS]
-        count = len(self.faults) + len(errors)
+        self.located = located[:MAX_ERRORS]
+        count = len(self.located) + len(errors)
         most = "at least " * (count >= MAX_ERRORS)
         counted = f"The request has {most}{count} error{'' if count == 1 else 's'}"
         super().__init__(detail or f"{counted}, listed in `errors`.{self._hint}", errors=errors)
 
     def locate(self, body: Any, at: Location = ()) -> None:
-        """Convert the faults to errors with JSON pointers. A second call has no effect.
+        """Convert the located errors to `errors` with JSON pointers. A second call has no effect.
 
         Args:
             body: the scene as the client sent it, for the pointers; see `pointer`.
@@ -162,13 +166,13 @@ class RequestError(ServiceError):
         """
         self.errors += [
             FieldError(
-                pointer=pointer(at) + pointer(fault.location, body)[1:],
-                message=fault.message,
-                suggestions=list(fault.suggestions),
+                pointer=pointer(at) + pointer(error.location, body)[1:],
+                message=error.message,
+                suggestions=list(error.suggestions),
             )
-            for fault in self.faults
+            for error in self.located
         ]
-        self.faults = ()
+        self.located = ()
 
 
 class NotJSONError(ServiceError, slug="not-json", status=400, steps=("body",)):

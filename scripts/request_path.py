@@ -1,8 +1,8 @@
 """``python -m scripts.request_path``: list the functions of this project that a request calls.
 
-The script sends a scene with poses to an application in this process, after 20 warm-up requests. It lists
-the Python functions and compiled kernels of `app` and `scene_client` that the request calls. A
-comprehension or lambda counts as part of the function that contains it.
+The script sends a scene with poses to an application in this process, after 20 warm-up requests.
+It lists the Python functions and compiled kernels of `app` and `scene_client` that the request
+calls. A comprehension or lambda counts as part of the function that contains it.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic_core import from_json, to_json, to_jsonable_python
 
 from app.compiling import compiled
-from app.errors import AnswerTooLargeError, Fault
+from app.errors import AnswerTooLargeError, LocatedError
 from app.questions.posterior import Present
 from app.questions.ranking import strongest
 from app.questions.reading import Reading
@@ -168,7 +168,7 @@ class SizeLimit:
                 f"{self._most} bytes here. Lower `{field}`, send fewer objects, relations or "
                 "scenes, or use shorter ids"
             )
-            raise AnswerTooLargeError([Fault((field,), message)])
+            raise AnswerTooLargeError([LocatedError((field,), message)])
 
     def _size(self, fixed: int, names: int, name: int) -> int:
         """Return the size in bytes of the answer if the longest id or label has `name` bytes."""

@@ -33,7 +33,7 @@ from app.questions.answer import (
     SizeLimit,
     rounded_number,
 )
-from app.questions.names import Faults
+from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import given_relations, present
 from app.questions.question import BEDROOM, POSES, REFUSED, Example, Options, Question
@@ -125,7 +125,7 @@ def generate(
     shown = ~artifact.vocabulary.structure
     shown[conditions.classes] = True
     of = [thing.class_index or 0 for thing in scene.objects]
-    given = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
+    evidence = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
     scenes: list[Fields] = []
     plausible = Plausible(artifact, scene)
     while len(scenes) < count and not stop():
@@ -134,7 +134,7 @@ def generate(
             drawn = conditioned.draw(steps, stream)
             seen = shown[drawn.classes]
             if plausible(drawn.classes[seen].tolist()) or stop() or attempt == ATTEMPTS - 1:
-                scenes.append(_scene(artifact, conditioned, drawn, seen, given))
+                scenes.append(_scene(artifact, conditioned, drawn, seen, evidence))
                 break
     if size_limit is not None:
         size_limit.check("count", *_size(scenes))
@@ -178,17 +178,17 @@ def _scene(
     chains: ConditionedChains,
     drawn: Drawn,
     shown: NDArray[np.bool_],
-    given: set[Triple],
+    evidence: set[Triple],
 ) -> Fields:
     """Return the fields of `scene_client.schemas.GeneratedScene` for a drawn scene."""
     labels = artifact.vocabulary.labels
     units = np.nonzero(drawn.r & shown[:, None] & shown)
     a, i, j = units
     named = np.stack([a, drawn.classes[i], drawn.classes[j]], axis=1)
-    stay = staying(named, drawn.logits[units], given, artifact.vocabulary.structure)
+    stay = staying(named, drawn.logits[units], evidence, artifact.vocabulary.structure)
     kept = np.zeros_like(drawn.r)
     kept[units] = stay
-    triples = sorted({*map(tuple, named[stay].tolist()), *given})
+    triples = sorted({*map(tuple, named[stay].tolist()), *evidence})
     return {
         "objects": [labels[index] for index in drawn.classes[shown].tolist()],
         "relations": [
@@ -208,7 +208,7 @@ def _layer_sizes(spec: MachineSpec) -> dict[str, int]:
 def staying(
     units: NDArray[np.int64],
     logits: NDArray[np.floating[Any]],
-    given: Collection[Triple],
+    evidence: Collection[Triple],
     structure: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """Select drawn relations that do not contradict each other. Return them as a bool mask (m,).
@@ -228,10 +228,10 @@ def staying(
         units: (m, 3) distinct triples (relation a, subject class i, object class j).
         logits: (m,) logit of each triple. Of triples with equal logits, the smallest (a, i, j) is
             tried first.
-        given: triples (a, i, j) of the evidence.
+        evidence: triples (a, i, j) of the evidence.
         structure: (V,) bool, True for structural classes.
     """
-    fixed = np.array(sorted(given), dtype=np.int64).reshape(-1, 3)
+    fixed = np.array(sorted(evidence), dtype=np.int64).reshape(-1, 3)
     order = np.lexsort((*units.T[::-1], -logits))
     possible = (units[:, 1] != units[:, 2]) & ~structure[units[:, 1:]].any(axis=1)
     every = np.concatenate([fixed, units])
@@ -240,7 +240,7 @@ def staying(
         np.ascontiguousarray(every[:, 0]),
         *(places.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)),
     )
-    if given:
+    if evidence:
         shape = len(CANONICAL), len(structure), len(structure)
         stay |= np.isin(np.ravel_multi_index(units.T, shape), np.ravel_multi_index(fixed.T, shape))
     return stay
@@ -251,31 +251,31 @@ def _holding(
     relation: NDArray[np.int64],
     places: NDArray[np.int64],
     order: NDArray[np.int64],
-    given: int,
+    fixed: int,
     count: int,
 ) -> NDArray[np.bool_]:
     """Select relations that contradict neither the evidence nor each other, as a bool mask (m,).
 
     Args:
-        relation: (given + m,) canonical relations. The relations of the evidence come first.
-        places: (given + m, 2) indices of the subject and object classes, from 0 to count - 1.
+        relation: (fixed + m,) canonical relations. The relations of the evidence come first.
+        places: (fixed + m, 2) indices of the subject and object classes, from 0 to count - 1.
         order: indices from 0 to m - 1 of the drawn relations to try, likeliest first.
-        given: number of relations in the evidence.
+        fixed: number of relations in the evidence.
         count: number of classes.
     """
     # beyond[d, x, y] is True if relations of direction d lead from x to y, directly or through
     # other classes.
     beyond = np.zeros((3, count, count), np.bool_)
     related, supported = np.zeros((count, count), np.bool_), np.zeros(count, np.bool_)
-    stay = np.zeros(len(relation) - given, np.bool_)
-    for turn in range(given + len(order)):
-        e = turn if turn < given else given + order[turn - given]
+    stay = np.zeros(len(relation) - fixed, np.bool_)
+    for turn in range(fixed + len(order)):
+        e = turn if turn < fixed else fixed + order[turn - fixed]
         x, y, far = places[e, 0], places[e, 1], beyond[_DIRECTION[relation[e]]]
         on_top = relation[e] == ON_TOP
-        if turn >= given:
+        if turn >= fixed:
             if far[y, x] or related[x, y] or (on_top and supported[x]):
                 continue
-            stay[e - given] = True
+            stay[e - fixed] = True
         related[x, y] = related[y, x] = True
         supported[x] |= on_top
         for k in range(count):
@@ -297,7 +297,7 @@ class Plausible:
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
         self._artifact, self._room = artifact, scene.room_type
-        self._given = {thing.class_index for thing in scene.objects}
+        self._listed = {thing.class_index for thing in scene.objects}
         smallest = artifact.calibration.smallest
         # The last entry is for scenes without a room type.
         self._least = 0
@@ -313,7 +313,7 @@ class Plausible:
         labels = self._artifact.vocabulary.labels
         objects = [SceneObject(labels[index], labels[index], index) for index in classes]
         judged = Scene(tuple(objects), room_type=self._room)
-        return self._given.issuperset(intruders(self._artifact, judged).tolist())
+        return self._listed.issuperset(intruders(self._artifact, judged).tolist())
 
     def _suits_room(self, classes: list[int]) -> bool:
         limits = self._artifact.calibration.room_fit
@@ -341,8 +341,8 @@ def room_fit(weights: Weights, v: NDArray[np.float32], room: int) -> NDArray[np.
     """
     x = weights["c1"] + v @ weights["W"]
     change = softplus(x + weights["Q"][room]) - softplus(x)
-    found: NDArray[np.float64] = np.sum(change, axis=1, dtype=np.float64)
-    return found
+    fit: NDArray[np.float64] = np.sum(change, axis=1, dtype=np.float64)
+    return fit
 
 
 def _size(scenes: Sequence[Fields]) -> tuple[int, int]:
@@ -356,19 +356,19 @@ def _size(scenes: Sequence[Fields]) -> tuple[int, int]:
 
 def _read(request: GenerateRequest, artifact: Artifact, _: Reading) -> Options:
     """Return the arguments of `generate` for a request."""
-    faults, sizes = Faults(), _layer_sizes(artifact.spec)
+    errors, sizes = ErrorList(), _layer_sizes(artifact.spec)
     for layer, units in (request.context or {}).items():
         size = sizes.get(layer)
         if size is None:
             message = "the model lacks this hidden layer"
-            faults.add(InvalidRequestError, ("context", layer), message, tuple(sizes))
+            errors.add(InvalidRequestError, ("context", layer), message, tuple(sizes))
             continue
         for position, unit in enumerate(units):
             if unit >= size:
                 message = f"the hidden layer has only the units 0 to {size - 1}"
-                faults.add(InvalidRequestError, ("context", layer, position), message)
-    if faults.found:
-        faults.raise_any()
+                errors.add(InvalidRequestError, ("context", layer, position), message)
+    if errors.by_class:
+        errors.raise_any()
     return {
         "count": request.count,
         "seed": secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed,

@@ -28,7 +28,7 @@ from app.questions.answer import (
 )
 from app.questions.calibration import calibrated, placed_logits
 from app.questions.counts import more
-from app.questions.names import Faults
+from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import Posterior, posterior_of
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
@@ -196,18 +196,18 @@ def _among(absent: NDArray[np.int64], classes: int, candidates: Sequence[int]) -
 
 def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Options:
     """Return the arguments of `missing` for a request."""
-    faults, size = Faults(), len(artifact.vocabulary)
+    errors, size = ErrorList(), len(artifact.vocabulary)
     # Only the default of `top_k` may exceed the size of the vocabulary.
     if request.top_k > size and "top_k" in request.model_fields_set:
         message = f"`top_k` must be at most {size}, the size of the vocabulary"
-        faults.add(InvalidRequestError, ("top_k",), message)
+        errors.add(InvalidRequestError, ("top_k",), message)
     candidates = at = None
     if request.candidates is not None:
-        candidates = _candidates(request.candidates, reading, faults)
+        candidates = _candidates(request.candidates, reading, errors)
     if request.at is not None:
-        at = _at(request.at, artifact, reading, faults)
-    if faults.found:
-        faults.raise_any()
+        at = _at(request.at, artifact, reading, errors)
+    if errors.by_class:
+        errors.raise_any()
     return {
         "top_k": request.top_k,
         "candidates": candidates,
@@ -218,23 +218,25 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
     }
 
 
-def _candidates(labels: list[str], reading: Reading, faults: Faults) -> list[int]:
+def _candidates(labels: list[str], reading: Reading, errors: ErrorList) -> list[int]:
     """Return the class indices of the labels in the request's field `candidates`."""
     indices: dict[int, None] = {}
     for position, label in enumerate(labels):
         index = reading.unknown.vocabulary.index(label)
         if index is None:
-            index = reading.unknown.resolve(label, label, ("candidates", position), faults)
+            index = reading.unknown.resolve(label, label, ("candidates", position), errors)
         if index is not None:
             indices[index] = None
     return list(indices)
 
 
-def _at(at: Anchor, artifact: Artifact, reading: Reading, faults: Faults) -> tuple[str, int] | None:
+def _at(
+    at: Anchor, artifact: Artifact, reading: Reading, errors: ErrorList
+) -> tuple[str, int] | None:
     canonical = artifact.manifest.vocabulary.relations
     if at.relation not in {*canonical, *map(opposite, canonical)}:
-        faults.add(InvalidRequestError, ("at", "relation"), "the model does not know this relation")
-    anchor = reading.names.find(at.object, ("at", "object"), faults)
+        errors.add(InvalidRequestError, ("at", "relation"), "the model does not know this relation")
+    anchor = reading.names.find(at.object, ("at", "object"), errors)
     return None if anchor is None else (at.relation, anchor)
 
 

@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import Final
 
 from app.errors import (
-    Fault,
     InvalidRequestError,
+    LocatedError,
     Location,
     RequestError,
     UnknownLabelsError,
@@ -37,14 +37,14 @@ MAX_MAPPED: Final = 256
 
 
 @dataclass(slots=True)
-class Faults:
+class ErrorList:
     """The errors of a request found so far.
 
     Attributes:
-        found: dictionary from each class of exception to its errors.
+        by_class: dictionary from each class of exception to its errors.
     """
 
-    found: dict[type[RequestError], list[Fault]] = field(default_factory=dict)
+    by_class: dict[type[RequestError], list[LocatedError]] = field(default_factory=dict)
 
     def add(
         self,
@@ -54,12 +54,14 @@ class Faults:
         suggestions: Sequence[str] = (),
     ) -> None:
         """Add an error without raising it."""
-        self.found.setdefault(kind, []).append(Fault(location, message, tuple(suggestions)))
+        self.by_class.setdefault(kind, []).append(
+            LocatedError(location, message, tuple(suggestions))
+        )
 
     @property
     def are_many(self) -> bool:
         """Whether an answer cannot list further errors."""
-        return sum(map(len, self.found.values())) >= MAX_ERRORS
+        return sum(map(len, self.by_class.values())) >= MAX_ERRORS
 
     def raise_any(self) -> None:
         """Raise an exception if the request has errors.
@@ -68,9 +70,9 @@ class Faults:
             RequestError: the request has errors. The exception contains all errors of one class,
                 the first class in `app.errors` with errors.
         """
-        for kind in RequestError.__subclasses__() if self.found else ():
-            if kind in self.found:
-                raise kind(self.found[kind])
+        for kind in RequestError.__subclasses__() if self.by_class else ():
+            if kind in self.by_class:
+                raise kind(self.by_class[kind])
 
 
 @dataclass(slots=True)
@@ -135,7 +137,7 @@ class Unknown:
     _guesses: dict[tuple[str, bool], Guess | None] = field(default_factory=dict)
 
     def resolve(
-        self, label: str, name: str, location: Location, faults: Faults, *, is_room: bool = False
+        self, label: str, name: str, location: Location, errors: ErrorList, *, is_room: bool = False
     ) -> int | None:
         """Return the class or room type that replaces an unlisted label.
 
@@ -146,17 +148,17 @@ class Unknown:
             name: name of the object with this label. The list of ignored names contains it if the
                 label is ignored.
             location: location of the label in the request, for an error message.
-            faults: list of errors. If the method refuses the label, it adds an error to this list.
+            errors: list of errors. If the method refuses the label, it adds an error to this list.
             is_room: whether the label is the name of a room type.
 
         Returns:
             Index of the class or room type. None means that the label is ignored or refused.
         """
-        found = self.vocabulary.read(label, is_room=is_room)
-        if found is None and self.treatment.startswith("nearest"):
-            found = self._guess(label, is_room=is_room)
-        if found is not None:
-            entry, similarity, rule = found
+        match = self.vocabulary.read(label, is_room=is_room)
+        if match is None and self.treatment.startswith("nearest"):
+            match = self._guess(label, is_room=is_room)
+        if match is not None:
+            entry, similarity, rule = match
             name = (self.vocabulary.room_types if is_room else self.vocabulary.labels)[entry]
             mapped = Mapped(label=label, class_=name, similarity=similarity, rule=rule)
             self.mapped[label, is_room] = mapped
@@ -164,7 +166,7 @@ class Unknown:
         if self.treatment.endswith("ignore"):
             self.ignored.append(name)
         else:
-            self._refuse(label, location, faults, is_room=is_room)
+            self._refuse(label, location, errors, is_room=is_room)
         return None
 
     def copy(self) -> Unknown:
@@ -179,15 +181,15 @@ class Unknown:
                 return self._guesses.setdefault(key, guess)
         return None
 
-    def _refuse(self, label: str, location: Location, faults: Faults, *, is_room: bool) -> None:
-        known = self.vocabulary.room_types if is_room else self.vocabulary.labels
+    def _refuse(self, label: str, location: Location, errors: ErrorList, *, is_room: bool) -> None:
+        names = self.vocabulary.room_types if is_room else self.vocabulary.labels
         message = "the model does not know this label"
         if not is_room and self.vocabulary.room_index(label) is not None:
             message += "; it is a room type: send it as `room_type`"
         if is_room:
             message = "this model does not have room types"
-            if known:
-                message = f"the model does not know this room type; it knows {some_of(known)}"
+            if names:
+                message = f"the model does not know this room type; it knows {some_of(names)}"
         if self.treatment == "nearest" and (label, is_room) not in self._guesses:
             message += (
                 f"; the service maps at most {MAX_SUGGESTED} unknown labels per scene and "
@@ -196,9 +198,9 @@ class Unknown:
         suggestions: list[str] = []
         if self.look_ups.suggestions < MAX_SUGGESTED:
             matches = self.look_ups.similar(self.vocabulary, label, is_room=is_room)
-            suggestions = [known[match.entry] for match in matches]
+            suggestions = [names[match.entry] for match in matches]
         self.look_ups.suggestions += bool(suggestions)
-        faults.add(UnknownLabelsError, location, message, suggestions)
+        errors.add(UnknownLabelsError, location, message, suggestions)
 
 
 class Names:
@@ -225,51 +227,51 @@ class Names:
 
     @cached_property
     def _by_id(self) -> dict[str, int]:
-        return {thing.id: place for place, thing in enumerate(self._objects)}
+        return {thing.id: index for index, thing in enumerate(self._objects)}
 
     @cached_property
     def _by_label(self) -> dict[str, list[int]]:
-        places: dict[str, list[int]] = {}
-        for place, thing in enumerate(self._objects):
-            places.setdefault(thing.label, []).append(place)
-        return places
+        indices: dict[str, list[int]] = {}
+        for index, thing in enumerate(self._objects):
+            indices.setdefault(thing.label, []).append(index)
+        return indices
 
     @cached_property
     def _by_class(self) -> dict[int, list[int]]:
-        places: dict[int, list[int]] = {}
-        for place, thing in enumerate(self._objects):
+        indices: dict[int, list[int]] = {}
+        for index, thing in enumerate(self._objects):
             if thing.class_index is not None:
-                places.setdefault(thing.class_index, []).append(place)
-        return places
+                indices.setdefault(thing.class_index, []).append(index)
+        return indices
 
     @cached_property
     def _plain_ids(self) -> list[str]:
         # A request cannot put arbitrary text into an error through its ids.
         return [thing.id for thing in self._objects if PLAIN.fullmatch(thing.id.replace(" ", "_"))]
 
-    def find(self, name: str, location: Location, faults: Faults) -> int | None:
+    def find(self, name: str, location: Location, errors: ErrorList) -> int | None:
         """Return the index of the object with a name. On failure, add an error and return None.
 
         The name is an id or a label. Ids take precedence over labels. A label may have any spelling
         that the vocabulary accepts for its class.
         """
-        if (place := self._by_id.get(name)) is not None:
-            return place
-        places = self._by_label.get(name)
-        if places is None:
-            index = self._unknown.vocabulary.index(name)
-            places = [] if index is None else self._by_class.get(index, [])
-        if len(places) == 1:
-            return places[0]
-        if places:
+        if (index := self._by_id.get(name)) is not None:
+            return index
+        indices = self._by_label.get(name)
+        if indices is None:
+            of_class = self._unknown.vocabulary.index(name)
+            indices = [] if of_class is None else self._by_class.get(of_class, [])
+        if len(indices) == 1:
+            return indices[0]
+        if indices:
             message = (
-                f"{len(places)} objects have this label; use the id of one of them. The service "
+                f"{len(indices)} objects have this label; use the id of one of them. The service "
                 "numbers objects without an id, such as chair_1 and chair_2"
             )
-            faults.add(InvalidRequestError, location, message)
+            errors.add(InvalidRequestError, location, message)
         else:
             message = "no entry of `objects` has this id or label"
-            faults.add(InvalidRequestError, location, message, self._similar(name))
+            errors.add(InvalidRequestError, location, message, self._similar(name))
         return None
 
     def _similar(self, name: str) -> list[str]:

@@ -54,9 +54,9 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
         ValueError: the machine does not know the class of an object or the room type.
     """
     V, indices = spec.V, [thing.class_index for thing in scene.objects]
-    for place, index in enumerate(indices):
+    for number, index in enumerate(indices):
         if index is None or index >= V:
-            name = scene.objects[place].id
+            name = scene.objects[number].id
             raise ValueError(f"class_index of {name!r} is {index}, but must be below V = {V}")
     if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
         raise ValueError(f"room_type is {scene.room_type}, but must be from 0 to {spec.C - 1}")
@@ -184,10 +184,10 @@ def with_unlisted(
     """
     completions, weight = artifact.completions, artifact.calibration.coverage_weight
     unlisted = math.log1p(-min(coverage, FULL))
-    found: Floats = log_odds + unlisted
+    total: Floats = log_odds + unlisted
     if completions is None or coverage >= FULL or weight == 0:
-        return found
+        return total
     partial = completions.log_odds(y, present.classes, present.presence, coverage, room)[absent]
     base = (log_odds if closed is None else closed) + unlisted
-    found += np.float32(weight) * (partial - base)
-    return found
+    total += np.float32(weight) * (partial - base)
+    return total

@@ -43,12 +43,12 @@ def best(values, usable, count):
             heap[at] = position
         elif values[position] > values[heap[0]]:
             _sink(values, heap, size, position)
-    found = heap[:size]
+    ranked = heap[:size]
     for last in range(size - 1, 0, -1):
         worst, moved = heap[0], heap[last]
         _sink(values, heap, last, moved)
-        found[last] = worst
-    return found
+        ranked[last] = worst
+    return ranked
 
 
 @compiled
@@ -94,7 +94,7 @@ def likeliest_classes(logits, usable, count):
 
 
 @compiled
-def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposites, count):
+def likeliest_relations(slopes, log_odds, log_counts, row, judged, least, opposites, count):
     """Return the `count` likeliest relations between N objects, likeliest first.
 
     Args:
@@ -102,7 +102,7 @@ def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposit
         log_odds: (A, n, n) log-odds of the A relations between the n classes of the scene.
         log_counts: (n,) log of the number of instances of each class.
         row: (N,) index of each object's class among the n classes.
-        asked: (N, N) bool, True for the ordered pairs of objects to judge.
+        judged: (N, N) bool, True for the ordered pairs of objects to judge.
         least: minimum probability of a relation in the result.
         opposites: whether the result also contains opposite relations. The opposite of relation a
             has the number A + a.
@@ -116,13 +116,13 @@ def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposit
     for i in range(n):
         for j in range(n):
             counts[i, j] = log_counts[i] + log_counts[j]
-    found = relation_probability(slopes, log_odds.reshape(1, A, n * n), counts.reshape(-1), n)
-    p = found.reshape(A, n, n)
+    p = relation_probability(slopes, log_odds.reshape(1, A, n * n), counts.reshape(-1), n)
+    p = p.reshape(A, n, n)
     names = 2 * A if opposites else A
     grid, usable = np.zeros((size, size, names), p.dtype), np.zeros((size, size, names), np.bool_)
     for x in range(size):
         for y in range(size):
-            if asked[x, y]:
+            if judged[x, y]:
                 i, j = row[x], row[y]
                 for a in range(A):
                     to, back = exclusive(p[a, i, j], p[a, j, i])
@@ -212,7 +212,7 @@ def strongest(change, rows, count):
 
 
 @compiled
-def observed_pairs(triples, row, asked, classes, relations):
+def observed_pairs(triples, row, judged, classes, relations):
     """Return the pairs of objects with at least one observed relation, and their relations.
 
     A bit set contains the relations of a pair. Bit a stands for relation a from subject to object.
@@ -221,7 +221,7 @@ def observed_pairs(triples, row, asked, classes, relations):
     Args:
         triples: (T, 3) observed relations, each as (relation, subject, object).
         row: (N,) index of each object's class among the n classes.
-        asked: (N, N) bool, True for the ordered pairs of objects to judge. The result contains a
+        judged: (N, N) bool, True for the ordered pairs of objects to judge. The result contains a
             pair if one of its two orders is True.
         classes: number n of classes in the scene.
         relations: number A of canonical relations.
@@ -238,21 +238,21 @@ def observed_pairs(triples, row, asked, classes, relations):
         holds[y, x] |= 1 << (relations + a)
         of_classes[row[x], row[y]] |= 1 << a
         of_classes[row[y], row[x]] |= 1 << (relations + a)
-    found = np.empty((4, min(len(triples), size * size)), np.int64)
+    columns = np.empty((4, min(len(triples), size * size)), np.int64)
     pairs, forward = 0, (1 << relations) - 1
     for x in range(size):
         for y in range(x + 1, size):
-            if holds[x, y] and (asked[x, y] or asked[y, x]):
+            if holds[x, y] and (judged[x, y] or judged[y, x]):
                 # The subject of the pair is the subject of its observed relation with the lowest
                 # number.
                 one, other = holds[x, y] & forward, holds[y, x] & forward
                 swapped = one == 0 or (other != 0 and (other & -other) < (one & -one))
                 subject, object_ = (y, x) if swapped else (x, y)
-                found[0, pairs], found[1, pairs] = subject, object_
-                found[2, pairs] = holds[subject, object_]
-                found[3, pairs] = of_classes[row[subject], row[object_]]
+                columns[0, pairs], columns[1, pairs] = subject, object_
+                columns[2, pairs] = holds[subject, object_]
+                columns[3, pairs] = of_classes[row[subject], row[object_]]
                 pairs += 1
-    return found[0, :pairs], found[1, :pairs], found[2, :pairs], found[3, :pairs]
+    return columns[0, :pairs], columns[1, :pairs], columns[2, :pairs], columns[3, :pairs]
 
 
 @compiled

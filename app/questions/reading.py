@@ -17,7 +17,7 @@ from typing import Final, Literal
 from pydantic_core import to_json
 
 from app.errors import ContradictionError, InvalidRequestError, Location
-from app.questions.names import Faults, LookUps, Names, Unknown
+from app.questions.names import ErrorList, LookUps, Names, Unknown
 from app.scene.geometry import (
     LARGEST,
     MOST_DISTANT,
@@ -114,43 +114,43 @@ def read_scene(
         may_be_empty: whether a scene without objects of known classes is valid.
 
     Raises:
-        RequestError: the scene is invalid; see `Faults.raise_any`.
+        RequestError: the scene is invalid; see `ErrorList.raise_any`.
     """
-    faults = Faults()
-    _check_sizes(request, limits, faults)
-    ids = _ids(request.objects, faults)
+    errors = ErrorList()
+    _check_sizes(request, limits, errors)
+    ids = _ids(request.objects, errors)
     unknown = Unknown(vocabulary, request.unknown_labels, look_ups or LookUps())
     reading = Reading(Scene(()), ids, unknown)
     objects: list[SceneObject] = []
     optical = request.frame_id is not None and is_optical(request.frame_id)
     has_poses = has_detections = False
-    for place, entry in enumerate(request.objects):
+    for number, entry in enumerate(request.objects):
         label = entry if isinstance(entry, str) else entry.label
         index = vocabulary.index(label)
         if index is None:
-            location: Location = ("objects", place)
+            location: Location = ("objects", number)
             if not isinstance(entry, str):
                 location = (*location, "label")
-            index = unknown.resolve(label, ids[place], location, faults)
-            if faults.found and faults.are_many:
+            index = unknown.resolve(label, ids[number], location, errors)
+            if errors.by_class and errors.are_many:
                 break
         if index is None:
-            reading.left_out.append((ids[place], label))
+            reading.left_out.append((ids[number], label))
         elif isinstance(entry, str):
-            objects.append(SceneObject(ids[place], label, index))
+            objects.append(SceneObject(ids[number], label, index))
         else:
             has_detections = True
             has_poses = has_poses or entry.position is not None
-            objects.append(_scene_object(ids[place], entry, index, optical=optical))
+            objects.append(_scene_object(ids[number], entry, index, optical=optical))
     room, name = None, request.room_type
     if name is not None and (room := vocabulary.room_index(name)) is None:
-        room = unknown.resolve(name, name, ("room_type",), faults, is_room=True)
-    if not objects and not may_be_empty and not faults.found:
-        faults.add(
+        room = unknown.resolve(name, name, ("room_type",), errors, is_room=True)
+    if not objects and not may_be_empty and not errors.by_class:
+        errors.add(
             InvalidRequestError, ("objects",), "the model does not know any of these objects"
         )
-    if faults.found:
-        faults.raise_any()
+    if errors.by_class:
+        errors.raise_any()
 
     reading.scene = Scene(tuple(objects), None, False, room)
     if reading.left_out:
@@ -158,34 +158,34 @@ def read_scene(
         reading.ids = [name for name in ids if name not in left_out]
     stated = _stated(request, ids)
     if stated is not None:
-        triples, reading.flipped = _triples(stated, reading, faults)
-        faults.raise_any()
+        triples, reading.flipped = _triples(stated, reading, errors)
+        errors.raise_any()
         reading.scene = Scene(reading.scene.objects, triples, request.relations_complete, room)
     if has_detections:
         _derive(request, reading, vocabulary, has_poses=has_poses)
     return reading
 
 
-def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
+def _check_sizes(request: SceneRequest, limits: Limits, errors: ErrorList) -> None:
     for name, most in (("objects", limits.objects), ("relations", limits.relations)):
         if len(getattr(request, name) or ()) > most:
-            faults.add(InvalidRequestError, (name,), f"the scene must have at most {most} {name}")
+            errors.add(InvalidRequestError, (name,), f"the scene must have at most {most} {name}")
     if request.relations is None and request.relations_complete:
         message = "`relations_complete` requires the field `relations`"
-        faults.add(InvalidRequestError, ("relations_complete",), message)
-    if faults.found:
-        faults.raise_any()
+        errors.add(InvalidRequestError, ("relations_complete",), message)
+    if errors.by_class:
+        errors.raise_any()
 
 
 def _derive(
     request: SceneRequest, reading: Reading, vocabulary: Vocabulary, *, has_poses: bool
 ) -> None:
     """Add to ``reading`` the relations and warnings that follow from the poses of the objects."""
-    given = reading.scene
-    if has_poses and given.relations is None:
+    stated = reading.scene
+    if has_poses and stated.relations is None:
         view = request.viewpoint
         reading.scene = observe(
-            given,
+            stated,
             frame_id=request.frame_id,
             viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
             typical_sizes=vocabulary.sizes,
@@ -195,10 +195,10 @@ def _derive(
             ObservedRelation(ids[i], CANONICAL[a], ids[j])  # type: ignore[arg-type]
             for a, i, j in reading.scene.relations or ()
         ]
-    reading.warnings = scene_warnings(given, reading.scene, vocabulary, request)
+    reading.warnings = scene_warnings(stated, reading.scene, vocabulary, request)
 
 
-def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
+def _ids(entries: Sequence[str | Detection], errors: ErrorList) -> list[str]:
     """Return the ids of the objects in a request.
 
     An object without an id has its label as id. If several objects have this label, a number at the
@@ -209,15 +209,15 @@ def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
         return labels
     taken: dict[str, None] = {}
     labels = []
-    for place, entry in enumerate(entries):
+    for index, entry in enumerate(entries):
         if isinstance(entry, str):
             labels.append(entry)
         elif entry.id is None:
             labels.append(entry.label)
         else:
             if entry.id in taken:
-                faults.add(
-                    InvalidRequestError, ("objects", place, "id"), "another object has this id"
+                errors.add(
+                    InvalidRequestError, ("objects", index, "id"), "another object has this id"
                 )
             taken[entry.id] = None
     if len(taken) == len(entries):
@@ -273,11 +273,11 @@ def _stated(
     """
     supports: list[tuple[Location, str, RelationName, str]] = []
     has_positions = True
-    for place, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
+    for index, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
         if isinstance(entry, str) or entry.position is None:
             has_positions = False
         if not isinstance(entry, str) and entry.supported_by is not None:
-            location = ("objects", place, "supported_by")
+            location = ("objects", index, "supported_by")
             supports.append((location, name, "on-top", entry.supported_by))
     if request.relations is None and (has_positions or not supports):
         return None
@@ -287,7 +287,7 @@ def _stated(
 
 
 def _triples(
-    stated: Sequence[tuple[Location, str, RelationName, str]], reading: Reading, faults: Faults
+    stated: Sequence[tuple[Location, str, RelationName, str]], reading: Reading, errors: ErrorList
 ) -> tuple[tuple[Triple, ...], frozenset[Triple]]:
     """Return the canonical triples of the stated relations.
 
@@ -298,21 +298,21 @@ def _triples(
     for location, first, relation, second in stated:
         if some_ignored and (names.is_ignored(first) or names.is_ignored(second)):
             continue
-        if faults.found and faults.are_many:
+        if errors.by_class and errors.are_many:
             break
         is_relation = location[0] == "relations"
-        subject = names.find(first, (*location, "subject") if is_relation else location, faults)
-        other = names.find(second, (*location, "object") if is_relation else location, faults)
+        subject = names.find(first, (*location, "subject") if is_relation else location, errors)
+        other = names.find(second, (*location, "object") if is_relation else location, errors)
         if subject is None or other is None:
             continue
         if subject == other:
             message = "an object cannot have a relation to itself"
-            faults.add(ContradictionError, location, message)
+            errors.add(ContradictionError, location, message)
             continue
         index, i, j = canonicalise(subject, relation, other)
         if (index, j, i) in triples:
             message = "this relation contradicts an earlier relation of the same two objects"
-            faults.add(ContradictionError, location, message)
+            errors.add(ContradictionError, location, message)
         triples.setdefault((index, i, j), i != subject)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])
 
@@ -339,12 +339,12 @@ Code = Literal["implausible-position", "implausible-size", "flat-scene", "unknow
 
 
 def scene_warnings(
-    given: Scene, scene: Scene, vocabulary: Vocabulary, request: SceneRequest
+    stated: Scene, scene: Scene, vocabulary: Vocabulary, request: SceneRequest
 ) -> list[SceneWarning]:
     """Return the warnings about a scene.
 
     Args:
-        given: the scene in the request's frame, in axes of REP-103 (x forward, y left, z up).
+        stated: the scene in the request's frame, in axes of REP-103 (x forward, y left, z up).
         scene: the same scene after `observe`, in the axes of the viewer if the request has a
             viewpoint.
         vocabulary: classes of the model, with their typical sizes.
@@ -353,44 +353,46 @@ def scene_warnings(
     # Python loops are fast enough, because most scenes have no poses or pass all checks.
     placed = [thing for thing in scene.objects if thing.position is not None]
     odd = [thing for thing in scene.objects if not _is_plausible(thing.size)]
-    is_seen_flat = request.frame_id is not None and is_optical(request.frame_id) and _is_flat(given)
+    is_seen_flat = (
+        request.frame_id is not None and is_optical(request.frame_id) and _is_flat(stated)
+    )
     has_poses = scene.poses is not None and len(placed) > 1
-    found: list[tuple[Code, str, Sequence[SceneObject]]] = [
-        ("implausible-position", _TOO_FAR, _distant(given, request) if placed else ()),
+    kinds: list[tuple[Code, str, Sequence[SceneObject]]] = [
+        ("implausible-position", _TOO_FAR, _distant(stated, request) if placed else ()),
         ("implausible-size", _ODD_SIZE, odd),
         ("flat-scene", _FLAT, placed if is_seen_flat else ()),
         ("unknown-sizes", _UNSIZED, _unsized(placed, vocabulary) if has_poses else ()),
     ]
     return [
         SceneWarning(code=code, message=message, objects=[thing.id for thing in objects])
-        for code, message, objects in found
+        for code, message, objects in kinds
         if objects
     ]
 
 
-def _distant(given: Scene, request: SceneRequest) -> list[SceneObject]:
+def _distant(stated: Scene, request: SceneRequest) -> list[SceneObject]:
     """Return the objects that are too far from the viewer.
 
     In a world-fixed frame without a viewpoint, the position of the viewer is unknown. The median
     position of the objects then replaces the position of the viewer.
     """
-    placed = [(thing, thing.position) for thing in given.objects if thing.position is not None]
+    placed = [(thing, thing.position) for thing in stated.objects if thing.position is not None]
     centre: Point = (0.0, 0.0, 0.0)
     if request.viewpoint is not None:
         centre = (request.viewpoint.x, request.viewpoint.y, 0.0)
     elif request.frame_id is not None and is_world_fixed(request.frame_id):
         xs, ys, zs = zip(*[position for _, position in placed], strict=True)
         centre = (median(xs), median(ys), median(zs))
-    return [thing for thing, place in placed if math.dist(place, centre) > MOST_DISTANT]
+    return [thing for thing, position in placed if math.dist(position, centre) > MOST_DISTANT]
 
 
 def _is_plausible(size: Point | None) -> bool:
     return size is None or SMALLEST <= max(size) <= LARGEST
 
 
-def _is_flat(given: Scene) -> bool:
+def _is_flat(stated: Scene) -> bool:
     """Return whether all objects have the same depth, the distance along the optical axis."""
-    depths = [thing.position[0] for thing in given.objects if thing.position is not None]
+    depths = [thing.position[0] for thing in stated.objects if thing.position is not None]
     return len(depths) >= _LEAST_FLAT and max(depths) - min(depths) <= _SAME_DEPTH
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError, Location
 from app.questions.answer import RELATION_BYTES, Fields, SizeLimit, significant
-from app.questions.names import Faults
+from app.questions.names import ErrorList
 from app.questions.posterior import Posterior, Present, posterior_of, relations_given
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.ranking import disagreeing, likeliest_relations, observed_pairs
@@ -230,24 +230,24 @@ def _read(request: RelationsRequest, _: Artifact, reading: Reading) -> Options:
 
 
 def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]:
-    faults, names = Faults(), reading.names
+    errors, names = ErrorList(), reading.names
     pairs: dict[tuple[int, int], None] = {}
     for position, pair in enumerate(request.pairs or ()):
         location: Location = ("pairs", position)
         if names.is_ignored(pair.subject) or names.is_ignored(pair.object):
             continue
-        subject = names.find(pair.subject, (*location, "subject"), faults)
-        other = names.find(pair.object, (*location, "object"), faults)
+        subject = names.find(pair.subject, (*location, "subject"), errors)
+        other = names.find(pair.object, (*location, "object"), errors)
         if subject is None or other is None:
             continue
         if subject == other:
-            faults.add(
+            errors.add(
                 InvalidRequestError, location, "subject and object must be two different objects"
             )
             continue
         pairs[subject, other] = None
-    if faults.found:
-        faults.raise_any()
+    if errors.by_class:
+        errors.raise_any()
     return list(pairs)
 
 

@@ -266,7 +266,7 @@ def _refusal(error: StoreError) -> Exception:
         case "name_conflict":
             return errors.AliasConflictError("A model already has the name of this alias.")
         case "invalid_reference":
-            return errors.InvalidRequestError([errors.Fault((), error.reason)])
+            return errors.InvalidRequestError([errors.LocatedError((), error.reason)])
         case "unknown_model" | "unknown_version":
             return errors.UnknownModelError("The store no longer contains this version.")
         case "locked":
