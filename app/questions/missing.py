@@ -26,11 +26,10 @@ from app.questions.answer import (
     reasons,
     significant,
 )
-from app.questions.calibration import calibrated, placed_logits
 from app.questions.counts import more
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
-from app.questions.posterior import Posterior, posterior_of
+from app.questions.posterior import Posterior, calibrated, placed_logits, posterior_of
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.ranking import likeliest_classes
 from app.questions.reading import Reading

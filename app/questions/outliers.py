@@ -39,8 +39,7 @@ from app.questions.answer import (
     rounded_number,
     significant,
 )
-from app.questions.calibration import calibrated, false_log_odds
-from app.questions.posterior import Posterior, posterior_of
+from app.questions.posterior import Posterior, calibrated, false_log_odds, posterior_of
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
 from app.questions.ranking import best
 from app.questions.reading import Reading, Triple

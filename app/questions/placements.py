@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.inference.relations import NO_UNIT
 from app.questions.answer import Fields, significant
-from app.questions.calibration import placement_log_p
-from app.questions.posterior import Posterior
+from app.questions.posterior import Posterior, placement_log_p
 from app.questions.ranking import likeliest_places
 from app.registry.artifact import Artifact
 from app.registry.offsets import NOTHING, Offsets, look_up

@@ -1,4 +1,4 @@
-"""The posterior: log-odds of unobserved objects and relations, given an observed scene."""
+"""The posterior: log-odds of objects and relations, given a scene, and their calibration."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from app.inference import MachineSpec
 from app.inference.posterior import Pull, ScenePosterior
 from app.inference.relations import Given
+from app.questions.ranking import bend
 from app.registry.artifact import Artifact
-from app.registry.description import EvidenceWeights
+from app.registry.description import Calibration, CountSlope, EvidenceWeights, Slope
 from app.scene.scene import Scene, instance_evidence, pool_classes, pooled
 
 Floats = NDArray[np.floating[Any]]
@@ -191,3 +192,59 @@ def with_unlisted(
     base = (log_odds if closed is None else closed) + unlisted
     total += np.float32(weight) * (partial - base)
     return total
+
+
+# --------------------------------------------------------------------------------- calibration
+#
+# Validation scenes determine the coefficients, which are fields of `Calibration`.
+
+
+def calibrated(entry: CountSlope, z: Floats, n: int | NDArray[np.integer[Any]]) -> Floats:
+    """Return the calibrated log-odds of N logits, (N,); see `CountSlope` for the formula.
+
+    Args:
+        entry: calibration of a question.
+        z: (N,) logits.
+        n: number n of the formula, or an array (N,) with a number for each logit.
+    """
+    log_odds: Floats = entry.intercept + entry.log_count * np.log(n) + entry.slope * z
+    return log_odds
+
+
+def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int) -> Floats:
+    """Calibrate log p(relation to the anchor | candidate is present) of N candidate classes, (N,).
+
+    Args:
+        entry: (4 + 2K,) row of the relation in a table of `RelationSlopes`.
+        log_p: (N,) log probability of the relation between the classes, not yet calibrated.
+        log_count: log of the number of instances of the anchor's class.
+        classes: number of distinct classes in the scene, the candidate included.
+    """
+    intercept, gain, weight, size = entry[:4]
+    odds = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-7)))
+    logits = intercept + gain * odds + weight * log_count + size * math.log(classes)
+    bend(entry, logits)
+    log_probability: Floats = -np.logaddexp(0.0, -logits)
+    return log_probability
+
+
+def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, listed: int) -> Floats:
+    """Return the logits of p(present but unlisted) · p(relation holds | present), (N,).
+
+    Args:
+        calibration: calibration of the model.
+        log_odds: (N,) log-odds that each candidate class is present, not yet calibrated.
+        log_p: (N,) calibrated log p(relation holds | present) of each candidate class.
+        listed: number of classes that the scene lists.
+    """
+    both = log_p - np.logaddexp(0.0, -calibrated(calibration.missing, log_odds, listed))
+    logits: Floats = both - np.log(-np.expm1(np.minimum(both, -1e-7)))
+    return logits
+
+
+def false_log_odds(entry: Slope, log_odds: Floats) -> Floats:
+    """Convert the log-odds that stated relations hold to the log-odds that they are false.
+
+    `entry` is `Calibration.misplaced`.
+    """
+    return entry.intercept + entry.slope * log_odds

@@ -1,16 +1,78 @@
-"""Compiled loops that rank the entries of answers.
+"""Compiled loops that calibrate relations and rank the entries of answers.
 
 Entries with equal values keep the order of their indices. Several functions take tables of
-`RelationSlopes`, which contain the calibration of relations.
+`RelationSlopes`, which contain the calibration of relations. Each table has one row for each
+relation, with intercept, slope, log_count, log_classes, and K bends (at, change).
 """
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from app.compiling import compiled
+import numpy as np
+from numpy.typing import NDArray
+
+from app.compiling import compiled, inlined
+from app.inference.elementary import logistic
 from app.inference.relations import NO_UNIT
-from app.questions.calibration import exclusive, relation_probability
+
+Floats = NDArray[np.floating[Any]]
+
+
+@compiled
+def bend(entry: Floats, logits: Floats) -> None:
+    """Add change·(x - at) to each log-odds x above ``at``, for each bend of a relation, in place.
+
+    Args:
+        entry: (4 + 2K,) row of the relation in a table of `RelationSlopes`.
+        logits: (n,) log-odds x.
+    """
+    for j in range(len(logits) if len(entry) > 4 else 0):
+        x = y = logits[j]
+        for k in range(4, len(entry), 2):
+            y += entry[k + 1] * max(x - entry[k], np.float32(0.0))
+        logits[j] = y
+
+
+@compiled
+def relation_probability(
+    slopes: Floats, log_odds: Floats, log_count: Floats, classes: int
+) -> Floats:
+    """Return the probability that each relation holds between two objects, (B, A, N).
+
+    The shape is (B candidate classes, A relations, N pairs of classes). B is 1 without candidates.
+
+    Args:
+        slopes: (A, 4 + 2K) table of `RelationSlopes`.
+        log_odds: (B, A, N) log-odds of the relation between classes.
+        log_count: (N,) log of the number of object pairs with these two classes.
+        classes: number of distinct classes in the scene.
+    """
+    p = np.empty_like(log_odds)
+    size = np.log(classes)
+    for a in range(p.shape[1]):
+        slope, weight = slopes[a, 1], slopes[a, 2]
+        intercept = np.float32(slopes[a, 0] + slopes[a, 3] * size)
+        for b in range(len(p)):
+            row, logits = log_odds[b, a], p[b, a]
+            for j in range(len(row)):
+                logits[j] = intercept + slope * row[j] + weight * log_count[j]
+            bend(slopes[a], logits)
+    # One loop over all rows is faster than one loop per row, because a row may be short.
+    flat = p.reshape(-1)
+    for e in range(len(flat)):
+        flat[e] = logistic(np.float32(flat[e]))
+    return p
+
+
+@inlined
+def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
+    """Scale p(a(x,y)) and p(a(y,x)) so that their sum is at most 1.
+
+    The reason is that a relation a cannot hold in both directions between the same two objects.
+    """
+    total = np.maximum(forward + backward, np.float32(1.0))
+    return forward / total, backward / total
 
 
 @compiled

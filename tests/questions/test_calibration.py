@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.questions.calibration import relation_probability
+from app.questions.ranking import relation_probability
 from app.registry.description import Calibration, CountSlope, PairSlope, RelationSlopes, Slope
 from tests.questions.answers import missing, outliers, relations
 from tests.questions.artifacts import larger_artifact, scene_of

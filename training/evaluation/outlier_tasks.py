@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from app.questions import Sensitivity
-from app.questions.calibration import calibrated
+from app.questions.posterior import calibrated
 from app.registry import Artifact, Calibration
 from app.scene import Scene
 from training.datasets import EncodedScene

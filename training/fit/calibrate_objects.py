@@ -27,9 +27,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.questions.calibration import calibrated
 from app.questions.generate import room_fit
-from app.questions.posterior import posterior_of
+from app.questions.posterior import calibrated, posterior_of
 from app.registry import NEVER, Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
 from app.scene import Scene
 from training.datasets.array_types import Flags, Floats, Rng

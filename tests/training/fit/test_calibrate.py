@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.questions.calibration import calibrated
-from app.questions.posterior import posterior_of
+from app.questions.posterior import calibrated, posterior_of
 from app.registry import Calibration, CountSlope
 from tests.questions.answers import outliers
 from tests.questions.artifacts import artifact_of
