@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from scene_client.schemas import (
     RelationsAnswer,
 )
 from tests.client.peers import answer, read_head
+from tests.conftest import run_program
 
 ANSWERED: dict[str, Any] = {
     "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
@@ -375,17 +375,9 @@ def test_the_key_is_taken_from_the_environment(
     assert b"x-api-key: " + b"k" * 16 in heads[0]
 
 
-def test_it_is_a_program(repository: Path, url: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "scene_client", "outliers", "bed", "lamp"],
-        cwd=repository,
-        env={**os.environ, "SCENE_URL": url},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "log-odds" in done.stdout
+def test_it_is_a_program(url: str) -> None:
+    command = (sys.executable, "-W", "error", "-m", "scene_client", "outliers", "bed", "lamp")
+    assert "log-odds" in run_program(*command, env={**os.environ, "SCENE_URL": url}).stdout
 
 
 def shown(renderable: Any) -> str:

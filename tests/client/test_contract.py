@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from scene_client import (
 )
 from tests.client.callers import Caller
 from tests.client.conftest import EVERY
-from tests.conftest import REPOSITORY
+from tests.conftest import run_program
 from tests.http.stores import make_store
 from tests.services import ADMIN_KEY, LiveService, launch
 
@@ -143,16 +142,11 @@ except DeadlineError:
 def test_an_unclosed_offline_client_does_not_block_the_exit(
     shared_store: Path,
 ) -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", UNCLOSED, shared_store],
-        cwd=REPOSITORY,
-        # What the environment says of a service does not concern it.
-        env={**os.environ, "SCENE_API_KEY": "short", "SCENE_STORE": "/nowhere"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "late\n", "")
+    # The client ignores the settings of a service.
+    environment = {**os.environ, "SCENE_API_KEY": "short", "SCENE_STORE": "/nowhere"}
+    command = (sys.executable, "-W", "error", "-c", UNCLOSED, shared_store)
+    done = run_program(*command, env=environment)
+    assert (done.stdout, done.stderr) == ("late\n", "")
 
 
 def test_a_store_that_is_none_is_refused(tmp_path: Path) -> None:
