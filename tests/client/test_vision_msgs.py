@@ -249,17 +249,30 @@ def test_the_most_confident_of_too_many_are_kept_in_their_order() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frame", "sent"),
+    ("header", "field", "sent", "reasons_"),
     [
-        ("base_link", "base_link"),
-        ("/camera_optical_frame", "camera_optical_frame"),
-        ("//robot/map", "robot/map"),
-        ("", None),
-        ("/", None),
+        *[
+            ({"frame": frame}, "frame_id", sent, [])
+            for frame, sent in (
+                ("base_link", "base_link"),
+                ("/camera_optical_frame", "camera_optical_frame"),
+                ("//robot/map", "robot/map"),
+                ("", None),
+                ("/", None),
+            )
+        ],
+        ({"stamp": {"sec": 5, "nanosec": 6}}, "stamp", {"sec": 5, "nanosec": 6}, []),
+        # ROS 1
+        ({"stamp": {"secs": 5, "nsecs": 6}}, "stamp", {"sec": 5, "nanosec": 6}, []),
+        ({"stamp": {"sec": 5, "nanosec": 1_000_000_000}}, "stamp", None, [(None, "no-stamp")]),
+        ({"stamp": {"sec": None, "nanosec": 0}}, "stamp", None, [(None, "no-stamp")]),
     ],
 )
-def test_frames_lose_their_leading_slash(frame: str, sent: str | None) -> None:
-    assert from_detection3d_array(array(seen(result("bed")), frame=frame)).get("frame_id") == sent
+def test_frame_and_stamp_of_the_header(
+    header: dict[str, Any], field: str, sent: Any, reasons_: Any
+) -> None:
+    fields = from_detection3d_array(array(seen(result("bed")), **header))
+    assert (fields.get(field), reasons(fields)) == (sent, reasons_)
 
 
 def test_the_frame_of_the_detections_serves_where_the_message_names_none() -> None:
@@ -274,21 +287,6 @@ def test_the_frame_of_the_detections_serves_where_the_message_names_none() -> No
     assert fields["frame_id"] == "odom"
     assert ["position" in thing for thing in fields["objects"]] == [True, True, False]
     assert reasons(fields) == [(2, "no-position")]
-
-
-@pytest.mark.parametrize(
-    ("stamp", "sent"),
-    [
-        ({"sec": 5, "nanosec": 6}, {"sec": 5, "nanosec": 6}),
-        ({"secs": 5, "nsecs": 6}, {"sec": 5, "nanosec": 6}),  # ROS 1
-        ({"sec": 5, "nanosec": 1_000_000_000}, None),
-        ({"sec": None, "nanosec": 0}, None),
-    ],
-)
-def test_stamps(stamp: Any, sent: Any) -> None:
-    fields = from_detection3d_array(array(seen(result("bed")), stamp=stamp))
-    assert fields.get("stamp") == sent
-    assert reasons(fields) == ([] if sent else [(None, "no-stamp")])
 
 
 @pytest.mark.parametrize("viewpoint", [(1.0, -2.0, 0.5), {"x": 1.0, "y": -2.0, "yaw": 0.5}])

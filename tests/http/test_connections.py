@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.chaos.wire import BODY, Answer, Wire, exchange
+from tests.chaos.wire import BODY, LIVE, Answer, Wire, exchange
 from tests.http.stores import make_store
 from tests.http.test_problems import problem
 from tests.services import LiveService, launch, live_service, wait_until
@@ -21,7 +21,6 @@ HEAD = (
     b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     b"Content-Length: %d\r\n\r\n"
 )
-LIVE = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
 service = live_service(SCENE_CLIENT_TIMEOUT="1", logs_errors=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 from app.registry.card import render_card
 from app.registry.manifest import TensorEntry
-from tests.registry.small_artifacts import description
+from tests.registry.small_artifacts import DATA, FIGURE, description
 
 TENSORS = {
     "W": TensorEntry(dtype="float16", shape=(3, 5)),
@@ -16,13 +16,8 @@ TENSORS = {
 
 
 def source(name: str, *, research_only: bool) -> dict[str, Any]:
-    return {
-        "source": name,
-        "scenes": 8133,
-        "digest": "cd" * 32,
-        "terms": f"terms of {name}",
-        "research_only": research_only,
-    }
+    changes = {"scenes": 8133, "digest": "cd" * 32, "terms": f"terms of {name}"}
+    return DATA | changes | {"source": name, "research_only": research_only}
 
 
 def card(**changes: Any) -> str:
@@ -54,9 +49,8 @@ def test_warns_of_research_data_by_name_and_of_no_other() -> None:
 
 def test_a_source_is_a_column_and_a_figure_stands_once() -> None:
     """Sources that list no relations leave their cells empty."""
-    figure = {"value": 0.5, "low": 0.4, "high": 0.6, "n": 34}
     measured = [("T1", "R", "a"), ("T2", "MRR", "a"), ("T2", "MRR", "b"), ("T4", "MMD", "pooled")]
-    page = card(metrics=[{"task": t, "metric": m, "source": s} | figure for t, m, s in measured])
+    page = card(metrics=[{"task": t, "metric": m, "source": s} | FIGURE for t, m, s in measured])
     cell = "0.500 [0.400, 0.600]"
     lines = page.splitlines()
     first = lines.index("| Task | Metric | a | b | pooled |")

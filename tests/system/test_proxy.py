@@ -19,7 +19,7 @@ import yaml
 
 from app.settings import Settings
 from scene_client import Client
-from tests.chaos.wire import BODY, Wire, exchange, wires
+from tests.chaos.wire import BODY, LIVE, Wire, exchange, wires
 from tests.http.stores import make_store
 from tests.services import ADMIN_KEY, LiveService, is_ready, launch, live_service, wait_until
 from tests.system.conftest import Proxy, StartProxy
@@ -30,7 +30,6 @@ API_KEY = "incorrect-zebra-capacitor-nail"
 CONNECTIONS, REQUESTS = 30, 400
 SCENE = {"objects": ["bed", "lamp"]}
 HEAD = b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
-LIVE = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
 service = live_service(SCENE_CLIENT_TIMEOUT="3")
