@@ -168,8 +168,8 @@ def test_only_misplaced_relations_are_in_the_wrong_place(bedroom: Board) -> None
     assert bedroom.edges == [("misplaced", "on top of?")]
     expect(bedroom.page.locator("#legend .misplaced")).to_have_text("probably in the wrong place")
     expect(bedroom.page.locator("#alarms")).to_have_text("1")
-    assert "In the wrong place: lamp on top of bed." in bedroom.said
-    assert "Nothing looks wrong" not in bedroom.said
+    assert "In the wrong place: lamp on top of bed." in bedroom.announced
+    assert "Nothing looks wrong" not in bedroom.announced
 
 
 def test_sensitivity_sets_the_alarms(bedroom: Board, api: httpx.Client) -> None:

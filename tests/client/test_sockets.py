@@ -148,7 +148,7 @@ def test_a_refused_connection_is_unreachable_and_not_ready(open_caller: Any) -> 
 
 
 @every_client
-def test_the_key_and_the_time_left_are_told(peer: Any, open_caller: Any) -> None:
+def test_the_key_and_the_time_left_are_sent(peer: Any, open_caller: Any) -> None:
     heads: list[bytes] = []
     with open_caller(
         peer(partial(serve, heads=heads)).url + "/robot/", api_key="k" * 16, timeout=5.0

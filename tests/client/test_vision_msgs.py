@@ -195,7 +195,7 @@ def test_a_detection_without_a_sure_label_is_left_out_and_reported(
     assert reasons(fields) == [(0, reason)]
 
 
-def test_a_box_that_was_never_filled_in_gives_way_to_the_pose_of_the_hypothesis() -> None:
+def test_an_empty_box_is_replaced_by_the_pose_of_the_hypothesis() -> None:
     where = pose((1, 2, 3))
     empty = {"at": (0, 0, 0), "size": (0, 0, 0)}
     fields = from_detection3d_array(
@@ -328,7 +328,7 @@ def test_wrong_arguments_are_refused(wrong: dict[str, Any]) -> None:
         {"header": {"frame_id": "a\nb"}, "detections": []},
     ],
 )
-def test_what_is_no_message_is_refused(message: Any) -> None:
+def test_other_values_than_messages_are_refused(message: Any) -> None:
     with pytest.raises(MessageError):
         from_message(message)
 
@@ -393,7 +393,7 @@ def lefts(fields: SceneFields) -> set[tuple[str, str]]:
     return {(entry["subject"], entry["object"]) for entry in fields["relations"]}
 
 
-def test_an_image_tells_left_from_right_of_neighbours_and_nothing_else() -> None:
+def test_image_boxes_give_left_and_right_of_neighbours() -> None:
     fields = from_detection2d_array(
         array(
             flat("cup", 100, 100),
@@ -422,7 +422,7 @@ def test_a_turned_box_counts_as_the_upright_one_around_it() -> None:
     assert apart(math.pi / 2)
 
 
-def test_boxes_that_are_none_are_reported() -> None:
+def test_invalid_boxes_are_reported() -> None:
     fields = from_detection2d_array(
         array(
             flat("cup", 100, 100),

@@ -42,7 +42,7 @@ def test_names_are_those_of_this_machine_or_listed(
 
 
 @pytest.mark.anyio
-async def test_a_page_of_another_name_is_refused(shared_store: Path) -> None:
+async def test_requests_for_another_host_are_refused(shared_store: Path) -> None:
     accepted = ("127.0.0.1", "127.0.0.1:8000", "LOCALHOST:1", "[::1]:8000")
     others = ("evil.example", "127.0.0.1.evil.example", "localhost@evil.example")
     malformed = ("localhost:80:80", "localhost:port", "::1", "")

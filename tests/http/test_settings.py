@@ -94,7 +94,7 @@ def test_settings_come_from_the_environment(
         ("opentelemetry", "perhaps"),
     ],
 )
-def test_nonsense_is_refused(tmp_path: Path, name: str, value: object) -> None:
+def test_invalid_settings_are_refused(tmp_path: Path, name: str, value: object) -> None:
     with pytest.raises(ValidationError) as error:
         Settings(**{"store": tmp_path, name: value})
     (fault,) = error.value.errors()

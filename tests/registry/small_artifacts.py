@@ -48,8 +48,11 @@ JUDGING = {
 
 
 DATA = {
-    **{"source": "generated", "scenes": 12, "digest": "0" * 64},
-    **{"terms": "Apache-2.0", "research_only": False},
+    "source": "generated",
+    "scenes": 12,
+    "digest": "0" * 64,
+    "terms": "Apache-2.0",
+    "research_only": False,
 }
 FIGURE = {"value": 0.5, "low": 0.4, "high": 0.6, "n": 34}
 

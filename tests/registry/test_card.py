@@ -47,7 +47,7 @@ def test_warns_of_research_data_by_name_and_of_no_other() -> None:
     assert warned.index("commercial robot") < warned.index("## Model"), "before anything else"
 
 
-def test_a_source_is_a_column_and_a_figure_stands_once() -> None:
+def test_metrics_have_a_column_for_each_source() -> None:
     """Sources that list no relations leave their cells empty."""
     measured = [("T1", "R", "a"), ("T2", "MRR", "a"), ("T2", "MRR", "b"), ("T4", "MMD", "pooled")]
     page = card(metrics=[{"task": t, "metric": m, "source": s} | FIGURE for t, m, s in measured])
@@ -64,7 +64,7 @@ def test_a_source_is_a_column_and_a_figure_stands_once() -> None:
     assert "- misplaced: the relation is false" in page
 
 
-def test_text_stays_in_its_cell() -> None:
+def test_markdown_in_a_source_is_escaped() -> None:
     hostile = source("a|b\n\n# Heading", research_only=True)
     page = card(data=[hostile])
     assert "\n# Heading" not in page
