@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 # One thread per test, as in a serving worker. So tests do not compete for cores, and results do not
 # depend on the number of threads. This must come before the import of torch or numpy.
@@ -31,6 +33,16 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+def run_program(
+    *command: str | Path, status: int = 0, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Run a program in the repository with text in and out. Another exit status is an error."""
+    options = {"cwd": REPOSITORY, "timeout": 120, **options}
+    done = subprocess.run(command, capture_output=True, text=True, **options)
+    assert done.returncode == status, done.stdout + done.stderr
+    return done
 
 
 @pytest.fixture(scope="session")

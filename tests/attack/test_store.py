@@ -134,7 +134,7 @@ async def test_a_version_that_turns_hostile_goes_on_answering(published: Path) -
 
 
 @pytest.mark.parametrize("error", [OverflowError, MemoryError, RecursionError, KeyError])
-def test_any_failure_of_one_version_is_that_version_s(
+def test_any_error_of_one_version_refuses_only_this_version(
     published: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
     load = Store.load

@@ -122,7 +122,7 @@ class Board:
         ]
 
     @property
-    def said(self) -> str:
+    def announced(self) -> str:
         """What a screen reader was told last."""
         return plain(self.page.locator("#live").text_content())
 

@@ -151,7 +151,7 @@ def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
 def test_answers_and_movements_are_announced(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board()
     best = api.post("/missing", json=board.scene).json()["missing"][0]["label"]
-    assert f"Most likely missing: {best}" in board.said
+    assert f"Most likely missing: {best}" in board.announced
     board.thing("chair").focus()
     board.page.keyboard.press("ArrowUp")
     expect(board.page.locator("#live")).to_contain_text("chair: x 1.10, y 0.00")

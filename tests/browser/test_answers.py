@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.browser.driving import Board, OpenBoard, percent
+from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
 
@@ -168,8 +168,8 @@ def test_only_misplaced_relations_are_in_the_wrong_place(bedroom: Board) -> None
     assert bedroom.edges == [("misplaced", "on top of?")]
     expect(bedroom.page.locator("#legend .misplaced")).to_have_text("probably in the wrong place")
     expect(bedroom.page.locator("#alarms")).to_have_text("1")
-    assert "In the wrong place: lamp on top of bed." in bedroom.said
-    assert "Nothing looks wrong" not in bedroom.said
+    assert "In the wrong place: lamp on top of bed." in bedroom.announced
+    assert "Nothing looks wrong" not in bedroom.announced
 
 
 def test_sensitivity_sets_the_alarms(bedroom: Board, api: httpx.Client) -> None:
@@ -297,7 +297,7 @@ def test_the_curl_shown_gives_the_answer_shown(
     question = "relations"
     bedroom.tab("Relations")
     command = bedroom.curl(question)
-    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=True)
+    done = run_program("sh", "-c", command)
     answer, body = json.loads(done.stdout), bedroom.body(question)
     asked = ask(api, question, body)
     assert {**answer, "request_id": ""} == {**asked, "request_id": ""}
@@ -309,13 +309,8 @@ def test_the_python_call_shown_gives_the_same_answer(
     bedroom: Board, api: httpx.Client, repository: Path
 ) -> None:
     pytest.importorskip("scene_client")
-    done = subprocess.run(
-        [sys.executable, "-c", bedroom.python("missing")],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "PYTHONPATH": str(repository)},
-    )
+    environment = {**os.environ, "PYTHONPATH": str(repository)}
+    done = run_program(sys.executable, "-c", bedroom.python("missing"), env=environment)
     answer = ask(api, "missing", bedroom.body("missing"))
     shown = [(one["label"], one["probability"]) for one in json.loads(done.stdout)["missing"]]
     assert shown == [(one["label"], one["probability"]) for one in answer["missing"]]

@@ -104,7 +104,7 @@ def _chunked(*chunks: bytes, fields: Sequence[bytes] = ()) -> bytes:
     return _post(b"Transfer-Encoding: chunked", *fields, body=body, length=False)
 
 
-_LIVE: Final = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
+LIVE: Final = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
 _SMUGGLED: Final = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\nX-Request-Id: smuggled\r\n\r\n"
 
 
@@ -188,17 +188,17 @@ def _smuggling() -> Iterator[Wire]:
 
 
 def _heads() -> Iterator[Wire]:
-    yield Wire("no host", [_LIVE.replace(b"Host: localhost\r\n", b"")], (400,))
+    yield Wire("no host", [LIVE.replace(b"Host: localhost\r\n", b"")], (400,))
     yield Wire(
-        "two hosts", [_LIVE.replace(b"Host: localhost", b"Host: localhost\r\nHost: y")], (400,)
+        "two hosts", [LIVE.replace(b"Host: localhost", b"Host: localhost\r\nHost: y")], (400,)
     )
-    yield Wire("absolute form", [_LIVE.replace(b"GET /", b"GET http://elsewhere/")], (400,))
+    yield Wire("absolute form", [LIVE.replace(b"GET /", b"GET http://elsewhere/")], (400,))
     yield Wire("asterisk", [b"OPTIONS * HTTP/1.1\r\nHost: localhost\r\n\r\n"], (400,))
-    yield Wire("empty lines first", [b"\r\n" * 20 + _LIVE], (200,))
+    yield Wire("empty lines first", [b"\r\n" * 20 + LIVE], (200,))
     upgrade = (
         b"Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13"
     )
-    socket_wanted = _LIVE.replace(b"Host: localhost", upgrade)
+    socket_wanted = LIVE.replace(b"Host: localhost", upgrade)
     yield Wire("WebSocket without a key", [socket_wanted], (400,))
     for name, text in {
         "null bytes": b"\x00" * 100,
@@ -208,24 +208,24 @@ def _heads() -> Iterator[Wire]:
         "connect": b"CONNECT elsewhere:443 HTTP/1.1\r\nHost: localhost\r\n\r\n",
         "raw bytes in the path": b"GET /\xff\xfe HTTP/1.1\r\nHost: localhost\r\n\r\n",
         "space in the path": b"GET /a b HTTP/1.1\r\nHost: localhost\r\n\r\n",
-        "no colon": _LIVE.replace(b"Host: localhost", b"Host localhost"),
-        "control in a value": _LIVE.replace(b"Host: localhost", b"Host: localhost\r\nA: \x01\x02"),
-        "method in small letters": _LIVE.replace(b"GET", b"get"),
+        "no colon": LIVE.replace(b"Host: localhost", b"Host localhost"),
+        "control in a value": LIVE.replace(b"Host: localhost", b"Host: localhost\r\nA: \x01\x02"),
+        "method in small letters": LIVE.replace(b"GET", b"get"),
         "long method": b"A" * 5_000 + b" / HTTP/1.1\r\n\r\n",
     }.items():
         yield Wire(f"head: {name}", [text], (400,), closes=True)
     for name, text in {
         "long path": b"GET /" + b"a" * 20_000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
-        "long value": _LIVE.replace(b"Host: localhost", b"Host: localhost\r\nA: " + b"a" * 20_000),
-        "long name": _LIVE.replace(
+        "long value": LIVE.replace(b"Host: localhost", b"Host: localhost\r\nA: " + b"a" * 20_000),
+        "long name": LIVE.replace(
             b"Host: localhost", b"Host: localhost\r\n" + b"a" * 20_000 + b": b"
         ),
-        "many fields": _LIVE[:-2] + b"A: b\r\n" * 3_000 + b"\r\n",
-        "a hundred fields": _LIVE[:-2] + b"A: b\r\n" * 100 + b"\r\n",
+        "many fields": LIVE[:-2] + b"A: b\r\n" * 3_000 + b"\r\n",
+        "a hundred fields": LIVE[:-2] + b"A: b\r\n" * 100 + b"\r\n",
     }.items():
         yield Wire(f"head: {name}", [text], (400,), closes=True)
     yield Wire("HTTP/2", [b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"], None, closes=True)
-    yield Wire("line feeds alone", [_LIVE.replace(b"\r", b"")], (200,))
+    yield Wire("line feeds alone", [LIVE.replace(b"\r", b"")], (200,))
     yield Wire("HTTP/0.9", [b"GET /\r\n"], (400,), closes=True)
     # Closing with bytes unread resets the connection, which may overtake the answer.
     yield Wire(
@@ -238,12 +238,10 @@ def _heads() -> Iterator[Wire]:
 
 def _orders() -> Iterator[Wire]:
     """Many requests at once: answered in order, whatever comes behind them."""
-    yield Wire("two at once", [_post() + _LIVE], (200, 200))
-    yield Wire("sixty at once", [_LIVE * 60], (200,) * 60)
-    yield Wire("mixed", [_post() + _post(body=b"{") + _LIVE + _post()], (200, 400, 200, 200))
+    yield Wire("two at once", [_post() + LIVE], (200, 200))
+    yield Wire("sixty at once", [LIVE * 60], (200,) * 60)
+    yield Wire("mixed", [_post() + _post(body=b"{") + LIVE + _post()], (200, 400, 200, 200))
     yield Wire("noise behind", [_post() + b"\x00noise\r\n\r\n"], (200, 400), closes=True)
-    yield Wire(
-        "noise behind two", [_LIVE + _post() + b"\x00\r\n\r\n"], (200, 200, 400), closes=True
-    )
-    yield Wire("far too many at once", [_LIVE * 6_000], None, closes=True)
-    yield Wire("close, then more", [_post(b"Connection: close") + _LIVE], (200,), closes=True)
+    yield Wire("noise behind two", [LIVE + _post() + b"\x00\r\n\r\n"], (200, 200, 400), closes=True)
+    yield Wire("far too many at once", [LIVE * 6_000], None, closes=True)
+    yield Wire("close, then more", [_post(b"Connection: close") + LIVE], (200,), closes=True)

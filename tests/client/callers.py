@@ -25,7 +25,7 @@ from scene_client import (
     UnreachableError,
 )
 from scene_client.schemas import FieldError
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, run_program
 
 
 class Caller(Protocol):
@@ -113,8 +113,7 @@ def compiled(
         *(source, "-o", program),
         *found.stdout.split(),
     ]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    run_program(*command)
     return program
 
 

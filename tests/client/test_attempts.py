@@ -105,7 +105,7 @@ def promote(client: Client) -> Any:
     return client.promote("default", "home")
 
 
-def test_an_answer_of_a_newer_service_may_say_more() -> None:
+def test_unknown_fields_of_an_answer_are_ignored() -> None:
     assert World((200, {}, b'{"models": [], "aliases": {}, "mood": "fine"}')).run().models == []
     # Parts of answers that are parts of requests too are as patient.
     scene = {"objects": ["bed"], "log_score": -1.0, "context": {}, "mood": "fine"}
@@ -121,7 +121,7 @@ def test_an_answer_of_a_newer_service_may_say_more() -> None:
 
 
 @pytest.mark.parametrize("body", [b"", b"<html>", b"{}", b"[]", b'{"models": 1}'])
-def test_success_that_cannot_be_read_is_said_to_be_so(body: bytes) -> None:
+def test_an_unreadable_answer_is_an_error(body: bytes) -> None:
     world = World((200, {}, body))
     with pytest.raises(AnswerError, match="/models does not match the schema ModelList"):
         world.run()
@@ -177,14 +177,14 @@ def test_permanent_errors_are_not_retried(status: int) -> None:
         UnreachableError("gone"),
     ],
 )
-def test_errors_survive_the_way_between_processes(error: Exception) -> None:
+def test_errors_can_be_pickled(error: Exception) -> None:
     other = pickle.loads(pickle.dumps(error))
     assert type(other) is type(error)
     assert str(other) == str(error)
     assert vars(other) == vars(error)
 
 
-def test_an_error_that_is_no_problem_document_is_one_all_the_same() -> None:
+def test_other_error_answers_become_problems() -> None:
     with pytest.raises(ProblemError) as raised:
         World((502, {"x-request-id": "p7"}, b"<html>Bad Gateway</html>")).run()
     problem = raised.value
@@ -194,7 +194,7 @@ def test_an_error_that_is_no_problem_document_is_one_all_the_same() -> None:
         World((799, {}, b"")).run()
 
 
-def test_the_service_s_own_deadline_is_the_caller_s() -> None:
+def test_status_504_is_a_deadline_error() -> None:
     world = World(refusal(504))
     with pytest.raises(DeadlineError) as raised:
         world.run()
@@ -221,7 +221,7 @@ def test_a_promotion_is_retried_only_if_it_was_not_sent() -> None:
     assert len(world.told) == RETRIES + 1
 
 
-def test_an_answer_that_is_complete_after_the_deadline_is_none(
+def test_a_late_answer_is_a_deadline_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(FINE)

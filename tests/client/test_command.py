@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from scene_client.schemas import (
     RelationsAnswer,
 )
 from tests.client.peers import answer, read_head
+from tests.conftest import run_program
 
 ANSWERED: dict[str, Any] = {
     "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
@@ -46,7 +46,7 @@ def scene(url: str, monkeypatch: pytest.MonkeyPatch) -> Any:
     return run
 
 
-def test_a_place_in_a_file_is_a_place(scene: Any, tmp_path: Path) -> None:
+def test_at_in_a_file_equals_the_option_at(scene: Any, tmp_path: Path) -> None:
     body = {"objects": ["bed"], "at": ["on-top", "bed"], "candidates": ["lamp"]}
     (tmp_path / "scene.json").write_text(json.dumps(body))
     by_option = scene("missing", "bed", "--at", "on-top bed", "--candidates", "lamp")
@@ -54,7 +54,7 @@ def test_a_place_in_a_file_is_a_place(scene: Any, tmp_path: Path) -> None:
     assert scene("missing", str(tmp_path / "scene.json")).stdout == by_option.stdout
 
 
-def test_what_is_missing_is_a_table(scene: Any, url: str) -> None:
+def test_missing_objects_are_a_table(scene: Any, url: str) -> None:
     done = scene("missing", "bed", "nightstand", "--at", "on-top nightstand", "--top-k", "2")
     assert done.exit_code == 0
     with Client(url) as client:
@@ -146,7 +146,7 @@ def test_scenes_are_drawn(scene: Any, tmp_path: Path) -> None:
     assert "cannot draw the picture" in done.stderr
 
 
-def test_without_matplotlib_nothing_is_asked_and_the_way_out_is_said(
+def test_plot_without_matplotlib_names_the_package(
     scene: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("scene_client.command.find_spec", lambda _: None)
@@ -224,7 +224,7 @@ NOT_FINITE = """{"detections": [{"id": "\\"NaN", "results": [{
 """A flat box, and numbers that JSON lacks where the box makes them unnecessary."""
 
 
-def test_numbers_that_json_lacks_stop_no_message(scene: Any) -> None:
+def test_nan_and_infinity_are_read(scene: Any) -> None:
     done = scene("outliers", "-", "--json", stdin=NOT_FINITE)
     assert done.exit_code == 0, done.stderr
     found = json.loads(done.stdout)
@@ -333,7 +333,7 @@ def test_unknown_labels_can_be_ignored(scene: Any) -> None:
     ("status", "body", "code"),
     [(b"503 No", b"{}", 5), (b"429 No", b"{}", 5), (b"500 No", b"{}", 6), (b"200 OK", b"{}", 6)],
 )
-def test_busy_is_5_and_anything_else_6(
+def test_exit_status_of_a_busy_and_of_a_defective_service(
     scene: Any, peer: Any, status: bytes, body: bytes, code: int
 ) -> None:
     started = peer(
@@ -343,7 +343,7 @@ def test_busy_is_5_and_anything_else_6(
     assert (done.exit_code, done.stdout) == (code, "")
 
 
-def test_readiness_is_told_by_the_exit_status(scene: Any, peer: Any) -> None:
+def test_exit_status_of_ready(scene: Any, peer: Any) -> None:
     assert scene("ready").exit_code == 0
     assert scene("ready", "--url", "http://127.0.0.1:9").exit_code == 3
     silent = peer(lambda connection: (read_head(connection), connection.recv(1)))
@@ -356,7 +356,7 @@ def test_readiness_is_told_by_the_exit_status(scene: Any, peer: Any) -> None:
     assert starting.connections == 1
 
 
-def test_the_version_is_told_without_a_service(scene: Any) -> None:
+def test_the_version_needs_no_service(scene: Any) -> None:
     done = scene("--version")
     assert (done.exit_code, done.stdout) == (0, f"scene {__version__}\n")
 
@@ -375,17 +375,9 @@ def test_the_key_is_taken_from_the_environment(
     assert b"x-api-key: " + b"k" * 16 in heads[0]
 
 
-def test_it_is_a_program(repository: Path, url: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "scene_client", "outliers", "bed", "lamp"],
-        cwd=repository,
-        env={**os.environ, "SCENE_URL": url},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "log-odds" in done.stdout
+def test_the_package_is_a_program(url: str) -> None:
+    command = (sys.executable, "-W", "error", "-m", "scene_client", "outliers", "bed", "lamp")
+    assert "log-odds" in run_program(*command, env={**os.environ, "SCENE_URL": url}).stdout
 
 
 def shown(renderable: Any) -> str:
@@ -428,7 +420,7 @@ def test_offsets_reasons_and_disagreements_are_shown_where_an_answer_has_them() 
     assert "on-top 0.900" in text
 
 
-def test_words_of_a_service_cannot_dress_themselves_up() -> None:
+def test_markup_of_a_service_is_not_rendered() -> None:
     hostile = Outlier(
         object="[red]x[/red]",
         label=":bed:",
@@ -441,7 +433,7 @@ def test_words_of_a_service_cannot_dress_themselves_up() -> None:
     assert "[red]x[/red]" in text
 
 
-def test_of_many_given_relations_the_likeliest_to_be_wrong_are_shown() -> None:
+def test_the_likeliest_misplaced_relations_are_shown() -> None:
     given = [
         MisplacedRelation(subject=f"a_{i}", relation="left", object="b", probability=1 - i / 40)
         for i in range(12)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from scene_client import (
 )
 from tests.client.callers import Caller
 from tests.client.conftest import EVERY
-from tests.conftest import REPOSITORY
+from tests.conftest import run_program
 from tests.http.stores import make_store
 from tests.services import ADMIN_KEY, LiveService, launch
 
@@ -106,7 +105,7 @@ def test_the_text_of_a_problem_has_the_first_errors(caller: Caller) -> None:
 
 
 @every_client
-def test_a_passed_deadline_is_an_error_and_the_client_stays_usable(caller: Caller) -> None:
+def test_a_client_is_usable_after_a_deadline_error(caller: Caller) -> None:
     long = {"objects": [], "count": 64, "steps": 2000, "temperature": 1.5}
     for timeout in (0.001, 0.02):
         with pytest.raises(DeadlineError, match=f"within {timeout:g} s"):
@@ -114,9 +113,7 @@ def test_a_passed_deadline_is_an_error_and_the_client_stays_usable(caller: Calle
     assert caller("missing", {"objects": ["bed"]})["missing"]
 
 
-def test_clients_without_a_service_answer_the_whole_catalogue_alike(
-    url: str, shared_store: Path
-) -> None:
+def test_offline_and_online_clients_list_models_alike(url: str, shared_store: Path) -> None:
     with Client(url) as online, OfflineClient(shared_store) as offline:
         for ask in (
             lambda client: client.model("home"),
@@ -143,19 +140,14 @@ except DeadlineError:
 def test_an_unclosed_offline_client_does_not_block_the_exit(
     shared_store: Path,
 ) -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", UNCLOSED, shared_store],
-        cwd=REPOSITORY,
-        # What the environment says of a service does not concern it.
-        env={**os.environ, "SCENE_API_KEY": "short", "SCENE_STORE": "/nowhere"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "late\n", "")
+    # The client ignores the settings of a service.
+    environment = {**os.environ, "SCENE_API_KEY": "short", "SCENE_STORE": "/nowhere"}
+    command = (sys.executable, "-W", "error", "-c", UNCLOSED, shared_store)
+    done = run_program(*command, env=environment)
+    assert (done.stdout, done.stderr) == ("late\n", "")
 
 
-def test_a_store_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_an_offline_client_needs_a_folder(tmp_path: Path) -> None:
     with pytest.raises(InvalidRequestError, match="directory"):
         OfflineClient(tmp_path / "nowhere")
 

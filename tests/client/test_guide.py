@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from tests.client import callers
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, run_program
 
 GUIDE = (REPOSITORY / "docs" / "clients.md").read_text(encoding="utf-8")
 
@@ -24,15 +23,12 @@ def test_the_cpp_block_compiles_and_runs(
     (program,) = re.findall(r"^```cpp\n(.*?)^```$", GUIDE, flags=re.MULTILINE | re.DOTALL)
     source = tmp_path / "block.cpp"
     source.write_text(program)
-    found = callers.compiled(
+    block = callers.compiled(
         source, tmp_path / "block", require_system_tool("g++"), require_system_tool("pkg-config")
     )
-    done = subprocess.run([found, url], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip().strip('"')
-    done = subprocess.run([found, "robot:8000"], capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr
+    assert run_program(block, url).stdout.strip().strip('"')
+    done = run_program(block, "robot:8000", status=2)
+    assert (done.stdout, bool(done.stderr)) == ("", True)
 
 
 @pytest.mark.slow
@@ -43,22 +39,14 @@ def test_the_cpp_example_is_made_and_asks_all_four_questions(
     # Asking for `bridge` leaves this test out where the libraries are missing.
     folder = shutil.copytree(REPOSITORY / "clients" / "cpp", tmp_path / "cpp")
     make = require_system_tool("make")
-    done = subprocess.run([make, "-C", folder, "CXXFLAGS=-O0"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-    def run(where: str, seconds: str = "30") -> subprocess.CompletedProcess[str]:
-        arguments = [folder / "example", where, seconds]
-        return subprocess.run(arguments, capture_output=True, text=True, timeout=60)
-
-    done = run(url)
-    assert done.returncode == 0, done.stderr
+    run_program(make, "-C", folder, "CXXFLAGS=-O0")
+    example = folder / "example"
+    answered = run_program(example, url, "30").stdout
     for heading in ("Missing:", "How they stand:", "Least fitting first:", "A scene like it:"):
-        assert heading in done.stdout
-    done = run("http://127.0.0.1:9")
-    assert (done.returncode, done.stdout) == (2, "Missing:\n")
-    assert done.stderr.startswith("cannot reach http://127.0.0.1:9: connection refused")
-    # What was mistyped is said, and ends nothing by force.
-    done = run("robot:8000")
-    assert (done.returncode, done.stderr) == (2, "the URL must begin with http://\n")
-    done = run(url, "soon")
-    assert (done.returncode, done.stderr) == (2, "SECONDS must be a number, not 'soon'\n")
+        assert heading in answered
+    for arguments, error in (
+        (["http://127.0.0.1:9"], "cannot reach http://127.0.0.1:9: connection refused"),
+        (["robot:8000"], "the URL must begin with http://\n"),
+        ([url, "soon"], "SECONDS must be a number, not 'soon'\n"),
+    ):
+        assert run_program(example, *arguments, status=2).stderr.startswith(error)

@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 
 from scripts import sync_client
+from tests.conftest import run_program
 
 
 def test_the_blocking_client_is_up_to_date():
@@ -61,14 +62,7 @@ except ImportError as error:
 """
 
 
-def test_the_client_works_where_nothing_of_the_service_is_installed(repository: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", PROGRAM],
-        cwd=repository,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
+def test_the_client_works_where_nothing_of_the_service_is_installed() -> None:
+    done = run_program(sys.executable, "-W", "error", "-c", PROGRAM)
     # Whoever wants answers without a service is told what that takes.
     assert "pip install '.[service]' in the repository" in done.stdout

@@ -64,7 +64,7 @@ def scene(recorder: Recorder) -> Client:
     return Client("http://robot/api/", transport=httpx.MockTransport(recorder))
 
 
-def test_only_what_was_said_is_sent(scene: Client, recorder: Recorder) -> None:
+def test_only_set_fields_are_sent(scene: Client, recorder: Recorder) -> None:
     scene.missing(["bed", "nightstand"], at=("on-top", "nightstand"), top_k=5)
     assert recorder.body == {
         "objects": ["bed", "nightstand"],
@@ -74,7 +74,7 @@ def test_only_what_was_said_is_sent(scene: Client, recorder: Recorder) -> None:
     assert recorder.requests[-1].headers["content-type"] == "application/json"
 
 
-def test_short_and_long_forms_say_the_same(scene: Client, recorder: Recorder) -> None:
+def test_short_and_long_forms_are_sent_alike(scene: Client, recorder: Recorder) -> None:
     lamp = Detection(label="lamp", id="l", position=Position(x=1.0, y=0.0, z=0.5))
     plain = {"label": "lamp", "id": "l", "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
     stated = {"subject": "l", "relation": "on-top", "object": "desk"}
@@ -162,7 +162,7 @@ def test_invalid_requests_are_not_sent(
 
 
 @pytest.mark.parametrize("url", ["", "robot:8000", "ftp://robot", "http://", "http://robot?a=b"])
-def test_an_address_that_is_none_is_refused_at_once(url: str) -> None:
+def test_invalid_urls_are_refused(url: str) -> None:
     with pytest.raises(InvalidRequestError, match="URL"):
         Client(url)
     with pytest.raises(InvalidRequestError, match="URL"):
@@ -206,7 +206,7 @@ def test_keys_go_where_they_are_needed_and_nowhere_else(recorder: Recorder) -> N
     assert "bbbb" not in repr(scene.options)
 
 
-def test_moving_an_alias_says_what_it_expects_only_if_told() -> None:
+def test_expected_is_sent_only_if_set() -> None:
     recorder = Recorder({"request_id": "r", "alias": "a/b", "model": "home"})
     scene = Client("http://robot", admin_key="b" * 16, transport=httpx.MockTransport(recorder))
     scene.promote("default", "home")

@@ -7,6 +7,7 @@ import ssl
 import subprocess
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,9 +29,12 @@ from tests.client.conftest import OVER_HTTP
 from tests.client.peers import answer, read_head
 
 
-def serve(connection: socket.socket) -> None:
+def serve(connection: socket.socket, heads: list[bytes] | None = None) -> None:
+    """Answer each request, and record its head."""
     while True:
-        read_head(connection)
+        head = read_head(connection)
+        if heads is not None:
+            heads.append(head)
         answer(connection)
 
 
@@ -103,13 +107,7 @@ def test_no_service_holds_a_call_beyond_the_deadline(
 
 
 def test_nothing_is_sent_after_the_deadline(peer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    heads = []
-
-    def listen(connection: socket.socket) -> None:
-        while True:
-            heads.append(read_head(connection))
-            answer(connection)
-
+    heads: list[bytes] = []
     clock = SimpleNamespace(stands=0.0)
     connect = httpcore.SyncBackend.connect_tcp
 
@@ -120,7 +118,7 @@ def test_nothing_is_sent_after_the_deadline(peer: Any, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(connection, "monotonic", lambda: clock.stands)
     monkeypatch.setattr(httpcore.SyncBackend, "connect_tcp", connect_for_long)
-    started = peer(listen)
+    started = peer(partial(serve, heads=heads))
     with Client(started.url, timeout=5.0) as scene:
         with pytest.raises(DeadlineError):
             scene.models()
@@ -150,15 +148,11 @@ def test_a_refused_connection_is_unreachable_and_not_ready(open_caller: Any) -> 
 
 
 @every_client
-def test_the_key_and_the_time_left_are_told(peer: Any, open_caller: Any) -> None:
-    heads = []
-
-    def listen(connection: socket.socket) -> None:
-        while True:
-            heads.append(read_head(connection))
-            answer(connection)
-
-    with open_caller(peer(listen).url + "/robot/", api_key="k" * 16, timeout=5.0) as call:
+def test_the_key_and_the_time_left_are_sent(peer: Any, open_caller: Any) -> None:
+    heads: list[bytes] = []
+    with open_caller(
+        peer(partial(serve, heads=heads)).url + "/robot/", api_key="k" * 16, timeout=5.0
+    ) as call:
         call("is_ready")
     (head,) = heads
     assert head.startswith(b"GET /robot/health/ready HTTP/1.1\r\n")

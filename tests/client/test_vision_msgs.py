@@ -195,7 +195,7 @@ def test_a_detection_without_a_sure_label_is_left_out_and_reported(
     assert reasons(fields) == [(0, reason)]
 
 
-def test_a_box_that_was_never_filled_in_gives_way_to_the_pose_of_the_hypothesis() -> None:
+def test_an_empty_box_is_replaced_by_the_pose_of_the_hypothesis() -> None:
     where = pose((1, 2, 3))
     empty = {"at": (0, 0, 0), "size": (0, 0, 0)}
     fields = from_detection3d_array(
@@ -249,17 +249,30 @@ def test_the_most_confident_of_too_many_are_kept_in_their_order() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frame", "sent"),
+    ("header", "field", "sent", "reasons_"),
     [
-        ("base_link", "base_link"),
-        ("/camera_optical_frame", "camera_optical_frame"),
-        ("//robot/map", "robot/map"),
-        ("", None),
-        ("/", None),
+        *[
+            ({"frame": frame}, "frame_id", sent, [])
+            for frame, sent in (
+                ("base_link", "base_link"),
+                ("/camera_optical_frame", "camera_optical_frame"),
+                ("//robot/map", "robot/map"),
+                ("", None),
+                ("/", None),
+            )
+        ],
+        ({"stamp": {"sec": 5, "nanosec": 6}}, "stamp", {"sec": 5, "nanosec": 6}, []),
+        # ROS 1
+        ({"stamp": {"secs": 5, "nsecs": 6}}, "stamp", {"sec": 5, "nanosec": 6}, []),
+        ({"stamp": {"sec": 5, "nanosec": 1_000_000_000}}, "stamp", None, [(None, "no-stamp")]),
+        ({"stamp": {"sec": None, "nanosec": 0}}, "stamp", None, [(None, "no-stamp")]),
     ],
 )
-def test_frames_lose_their_leading_slash(frame: str, sent: str | None) -> None:
-    assert from_detection3d_array(array(seen(result("bed")), frame=frame)).get("frame_id") == sent
+def test_frame_and_stamp_of_the_header(
+    header: dict[str, Any], field: str, sent: Any, reasons_: Any
+) -> None:
+    fields = from_detection3d_array(array(seen(result("bed")), **header))
+    assert (fields.get(field), reasons(fields)) == (sent, reasons_)
 
 
 def test_the_frame_of_the_detections_serves_where_the_message_names_none() -> None:
@@ -274,21 +287,6 @@ def test_the_frame_of_the_detections_serves_where_the_message_names_none() -> No
     assert fields["frame_id"] == "odom"
     assert ["position" in thing for thing in fields["objects"]] == [True, True, False]
     assert reasons(fields) == [(2, "no-position")]
-
-
-@pytest.mark.parametrize(
-    ("stamp", "sent"),
-    [
-        ({"sec": 5, "nanosec": 6}, {"sec": 5, "nanosec": 6}),
-        ({"secs": 5, "nsecs": 6}, {"sec": 5, "nanosec": 6}),  # ROS 1
-        ({"sec": 5, "nanosec": 1_000_000_000}, None),
-        ({"sec": None, "nanosec": 0}, None),
-    ],
-)
-def test_stamps(stamp: Any, sent: Any) -> None:
-    fields = from_detection3d_array(array(seen(result("bed")), stamp=stamp))
-    assert fields.get("stamp") == sent
-    assert reasons(fields) == ([] if sent else [(None, "no-stamp")])
 
 
 @pytest.mark.parametrize("viewpoint", [(1.0, -2.0, 0.5), {"x": 1.0, "y": -2.0, "yaw": 0.5}])
@@ -330,7 +328,7 @@ def test_wrong_arguments_are_refused(wrong: dict[str, Any]) -> None:
         {"header": {"frame_id": "a\nb"}, "detections": []},
     ],
 )
-def test_what_is_no_message_is_refused(message: Any) -> None:
+def test_other_values_than_messages_are_refused(message: Any) -> None:
     with pytest.raises(MessageError):
         from_message(message)
 
@@ -395,7 +393,7 @@ def lefts(fields: SceneFields) -> set[tuple[str, str]]:
     return {(entry["subject"], entry["object"]) for entry in fields["relations"]}
 
 
-def test_an_image_tells_left_from_right_of_neighbours_and_nothing_else() -> None:
+def test_image_boxes_give_left_and_right_of_neighbours() -> None:
     fields = from_detection2d_array(
         array(
             flat("cup", 100, 100),
@@ -424,7 +422,7 @@ def test_a_turned_box_counts_as_the_upright_one_around_it() -> None:
     assert apart(math.pi / 2)
 
 
-def test_boxes_that_are_none_are_reported() -> None:
+def test_invalid_boxes_are_reported() -> None:
     fields = from_detection2d_array(
         array(
             flat("cup", 100, 100),

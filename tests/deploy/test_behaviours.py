@@ -158,7 +158,7 @@ def test_a_tick_never_waits_and_a_condition_fails_in_time(behaviours: Any, plant
     client.answering.set()
 
 
-def test_the_next_time_it_asks_about_the_scene_of_that_time(behaviours: Any, plant: Plant) -> None:
+def test_an_interrupted_condition_uses_the_next_scene(behaviours: Any, plant: Plant) -> None:
     client, scenes = Slow(), iter([["bed"], ["lamp"], ["sofa"]])
     condition = behaviours.SceneComplete(
         "complete", client, lambda: {"objects": next(scenes)}, timeout=30.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import socket
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import pytest
 from scene_client import Client
 from scene_client.vision_msgs import SceneFields
 from tests.client import callers
+from tests.conftest import run_program
 from tests.services import LiveService
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
@@ -39,14 +39,8 @@ def program(
 
 def tick(program: Path, url: str, kind: str, *ports: Any, timeout: float = 20.0) -> list[Any]:
     """What becomes of one condition, ticked to its end with one set of ports after the other."""
-    done = subprocess.run(
-        [program, url, kind, str(timeout)],
-        input="".join(json.dumps(entry) + "\n" for entry in ports),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
+    lines = "".join(json.dumps(entry) + "\n" for entry in ports)
+    done = run_program(program, url, kind, str(timeout), input=lines)
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 

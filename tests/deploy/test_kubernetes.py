@@ -19,6 +19,7 @@ import yaml
 from app.main import create_app
 from app.registry import AliasTarget, Store, load_model_set
 from app.settings import Settings
+from tests.conftest import run_program
 from tests.http.stores import make_store
 from tests.services import wait_until
 from tests.system.test_container import split_stages
@@ -54,9 +55,7 @@ def rendered(
     edited.write_text(text + "components: [../../monitoring]\n", "utf-8")
 
     def render(name: str) -> str:
-        command = [kubectl, "kustomize", copy / "overlays" / name]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
+        done = run_program(kubectl, "kustomize", copy / "overlays" / name)
         assert not done.stderr  # warnings of outdated fields
         return done.stdout
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
+from tests.conftest import run_program
 from tests.services import LiveService
 
 
@@ -46,16 +46,9 @@ def bridge(*published: Any) -> Iterator[tuple[str, list[Any]]]:
 
 def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
     script = repository / "clients" / "ros2" / "over_rosbridge.py"
-    done = subprocess.run(
-        [sys.executable, str(script), *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        cwd=repository,
-        env={"PYTHONPATH": str(repository), "PATH": "/usr/bin:/bin"},
-    )
-    # A bridge that hangs up is never the end that was wanted: whoever supervises this restarts it.
-    assert done.returncode == 1, done.stderr
+    # The bridge hung up: the status tells a supervisor to restart the program.
+    environment = {"PYTHONPATH": str(repository), "PATH": "/usr/bin:/bin"}
+    done = run_program(sys.executable, script, *arguments, status=1, env=environment)
     *errors, last = done.stderr.splitlines()
     assert last.startswith(("the bridge at ws://", "no bridge at "))
     return [json.loads(line) for line in done.stdout.splitlines()], errors

@@ -155,7 +155,7 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
     assert running.published("~/answers") == []
 
 
-def test_a_service_that_is_not_there_is_diagnosed_and_its_return_noticed(
+def test_an_unreachable_service_is_diagnosed_until_it_returns(
     run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
     running = run(url="http://127.0.0.1:9", timeout=0.5)
@@ -169,7 +169,7 @@ def test_a_service_that_is_not_there_is_diagnosed_and_its_return_noticed(
     assert running.status().level == 0
 
 
-def test_a_view_of_nothing_asks_nothing(run: Callable[..., Running]) -> None:
+def test_empty_detections_send_no_request(run: Callable[..., Running]) -> None:
     running = run(url="http://127.0.0.1:9")
     assert running.answer(blank(STORE, "vision_msgs/msg/Detection3DArray"))["notes"] == []
     assert (running.status().level, running.status().message) == (1, "nothing was seen")

@@ -77,13 +77,13 @@ def test_data_can_be_read(block: Block) -> None:
 
 
 @pytest.mark.parametrize("page", sorted(RUN_BY.keys() & BLOCKS.keys()))
-def test_pages_that_are_run_elsewhere_are(page: str) -> None:
+def test_pages_run_by_scripts_are_named_there(page: str) -> None:
     assert page in (REPOSITORY / RUN_BY[page]).read_text(encoding="utf-8")
 
 
 @pytest.mark.system
 @pytest.mark.parametrize("page", WITH_CODE)
-def test_a_page_does_what_it_says(
+def test_the_code_of_a_page_runs(
     workplace: Workplace, page: str, eval_example: EvalExample, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "path", [*sys.path])  # a page may add to it

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -16,7 +15,7 @@ import pytest
 from playwright.sync_api import sync_playwright
 
 from scripts.site import DIRECTIVE, checks
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, run_program
 from tests.docs.conftest import Workplace
 from tests.services import http_server
 
@@ -32,15 +31,8 @@ CODE = re.compile(r"<(code|pre|script|style|math)\b.*?</\1>", re.DOTALL)
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The site, built as `make docs` does it."""
     folder = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
-        cwd=REPOSITORY,
-        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    command = (sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder)
+    done = run_program(*command, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"})
     assert "WARNING" not in done.stderr
     return folder
 
@@ -101,15 +93,7 @@ def test_every_test_that_a_formula_names_exists() -> None:
 
 @pytest.mark.system
 def test_one_command_builds_it(workplace: Workplace) -> None:
-    done = subprocess.run(
-        ["make", "docs"],
-        cwd=workplace.folder,
-        env=workplace.environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    run_program("make", "docs", cwd=workplace.folder, env=workplace.environment)
     assert (workplace.folder / "build" / "site" / "index.html").is_file()
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -122,3 +124,18 @@ def draw_states(
     if joint.machine.spec.variant == "triway":
         edges = joint.machine.edges(torch.arange(joint.machine.spec.V).expand(count, -1))
     return State(joint.v[pick], joint.h1[pick], joint.h2[pick], joint.r[pick], edges)
+
+
+def check_frequencies(codes: np.ndarray, keys: np.ndarray, p: np.ndarray) -> None:
+    """Compare a histogram of codes with the law p of the sorted keys.
+
+    The total variation is within 1.1 of its mean for exact draws, and McDiarmid's slack: one chain
+    moves it by 1/N, so P(TV > E + t) <= exp(-2 N t²) = 1e-9.
+    """
+    index = np.searchsorted(keys, codes).clip(max=len(keys) - 1)
+    assert (keys[index] == codes).all()
+    assert (p[index] > 0).all(), "a state of probability zero"
+    frequency = np.bincount(index, minlength=len(keys)) / len(codes)
+    floor = 0.5 * np.sqrt(2 * p * (1 - p) / (math.pi * len(codes))).sum()
+    slack = math.sqrt(9 * math.log(10) / (2 * len(codes)))
+    assert 0.5 * np.abs(frequency - p).sum() < 1.1 * floor + slack

@@ -15,7 +15,12 @@ import torch
 
 from app.inference.chains import Conditions, SceneChains, random_stream
 from app.inference.relations import Given
-from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+from tests.enumeration.small_machines import (
+    SMALL,
+    check_frequencies,
+    enumerate_joint,
+    small_machine,
+)
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
 from training.machines.chain_samples import ChainSamples, pack_scenes
@@ -23,8 +28,6 @@ from training.machines.edges import present_classes
 from training.machines.gibbs import Clamp, run, sample_relations
 
 CHAINS = 10_000
-# McDiarmid: one chain moves a total variation by 1/N, so P(TV > E + t) <= exp(-2 N t²) = 1e-9.
-SLACK = math.sqrt(9 * math.log(10) / (2 * CHAINS))
 NAMES = [name for name, spec in SMALL.items() if spec.form == "local"]
 NOTHING = np.zeros(0, dtype=np.int64)
 
@@ -95,13 +98,7 @@ def check_stationary(name, condition, given, room=None, beta=1.0):
         if not spec.G:
             r[chain][:, drawn.classes[:, None], drawn.classes] = drawn.r
         v[chain, drawn.classes], h1[chain, drawn.h1] = 1, 1
-    found = code(v, r, h1)
-    place = np.searchsorted(keys, found).clip(max=len(keys) - 1)
-    assert (keys[place] == found).all()
-    assert (p[place] > 0).all(), "a state of probability zero"
-    frequency = np.bincount(place, minlength=len(keys)) / CHAINS
-    floor = 0.5 * np.sqrt(2 * p * (1 - p) / (math.pi * CHAINS)).sum()
-    assert 0.5 * np.abs(frequency - p).sum() < 1.1 * floor + SLACK
+    check_frequencies(code(v, r, h1), keys, p)
 
 
 @pytest.mark.parametrize("name", NAMES)

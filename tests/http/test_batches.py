@@ -58,7 +58,7 @@ async def test_a_batch_holds_1_to_256_scenes(client: httpx.AsyncClient, scenes: 
 
 
 @pytest.mark.parametrize("fault", ["raised", math.nan])
-async def test_a_defect_spoils_one_entry_only(
+async def test_a_defect_affects_one_entry(
     client: httpx.AsyncClient, replace: Replace, fault: Any
 ) -> None:
     def fail_on_sofas(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
@@ -79,7 +79,7 @@ async def test_a_defect_spoils_one_entry_only(
     assert (await client.post("/outliers", json=scenes[1])).status_code == 500
 
 
-async def test_a_name_may_be_that_of_what_is_no_number(client: httpx.AsyncClient) -> None:
+async def test_an_id_may_be_the_text_nan(client: httpx.AsyncClient) -> None:
     objects = [{"id": "NaN", "label": "bed"}, {"id": "-Infinity", "label": "lamp"}]
     answer = (await client.post("/outliers", json={"objects": objects})).json()
     assert {entry["object"] for entry in answer["outliers"]} == {"NaN", "-Infinity"}

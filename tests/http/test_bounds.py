@@ -38,7 +38,7 @@ async def test_a_deadline_is_a_whole_number_within_the_limit(shared_store: Path)
 
 
 @pytest.mark.anyio
-async def test_drawing_past_the_deadline_is_a_504_and_delays_nobody(
+async def test_generate_past_its_deadline_gets_504_and_delays_no_request(
     shared_store: Path, hold: Hold
 ) -> None:
     async with serve(shared_store) as client:
@@ -57,7 +57,7 @@ async def test_drawing_past_the_deadline_is_a_504_and_delays_nobody(
 
 
 @pytest.mark.anyio
-async def test_the_service_s_own_deadline_holds_without_a_header(
+async def test_the_default_deadline_applies_without_a_header(
     shared_store: Path, hold: Hold
 ) -> None:
     async with serve(shared_store, request_timeout_ms=200) as client:
@@ -66,7 +66,7 @@ async def test_the_service_s_own_deadline_holds_without_a_header(
 
 
 @pytest.mark.anyio
-async def test_rows_that_no_queue_has_room_for_are_a_429(shared_store: Path, hold: Hold) -> None:
+async def test_a_full_queue_gets_429(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store, queue_rows=256) as client:
         release = hold("generate").release
         drawing = [
@@ -94,7 +94,7 @@ async def test_rows_that_no_queue_has_room_for_are_a_429(shared_store: Path, hol
 
 
 @pytest.mark.anyio
-async def test_batches_give_their_rows_back(shared_store: Path) -> None:
+async def test_a_batch_frees_its_queue_rows(shared_store: Path) -> None:
     async with serve(shared_store, queue_rows=256) as client:
         scenes: list[Any] = [SCENE, {**SCENE, "model": "nobody"}, {"model": 7}, [], SCENE]
         for _ in range(2):
@@ -106,7 +106,7 @@ async def test_batches_give_their_rows_back(shared_store: Path) -> None:
 
 
 @pytest.mark.anyio
-async def test_nothing_is_told_to_wait_once_it_has_ended(shared_store: Path, hold: Hold) -> None:
+async def test_pending_rows_are_zero_after_a_request(shared_store: Path, hold: Hold) -> None:
     """After a batch, and after work that was given up, the gauge is back at 0."""
     async with serve(shared_store) as client:
 
@@ -173,7 +173,7 @@ sys.exit(main())
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_at_its_end_the_service_answers_everything_and_closes_connections(
+def test_a_stopping_service_answers_requests_in_progress(
     shared_store: Path, tmp_path: Path
 ) -> None:
     begun, release = tmp_path / "begun", tmp_path / "release"

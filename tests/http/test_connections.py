@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.chaos.wire import BODY, Answer, Wire, exchange
+from tests.chaos.wire import BODY, LIVE, Answer, Wire, exchange
 from tests.http.stores import make_store
 from tests.http.test_problems import problem
 from tests.services import LiveService, launch, live_service, wait_until
@@ -21,7 +21,6 @@ HEAD = (
     b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     b"Content-Length: %d\r\n\r\n"
 )
-LIVE = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
 service = live_service(SCENE_CLIENT_TIMEOUT="1", logs_errors=True)
@@ -36,7 +35,7 @@ def connect(service: LiveService) -> socket.socket:
     [HEAD % len(BODY), HEAD % len(BODY) + BODY[:-1], HEAD % 250_000 + b" " * 200_000],
     ids=["no body", "part of a body", "part of a large body"],
 )
-def test_the_rest_of_a_body_is_not_waited_for(service: LiveService, part: bytes) -> None:
+def test_an_unfinished_body_gets_408(service: LiveService, part: bytes) -> None:
     (answer,), closed = exchange(service.port, Wire("", [part], None))
     is_problem(answer, 408, "request-timeout")
     assert closed
@@ -67,7 +66,7 @@ def test_an_upgrade_request_gets_a_plain_answer(
     assert "WebSocket" not in service.log.read_text()
 
 
-def test_a_byte_now_and_then_keeps_no_connection(service: LiveService) -> None:
+def test_slow_bodies_are_disconnected(service: LiveService) -> None:
     """Sixty bodies at once; others are answered meanwhile, and all sixty are ended."""
     before = service.control()
     files = service.descriptors
@@ -96,7 +95,7 @@ def test_a_byte_now_and_then_keeps_no_connection(service: LiveService) -> None:
     assert service.descriptors <= files + 2
 
 
-def test_a_closed_connection_leaves_nothing_behind(service: LiveService) -> None:
+def test_closed_connections_free_their_sockets(service: LiveService) -> None:
     before = service.control()
     files = service.descriptors
     request = HEAD % len(BODY) + BODY
@@ -140,7 +139,7 @@ def wait_for_descriptors(service: LiveService, files: int) -> None:
 
 
 @pytest.mark.slow
-def test_unfinished_bodies_leave_memory_to_others(tmp_path: Path) -> None:
+def test_unfinished_bodies_use_bounded_memory(tmp_path: Path) -> None:
     """Sixty bodies of 2 MiB less one byte: the service holds as many as its budget allows."""
     store = make_store(tmp_path / "store")
     settings = {"SCENE_CLIENT_TIMEOUT": "60", "SCENE_HELD_BODY_BYTES": str(8 * 2**20)}

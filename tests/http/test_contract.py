@@ -31,7 +31,7 @@ def session() -> Iterator[requests.Session]:
 
 
 @api.parametrize()
-def test_every_operation_keeps_its_promises(
+def test_every_operation_matches_the_document(
     case: schemathesis.Case, service: LiveService, session: requests.Session
 ) -> None:
     call(case, service, session)

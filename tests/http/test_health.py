@@ -21,7 +21,7 @@ pytestmark = pytest.mark.anyio
 READY = ["/health/ready", "/v2/health/ready", "/v2/models/default/ready"]
 
 
-async def test_a_ready_service_says_so(client: httpx.AsyncClient) -> None:
+async def test_health_of_a_ready_service(client: httpx.AsyncClient) -> None:
     answers = {
         "/health/live": {"status": "live"},
         "/health/ready": {"status": "ready"},

@@ -15,7 +15,7 @@ from tests.services import CHAOS, LiveService, live_service
 pytestmark = pytest.mark.system
 
 # A prime, so that each wrong value comes to stand at many places.
-EVERY = 1 if CHAOS else 53
+EVERY = 1 if CHAOS else 37
 MAX_GROWTH = 8 * 2**20
 """Bytes that the last round may add to what the largest requests left with the allocator."""
 

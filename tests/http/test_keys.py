@@ -110,7 +110,7 @@ async def test_other_keys_are_refused(guarded: httpx.AsyncClient, headers: Any) 
     problem(await guarded.post("/relations", json=SCENE, headers=headers), 401, "unauthorized")
 
 
-async def test_a_key_in_the_address_is_none(guarded: httpx.AsyncClient) -> None:
+async def test_a_key_in_the_query_is_ignored(guarded: httpx.AsyncClient) -> None:
     # Addresses end up in histories and in the logs of proxies.
     response = await guarded.post(f"/relations?api_key={API_KEY}", json=SCENE)
     problem(response, 401, "unauthorized")

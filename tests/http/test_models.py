@@ -303,7 +303,7 @@ async def test_a_new_alias_is_made(store: Path) -> None:
         assert answer.json()["model"]["name"] == "plain"
 
 
-async def test_of_two_that_expect_the_same_one_wins(store: Path) -> None:
+async def test_one_of_two_conflicting_alias_moves_succeeds(store: Path) -> None:
     async with serve(store) as client:
         responses = await asyncio.gather(
             put(client, "default", model="home@1.1.0", expected="home@1.0.0"),
@@ -323,7 +323,7 @@ async def test_of_two_that_expect_the_same_one_wins(store: Path) -> None:
         ("plain", {"model": "home"}, 409, "alias-conflict"),
     ],
 )  # fmt: skip
-async def test_an_alias_has_a_name_of_its_own_and_leads_to_a_model(
+async def test_invalid_alias_moves_are_refused(
     client: httpx.AsyncClient, alias: str, body: dict[str, str], status: int, slug: str
 ) -> None:
     problem(await put(client, alias, **body), status, slug)
@@ -341,9 +341,7 @@ async def test_a_version_gone_from_the_store_takes_no_alias(store: Path) -> None
         problem(await put(client, "default", model="plain@1.0.0"), 404, "model-not-found")
 
 
-async def test_a_store_that_cannot_be_written_is_said_so(
-    store: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_read_only_store_gets_409(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = os.open
 
     def read_only(path: Any, flags: int, *args: Any, **keywords: Any) -> int:
@@ -360,9 +358,7 @@ async def test_a_store_that_cannot_be_written_is_said_so(
         assert await default(client) == "home@1.0.0"
 
 
-async def test_a_store_in_use_asks_to_come_back(
-    store: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_locked_store_gets_503(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """How long a writer waits, and for whom: tests/registry."""
 
     def busy(*_: Any, **__: Any) -> None:

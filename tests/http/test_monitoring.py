@@ -37,7 +37,7 @@ def documented_metrics() -> dict[str, tuple[str, set[str], str]]:
     return listed
 
 
-async def told(client: httpx.AsyncClient) -> dict[tuple[str, ...], float]:
+async def samples(client: httpx.AsyncClient) -> dict[tuple[str, ...], float]:
     """(name, label values in the order of their names) → value."""
     response = await client.get("/metrics")
     assert response.status_code == 200
@@ -70,7 +70,7 @@ async def test_the_documented_example_is_of_this_service(shared_store: Path) -> 
         assert line.rpartition(" ")[0] in text if line[0] != "#" else line in text
 
 
-async def test_requests_are_told_by_template_method_and_outcome(
+async def test_requests_are_counted_by_route_method_and_outcome(
     shared_store: Path, replace: Replace
 ) -> None:
     async with serve(shared_store) as client:
@@ -89,7 +89,7 @@ async def test_requests_are_told_by_template_method_and_outcome(
         await client.post("/models/refresh")
         await client.request("MADEUP", "/missing")
         await client.request("MADEUP-TOO", "/made-up")
-        found = await told(client)
+        found = await samples(client)
     version = "/models/{name}/versions/{version}"
     assert requests(found) == {
         ("POST", "internal-error", "/outliers"): 1,
@@ -109,7 +109,7 @@ async def test_requests_are_told_by_template_method_and_outcome(
     assert found["scene_request_duration_seconds_count", "/missing"] == 5
 
 
-async def test_addresses_and_methods_that_are_made_up_add_no_series(
+async def test_unknown_paths_and_methods_add_no_metrics(
     client: httpx.AsyncClient,
 ) -> None:
     async def ask(number: int) -> None:
@@ -121,14 +121,14 @@ async def test_addresses_and_methods_that_are_made_up_add_no_series(
         await client.post("/missing", json={**SCENE, "model": f"m{number}"})
 
     await ask(0)
-    await told(client)
-    before = set(await told(client))
+    await samples(client)
+    before = set(await samples(client))
     for number in range(1, 20):
         await ask(number)
-    assert set(await told(client)) == before
+    assert set(await samples(client)) == before
 
 
-async def test_work_is_told_by_model_and_question(shared_store: Path) -> None:
+async def test_work_is_measured_by_model_and_question(shared_store: Path) -> None:
     async with serve(shared_store) as client:
         for path in ("relations", "missing", "outliers", "generate"):
             body = {**SCENE, "model": "plain", "seed": 1} | (
@@ -137,7 +137,7 @@ async def test_work_is_told_by_model_and_question(shared_store: Path) -> None:
             assert (await client.post(f"/{path}", json=body)).status_code == 200
         batch = {"scenes": [SCENE, {"objects": ["nosuchthing"]}, SCENE]}
         assert (await client.post("/missing/batch", json=batch)).status_code == 200
-        found = await told(client)
+        found = await samples(client)
     for question in ("relations", "missing", "outliers", "generate"):
         label = ("plain", question, "1.0.0")
         assert found["scene_compute_duration_seconds_count", *label] == 1
@@ -150,7 +150,7 @@ async def test_work_is_told_by_model_and_question(shared_store: Path) -> None:
     assert found["scene_serialisation_duration_seconds_sum",] > 0
 
 
-async def test_reloads_are_told_with_refused_ones(store: Path, admin: dict[str, str]) -> None:
+async def test_reloads_are_counted_by_outcome(store: Path, admin: dict[str, str]) -> None:
     async with serve(store) as client:
 
         async def refresh() -> int:
@@ -166,7 +166,7 @@ async def test_reloads_are_told_with_refused_ones(store: Path, admin: dict[str, 
         publish(store, "home", "2.0.0", seed=2)
         corrupt(store, "home", "2.0.0")
         assert await refresh() == 409
-        found = await told(client)
+        found = await samples(client)
         led = [key[5] for key in found if key[:2] == ("scene_model_info", "default")]
     assert led == ["1.1.0"]
     assert {key[1:]: n for key, n in found.items() if key[0] == "scene_reloads_total"} == {
@@ -193,10 +193,10 @@ async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
 # ------------------------------------------------------------------------------- the models
 
 
-async def test_models_are_told_with_every_alias(store: Path, admin: dict[str, str]) -> None:
+async def test_model_info_has_every_alias(store: Path, admin: dict[str, str]) -> None:
     async with serve(store) as client:
         await client.put("/models/aliases/night", json={"model": "home"}, headers=admin)
-        infos = {key[1:] for key in await told(client) if key[0] == "scene_model_info"}
+        infos = {key[1:] for key in await samples(client) if key[0] == "scene_model_info"}
         expected = set()
         for alias, name, variant, version in (
             ("default", "home", "triway", "1.0.0"),
@@ -210,13 +210,13 @@ async def test_models_are_told_with_every_alias(store: Path, admin: dict[str, st
     assert infos == expected
 
 
-async def test_series_of_a_removed_model_go_away_and_stay_away(
+async def test_metrics_of_a_removed_model_disappear(
     store: Path, admin: dict[str, str], hold: Hold
 ) -> None:
     async with serve(store) as client:
 
         async def names(of: str) -> set[str]:
-            return {key[0] for key in await told(client) if of in key}
+            return {key[0] for key in await samples(client) if of in key}
 
         async def ask(model: str, objects: int = 2) -> int:
             body = {"objects": ["bed"] * objects, "model": model}
@@ -240,21 +240,21 @@ async def test_series_of_a_removed_model_go_away_and_stay_away(
         publish(store, "plain", "1.0.0", variant="rbm")
         await client.post("/models/refresh", headers=admin)
         assert await ask("plain") == 200
-        assert (await told(client))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
+        assert (await samples(client))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
 
 
 async def test_a_process_without_a_default_is_not_ready(
     tmp_path: Path, admin: dict[str, str]
 ) -> None:
     async with serve(tmp_path) as client:
-        found = await told(client)
+        found = await samples(client)
         assert found["scene_start_time_seconds",] > 1.7e9
         assert found["scene_ready_time_seconds",] == 0
         publish(tmp_path, "home", "1.0.0", alias="default")
         times = []
         for _ in range(2):
             assert (await client.post("/models/refresh", headers=admin)).status_code == 200
-            times.append((await told(client))["scene_ready_time_seconds",])
+            times.append((await samples(client))["scene_ready_time_seconds",])
     assert times[0] == times[1] >= found["scene_start_time_seconds",]
 
 
@@ -263,14 +263,14 @@ def test_the_documentation_lists_every_metric(live: LiveService) -> None:
     live.client.post("/missing/batch", json={"scenes": [SCENE]})
     live.client.get("/models")
     text = live.client.get("/metrics").text
-    told = {}
+    metrics = {}
     for family in text_string_to_metric_families(text):
         name = family.name + ("_total" if family.type == "counter" else "")
         labels = {label for sample in family.samples for label in sample.labels} - {"le"}
-        told[name] = (family.type, labels, family.documentation)
-    assert documented_metrics() == told
+        metrics[name] = (family.type, labels, family.documentation)
+    assert documented_metrics() == metrics
     explained = re.findall(r"^\| (`.+?) \|", OPERATIONS, re.MULTILINE)
-    assert {label for _, labels, _ in told.values() for label in labels} <= set(
+    assert {label for _, labels, _ in metrics.values() for label in labels} <= set(
         re.findall(r"`(\w+)`", " ".join(explained))
     )
 
@@ -328,6 +328,6 @@ def test_a_request_is_one_line(live: LiveService) -> None:
 def test_a_batch_over_several_models_names_none(live: LiveService) -> None:
     for models, named in ((["default", "home@1.0.0"], "home"), (["default", "plain"], None)):
         scenes = [{**SCENE, "model": model} for model in models]
-        told = line(live, "POST", "/missing/batch", json={"scenes": scenes})
-        assert told.get("model") == named
-        assert told["compute_ms"] > 0
+        entry = line(live, "POST", "/missing/batch", json={"scenes": scenes})
+        assert entry.get("model") == named
+        assert entry["compute_ms"] > 0

@@ -265,7 +265,7 @@ async def test_observed_relations_are_marked_from_either_end(client: httpx.Async
     assert marked == {("bed", "right", "lamp"), ("lamp", "left", "bed")}
 
 
-async def test_mapped_labels_are_told_with_their_class(client: httpx.AsyncClient) -> None:
+async def test_mapped_labels_are_reported_with_their_class(client: httpx.AsyncClient) -> None:
     answer = await ask(
         client,
         "missing",

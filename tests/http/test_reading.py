@@ -92,7 +92,7 @@ async def test_ids_win_over_labels_and_labels_are_read_in_any_spelling(
     assert marked == {("lamp", "left", "x"), ("lamp", "front", "trash can")}
 
 
-async def test_saying_one_thing_twice_is_no_contradiction(client: httpx.AsyncClient) -> None:
+async def test_a_repeated_relation_is_no_contradiction(client: httpx.AsyncClient) -> None:
     """And different relations of one pair may hold together."""
     stated = [relation("bed", "left", "lamp"), relation("lamp", "right", "bed")]
     stated.append(relation("bed", "front", "lamp"))
@@ -111,7 +111,7 @@ async def test_an_operator_may_lower_the_limits(shared_store: Path) -> None:
 # ------------------------------------------------------------------------------------ labels
 
 
-async def test_unknown_labels_can_be_left_out_with_all_that_hangs_on_them(
+async def test_ignored_labels_remove_their_relations(
     client: httpx.AsyncClient,
 ) -> None:
     scene = {
@@ -202,7 +202,7 @@ async def test_a_room_type_is_read_like_a_label(client: httpx.AsyncClient) -> No
     assert [(one["label"], one["class"]) for one in answer["mapped"]] == [("bedroom_1", "bedroom")]
 
 
-async def test_what_no_class_is_near_can_be_ignored(client: httpx.AsyncClient) -> None:
+async def test_unknown_labels_without_a_near_class_are_ignored(client: httpx.AsyncClient) -> None:
     answer = await ask(
         client,
         "outliers",
@@ -254,7 +254,7 @@ LYING: Turn = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 
 @drawn
 @given(seed=st.integers(0, 2**32))
-async def test_one_scene_told_in_three_frames_is_one_scene(
+async def test_a_scene_in_three_frames_has_equal_relations(
     client: httpx.AsyncClient, seed: int
 ) -> None:
     """Random boxes, turned and lying, by a robot, by its camera, and in a map."""
@@ -369,7 +369,7 @@ BED = {"id": "b", "label": "bed", "position": at(2, 1, 0.3)}
         ({"objects": [*BARE, BED], "relations": []}, None, []),
     ],
 )
-async def test_what_a_client_may_have_meant_otherwise_is_warned_of(
+async def test_implausible_scenes_get_warnings(
     client: httpx.AsyncClient, scene: dict[str, Any], code: str | None, named: list[str]
 ) -> None:
     found = (await ask(client, "missing", **scene))["warnings"]

@@ -38,7 +38,7 @@ def defective(
         yield service
 
 
-def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> None:
+def test_keys_and_payloads_are_not_in_the_log(defective: LiveService) -> None:
     client = defective.client
     sent = [
         {},

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ from pydantic import ValidationError
 from app.__main__ import main
 from app.serving.logs import JSONFormatter, PlainFormatter
 from app.settings import Settings
+from tests.conftest import run_program
 
 
 @pytest.fixture(autouse=True)
@@ -94,7 +94,7 @@ def test_settings_come_from_the_environment(
         ("opentelemetry", "perhaps"),
     ],
 )
-def test_nonsense_is_refused(tmp_path: Path, name: str, value: object) -> None:
+def test_invalid_settings_are_refused(tmp_path: Path, name: str, value: object) -> None:
     with pytest.raises(ValidationError) as error:
         Settings(**{"store": tmp_path, name: value})
     (fault,) = error.value.errors()
@@ -171,14 +171,7 @@ def test_a_misconfigured_service_says_which_variables_and_exits(tmp_path: Path) 
         "SCENE_ADMIN_KEY": "too-short-key",
         "SCENE_API_KEY": "a key that has spaces in it",
     }
-    run = subprocess.run(
-        [sys.executable, "-m", "app"],
-        env=os.environ | wrong,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert run.returncode == 2
+    run = run_program(sys.executable, "-m", "app", status=2, env=os.environ | wrong)
     assert sorted(line.partition(":")[0] for line in run.stderr.splitlines()) == sorted(wrong)
     for name in ("SCENE_ADMIN_KEY", "SCENE_API_KEY"):
         assert wrong[name] not in run.stdout + run.stderr

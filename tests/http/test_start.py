@@ -49,7 +49,7 @@ def taken() -> Iterator[socket.socket]:
         yield place
 
 
-def test_a_port_in_use_is_said_before_models_are_loaded(
+def test_a_used_port_ends_the_start_before_models_are_loaded(
     shared_store: Path, tmp_path: Path, taken: socket.socket
 ) -> None:
     taken.listen()
@@ -59,7 +59,7 @@ def test_a_port_in_use_is_said_before_models_are_loaded(
     assert (tmp_path / "log").read_text() == IN_USE.format(port)
 
 
-def test_a_port_that_is_taken_while_models_are_loaded(
+def test_a_port_taken_during_the_start_ends_the_start(
     shared_store: Path, tmp_path: Path, taken: socket.socket
 ) -> None:
     port = taken.getsockname()[1]
@@ -106,7 +106,7 @@ def test_connections_are_refused_until_the_service_is_ready(
         assert httpx.get(f"http://127.0.0.1:{port}/health/ready").status_code == 200
 
 
-def test_it_says_where_its_page_is(live: LiveService, shared_store: Path, tmp_path: Path) -> None:
+def test_the_log_names_the_page(live: LiveService, shared_store: Path, tmp_path: Path) -> None:
     assert any(f"http://127.0.0.1:{live.port}/ (" in line for line in messages(live.log))
     log = tmp_path / "log"
     # `live` has compiled every loop.

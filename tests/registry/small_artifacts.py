@@ -47,6 +47,16 @@ JUDGING = {
 }
 
 
+DATA = {
+    "source": "generated",
+    "scenes": 12,
+    "digest": "0" * 64,
+    "terms": "Apache-2.0",
+    "research_only": False,
+}
+FIGURE = {"value": 0.5, "low": 0.4, "high": 0.6, "n": 34}
+
+
 def description(
     name: str = "tiny", version: str = "1.0.0", variant: str = "rbm", **changes: Any
 ) -> Description:
@@ -60,26 +70,8 @@ def description(
             "vocabulary": VocabularyEntry.of(VOCABULARY),
             "calibration": Calibration.neutral(4).model_copy(update=JUDGING),
             "training": {"objective": "pcd", "seed": 7, "rate": 0.1},
-            "data": [
-                {
-                    "source": "generated",
-                    "scenes": 12,
-                    "digest": "0" * 64,
-                    "terms": "Apache-2.0",
-                    "research_only": False,
-                }
-            ],
-            "metrics": [
-                {
-                    "task": "missing",
-                    "source": "generated",
-                    "metric": "MRR",
-                    "value": 0.5,
-                    "low": 0.4,
-                    "high": 0.6,
-                    "n": 34,
-                }
-            ],
+            "data": [DATA],
+            "metrics": [{"task": "missing", "source": "generated", "metric": "MRR", **FIGURE}],
             "terms": "Apache-2.0",
             "libraries": {"torch": "2.0"},
             **changes,

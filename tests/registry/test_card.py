@@ -6,7 +6,7 @@ from typing import Any
 
 from app.registry.card import render_card
 from app.registry.manifest import TensorEntry
-from tests.registry.small_artifacts import description
+from tests.registry.small_artifacts import DATA, FIGURE, description
 
 TENSORS = {
     "W": TensorEntry(dtype="float16", shape=(3, 5)),
@@ -16,13 +16,8 @@ TENSORS = {
 
 
 def source(name: str, *, research_only: bool) -> dict[str, Any]:
-    return {
-        "source": name,
-        "scenes": 8133,
-        "digest": "cd" * 32,
-        "terms": f"terms of {name}",
-        "research_only": research_only,
-    }
+    changes = {"scenes": 8133, "digest": "cd" * 32, "terms": f"terms of {name}"}
+    return DATA | changes | {"source": name, "research_only": research_only}
 
 
 def card(**changes: Any) -> str:
@@ -52,11 +47,10 @@ def test_warns_of_research_data_by_name_and_of_no_other() -> None:
     assert warned.index("commercial robot") < warned.index("## Model"), "before anything else"
 
 
-def test_a_source_is_a_column_and_a_figure_stands_once() -> None:
+def test_metrics_have_a_column_for_each_source() -> None:
     """Sources that list no relations leave their cells empty."""
-    figure = {"value": 0.5, "low": 0.4, "high": 0.6, "n": 34}
     measured = [("T1", "R", "a"), ("T2", "MRR", "a"), ("T2", "MRR", "b"), ("T4", "MMD", "pooled")]
-    page = card(metrics=[{"task": t, "metric": m, "source": s} | figure for t, m, s in measured])
+    page = card(metrics=[{"task": t, "metric": m, "source": s} | FIGURE for t, m, s in measured])
     cell = "0.500 [0.400, 0.600]"
     lines = page.splitlines()
     first = lines.index("| Task | Metric | a | b | pooled |")
@@ -70,7 +64,7 @@ def test_a_source_is_a_column_and_a_figure_stands_once() -> None:
     assert "- misplaced: the relation is false" in page
 
 
-def test_text_stays_in_its_cell() -> None:
+def test_markdown_in_a_source_is_escaped() -> None:
     hostile = source("a|b\n\n# Heading", research_only=True)
     page = card(data=[hostile])
     assert "\n# Heading" not in page

@@ -87,7 +87,7 @@ def check_next_publication(root: Path) -> None:
     assert load_model_set(store).resolve("default").manifest.version == version
 
 
-def test_die_before_every_single_step(
+def test_a_publisher_may_stop_before_any_step(
     publishers: Publishers, published: Path, tmp_path: Path
 ) -> None:
     seen = set()
@@ -112,7 +112,7 @@ def test_die_before_every_single_step(
     }
 
 
-def test_publishers_and_readers_meet(publishers: Publishers, tmp_path: Path) -> None:
+def test_concurrent_publishers_and_readers(publishers: Publishers, tmp_path: Path) -> None:
     root, versions = tmp_path / "store", 12
     results = [tmp_path / f"{n}.json" for n in range(4)]
     children = [

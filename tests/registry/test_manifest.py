@@ -54,9 +54,6 @@ pair_slopes = st.builds(
 share = st.floats(0, 1)
 thresholds = st.builds(Thresholds, low=share, medium=share, high=share)
 count_slopes = st.builds(CountSlope, intercept=number, slope=number, log_count=number)
-metrics = st.tuples(number, number, number).map(
-    lambda v: {"value": v[0], "low": min(v[1:]), "high": max(v[1:])}
-)
 changes = st.fixed_dictionaries(
     {},
     optional={
@@ -85,21 +82,6 @@ changes = st.fixed_dictionaries(
                 ("relation", "relation_given", "placement", "asked_place"),
                 st.tuples(*[pair_slopes] * 4),
             ),
-        ),
-        "metrics": st.lists(
-            st.builds(
-                lambda figures, task, n: {
-                    "task": task,
-                    "source": task,
-                    "metric": task,
-                    "n": n + 1,
-                    **figures,
-                },
-                metrics,
-                text,
-                count,
-            ),
-            max_size=3,
         ),
         "tensors": st.dictionaries(
             text,

@@ -81,7 +81,7 @@ def test_a_name_means_the_newest_usable_version(store: Store) -> None:
             assert "tiny@2.0.0" in refused.value.reason
 
 
-def test_whatever_stands_in_a_versions_place_is_reported(store: Store) -> None:
+def test_other_files_in_place_of_a_version_are_reported(store: Store) -> None:
     (store.root / "tiny" / "3.0.0").mkdir()
     (store.root / "tiny" / "3.0.0" / "manifest.json").mkdir()
     (store.root / "tiny" / "4.0.0").write_text("not a directory")
@@ -110,7 +110,7 @@ def test_reuses_what_did_not_change(store: Store) -> None:
 
 
 @pytest.mark.parametrize("file", ["model.safetensors", "card.md"])
-def test_what_was_loaded_before_is_verified_again(file: str, store: Store) -> None:
+def test_loaded_versions_are_verified_again(file: str, store: Store) -> None:
     first = load_model_set(store)
     path = store.root / "tiny" / "2.0.0" / file
     good = path.read_bytes()

@@ -101,7 +101,7 @@ def test_can_be_read_by_another_user(store: Store) -> None:
         assert path.stat().st_mode & needed == needed, path
 
 
-def test_says_so_where_it_cannot_write(tmp_path: Path) -> None:
+def test_an_unwritable_store_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for root in (tmp_path / "file", tmp_path / "file" / "store"):
         with pytest.raises(StoreError) as error:
@@ -234,9 +234,7 @@ def test_an_alias_needs_a_target_and_a_name_of_its_own(store: Store) -> None:
         '{"default": {"version": "1.0.0"}}',
     ],
 )
-def test_a_spoilt_table_of_aliases_is_neither_believed_nor_replaced(
-    text: str, store: Store
-) -> None:
+def test_an_invalid_alias_table_is_refused_and_kept(text: str, store: Store) -> None:
     publish(store)
     (store.root / "aliases.json").write_text(text)
     target = AliasTarget(name="tiny")
@@ -295,7 +293,7 @@ def test_a_model_outside_the_root_is_no_model(store: Store, tmp_path: Path) -> N
     assert outside.versions("foreign") == ("1.0.0",)
 
 
-def test_other_files_in_the_root_are_none_of_its_business(store: Store) -> None:
+def test_other_files_in_the_store_are_ignored(store: Store) -> None:
     publish(store)
     (store.root / "README.md").write_text("about")
     (store.root / "plain").write_text("a file")
@@ -317,7 +315,7 @@ def test_no_name_leads_out_of_the_root(name: str, store: Store) -> None:
             store.load("tiny", version)
 
 
-def test_a_missing_store_is_told_from_an_empty_one(store: Store) -> None:
+def test_a_missing_store_is_an_error_and_an_empty_one_is_not(store: Store) -> None:
     with refused("unreadable"):
         store.names()
     store.root.mkdir()

@@ -94,7 +94,7 @@ async def test_jobs_run_in_order_each_with_its_result(queue: WorkQueue) -> None:
 
 
 @pytest.mark.parametrize("ask", WAYS)
-async def test_one_failure_is_one_request_s(queue: WorkQueue, ask: Any) -> None:
+async def test_a_failure_affects_one_request(queue: WorkQueue, ask: Any) -> None:
     def broken() -> None:
         raise ZeroDivisionError
 
@@ -146,7 +146,7 @@ async def test_work_whose_deadline_has_passed_is_never_begun(queue: WorkQueue, a
     assert not begun
 
 
-async def test_an_answer_that_comes_too_late_is_none(queue: WorkQueue) -> None:
+async def test_late_work_on_the_event_loop_is_refused(queue: WorkQueue) -> None:
     with pytest.raises(DeadlinePassedError):
         await in_tick(queue, lambda: sleep(0.1), Ticket(monotonic() + 0.05))
 
@@ -171,7 +171,7 @@ async def test_costly_work_ends_the_wait_at_the_deadline(queue: WorkQueue, ask: 
     assert not behind
 
 
-async def test_a_drawing_hears_that_it_was_given_up(queue: WorkQueue) -> None:
+async def test_a_cancelled_generation_is_notified(queue: WorkQueue) -> None:
     """By the deadline, or by a client that leaves while it is under way."""
     heard = threading.Event()
     here = True
@@ -223,7 +223,7 @@ async def test_an_unmeasured_question_never_holds_up_the_event_loop(took: Any) -
         assert not await took(100 * CHEAP, size=size)
 
 
-async def test_a_kind_is_put_where_its_cost_belongs(took: Any) -> None:
+async def test_costly_kinds_run_in_a_thread(took: Any) -> None:
     await took(CHEAP / 10, size=1)
     assert await took(CHEAP / 10, size=1)
     await took(CHEAP * 10, size=100)
@@ -240,7 +240,7 @@ async def test_small_questions_do_not_make_large_ones_look_costly(took: Any) -> 
     assert await took(CHEAP / 3, size=169)
 
 
-async def test_one_that_was_held_up_sends_none_to_the_thread(took: Any) -> None:
+async def test_one_slow_measurement_keeps_a_kind_on_the_event_loop(took: Any) -> None:
     await took(CHEAP / 3, size=100)
     for seconds in (CHEAP / 3, CHEAP / 3, 100 * CHEAP, CHEAP / 3):
         assert await took(seconds, size=100)
@@ -259,7 +259,7 @@ async def test_clients_cannot_fill_the_memory_with_kinds(took: Any) -> None:
 
 
 @pytest.mark.parametrize("ask", IN_THREADS)
-async def test_costly_work_of_those_who_have_gone_is_dropped(queue: WorkQueue, ask: Any) -> None:
+async def test_costly_work_of_disconnected_clients_is_dropped(queue: WorkQueue, ask: Any) -> None:
     begun: list[int] = []
 
     async def gone() -> bool:
@@ -271,7 +271,7 @@ async def test_costly_work_of_those_who_have_gone_is_dropped(queue: WorkQueue, a
 
 
 @pytest.mark.parametrize("ask", WAYS)
-async def test_waiting_and_computing_are_told_apart(
+async def test_waiting_and_computing_times_are_separate(
     queue: WorkQueue, monkeypatch: pytest.MonkeyPatch, ask: Any
 ) -> None:
     now = 0.0
@@ -421,7 +421,7 @@ async def test_the_measured_pace_decides_how_long_the_backlog_gets() -> None:
     assert PACE < counts["begun"] < PACE + 50
 
 
-async def test_refusals_hold_up_no_tick_either() -> None:
+async def test_refusals_per_tick_are_bounded() -> None:
     backlog = Backlog(1)
     refused: list[str] = []
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, run_program
 
 # A process of its own: in this one other tests have called the loops with arrays of other layouts.
 _PROGRAM = """
@@ -81,10 +80,5 @@ asyncio.run(main(Path(sys.argv[1])))
 
 def test_no_question_compiles_a_loop() -> None:
     """A drawing with two relations once took ten seconds: their arrays had another layout."""
-    done = subprocess.run(
-        [sys.executable, "-c", _PROGRAM, str(REPOSITORY / "model_store")],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-    )
-    assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr
+    store = REPOSITORY / "model_store"
+    assert run_program(sys.executable, "-c", _PROGRAM, store, timeout=600).stdout == "[]\n"

@@ -68,7 +68,7 @@ def test_a_flaw_is_named_with_its_cure() -> None:
         ("[]", "", "no answer"),
     ],
 )
-def test_silence_is_not_run(output: str, trouble: str, reason: str) -> None:
+def test_missing_answers_are_not_run(output: str, trouble: str, reason: str) -> None:
     outcome = judge(output, trouble, {"a", "b"})
     assert outcome.verdict is Verdict.NOT_RUN
     assert reason in outcome.lines[0]
@@ -84,7 +84,7 @@ def test_silence_is_not_run(output: str, trouble: str, reason: str) -> None:
         ({"pypi": skipped, "osv": sound}, Verdict.NOT_RUN, []),
     ],
 )
-def test_a_service_without_advisories_is_not_believed(
+def test_a_database_without_the_canary_is_not_used(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     answers: dict[str, Any],
@@ -114,7 +114,7 @@ def test_a_service_without_advisories_is_not_believed(
         ([Verdict.FOUND, Verdict.OK], 1, 1),
     ],
 )
-def test_the_exit_status_tells_what_was_found_from_what_was_not_run(
+def test_exit_status_of_findings_and_of_skipped_checks(
     verdicts: list[Verdict], strict: int, lenient: int
 ) -> None:
     assert exit_status(verdicts, may_be_unreachable=False) == strict

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from collections.abc import Callable
 from configparser import ConfigParser
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import yaml
 
 from app.settings import Settings
 from deploy.image import first_base, pip_settings
+from tests.conftest import run_program
 
 pytestmark = pytest.mark.system
 
@@ -67,17 +67,14 @@ def arguments(stage: list[Instruction], keyword: str) -> list[str]:
     return [i.argument for i in stage if i.keyword == keyword]
 
 
-def run(*command: str | Path) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
 def test_dockerfile_has_no_lint(repository: Path, require_system_tool: FindTool) -> None:
-    run(require_system_tool("hadolint"), "--failure-threshold=style", repository / "Dockerfile")
+    run_program(
+        require_system_tool("hadolint"), "--failure-threshold=style", repository / "Dockerfile"
+    )
 
 
 def test_shell_scripts_have_no_lint(repository: Path, require_system_tool: FindTool) -> None:
-    run(require_system_tool("shellcheck"), repository / ".ci" / "run")
+    run_program(require_system_tool("shellcheck"), repository / ".ci" / "run")
 
 
 def test_compose_file_fits_the_compose_specification(
@@ -85,7 +82,7 @@ def test_compose_file_fits_the_compose_specification(
 ) -> None:
     checker = require_system_tool("check-jsonschema")
     schema = "--builtin-schema=vendor.compose-spec"
-    run(checker, schema, repository / "docker-compose.yml")
+    run_program(checker, schema, repository / "docker-compose.yml")
 
 
 @pytest.mark.parametrize("name", ["runtime", "ray", "train"])

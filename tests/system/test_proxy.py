@@ -19,7 +19,7 @@ import yaml
 
 from app.settings import Settings
 from scene_client import Client
-from tests.chaos.wire import BODY, Wire, exchange, wires
+from tests.chaos.wire import BODY, LIVE, Wire, exchange, wires
 from tests.http.stores import make_store
 from tests.services import ADMIN_KEY, LiveService, is_ready, launch, live_service, wait_until
 from tests.system.conftest import Proxy, StartProxy
@@ -30,7 +30,6 @@ API_KEY = "incorrect-zebra-capacitor-nail"
 CONNECTIONS, REQUESTS = 30, 400
 SCENE = {"objects": ["bed", "lamp"]}
 HEAD = b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
-LIVE = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
 service = live_service(SCENE_CLIENT_TIMEOUT="3")
@@ -105,7 +104,7 @@ def test_an_answer_may_take_longer_than_a_client_may_pause(
     assert response.elapsed.total_seconds() > 2
 
 
-def test_the_name_that_clients_use_reaches_the_service(proxy: Proxy) -> None:
+def test_the_host_header_reaches_the_service(proxy: Proxy) -> None:
     response = httpx.get(f"{proxy.address}/models", headers={"Host": "evil.example"})
     assert response.status_code == 421
     assert response.json()["type"] == "/problems/host-refused"
@@ -199,7 +198,7 @@ def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
     assert b"/problems/request-timeout" in received
 
 
-def test_one_address_has_so_many_connections(proxy: Proxy) -> None:
+def test_connections_per_address_are_limited(proxy: Proxy) -> None:
     wait_until(lambda: is_ready(proxy.port))
     with ExitStack() as held:
         answered = 0
@@ -213,7 +212,7 @@ def test_one_address_has_so_many_connections(proxy: Proxy) -> None:
     wait_until(lambda: is_ready(proxy.port))
 
 
-def test_one_address_asks_so_often(
+def test_requests_per_address_are_limited(
     behind: StartProxy, service: LiveService, tmp_path: Path
 ) -> None:
     with (
@@ -246,7 +245,7 @@ HIDDEN = [
 
 
 @pytest.mark.parametrize(("method", "path"), HIDDEN)
-def test_administration_and_figures_are_not_for_the_outside(
+def test_administration_and_metrics_are_hidden_by_the_proxy(
     proxy: Proxy, service: LiveService, method: str, path: str
 ) -> None:
     before = lines(service)
@@ -261,7 +260,7 @@ def test_administration_and_figures_are_not_for_the_outside(
     assert all("/health/" in line for line in added)
 
 
-def test_an_escape_that_is_none_hides_no_route(proxy: Proxy) -> None:
+def test_invalid_escapes_are_refused(proxy: Proxy) -> None:
     request = "PUT /models/aliases/%zz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
     answers, _ = send(proxy, request.encode())
     assert answers[0].status in {400, 404}
@@ -296,7 +295,7 @@ def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
 
 
 @pytest.mark.slow
-def test_a_service_that_is_not_ready_is_not_asked(behind: StartProxy, tmp_path: Path) -> None:
+def test_the_proxy_answers_503_without_a_ready_service(behind: StartProxy, tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
     with (
         launch(store, tmp_path / "service") as service,
