@@ -24,7 +24,7 @@ V = LARGER["triway-local"].V
 A = len(CANONICAL)
 
 
-def known(V: int = V) -> Offsets:
+def offsets_of_every_pair(V: int = V) -> Offsets:
     """Every pair has an offset of its own, drawn."""
     rng = np.random.default_rng(0)
     nothing = np.zeros((A, V, 6), np.float32)
@@ -48,7 +48,7 @@ class Offset(NamedTuple):
     scenes: int
 
 
-OFFSETS = known()
+OFFSETS = offsets_of_every_pair()
 VIEWER = viewer_axes()
 
 
@@ -124,8 +124,7 @@ def test_placements_have_the_offsets_of_their_classes(name):
     artifact = larger_artifact(name)
     centre = (0.0, 0.0, 0.0)
     things = tuple(
-        SceneObject(str(k), "", index, position=centre)
-        for k, index in enumerate((2, 0, 8, 2, 4))
+        SceneObject(str(k), "", index, position=centre) for k, index in enumerate((2, 0, 8, 2, 4))
     )
     scene = Scene(things)
     bare = missing(artifact, scene)
