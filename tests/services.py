@@ -16,7 +16,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import wraps
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -35,21 +35,16 @@ Replace = Callable[[str, Callable[..., Any]], None]
 
 DEFECTIVE = """
 import sys
-from app import questions
 from app.__main__ import main
+from app.questions.missing import MISSING
 
-missing = questions.missing
-
-def fail(artifact, scene, **parameters):
-    # Scenes without a room type still work, since a failed warm-up would exclude the model.
-    if scene.room_type is None:
-        return missing(artifact, scene, **parameters)
+def fail(*args, **options):
     raise ZeroDivisionError({message!r})
 
-questions.missing = fail
+MISSING.answer = fail
 sys.exit(main())
 """
-"""A program for `launch`: its question `missing` fails for every scene with a room type."""
+"""A program for `launch`: its question `missing` fails for every scene."""
 
 
 @asynccontextmanager
@@ -102,17 +97,18 @@ def admin() -> dict[str, str]:
 
 @pytest.fixture
 def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
-    """Replace a question by a function; the function gets the question as its first argument."""
-    from app import questions
+    """Replace the function of a question, for requests and for the warm-up.
+
+    The new function gets the original function as its first argument.
+    """
+    from app.questions import QUESTIONS
+
+    questions = {question.name: question for question in QUESTIONS}
 
     def replace(name: str, function: Callable[..., Any]) -> None:
-        question = getattr(questions, name)
-
-        @wraps(question)
-        def replaced(*args: Any, **parameters: Any) -> Any:
-            return function(question, *args, **parameters)
-
-        monkeypatch.setattr(questions, name, replaced)
+        replaced = partial(function, questions[name].answer)
+        monkeypatch.setattr(questions[name], "answer", replaced)
+        monkeypatch.setattr(sys.modules[f"app.questions.{name}"], name, replaced)
 
     return replace
 

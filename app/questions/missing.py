@@ -43,7 +43,7 @@ VIEWER = viewer_axes()
 """Axes of a viewer who looks along the x axis of the frame."""
 
 _BLOCK: Final = 32
-_LEAST_CHANGE: Final = math.log(3)  # substantial evidence: a Bayes factor of at least 3
+LEAST_CHANGE: Final = math.log(3)  # substantial evidence: a Bayes factor of at least 3
 _OFFSET_BYTES: Final = 250
 
 
@@ -110,7 +110,7 @@ def missing(
         if len(posterior.present.classes):
             explained = classes[:EXPLAINED]
             change = posterior.reasons_for_absent(explained)
-            causes = reasons(scene, posterior.present, change, least=_LEAST_CHANGE)
+            causes = reasons(scene, posterior.present, change, least=LEAST_CHANGE)
             for entry, because in zip(entries, causes, strict=False):
                 entry["because"] = because
     further: list[Fields] = []

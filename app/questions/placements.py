@@ -27,7 +27,7 @@ from app.scene.scene import Scene
 PLACES: Final = 3
 """Maximum number of placements in the answer for one class."""
 
-_LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
+LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
 _UNTURNED: Final = np.eye(3)
 _PER_METRE: Final = 1000.0  # offsets are rounded to millimetres
@@ -99,7 +99,7 @@ def placements(
     The candidate is subject or object of the relation. Structural classes (floor, wall) are never
     anchors. If a class has several instances, the first instance is the anchor. If an object stands
     on top of another object, candidates are never placed under the upper object. A further place
-    has at least `_LEAST_SHARE` of the probability of the first place. An offset needs an anchor
+    has at least `LEAST_SHARE` of the probability of the first place. An offset needs an anchor
     with a position.
 
     Args:
@@ -135,7 +135,7 @@ def placements(
     each = len(which) // len(candidates)
     if first >= 0 and at is not None:
         p[::each] = np.exp(place_log_p(artifact, posterior, candidates, at))
-    likely = np.flatnonzero(p >= _LEAST_SHARE * np.repeat(p[::each], each))
+    likely = np.flatnonzero(p >= LEAST_SHARE * np.repeat(p[::each], each))
     which, relations, outgoing, columns = (
         values[likely] for values in (which, relations, outgoing, columns)
     )

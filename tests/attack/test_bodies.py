@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import sys
 import threading
 import time
 from pathlib import Path
@@ -13,11 +14,10 @@ import httpx
 import pytest
 from pydantic import ValidationError
 
-from app.questions import more
 from app.questions.reading import read_scene
 from scene_client.schemas import MissingRequest
 from tests.http.test_problems import problem
-from tests.services import LiveService, Replace, live_service, serve
+from tests.services import LiveService, live_service, serve
 
 API_KEY = "0123456789abcdef"
 JSON = {"Content-Type": "application/json"}
@@ -137,22 +137,23 @@ async def test_large_scenes_are_read_off_the_event_loop(
 
 @pytest.mark.anyio
 async def test_further_instances_are_counted_off_the_event_loop(
-    shared_store: Path, replace: Replace
+    shared_store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the rest of the question, in its thread and within its deadline."""
+    """The thread of the question counts them, within the deadline."""
     threads = []
 
-    def slow(question: Any, *args: Any, **options: Any) -> Any:
+    def slow(*_: Any, **__: Any) -> list[Any]:
         threads.append(threading.current_thread())
         time.sleep(0.5)
-        return question(*args, **options)
+        return []
 
     async with serve(shared_store) as client:
-        replace(more.__name__, slow)
+        monkeypatch.setattr(sys.modules["app.questions.missing"], "more", slow)
         asking = asyncio.ensure_future(
             client.post(
                 "/missing", json={"objects": ["bed"]}, headers={"X-Request-Timeout-Ms": "300"}
             )
         )
         problem(await asking, 504, "deadline-passed")
+    assert len(threads) == 1
     assert threading.main_thread() not in threads

@@ -10,10 +10,10 @@ from typing import Any
 import httpx
 import pytest
 
+from app.questions import names
 from app.scene.labels import readings
 from app.scene.nearest import LONGEST
 from app.scene.vocabulary import Vocabulary
-from app.serving import reading
 from scene_client.validation import MAX_ERRORS
 from tests.http.stores import VOCABULARY
 
@@ -39,7 +39,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
     for name in ("index", "read", "guess", "nearest"):
         count(Vocabulary, name)
-    count(reading, "spelt_alike")
+    count(names, "spelt_alike")
     return found
 
 

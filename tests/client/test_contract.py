@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from app import questions
 from app.api.examples import REQUESTS
-from app.serving import questions
 from scene_client import (
     Client,
     DeadlineError,

@@ -153,10 +153,10 @@ async def test_a_batch_stops_where_its_deadline_passes(
 HELD = """
 import sys, time
 from pathlib import Path
-from app import questions
 from app.__main__ import main
+from app.questions.generate import GENERATE
 
-generate, begun, release = questions.generate, Path({begun!r}), Path({release!r})
+generate, begun, release = GENERATE.answer, Path({begun!r}), Path({release!r})
 
 def held(*args, **parameters):
     if parameters["count"] == 3:
@@ -165,7 +165,7 @@ def held(*args, **parameters):
             time.sleep(0.01)
     return generate(*args, **parameters)
 
-questions.generate = held
+GENERATE.answer = held
 sys.exit(main())
 """
 """A program for `launch`: drawing three scenes takes until the file `release` exists."""

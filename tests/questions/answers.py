@@ -1,56 +1,64 @@
-"""Answers of the questions as named tuples, in which objects are indices instead of ids."""
+"""Answers of the questions as named tuples, with the indices of objects instead of their ids."""
 
 from __future__ import annotations
 
 from collections import namedtuple
-from functools import wraps
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache, partial
+from importlib import import_module
 from typing import Any
 
+import pytest
+
 from app import questions
-from app.questions.counts import more as _more
+from app.questions import counts
+from app.registry import Artifact
 from app.scene import Scene
 
+_entry = lru_cache(partial(namedtuple, "Entry"))
 
-def _tuples(part: Any, places: dict[str, int]) -> Any:
-    """Replace dictionaries by named tuples, lists by tuples and ids of objects by indices."""
+
+def _converted(part: Any, indices: dict[str, int]) -> Any:
     if isinstance(part, list):
-        return tuple(_tuples(entry, places) for entry in part)
+        return tuple(_converted(entry, indices) for entry in part)
     if not isinstance(part, dict):
         return part
-    fields = {
-        name: places.get(value, value) if name in ("subject", "object") else _tuples(value, places)
+    values = (
+        indices.get(value, value) if name in {"subject", "object"} else _converted(value, indices)
         for name, value in part.items()
-    }
-    if "relation" in fields and "probability" in fields and "observed" not in fields:
-        fields.setdefault("offset", None)
-    return namedtuple("Entry", fields)(**fields)
+    )
+    return _entry(tuple(part))(*values)
 
 
-def _asked(question: Any) -> Any:
-    @wraps(question)
-    def ask(artifact: Any, scene: Scene, **parameters: Any) -> Any:
-        places = {thing.id: k for k, thing in enumerate(scene.objects)}
-        return _tuples(question(artifact, scene, **parameters), places)
+def _question(function: Callable[..., Any], *path: str) -> Callable[..., Any]:
+    def ask(artifact: Artifact, scene: Scene, **options: Any) -> Any:
+        answer = function(artifact, scene, **options)
+        for name in path:
+            answer = answer[name]
+        return _converted(answer, {thing.id: k for k, thing in enumerate(scene.objects)})
 
     return ask
 
 
-more, misplaced, everything_missing = map(_asked, (_more, questions.misplaced, questions.missing))
-outliers, related, generated = map(
-    _asked, (questions.outliers, questions.relations, questions.generate)
-)
+# The answer to `outliers` has all its fields. The other functions return one list of an answer.
+outliers = _question(questions.outliers)
+misplaced = _question(questions.misplaced)
+missing = _question(questions.missing, "missing")
+more = _question(counts.more)
+relations = _question(questions.relations, "relations")
+disagreements = _question(questions.relations, "disagreements")
+generate = _question(questions.generate, "scenes")
 
 
-def missing(artifact: Any, scene: Scene, **parameters: Any) -> Any:
-    """The list `missing` of the answer."""
-    return everything_missing(artifact, scene, **parameters).missing
-
-
-def relations(artifact: Any, scene: Scene, **parameters: Any) -> Any:
-    """The lists `relations` and `disagreements` of the answer."""
-    return tuple(related(artifact, scene, **parameters))
-
-
-def generate(artifact: Any, scene: Scene, **parameters: Any) -> Any:
-    """The list `scenes` of the answer."""
-    return generated(artifact, scene, **parameters).scenes
+@contextmanager
+def without_minimums() -> Iterator[None]:
+    """List also improbable placements, weak reasons and improbable expected relations."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module, minimum in (
+            ("relations", "EXPECTED"),
+            ("missing", "LEAST_CHANGE"),
+            ("placements", "LEAST_SHARE"),
+        ):
+            patch.setattr(import_module(f"app.questions.{module}"), minimum, 0)
+        yield

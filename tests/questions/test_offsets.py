@@ -24,7 +24,7 @@ V = LARGER["triway-local"].V
 A = len(CANONICAL)
 
 
-def known(V: int = V) -> Offsets:
+def offsets_of_every_pair(V: int = V) -> Offsets:
     """Every pair has an offset of its own, drawn."""
     rng = np.random.default_rng(0)
     nothing = np.zeros((A, V, 6), np.float32)
@@ -48,7 +48,7 @@ class Offset(NamedTuple):
     scenes: int
 
 
-OFFSETS = known()
+OFFSETS = offsets_of_every_pair()
 VIEWER = viewer_axes()
 
 
