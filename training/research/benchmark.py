@@ -25,7 +25,7 @@ from training.evaluation.report import settings_by_source
 from training.evaluation.results import Results, grid, only, summarise, write
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
-from training.fit.settings import Config, ConfigError, DataConfig
+from training.fit.configuration import Config, ConfigError, DataConfig
 from training.research.baselines import BASELINES
 from training.research.entries import Entry, baseline_entries, machine_entry, reference_entries
 from training.research.measure import (
@@ -39,7 +39,7 @@ from training.research.measure import (
     slug,
 )
 from training.research.plots import write_plots
-from training.runs.config import data_folder, load_config, with_settings
+from training.runs.config_files import data_folder, load_config, with_settings
 from training.runs.pipeline import SplitScenes, prepare
 from training.seed.protocol import PAPER, SEED_TASKS
 

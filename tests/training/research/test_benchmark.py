@@ -17,7 +17,7 @@ from training.evaluation.report import SourceReport
 from training.evaluation.results import Cell, Difference, Results, summarise
 from training.evaluation.setting import Outcome, Setting
 from training.evaluation.tasks import TASKS
-from training.fit.settings import ConfigError
+from training.fit.configuration import ConfigError
 from training.fit.trainer import Trainer
 from training.research.benchmark import (
     DEFAULT,
