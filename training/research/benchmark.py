@@ -32,7 +32,7 @@ from training.research.measure import (
     POOLED,
     Plan,
     Reports,
-    measure_rows,
+    measure_entries,
     parameters,
     resumable,
     shown,
@@ -396,7 +396,7 @@ def _plan(
 
 def _measured(plan: Plan, entries: Sequence[Entry], options: Options, title: str) -> Reports:
     with shown(console, title, len(entries) * len(plan.settings)) as progress:
-        reports, _ = measure_rows(
+        reports, _ = measure_entries(
             *(plan, entries, progress),
             workers=options.workers,
             fresh=options.fresh,

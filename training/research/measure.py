@@ -172,7 +172,7 @@ class Plan:
         return {source: found[source] for source in self.settings}
 
 
-def measure_rows(
+def measure_entries(
     plan: Plan,
     entries: Sequence[Entry],
     progress: Progress,
