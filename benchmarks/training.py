@@ -16,8 +16,8 @@ from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import frequencies, presence, random_scenes
 from training.datasets.batches import Batch
+from training.fit.configuration import ObjectiveConfig
 from training.fit.objectives import ContrastiveDivergence
-from training.fit.settings import ObjectiveConfig
 from training.machines import MachineSpec, build
 
 OURS, LOCAL, DENSE = "ours, seed form", "ours, local form", "dense Triway"

@@ -33,13 +33,13 @@ from training.evaluation.metrics import Figure
 from training.evaluation.report import evaluate
 from training.evaluation.tasks import in_words
 from training.fit.checkpoint import RunError
-from training.fit.settings import Config, ConfigError, is_file, source_name
+from training.fit.configuration import Config, ConfigError, is_file, source_name
 from training.fit.trainer import Trainer
 from training.machines.distributed import is_first, process_group
 from training.research.ablate import ablate
 from training.research.benchmark import benchmark
 from training.research.tune import tune
-from training.runs.config import data_folder, load_config, shipped_configs, with_settings
+from training.runs.config_files import data_folder, load_config, shipped_configs, with_settings
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun, load_run, save_run
 from training.runs.live import Display, next_steps, summarise

@@ -12,7 +12,7 @@ import pytest
 from app.questions import missing
 from app.registry import Artifact, Store, load_model_set
 from app.scene import CANONICAL, Scene, SceneObject
-from training.runs.config import load_config
+from training.runs.config_files import load_config
 
 STORE = Store(Path(__file__).resolve().parents[2] / "model_store")
 SHIPPED = [
@@ -92,15 +92,15 @@ def test_the_indoor_vocabulary_is_large_enough(artifact):
 
 
 def test_the_training_configuration_is_stored(artifact):
-    from training.fit.settings import Config
-    from training.runs.config import shipped_configs
+    from training.fit.configuration import Config
+    from training.runs.config_files import shipped_configs
 
     config = Config.model_validate(artifact.manifest.training["config"])
     assert config.name in shipped_configs()
 
 
 def test_the_examples_of_its_configuration_fit_its_vocabulary(artifact):
-    from training.runs.config import load_config
+    from training.runs.config_files import load_config
     from training.runs.example_scenes import known_examples, read_examples
 
     examples = read_examples(load_config(artifact.manifest.name).examples, Path())

@@ -8,8 +8,8 @@ from typing import Any
 from typer.testing import CliRunner
 
 from training.cli import app
-from training.fit.settings import Config
-from training.runs.config import config_toml, with_settings
+from training.fit.configuration import Config
+from training.runs.config_files import config_toml, with_settings
 
 
 def invoke(*arguments: object, code: int = 0) -> str:

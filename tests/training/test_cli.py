@@ -21,7 +21,7 @@ from tests.registry.small_artifacts import description, state
 from tests.training.commands import invoke, small_config, write_config
 from training.fit.checkpoint import RunError
 from training.fit.offset_statistics import fit_offsets
-from training.runs.config import load_config, with_settings
+from training.runs.config_files import load_config, with_settings
 from training.runs.pipeline import prepare
 from training.runs.publish import refit
 

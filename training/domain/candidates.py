@@ -1,6 +1,6 @@
-"""The two sides of a comparison of models, and the scenes held out from both sides.
+"""The two candidates of a comparison of models, and the scenes held out from both.
 
-A side is the model of a finished run, a published model, or a set of baselines.
+A candidate is the model of a finished run, a published model, or a set of baselines.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, placed_
 from training.evaluation.baselines.fitting import Baseline
 from training.evaluation.model import Model
 from training.fit.checkpoint import RunError
-from training.fit.settings import Config, ConfigError, DataConfig, source_name
+from training.fit.configuration import Config, ConfigError, DataConfig, source_name
 from training.runs.folder import load_run
 from training.runs.pipeline import digest_of, prepare, read_sources
 from training.runs.publish import calibrated_draft
 
 BASELINES = "baselines"
-"""Name of the side of baselines: EASE for objects, and a frequency table for relations.
+"""Name of the baselines as a candidate: EASE for objects, and a frequency table for relations.
 
 Objects at a place are scored by the product of EASE and a frequency table of places.
 """
@@ -44,7 +44,7 @@ class Candidate:
         title: name of the model in tables.
         learnt: digest of each data source of the training, by source name.
         artifact: the model. None for the baselines.
-        data: folder with the scene files of a run. None if the side is not a run.
+        data: folder with the scene files of a run. None if the candidate is not a run.
     """
 
     title: str
@@ -55,7 +55,7 @@ class Candidate:
 
     @property
     def vocabulary(self) -> Vocabulary | None:
-        """Classes of the model. None for the baselines, which use the classes of the other side."""
+        """Classes of the model. None for the baselines, which use those of the other candidate."""
         return None if self.artifact is None else self.artifact.vocabulary
 
     def model(self, scenes: Vocabulary, data: TrainingData, say: Say) -> Model:
@@ -73,7 +73,7 @@ class Candidate:
 
 
 def run_candidate(folder: Path, data: Path | None, say: Say) -> Candidate:
-    """Load a finished run as a side, and calibrate its model as for publication.
+    """Load a finished run as a candidate, and calibrate its model as for publication.
 
     Args:
         data: folder with the scene files. None means the folder that the run records.
@@ -93,7 +93,7 @@ def run_candidate(folder: Path, data: Path | None, say: Say) -> Candidate:
 
 
 def stored_candidate(reference: str, store: Store) -> Candidate:
-    """Load a published model as a side.
+    """Load a published model as a candidate.
 
     Raises:
         StoreError, ArtifactError: the model does not exist or cannot be used.
@@ -110,7 +110,7 @@ def stored_candidate(reference: str, store: Store) -> Candidate:
 
 
 def find(reference: str, store: Store, data: Path | None, say: Say) -> Candidate:
-    """Return the side that a reference names.
+    """Return the candidate that a reference names.
 
     Args:
         reference: folder of a run, `BASELINES`, or a published model.
@@ -120,7 +120,7 @@ def find(reference: str, store: Store, data: Path | None, say: Say) -> Candidate
         RunError: the folder holds no finished run. See also `run_candidate` and `stored_candidate`.
     """
     if reference == BASELINES:
-        # The baselines are fitted later, on the training scenes of the other side.
+        # The baselines are fitted later, on the training scenes of the other candidate.
         return Candidate(BASELINES, None, {}, None)
     folder = Path(reference)
     if (folder / "config.json").is_file():
@@ -207,8 +207,8 @@ def held_out(
     notes: list[str] = []
     certain = True
     kept = candidates
-    for side in (a, b):
-        judge, note, sure = _kept(side, sources, root)
+    for candidate in (a, b):
+        judge, note, sure = _kept(candidate, sources, root)
         if note:
             notes.append(note)
         certain &= sure
@@ -228,24 +228,24 @@ def held_out(
 
 
 def _kept(
-    side: Candidate, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
+    candidate: Candidate, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
 ) -> tuple[Kept, str, bool]:
     """Return a filter of the held-out scenes, a note or "", and whether the filter is certain."""
-    if side.artifact is None:
+    if candidate.artifact is None:
         return _all, "", True  # the baselines are fitted on the training scenes of the first model
     digests = {name: digest_of(some) for name, some in sources.items()}
     shared = {
         name
         for name, digest in digests.items()
-        if name in side.learnt or digest in side.learnt.values()
+        if name in candidate.learnt or digest in candidate.learnt.values()
     }
     if not shared:
-        names = ", ".join(side.learnt) or "unknown"
-        return _all, f"{side.title} learnt from other data sources ({names})", True
-    if side.config is None:
-        note = f"{side.title} does not record its split and may have learnt from these scenes"
+        names = ", ".join(candidate.learnt) or "unknown"
+        return _all, f"{candidate.title} learnt from other data sources ({names})", True
+    if candidate.config is None:
+        note = f"{candidate.title} does not record its split and may have learnt from these scenes"
         return _all, note, False
-    data = side.config.data
+    data = candidate.config.data
     if data.split == "stable":
         seed = data.split_seed
         return (
@@ -253,11 +253,11 @@ def _kept(
             "",
             True,
         )
-    if (own := _scenes_of(data, side.learnt, sources, digests, root)) is None:
+    if (own := _scenes_of(data, candidate.learnt, sources, digests, root)) is None:
         note = (
-            f"{side.title} may have learnt from these scenes: it learnt from other versions of "
-            f"{', '.join(sorted(shared))}, so its split cannot be reproduced. Use the stable split "
-            "to avoid this"
+            f"{candidate.title} may have learnt from these scenes: it learnt from other versions "
+            f"of {', '.join(sorted(shared))}, so its split cannot be reproduced. Use the "
+            "stable split to avoid this"
         )
         return _all, note, False
     parts = split(own, seed=data.split_seed, protocol=data.split)
@@ -277,7 +277,7 @@ def _scenes_of(
     digests: Mapping[str, str],
     root: Path,
 ) -> list[AnnotatedScene] | None:
-    """Return all scenes of a side before its split, or None if a data source has changed."""
+    """Return all scenes of a candidate before its split, or None if a data source has changed."""
     found: list[AnnotatedScene] = []
     for source in data.sources:
         name = source_name(source)

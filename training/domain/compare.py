@@ -32,7 +32,7 @@ from training.evaluation.results import Difference, Results, only, summarise
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS, in_words
 from training.fit.checkpoint import RunError
-from training.fit.settings import ConfigError
+from training.fit.configuration import ConfigError
 from training.runs.pipeline import read_sources, split_and_encode
 
 COMPARED: dict[str, tuple[str, ...]] = {
@@ -164,9 +164,9 @@ def compare_command(
     show(comparison, console)
 
 
-def _root(given: Path | None, *sides: Candidate) -> Path:
-    known = (side.data for side in sides)
-    return given or next((path for path in known if path is not None), DATA)
+def _root(given: Path | None, *candidates: Candidate) -> Path:
+    folders = (candidate.data for candidate in candidates)
+    return given or next((path for path in folders if path is not None), DATA)
 
 
 def show(comparison: Comparison, console: Console) -> None:

@@ -19,8 +19,8 @@ from training.datasets.rooms import DOMAINS
 from training.domain.proposal import Proposal, propose
 from training.domain.proposal_report import as_dict, show
 from training.evaluation.report import write_whole
-from training.fit.settings import ConfigError, is_file, source_name
-from training.runs.config import shipped_configs
+from training.fit.configuration import ConfigError, is_file, source_name
+from training.runs.config_files import shipped_configs
 from training.runs.example_scenes import examples_json
 
 # Maximum number of invalid lines that are printed. Further invalid lines are only counted.

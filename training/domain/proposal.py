@@ -27,8 +27,8 @@ from training.datasets import (
 from training.domain.labels import Label, Lookalike, count_labels, lookalikes
 from training.domain.look import Facts, look
 from training.evaluation.metrics import FEWEST_GROUPS
-from training.fit.settings import Config, ConfigError
-from training.runs.config import sections_toml
+from training.fit.configuration import Config, ConfigError
+from training.runs.config_files import sections_toml
 from training.runs.example_scenes import choose_examples
 
 # Possible minimum numbers of objects of a class, in order of preference. A class with few objects

@@ -225,13 +225,11 @@ def evaluate(
         task for task, one in EVERY_TASK.items() if one.card and (tasks is None or task in tasks)
     ]
     single = [task for task in wanted if task not in WHOLE_SET]
-    sources = list(by_source(scenes))
-    training = dict(by_source(train))
+    settings = dict(settings_by_source(scenes, structure, train, None, limit=limit))
     rows: list[CardMetric] = []
-    for source, some in sources:
-        setting = Setting(some, structure, training.get(source), limit=limit)
+    for source, setting in settings.items():
         rows += _published(model, setting, source, single, progress)
-    together = sources[0][0] if len(sources) == 1 else "pooled"
+    together = next(iter(settings)) if len(settings) == 1 else "pooled"
     setting = Setting(scenes, structure, train, limit=limit)
     whole = [task for task in wanted if task in WHOLE_SET and task not in ONCE]
     rows += _published(model, setting, together, whole, progress)

@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from training.datasets.batches import SceneTensors
-from training.fit.settings import ObjectsConfig, PolishConfig
+from training.fit.configuration import ObjectsConfig, PolishConfig
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
 from training.machines.chain_samples import pack_scenes

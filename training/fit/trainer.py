@@ -33,9 +33,9 @@ from training.fit.checkpoint import (
     write_csv,
     write_plot,
 )
+from training.fit.configuration import Config
 from training.fit.object_weights import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
 from training.fit.objectives import OBJECTIVES, Objective
-from training.fit.settings import Config
 from training.machines import BoltzmannMachine, MachineSpec, build, distributed
 from training.machines.bernoulli import log_odds_of
 from training.machines.edges import find_triples, triple_keys

@@ -15,11 +15,11 @@ from training.evaluation.report import SourceReport, pooled, settings_by_source
 from training.evaluation.results import grid, only, summarise, write
 from training.evaluation.setting import Setting
 from training.fit.checkpoint import RunError
-from training.fit.settings import Config, ConfigError, first_error
+from training.fit.configuration import Config, ConfigError, first_error
 from training.research.entries import machine_entry
-from training.research.measure import Plan, Reports, measure_rows, place_of, resumable, shown
-from training.research.settings import own_or_shipped
-from training.runs.config import data_folder, load_config, read_toml, with_settings
+from training.research.measure import Plan, Reports, measure_entries, place_of, resumable, shown
+from training.research.shipped_files import own_or_shipped
+from training.runs.config_files import data_folder, load_config, read_toml, with_settings
 from training.runs.folder import load_run
 from training.runs.pipeline import prepare
 
@@ -76,7 +76,7 @@ def ablate(
             for seed in range(seeds)
         ]
         with shown(console, "ablation", len(entries) * len(plan.settings)) as progress:
-            measured, failures = measure_rows(
+            measured, failures = measure_entries(
                 *(plan, entries, progress),
                 workers=workers,
                 fresh=fresh,

@@ -25,21 +25,21 @@ from training.evaluation.report import settings_by_source
 from training.evaluation.results import Results, grid, only, summarise, write
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
-from training.fit.settings import Config, ConfigError, DataConfig
+from training.fit.configuration import Config, ConfigError, DataConfig
 from training.research.baselines import BASELINES
 from training.research.entries import Entry, baseline_entries, machine_entry, reference_entries
 from training.research.measure import (
     POOLED,
     Plan,
     Reports,
-    measure_rows,
+    measure_entries,
     parameters,
     resumable,
     shown,
     slug,
 )
 from training.research.plots import write_plots
-from training.runs.config import data_folder, load_config, with_settings
+from training.runs.config_files import data_folder, load_config, with_settings
 from training.runs.pipeline import SplitScenes, prepare
 from training.seed.protocol import PAPER, SEED_TASKS
 
@@ -396,7 +396,7 @@ def _plan(
 
 def _measured(plan: Plan, entries: Sequence[Entry], options: Options, title: str) -> Reports:
     with shown(console, title, len(entries) * len(plan.settings)) as progress:
-        reports, _ = measure_rows(
+        reports, _ = measure_entries(
             *(plan, entries, progress),
             workers=options.workers,
             fresh=options.fresh,

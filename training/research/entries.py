@@ -18,7 +18,7 @@ from training.evaluation.outlier_tasks import fitted_alarm
 from training.evaluation.report import write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
-from training.fit.settings import Config
+from training.fit.configuration import Config
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.baselines import BASELINES

@@ -43,7 +43,7 @@ from training.evaluation.report import SourceReport, digest, measure, pooled, wr
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, WHOLE_SET, Task
 from training.fit.checkpoint import RunError
-from training.fit.settings import ConfigError
+from training.fit.configuration import ConfigError
 from training.research.entries import Entry
 
 # A progress function receives the row, the source, and a note on the current step.
@@ -141,21 +141,19 @@ class Plan:
         The model is trained only if a report is missing. On KeyboardInterrupt, the results of
         finished tasks are already on disk.
         """
-        known = self.known(entry)
+        known, folder = self.known(entry), self.place(entry)
         model: Model | None = None
         for source, setting in self.settings.items():
             if source in known:
                 progress(entry.name, source, KNOWN)
                 continue
             say = partial(progress, entry.name, source)
-            place = self.place(entry)
             if model is None:
                 say("training")
-                model = entry.make(self.data, place, say)
-            _note_parameters(place, model.parameters)
-            path = place / f"{source}.json"
+                model = entry.make(self.data, folder, say)
+                _note_parameters(folder, model.parameters)
             measure(
-                *(path, model, setting, source),
+                *(folder / f"{source}.json", model, setting, source),
                 tasks=self.asked(source),
                 known=self.known_tasks,
                 progress=say,
@@ -174,7 +172,7 @@ class Plan:
         return {source: found[source] for source in self.settings}
 
 
-def measure_rows(
+def measure_entries(
     plan: Plan,
     entries: Sequence[Entry],
     progress: Progress,

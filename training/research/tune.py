@@ -37,11 +37,17 @@ from training.evaluation.model import Model
 from training.evaluation.relation_tasks import machine_score
 from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
 from training.evaluation.tasks import in_words
-from training.fit.settings import Config, ConfigError, first_error
+from training.fit.configuration import Config, ConfigError, first_error
 from training.fit.trainer import Trainer
 from training.research.measure import resumable
-from training.research.settings import own_or_shipped
-from training.runs.config import config_toml, data_folder, load_config, read_toml, with_settings
+from training.research.shipped_files import own_or_shipped
+from training.runs.config_files import (
+    config_toml,
+    data_folder,
+    load_config,
+    read_toml,
+    with_settings,
+)
 from training.runs.pipeline import prepare
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from training.datasets import AnnotatedScene, curated_names
 from training.datasets.encoding import room_viewpoint
 from training.datasets.records import AnnotatedObject
 from training.datasets.sources import SOURCES
-from training.fit.settings import ConfigError, first_error
+from training.fit.configuration import ConfigError, first_error
 
 _SHIPPED: Final = Path(__file__).parent / "examples"
 _READER: Final = TypeAdapter(Examples)

@@ -17,7 +17,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from training.fit.checkpoint import RunError, TrainingResult
-from training.fit.settings import Config
+from training.fit.configuration import Config
 from training.machines import BoltzmannMachine, MachineSpec, build
 
 

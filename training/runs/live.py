@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from training.fit.checkpoint import Epoch, TrainingResult
-from training.fit.settings import Config
+from training.fit.configuration import Config
 from training.fit.trainer import Trainer
 
 _LEVELS = "▁▂▃▄▅▆▇█"

@@ -31,7 +31,7 @@ from training.datasets import (
 from training.datasets.batches import SceneTensors, TrainingData, scene_tensors
 from training.datasets.files import DATA
 from training.datasets.words import class_vectors, read_word_vectors
-from training.fit.settings import Config, ConfigError, DataConfig, is_file, source_name
+from training.fit.configuration import Config, ConfigError, DataConfig, is_file, source_name
 
 
 @dataclass(frozen=True)

@@ -32,13 +32,13 @@ from training.evaluation.report import evaluate
 from training.evaluation.tasks import STATISTICS
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
+from training.fit.configuration import Config, DataConfig
 from training.fit.count_statistics import fit_counts
 from training.fit.offset_statistics import fit_offsets
 from training.fit.oracle.drawn import DrawnPosterior
-from training.fit.settings import Config, DataConfig
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
-from training.runs.config import load_config, shipped_configs
+from training.runs.config_files import load_config, shipped_configs
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
 from training.runs.pipeline import SplitScenes, read_sources, split_and_encode

@@ -29,7 +29,7 @@ from training.datasets import (
     read_scenes,
 )
 from training.datasets.readers import guess_format
-from training.fit.settings import ConfigError, DataConfig
+from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources
 
 Write = Callable[[Path], Path]

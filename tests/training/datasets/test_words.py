@@ -9,7 +9,7 @@ import pytest
 from app.scene import ObjectClass, Vocabulary
 from training.datasets import DatasetError, indoor_vocabulary, words
 from training.datasets.words import class_vectors, read_word_vectors
-from training.fit.settings import DataConfig
+from training.fit.configuration import DataConfig
 from training.runs.pipeline import read_sources, split_and_encode
 
 WORDS = np.array(["coffee", "table", "zero", "the", "sofa"])

@@ -15,9 +15,9 @@ from training.domain.compare import COMPARED, compare, show, side_by_side
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, POPULARITY
 from training.evaluation.model import Model
 from training.evaluation.tasks import in_words
-from training.fit.settings import Config, ConfigError
+from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import new_machine
-from training.runs.config import with_settings
+from training.runs.config_files import with_settings
 from training.runs.pipeline import prepare, read_sources
 from training.runs.publish import as_stored, draft_artifact
 

@@ -16,7 +16,7 @@ from training.domain.compare import RELATIONAL, Comparison, unmeasured
 from training.domain.gate import Usefulness, losses, measure_usefulness, seat
 from training.evaluation.metrics import Figure
 from training.evaluation.results import Difference, Results
-from training.fit.settings import Config
+from training.fit.configuration import Config
 from training.fit.trainer import Trainer
 from training.runs.pipeline import SplitScenes, prepare
 from training.runs.publish import as_stored, draft_artifact

@@ -6,7 +6,7 @@ import pytest
 
 from training.datasets import generate_rooms, split, stable_part
 from training.domain.candidates import BASELINES, Candidate, held_out
-from training.fit.settings import Config, ConfigError
+from training.fit.configuration import Config, ConfigError
 from training.runs.pipeline import digest_of
 
 SCENES = {"rooms": generate_rooms(500, 0)}

@@ -14,8 +14,8 @@ from training.datasets import generate_rooms
 from training.datasets.jsonl import write_jsonl
 from training.datasets.rooms import DOMAINS
 from training.domain.proposal import propose
-from training.fit.settings import ConfigError
-from training.runs.config import data_folder, load_config
+from training.fit.configuration import ConfigError
+from training.runs.config_files import data_folder, load_config
 from training.runs.pipeline import prepare
 
 SCENES = generate_rooms(80, 0, DOMAINS["workplaces"])

@@ -127,7 +127,7 @@ def test_every_machine_can_be_evaluated(name):
     assert set(report_of(model, silent, asked).outcomes.values()) == {None}
 
 
-def test_a_contender_without_scores_has_no_outcome():
+def test_a_model_without_scores_has_no_outcome():
     assert set(report_of(Model(), SETTING).outcomes.values()) == {None}
 
 

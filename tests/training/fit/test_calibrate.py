@@ -42,8 +42,8 @@ from training.fit.calibrate_objects import (
     smallest_scenes,
     thresholds,
 )
+from training.fit.configuration import ObjectsConfig
 from training.fit.object_weights import fit_objects, store_samples
-from training.fit.settings import ObjectsConfig
 from training.machines import MachineSpec, build
 from training.machines.arrays import machine_of
 from training.runs.publish import draft_artifact

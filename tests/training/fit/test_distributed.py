@@ -13,11 +13,11 @@ import pytest
 import torch
 
 from training.fit.checkpoint import Epoch
-from training.fit.settings import Config
+from training.fit.configuration import Config
 from training.fit.trainer import Trainer
 from training.machines.bernoulli import categorical, integers, uniform
 from training.machines.distributed import mean_part, new_generator, on_first, share
-from training.runs.config import config_toml, load_config, with_settings
+from training.runs.config_files import config_toml, load_config, with_settings
 from training.runs.pipeline import prepare
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -12,12 +12,12 @@ from tests.enumeration.small_machines import binary
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from tests.training.fit.test_trainer import small_config
 from training.fit import object_weights as objects
+from training.fit.configuration import ObjectsConfig, PolishConfig
 from training.fit.object_weights import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
-from training.fit.settings import ObjectsConfig, PolishConfig
 from training.fit.trainer import Trainer
 from training.machines import MachineSpec, build
 from training.machines.chain_samples import unpack_scenes
-from training.runs.config import with_settings
+from training.runs.config_files import with_settings
 from training.runs.pipeline import prepare
 
 V = 4

@@ -23,10 +23,10 @@ from tests.enumeration.small_machines import (
 from training.datasets.batches import Batch, relation_units
 from training.evaluation.missing_tasks import MachineScore
 from training.evaluation.relation_tasks import machine_score as relation_score
+from training.fit.configuration import ObjectiveConfig
 from training.fit.objectives import OBJECTIVES
 from training.fit.objectives.composite import mask_one_class, unlisted_off
 from training.fit.objectives.contrastive import centre_gradients, energy_difference
-from training.fit.settings import ObjectiveConfig
 from training.machines import build
 from training.machines.gibbs import State
 from training.machines.log_odds import object_log_odds

@@ -11,13 +11,13 @@ import torch
 
 from tests.training.evaluation.scenes import V, tensors, toy
 from training.datasets.batches import relation_units
+from training.fit.configuration import ObjectiveConfig
 from training.fit.objectives.relation_likelihood import (
     RelationLikelihood,
     bake_word_prior,
     partly_shown,
     with_counted_residuals,
 )
-from training.fit.settings import ObjectiveConfig
 from training.machines import MachineSpec, build
 
 CONFIG = ObjectiveConfig(name="relations", room_dropout=0.0, offset_prior=0.1, weight_prior=0.1)

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from training.fit.checkpoint import RunError
-from training.fit.settings import Config, ConfigError
+from training.fit.configuration import Config, ConfigError
 from training.fit.trainer import Trainer
 from training.machines import Triway
-from training.runs.config import with_settings
+from training.runs.config_files import with_settings
 from training.runs.folder import load_run, save_run
 from training.runs.pipeline import prepare
 

@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import pytest
 
-from training.fit.settings import ConfigError
+from training.fit.configuration import ConfigError
 from training.research.ablate import load_rows
-from training.research.settings import shipped_files
-from training.runs.config import load_config
+from training.research.shipped_files import shipped_files
+from training.runs.config_files import load_config
 
 FULL = load_config("indoor-triway")
 

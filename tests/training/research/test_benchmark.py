@@ -17,7 +17,7 @@ from training.evaluation.report import SourceReport
 from training.evaluation.results import Cell, Difference, Results, summarise
 from training.evaluation.setting import Outcome, Setting
 from training.evaluation.tasks import TASKS
-from training.fit.settings import ConfigError
+from training.fit.configuration import ConfigError
 from training.fit.trainer import Trainer
 from training.research.benchmark import (
     DEFAULT,
@@ -28,7 +28,7 @@ from training.research.benchmark import (
     shuffled_text,
 )
 from training.research.entries import Entry, baseline_entries
-from training.research.measure import BenchmarkError, Plan, measure_rows
+from training.research.measure import BenchmarkError, Plan, measure_entries
 from training.research.plots import read_curve, recall_points
 from training.runs.folder import load_run
 
@@ -312,8 +312,8 @@ def test_interrupting_keeps_what_is_finished(tmp_path):
     plan = _plan(tmp_path)
     entries = [Entry(name, 0, name, make(name)) for name in ("first", "second")]
     with pytest.raises(KeyboardInterrupt):
-        measure_rows(plan, entries, print)
-    assert set(measure_rows(plan, entries, print)[0]) == {("first", 0), ("second", 0)}
+        measure_entries(plan, entries, print)
+    assert set(measure_entries(plan, entries, print)[0]) == {("first", 0), ("second", 0)}
     assert made == ["first", "second", "second"]
 
 
@@ -326,15 +326,15 @@ def test_a_folder_of_another_row_or_other_scenes_is_refused(tmp_path):
     def row(identity):
         return Entry("row", 0, identity, lambda *_: Model())
 
-    measure_rows(_plan(tmp_path), [row("1")], print)
+    measure_entries(_plan(tmp_path), [row("1")], print)
     with pytest.raises(BenchmarkError, match="another configuration of row"):
-        measure_rows(_plan(tmp_path), [row("2")], print)
+        measure_entries(_plan(tmp_path), [row("2")], print)
     with pytest.raises(BenchmarkError, match="other training scenes"):
-        measure_rows(_plan(tmp_path, "other scenes"), [row("1")], print)
+        measure_entries(_plan(tmp_path, "other scenes"), [row("1")], print)
     # Nor one that does not say what it learnt from.
     (tmp_path / "row/seed-0/row.json").write_text(json.dumps({"identity": "1"}))
     with pytest.raises(BenchmarkError, match="other training scenes"):
-        measure_rows(_plan(tmp_path), [row("1")], print)
+        measure_entries(_plan(tmp_path), [row("1")], print)
 
 
 def test_rows_that_answered_in_other_sources_are_not_paired():

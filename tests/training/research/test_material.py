@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.training.commands import invoke, small_config, write_config
-from training.fit.settings import ConfigError, DataConfig
+from training.fit.configuration import ConfigError, DataConfig
 from training.research.benchmark import Options, compare_on_shuffled, read_domains
 from training.research.entries import baseline_entries
 from training.runs.pipeline import read_sources, split_and_encode

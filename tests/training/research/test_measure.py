@@ -10,7 +10,7 @@ from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.evaluation.model import Model
 from training.evaluation.setting import Setting
 from training.research.entries import Entry
-from training.research.measure import Plan, measure_rows, place_of
+from training.research.measure import Plan, measure_entries, place_of
 
 
 def answers(*_):
@@ -32,7 +32,7 @@ def test_a_row_that_fails_stops_no_other(tmp_path):
     makers = {"first": diverges, "second": answers, "third": diverges, "fourth": answers}
     entries = [Entry(name, 3, name, make) for name, make in makers.items()]
     said = []
-    reports, failed = measure_rows(
+    reports, failed = measure_entries(
         plan(tmp_path), entries, lambda row, _, note: said.append((row, note)), workers=2,
         failures=(FloatingPointError,),
     )  # fmt: skip
@@ -49,4 +49,4 @@ def test_a_row_that_fails_stops_no_other(tmp_path):
 def test_errors_other_than_failures_of_a_row_are_raised(tmp_path):
     entries = [Entry("first", 0, "first", diverges), Entry("second", 0, "second", answers)]
     with pytest.raises(FloatingPointError, match="loss is nan"):
-        measure_rows(plan(tmp_path), entries, print, workers=2)
+        measure_entries(plan(tmp_path), entries, print, workers=2)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from training.fit.settings import Config, ConfigError
-from training.research.settings import shipped_files
+from training.fit.configuration import Config, ConfigError
+from training.research.shipped_files import shipped_files
 from training.research.tune import load_space
-from training.runs.config import load_config, with_settings
+from training.runs.config_files import load_config, with_settings
 
 CONFIG = Config.model_validate(
     {

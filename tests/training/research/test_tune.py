@@ -15,7 +15,7 @@ from optuna.storages.journal import JournalFileBackend
 from tests.training.commands import invoke, small_config, write_config
 from training.fit.trainer import Trainer
 from training.research.tune import Search
-from training.runs.config import load_config
+from training.runs.config_files import load_config
 from training.runs.pipeline import prepare
 
 ROOT = Path(__file__).resolve().parents[3]

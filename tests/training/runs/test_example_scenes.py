@@ -13,7 +13,7 @@ from app.scene import ObjectClass, Vocabulary
 from scene_client.schemas import SceneRequest
 from training.datasets import generate_rooms, source_vocabulary
 from training.datasets.rooms import DOMAINS
-from training.fit.settings import ConfigError
+from training.fit.configuration import ConfigError
 from training.runs.example_scenes import (
     choose_examples,
     examples_json,

@@ -16,9 +16,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from tests.training.commands import invoke, small_config, write_config
 from training.fit.checkpoint import save_checkpoint
-from training.fit.settings import Config
+from training.fit.configuration import Config
 from training.fit.trainer import Trainer
-from training.runs.config import with_settings
+from training.runs.config_files import with_settings
 from training.runs.live import Display, next_steps, sparkline, summarise
 from training.runs.pipeline import prepare
 

@@ -49,7 +49,7 @@ def test_every_machine_is_asked_every_question(name):
             assert again.metrics[metric].value == value.value
 
 
-def test_a_contender_without_a_machine_has_no_outcome():
+def test_a_model_without_a_machine_has_no_outcome():
     assert [task(Model(), SETTING) for task in SEED_TASKS.values()] == [None] * 3
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from training.datasets.batches import Batch, SceneTensors, TrainingData
-from training.fit.settings import ObjectiveConfig
+from training.fit.configuration import ObjectiveConfig
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import uniform
 from training.machines.edges import Edges

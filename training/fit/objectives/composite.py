@@ -34,8 +34,8 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from training.datasets.batches import Batch, relation_units
+from training.fit.configuration import ObjectiveConfig
 from training.fit.objectives.base import Objective, relation_nll, withhold_counts, withhold_rooms
-from training.fit.settings import ObjectiveConfig
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli, categorical, uniform
 from training.machines.distributed import anywhere, gather, mean_part, share, total

@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 
 from training.datasets.batches import Batch, relation_units
+from training.fit.configuration import ObjectiveConfig
 from training.fit.objectives.base import Objective, bernoulli_nll, withhold_rooms
-from training.fit.settings import ObjectiveConfig
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
 from training.machines.distributed import anywhere, gather, mean_part, share, total

@@ -44,8 +44,8 @@ from torch.nn.utils.parametrize import (
 
 from training.datasets.array_types import Floats, Ints
 from training.datasets.batches import Batch, SceneTensors, TrainingData, relation_units
+from training.fit.configuration import ObjectiveConfig
 from training.fit.objectives.base import Objective, relation_nll, withhold_counts, withhold_rooms
-from training.fit.settings import ObjectiveConfig
 from training.machines import BoltzmannMachine, build
 from training.machines.bernoulli import uniform
 from training.machines.distributed import size, total

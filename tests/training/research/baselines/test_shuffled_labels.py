@@ -24,7 +24,7 @@ from training.evaluation.baselines import RELATIONS
 from training.evaluation.baselines.fitting import missing_mrr, partial_mrr
 from training.evaluation.model import RelationScore
 from training.evaluation.relation_tasks import rank, score_scenes
-from training.fit.settings import Config
+from training.fit.configuration import Config
 from training.fit.trainer import Trainer
 from training.research.baselines import BASELINES
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from training.fit.settings import Config, ConfigError
+from training.fit.configuration import Config, ConfigError
 
 
 def shipped_files(kind: str) -> dict[str, Path]:

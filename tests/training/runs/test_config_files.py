@@ -6,8 +6,8 @@ import pytest
 
 from training.datasets.files import DATA
 from training.datasets.sources import SOURCES
-from training.fit.settings import Config, ConfigError, source_name
-from training.runs.config import (
+from training.fit.configuration import Config, ConfigError, source_name
+from training.runs.config_files import (
     config_toml,
     data_folder,
     load_config,

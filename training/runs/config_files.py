@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from training.datasets.files import DATA
-from training.fit.settings import Config, ConfigError, first_error
+from training.fit.configuration import Config, ConfigError, first_error
 
 _TRAINING = Path(__file__).resolve().parents[1]
 _CONFIGS = (_TRAINING / "runs" / "configs", _TRAINING / "seed" / "configs")
