@@ -1,70 +1,60 @@
-"""Which drawn scenes are drawn again: too small ones, and those with an intruder."""
+"""Generated scenes that are drawn again: too small scenes, and scenes with an intruder."""
 
 from __future__ import annotations
 
 import pytest
 
-from app.registry.description import CountSlope, Thresholds
+from app.registry.description import Thresholds
 from tests.questions.answers import generate, outliers
-from tests.questions.artifacts import LARGER, larger_artifact, scene_of
+from tests.questions.artifacts import LABELS, LARGER, larger_artifact, scene_of
 
-LOCAL = [name for name, spec in LARGER.items() if spec.form == "local"]
-# Every object is an intruder, and none is.
-ALL, NONE = (Thresholds(low=p, medium=p, high=p) for p in (0.0, 1.0))
+LOCAL = [name for name, spec in LARGER.items() if spec.is_local]
 
 
-def drawn(artifact, scene, **options):
-    return generate(artifact, scene, count=24, seed=3, steps=4, **options)
+def thresholds(p):
+    return Thresholds(low=p, medium=p, high=p)
+
+
+# Every object is an intruder, or none is.
+ALL, NONE = thresholds(0.0), thresholds(1.0)
+
+
+def draw(name, scene, **calibration):
+    return generate(larger_artifact(name, **calibration), scene, count=24, seed=3, steps=4)
 
 
 @pytest.mark.parametrize("name", LOCAL)
-def test_scenes_that_are_too_small_are_drawn_again(name):
-    """Of eight attempts the last stands whatever it is, so that some may still be small."""
-    rooms = LARGER[name].C + 1
-    free = sorted(len(one.objects) for one in drawn(larger_artifact(name), scene_of([])))
-    # Half of the scenes are smaller, or nearly so.
+def test_too_small_scenes_are_drawn_again(name):
+    """The last attempt is accepted, so some scenes may still be small."""
+    free = sorted(len(scene.objects) for scene in draw(name, scene_of([])))
+    # About half of the scenes are smaller.
     least = free[12] if free[12] > free[0] else free[-1]
-    artifact = larger_artifact(name, smallest=(least,) * rooms)
-    large = [len(one.objects) for one in drawn(artifact, scene_of([]))]
-    assert sum(size < least for size in free) > sum(size < least for size in large)
+    scenes = draw(name, scene_of([]), smallest=(least,) * (LARGER[name].C + 1))
+    assert sum(size < least for size in free) > sum(len(one.objects) < least for one in scenes)
 
 
 @pytest.mark.parametrize("name", LOCAL)
-def test_the_last_attempt_stands(name):
-    """Where every scene is refused, as many come back as where none is."""
-    refused = drawn(larger_artifact(name, outlier_thresholds=ALL), scene_of([0]))
-    assert len(refused) == 24
-    assert all("bed" in one.objects for one in refused)
-    again = drawn(larger_artifact(name, outlier_thresholds=ALL), scene_of([0]))
-    assert refused == again
-    assert refused != drawn(larger_artifact(name, outlier_thresholds=NONE), scene_of([0]))
+def test_the_last_attempt_is_accepted(name):
+    """Every scene has an intruder, and the answer is still complete."""
+    scenes = draw(name, scene_of([0]), outlier_thresholds=ALL)
+    assert len(scenes) == 24
+    assert all("bed" in scene.objects for scene in scenes)
+    assert scenes == draw(name, scene_of([0]), outlier_thresholds=ALL)
+    assert scenes != draw(name, scene_of([0]), outlier_thresholds=NONE)
 
 
-def test_given_objects_are_never_a_reason():
-    """All classes are given: whatever they are, nothing is drawn again."""
-    scene = scene_of(list(range(9)))
-    first, second = (
-        drawn(larger_artifact("triway-local", outlier_thresholds=limits), scene)
-        for limits in (ALL, NONE)
-    )
-    assert first == second
+def test_listed_objects_are_never_intruders():
+    """The evidence contains all classes, so no scene is drawn again."""
+    scene = scene_of(list(range(len(LABELS))))
+    one, other = (draw("triway-local", scene, outlier_thresholds=limits) for limits in (ALL, NONE))
+    assert one == other
 
 
-def test_unlikely_classes_are_drawn_again():
-    """Fewer of what raises an alarm are left."""
-    entry = CountSlope(slope=-1.0)
-    counts = []
-    for limits in (NONE, Thresholds(low=0.5, medium=0.5, high=0.5)):
-        artifact = larger_artifact("triway-local", outlier=entry, outlier_thresholds=limits)
-        scenes = drawn(artifact, scene_of([]))
-        labels = artifact.vocabulary.labels
-        counts.append(
-            sum(
-                entry.probability > 0.5
-                for one in scenes
-                for entry in outliers(
-                    artifact, scene_of([labels.index(label) for label in one.objects])
-                ).outliers
-            )
-        )
+def test_scenes_with_intruders_are_drawn_again():
+    """Fewer intruders remain."""
+    plain, counts = larger_artifact("triway-local"), []
+    for limits in (NONE, thresholds(0.5)):
+        scenes = draw("triway-local", scene_of([]), outlier_thresholds=limits)
+        judged = [outliers(plain, scene_of(list(map(LABELS.index, one.objects)))) for one in scenes]
+        counts.append(sum(entry.probability > 0.5 for one in judged for entry in one.outliers))
     assert counts[1] < counts[0]

@@ -17,7 +17,7 @@ from app.scene import (
     canonicalise,
     contradiction,
 )
-from tests.questions.answers import disagreements, misplaced, missing, outliers, relations
+from tests.questions.answers import disagreements, generate, misplaced, missing, outliers, relations
 from tests.questions.artifacts import LABELS, LARGER, STRUCTURE, larger_artifact, scene_of
 
 pytestmark = pytest.mark.usefixtures("without_minimums")
@@ -323,6 +323,14 @@ def test_a_doubtful_object_weighs_less(name):
         (missing, {"at": ("near", 0)}, "near"),
         (outliers, {"threshold": -0.1}, "threshold"),
         (outliers, {"threshold": math.nan}, "threshold"),
+        (generate, {"seed": 0, "count": 0}, "count"),
+        (generate, {"seed": -1}, "seed"),
+        (generate, {"seed": 0, "steps": 0}, "steps"),
+        (generate, {"seed": 0, "temperature": 0.0}, "temperature"),
+        (generate, {"seed": 0, "temperature": math.nan}, "temperature"),
+        (generate, {"seed": 0, "context": {"h3": [0]}}, "h3"),
+        (generate, {"seed": 0, "context": {"h1": [6]}}, "unit 6"),
+        (generate, {"seed": 0, "context": {"h1": [-1]}}, "unit -1"),
     ],
 )
 def test_bad_input_is_refused(question, options, message):
@@ -334,9 +342,9 @@ def test_bad_input_is_refused(question, options, message):
 def test_classes_and_rooms_must_be_known_to_the_machine(question):
     objects = scene_of([0]).objects
     for index in (None, 9):
+        scene = Scene((*objects, SceneObject("x", "x", index)))
         with pytest.raises(ValueError, match="class_index"):
-            bad = SceneObject("x", "x", index)
-            question(ARTIFACTS["triway-local"], Scene((*objects, bad)))
+            question(ARTIFACTS["triway-local"], scene)
     with pytest.raises(ValueError, match="room_type"):
         question(ARTIFACTS["triway-local"], Scene(objects, room_type=2))
 
