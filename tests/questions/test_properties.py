@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from app.questions.answer import significant
 from app.scene import (
     CANONICAL,
     OPPOSITES,
@@ -347,6 +349,15 @@ def test_classes_and_rooms_must_be_known_to_the_machine(question):
             question(ARTIFACTS["triway-local"], scene)
     with pytest.raises(ValueError, match="room_type"):
         question(ARTIFACTS["triway-local"], Scene(objects, room_type=2))
+
+
+def test_numbers_have_six_significant_digits():
+    """Also numbers without an exact power of ten."""
+    numbers = [0.1 + 0.2, 123456.7, 999999.96, 1e300, -1e-300, 5e-324, 0.0]
+    assert significant(np.array(numbers)) == [float(f"{x:.6g}") for x in numbers]
+    rng = np.random.default_rng(0)
+    numbers = rng.normal(size=4096) * 10.0 ** rng.integers(-12, 4, 4096)
+    assert significant(numbers) == [float(f"{x:.6g}") for x in numbers]
 
 
 @few
