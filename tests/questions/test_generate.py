@@ -302,15 +302,8 @@ def test_the_log_score_is_the_log_probability_up_to_a_constant(name):
             assert scene.log_score == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
-# ------------------------------------------------------------------- scenes that are drawn again
-
-
-def thresholds(p):
-    return Thresholds(low=p, medium=p, high=p)
-
-
-# Every object is an intruder, or none is.
-ALL, NONE = thresholds(0.0), thresholds(1.0)
+# Thresholds at which every object is an intruder, none is, and some are.
+ALL, NONE, SOME = (Thresholds(low=p, medium=p, high=p) for p in (0.0, 1.0, 0.5))
 
 
 def draw(name, scene, **calibration):
@@ -347,7 +340,7 @@ def test_listed_objects_are_never_intruders():
 def test_scenes_with_intruders_are_drawn_again():
     """Fewer intruders remain."""
     plain, counts = ARTIFACTS["triway-local"], []
-    for limits in (NONE, thresholds(0.5)):
+    for limits in (NONE, SOME):
         scenes = draw("triway-local", scene_of([]), outlier_thresholds=limits)
         judged = [outliers(plain, scene_of(list(map(LABELS.index, one.objects)))) for one in scenes]
         counts.append(sum(entry.probability > 0.5 for one in judged for entry in one.outliers))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from dataclasses import replace
 from itertools import compress
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -78,14 +78,7 @@ def offsets_of_every_pair(V: int = V) -> Offsets:
     )
 
 
-class Offset(NamedTuple):
-    """Mean and standard deviation in metres, and the number of training scenes."""
-
-    mean: tuple[float, float, float]
-    std: tuple[float, float, float]
-    scenes: int
-
-
+Offset = namedtuple("Offset", "mean std scenes")
 OFFSETS = offsets_of_every_pair()
 VIEWER = viewer_axes()
 
