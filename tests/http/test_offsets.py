@@ -16,7 +16,7 @@ from app.scene import Scene, SceneObject
 from app.scene.geometry import viewer_axes
 from tests.http.stores import V, publish
 from tests.http.test_questions import ask
-from tests.questions.test_offsets import offsets_of_every_pair
+from tests.questions.test_placements import offsets_of_every_pair
 from tests.services import serve
 
 pytestmark = pytest.mark.anyio

@@ -1,4 +1,4 @@
-"""Small artifacts for the four questions: one entry here puts a machine through every test."""
+"""Small artifacts for tests of the questions. Every test uses each machine of this module."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from training.fit.oracle.drawn import DrawnPosterior
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.arrays import weights_of
 
-# Three classes, so that a present one leaves two to choose from; few enough states to enumerate.
+# Few enough states to enumerate.
 EXACT: dict[str, MachineSpec] = {
     "rbm": SMALL["rbm-three-classes"],
     "gbm": SMALL["gbm-one-layer"],
@@ -23,13 +23,13 @@ EXACT: dict[str, MachineSpec] = {
     "triway-local": MachineSpec("triway", V=3, A=1, H1=3, K=2, T=2, C=2, form="local"),
     "triway-implications": MachineSpec("triway", V=3, A=1, H1=3, K=2, T=2, C=2, G=2, form="local"),
 }
-# Too large to enumerate; with structure, four relations and two layers.
+# Too large to enumerate. With structure, four relations and two layers.
 LARGER: dict[str, MachineSpec] = {
     "rbm": MachineSpec("rbm", V=9, A=4, H1=6, T=40, C=2, form="local"),
     "gbm": MachineSpec("gbm", V=9, A=4, H1=6, H2=3, T=40, form="local"),
     "triway-seed": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, form="seed"),
     "triway-local": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, form="local"),
-    # Wide enough for logits that are as good as normal, and so in closed form without relations.
+    # Wide enough for nearly normal logits, so the closed form is exact without relations.
     "triway-wide": MachineSpec("triway", V=9, A=4, H1=90, K=3, T=60, C=2, G=2, form="local"),
     "triway-deep": MachineSpec("triway", V=9, A=4, H1=90, H2=20, K=3, T=60, C=2, form="local"),
     "rbm-wide": MachineSpec("rbm", V=9, A=4, H1=90, T=200, C=2, form="local"),
@@ -44,21 +44,14 @@ ROOMS = ("bedroom", "office")
 
 
 def calibration(relations: int, **changes: object) -> Calibration:
-    """Changes nothing but the signs: unlikely objects are intruders, unlikely relations false.
-
-    Nothing raises an alarm, so that every drawn scene stands.
-    """
-    neutral = {
-        **dict(Calibration.neutral(relations)),
-        "outlier": CountSlope(slope=-1.0),
-        "outlier_thresholds": NEVER,
-        "misplaced": Slope(intercept=0.0, slope=-1.0),
-        "misplaced_thresholds": NEVER,
-    }
-    return Calibration(**(neutral | changes))
+    """A neutral calibration without outliers, so every generated scene is plausible."""
+    line = {"outlier": CountSlope(slope=-1.0), "misplaced": Slope(intercept=0.0, slope=-1.0)}
+    never = {"outlier_thresholds": NEVER, "misplaced_thresholds": NEVER}
+    return Calibration(**{**dict(Calibration.neutral(relations)), **line, **never, **changes})
 
 
 def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:
+    """An artifact with a neutral calibration, except for the changed fields."""
     spec, weights = machine.spec, weights_of(machine)
     vocabulary = Vocabulary(
         [ObjectClass(label, structure=label in STRUCTURE) for label in LABELS[: spec.V]],
@@ -77,12 +70,12 @@ def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:
 
 
 def exact_artifact(name: str, scale: float = 1.3, **changes: object) -> Artifact:
-    """Float64, every weight drawn from N(0, scale²)."""
+    """An artifact in float64. All weights are random numbers from N(0, scale²)."""
     return artifact_of(random_machine(EXACT[name], torch.float64, scale), **changes)
 
 
 def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> Artifact:
-    """Float32, every weight drawn from N(0, scale²)."""
+    """An artifact in float32. All weights are random numbers from N(0, scale²)."""
     return artifact_of(random_machine(LARGER[name], torch.float32, scale), **changes)
 
 
@@ -111,7 +104,7 @@ def scene_of(
     *,
     complete: bool = False,
 ) -> Scene:
-    """Objects named by their place; relations are canonical triples over places."""
+    """A scene. The relations are canonical triples of a relation and two indices of objects."""
     objects = tuple(SceneObject(f"{LABELS[c]}_{k}", LABELS[c], c) for k, c in enumerate(classes))
     triples = None if relations is None else tuple(relations)
     return Scene(objects, triples, complete, room)

@@ -10,66 +10,60 @@ from app.scene import CANONICAL
 from tests.questions.artifacts import LABELS, LARGER, ROOMS, STRUCTURE, larger_artifact
 from training.machines.arrays import machine_of
 
+OBJECTS = [{"label": label} for label in LABELS if label not in STRUCTURE]
+
 
 def relation_weights(machine):
     """The relations in training between classes without structure, and their rows of U, (n, H1)."""
-    names, rows = [], []
+    entries, rows = [], []
     for a, i, j in machine.triples.tolist():
         if not {LABELS[i], LABELS[j]} & STRUCTURE:
             edges = machine.edges(torch.tensor([[i, j]]))
             ends = torch.stack([edges.relation[0], edges.subject[0], edges.object[0]], 1)
             unit = (ends == torch.tensor([a, i, j])).all(1).nonzero()[0, 0]
-            names.append((LABELS[i], CANONICAL[a], LABELS[j]))
+            entries.append({"subject": LABELS[i], "relation": CANONICAL[a], "object": LABELS[j]})
             rows.append(machine.relation_context(edges)[0, unit])
-    return names, torch.stack(rows)
+    return entries, torch.stack(rows)
 
 
-def strongest(names, weights, count):
-    """The names with the largest positive weights, and these weights."""
-    pairs = [(name, w) for name, w in zip(names, weights.tolist(), strict=False) if w > 0]
-    return (
-        zip(*sorted(pairs, key=lambda pair: -pair[1])[:count], strict=True) if pairs else ((), ())
-    )
+def strongest(entries, weights, count):
+    """The entries with the largest positive weights, and these weights."""
+    order = weights.argsort(descending=True)[:count].tolist()
+    return [
+        entries[k] | {"weight": pytest.approx(float(weights[k]), rel=1e-3)}
+        for k in order
+        if weights[k] > 0
+    ]
 
 
 @pytest.mark.parametrize("name", LARGER)
-def test_a_unit_is_described_by_its_largest_positive_weights(name):
+def test_a_unit_has_its_largest_positive_weights_and_a_name_of_them(name):
     artifact = larger_artifact(name)
     machine = machine_of(artifact.weights)
-    triples, rows = relation_weights(machine)
-    objects = [label for label in LABELS if label not in STRUCTURE]
-    weights = {"h1": (machine.W[: len(objects)], rows, machine.Q)}
+    relations, U = relation_weights(machine)
+    rooms = [{"label": room} for room in ROOMS]
+    weights = {"h1": (machine.W[: len(OBJECTS)], U, machine.Q)}
     if machine.spec.H2:
         weights["h2"] = tuple(part @ machine.J for part in weights["h1"])
     layers = contexts(artifact)
     assert layers.keys() == weights.keys()
-    for layer, (W, U, Q) in weights.items():
-        U = U - U.mean(1, keepdim=True)
-        assert [unit.unit for unit in layers[layer]] == list(range(W.shape[1]))
-        for k, unit in enumerate(layers[layer]):
-            for entries, expected in (
-                (unit.objects, strongest(objects, W[:, k], 8)),
-                (unit.relations, strongest(triples, U[:, k], 3)),
-                (unit.room_types, strongest(ROOMS, Q[:, k], 3)),
-            ):
-                names, values = expected
-                described = [
-                    tuple(entry.model_dump(exclude={"weight"}).values()) for entry in entries
-                ]
-                assert described == [name if isinstance(name, tuple) else (name,) for name in names]
-                assert [entry.weight for entry in entries] == pytest.approx(values, rel=1e-3)
-
-
-@pytest.mark.parametrize("name", LARGER)
-def test_a_unit_is_named_by_its_first_objects_and_relation(name):
-    names = []
-    for unit in (unit for units in contexts(larger_artifact(name)).values() for unit in units):
-        objects = ", ".join(entry.label for entry in unit.objects[:3])
-        relations = [f"{one.subject} {one.relation} {one.object}" for one in unit.relations[:1]]
-        assert unit.name == "; ".join(filter(None, [objects, *relations]))
-        names.append(unit.name)
+    names = {unit.name for units in layers.values() for unit in units}
     # Each unit has random weights of its own.
-    assert len(set(names)) > 0.9 * len(names)
+    assert len(names) > 0.9 * sum(map(len, layers.values()))
+    for layer, (W, U, Q) in weights.items():
+        assert len(layers[layer]) == W.shape[1]
+        for k, unit in enumerate(layers[layer]):
+            objects = strongest(OBJECTS, W[:, k], 8)
+            triples = strongest(relations, U[:, k] - U.mean(1), 3)
+            parts = [", ".join(entry["label"] for entry in objects[:3])]
+            parts += [" ".join(list(entry.values())[:3]) for entry in triples[:1]]
+            assert unit.model_dump() == {
+                "unit": k,
+                "name": "; ".join(filter(None, parts)),
+                "objects": objects,
+                "relations": triples,
+                "room_types": strongest(rooms, Q[:, k], 3),
+            }
 
 
 def test_a_unit_without_positive_weights_has_its_number_as_name():

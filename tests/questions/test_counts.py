@@ -1,9 +1,8 @@
-"""`more`: the numbers of instances follow the formula, and only sensible classes are proposed."""
+"""`more`: the distribution of the number of instances, and the classes in the answer."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +12,8 @@ from hypothesis import strategies as st
 
 from app.questions.counts import LIKELY, distribution
 from app.registry import Counts
-from app.scene import Scene
 from tests.questions.answers import more
-from tests.questions.artifacts import LABELS, LARGER, calibration, larger_artifact, scene_of
+from tests.questions.artifacts import LABELS, LARGER, larger_artifact, scene_of
 
 SPEC = LARGER["triway-local"]
 V, C, M = SPEC.V, SPEC.C, 5
@@ -40,13 +38,13 @@ EVERY = list(range(V))
 
 
 def by_hand(
-    found: Counts, row: int, listed: dict[int, int], room: int | None, rho: float = 1.0
+    counts: Counts, row: int, listed: dict[int, int], room: int | None, rho: float = 1.0
 ) -> list[float]:
     """The formula of `app.questions.counts`, term by term."""
-    own = int(found.classes[row])
+    own = int(counts.classes[row])
     k, others = listed[own], [j for j in listed if j != own]
     exponents = []
-    for a, b, c, *rest in found.weights[row].tolist():
+    for a, b, c, *rest in counts.weights[row].tolist():
         d, e = rest[:C], rest[C:]
         exponent = a + b * (k == 1) + (0.0 if room is None else d[room])
         if others:
@@ -54,7 +52,7 @@ def by_hand(
             exponent += sum(e[j] for j in others) / math.sqrt(len(others))
         exponents.append(exponent)
     eta, zeta = exponents
-    s = [math.exp(x) for x in found.log_share[row].tolist()]
+    s = [math.exp(x) for x in counts.log_share[row].tolist()]
     weight = [0.0] * M
     for n in range(k, M + 1):
         middle = math.log(n) * math.log(M / n)
@@ -69,70 +67,62 @@ def by_hand(
     st.integers(0, 5),
 )
 def test_the_distribution_is_the_formula(listed, room, unlisted, seed):
-    known = counts(seed=seed)
+    random = counts(seed=seed)
     classes = np.array(sorted(listed))
     numbers = np.array([listed[index] for index in classes.tolist()])
-    which, p = distribution(known, V, classes, numbers, room, unlisted)
-    largest = dict(zip(known.classes.tolist(), MOST.tolist(), strict=True))
+    which, p = distribution(random, V, classes, numbers, room, unlisted)
+    largest = dict(zip(random.classes.tolist(), MOST.tolist(), strict=True))
     covered = [listed[index] <= largest.get(index, 0) for index in sorted(listed)]
-    expected = np.flatnonzero(covered).tolist()
-    assert which.tolist() == expected
-    for k, found in zip(which.tolist(), p, strict=True):
-        row = known.classes.tolist().index(classes[k])
-        assert found == pytest.approx(by_hand(known, row, listed, room, unlisted), abs=1e-6)
+    assert which.tolist() == np.flatnonzero(covered).tolist()
+    for k, shares in zip(which.tolist(), p, strict=True):
+        row = random.classes.tolist().index(classes[k])
+        assert shares == pytest.approx(by_hand(random, row, listed, room, unlisted), abs=1e-6)
 
 
-@pytest.mark.parametrize("coverage", [None, 0.2, 0.5, 0.9])
+@pytest.mark.parametrize("coverage", [None, 0.2, 0.5, 0.9, 1.0])
 def test_answers_are_the_moments_of_the_distribution(coverage):
-    """A coverage up to the model's own, 0.5, changes nothing."""
-    rho = 0.2 if coverage == 0.9 else 1.0
-    found = {e.label: e for e in more(ARTIFACT, SCENE, candidates=EVERY, coverage=coverage)}
-    assert found.keys() == {"lamp", "chair"}
+    """Only a coverage above that of the model, 0.5, has an effect."""
+    rho = {0.9: 0.2, 1.0: 0.0}.get(coverage, 1.0)
+    entries = {e.label: e for e in more(ARTIFACT, SCENE, candidates=EVERY, coverage=coverage)}
+    assert entries.keys() == {"lamp", "chair"}
+    numbers = np.arange(1, M + 1)
     for row, label in ((0, "lamp"), (1, "chair")):
         p = np.array(by_hand(COUNTS, row, {DESK: 1, CHAIR: 2, LAMP: 1}, 1, rho))
-        entry = found[label]
-        numbers = np.arange(1, M + 1)
+        entry = entries[label]
         assert entry.listed_count == (2 if label == "chair" else 1)
         assert entry.expected_count == pytest.approx(p @ numbers, abs=1e-5)
         assert entry.probability == pytest.approx(p[entry.listed_count :].sum(), abs=1e-5)
-        inside = (numbers >= entry.low) & (numbers <= entry.high)
-        assert p[inside].sum() >= 0.8
+        assert p[(numbers >= entry.low) & (numbers <= entry.high)].sum() >= 0.8
         assert p[numbers < entry.low].sum() < 0.1
         assert p[numbers > entry.high].sum() <= 0.1 + 1e-9
 
 
-def test_only_probable_classes_are_proposed_likeliest_first():
-    every = more(ARTIFACT, SCENE, candidates=EVERY)
-    found = more(ARTIFACT, SCENE)
+def test_only_probable_classes_are_listed_likeliest_first():
+    every, entries = more(ARTIFACT, SCENE, candidates=EVERY), more(ARTIFACT, SCENE)
     likely = [entry for entry in every if entry.probability >= LIKELY]
-    assert found == tuple(sorted(likely, key=lambda entry: -entry.probability))
-    assert 0 < len(found) < len(every)
-    assert more(ARTIFACT, SCENE, top_k=1) == found[:1]
+    assert entries == tuple(sorted(likely, key=lambda entry: -entry.probability))
+    assert 0 < len(entries) < len(every)
+    assert more(ARTIFACT, SCENE, top_k=1) == entries[:1]
     assert more(ARTIFACT, SCENE, candidates=[DESK]) == ()
-
-
-def test_at_full_coverage_nothing_more_is_there():
     assert more(ARTIFACT, SCENE, coverage=1.0) == ()
-    for entry in more(ARTIFACT, SCENE, coverage=1.0, candidates=EVERY):
-        assert entry.expected_count == pytest.approx(entry.listed_count)
-        assert entry.probability == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize(("label", "most"), [(CHAIR, M - 1), (SHELF, 2)])
-def test_a_number_that_the_statistics_do_not_cover_is_left_out(label, most):
-    for number, expected in ((most, {LAMP, label}), (most + 1, {LAMP})):
-        found = more(ARTIFACT, scene_of([label] * number + [LAMP]), candidates=EVERY)
-        assert {entry.label for entry in found} == {LABELS[index] for index in expected}
+@pytest.mark.parametrize(("index", "most"), [(CHAIR, M - 1), (SHELF, 2)])
+def test_a_number_beyond_the_statistics_is_left_out(index, most):
+    for number, expected in ((most, {LAMP, index}), (most + 1, {LAMP})):
+        entries = more(ARTIFACT, scene_of([index] * number + [LAMP]), candidates=EVERY)
+        assert {entry.label for entry in entries} == {LABELS[index] for index in expected}
 
 
-def test_structure_and_models_without_counts_propose_nothing():
+def test_structure_and_models_without_counts_have_no_entries():
     assert more(ARTIFACT, scene_of([WALL, WALL]), candidates=EVERY) == ()
     assert more(replace(ARTIFACT, counts=None), SCENE, candidates=EVERY) == ()
-    assert more(ARTIFACT, Scene(()), candidates=EVERY) == ()
+    assert more(ARTIFACT, scene_of([]), candidates=EVERY) == ()
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_the_largest_weights_that_a_store_may_hold_give_numbers(sign):
+@pytest.mark.parametrize("coverage", [None, 0.0, 1.0])
+def test_the_largest_weights_of_a_store_give_finite_numbers(sign, coverage):
     huge = counts()
     weights = np.where(huge.weights == 0, 0, sign * 64).astype("f4")
     shares = np.full_like(huge.log_share, -64)
@@ -141,10 +131,9 @@ def test_the_largest_weights_that_a_store_may_hold_give_numbers(sign):
         larger_artifact("triway-local", coverage=1.0),
         counts=Counts(huge.classes, MOST, shares, weights),
     )
-    objects = [index for index in range(WALL) for _ in range(M - 1)]
-    assert Counter(objects)[CHAIR] == M - 1
-    for coverage in (None, 0.0, 1.0):
-        for entry in more(artifact, scene_of(objects), candidates=EVERY, coverage=coverage):
-            assert math.isfinite(entry.expected_count)
-            assert 0 <= entry.probability <= 1
-    assert calibration(1).coverage == 0.5
+    scene = scene_of([index for index in range(WALL) for _ in range(M - 1)])
+    entries = more(artifact, scene, candidates=EVERY, coverage=coverage)
+    assert len(entries) == 2
+    for entry in entries:
+        assert math.isfinite(entry.expected_count)
+        assert 0 <= entry.probability <= 1

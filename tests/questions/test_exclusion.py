@@ -1,4 +1,4 @@
-"""Which drawn relations stay: they can hold all at once, and none is left out without need."""
+"""Drawn relations that stay: no contradictions, and no relation removed without a reason."""
 
 from __future__ import annotations
 
@@ -12,15 +12,13 @@ from app.questions.generate import staying
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
 
 V = 6
-TRIPLES = st.tuples(
-    st.sampled_from([ON_TOP, ABOVE, LEFT, FRONT]), st.integers(0, V - 1), st.integers(0, V - 1)
-)
+CLASSES = st.integers(0, V - 1)
+TRIPLES = st.tuples(st.sampled_from([ON_TOP, ABOVE, LEFT, FRONT]), CLASSES, CLASSES)
 DRAWN = st.dictionaries(TRIPLES, st.sampled_from([-1.0, 0.0, 0.5, 2.0]), max_size=24)
-NONE = np.zeros(V, dtype=np.bool_)
 
 
-def possible(triples):
-    """One relation a pair, one support a class, and an order of the classes in each direction."""
+def is_possible(triples):
+    """One relation per pair, one support per class, and no cycle in any direction."""
     pairs = [frozenset((i, j)) for _, i, j in triples]
     if len(set(pairs)) < len(pairs) or any(len(pair) == 1 for pair in pairs):
         return False
@@ -39,36 +37,33 @@ def possible(triples):
     return True
 
 
-def kept(likelihood, fixed=frozenset(), structure=NONE):
-    units = np.array(list(likelihood), dtype=np.int64).reshape(-1, 3)
-    logits = np.array(list(likelihood.values()), dtype=np.float32)
-    stay = staying(units, logits, fixed, structure)
-    return {triple for triple, stays in zip(likelihood, stay.tolist(), strict=True) if stays}
+def kept(drawn, evidence=frozenset(), structure=(False,) * V):
+    units = np.array(list(drawn), dtype=np.int64).reshape(-1, 3)
+    logits = np.array(list(drawn.values()), dtype=np.float32)
+    stay = staying(units, logits, evidence, np.array(structure))
+    return {triple for triple, stays in zip(drawn, stay.tolist(), strict=True) if stays}
 
 
 @given(DRAWN)
-def test_kept_relations_are_consistent_and_removed_ones_are_not(likelihood):
-    """Each one that goes contradicts those that are at least as likely and stay."""
-    stay = kept(likelihood)
-    assert possible(stay)
-    for triple in set(likelihood) - stay:
-        likelier = {one for one in stay if likelihood[one] >= likelihood[triple]}
-        assert not possible(likelier | {triple})
+def test_kept_relations_are_possible_and_removed_relations_contradict_likelier_ones(drawn):
+    stay = kept(drawn)
+    assert is_possible(stay)
+    for triple in drawn.keys() - stay:
+        likelier = {other for other in stay if drawn[other] >= drawn[triple]}
+        assert not is_possible(likelier | {triple})
 
 
 @given(DRAWN, st.sets(TRIPLES, max_size=4))
-def test_given_relations_stay_and_exclude_others(likelihood, fixed):
-    stay = kept(likelihood, fixed)
-    assert fixed & set(likelihood) <= stay
-    for triple in stay - fixed:
-        assert all({*triple[1:]} != {*one[1:]} for one in fixed)
-    if possible(fixed):
-        assert possible(stay | fixed)
+def test_the_evidence_stays_and_excludes_other_relations(drawn, evidence):
+    stay = kept(drawn, evidence)
+    assert evidence & drawn.keys() <= stay
+    for _, *ends in stay - evidence:
+        assert all({*ends} != {*other[1:]} for other in evidence)
+    if is_possible(evidence):
+        assert is_possible(stay | evidence)
 
 
 @given(DRAWN, st.lists(st.booleans(), min_size=V, max_size=V))
-def test_structure_stands_in_no_relation(likelihood, structure):
-    stay = kept(likelihood, structure=np.array(structure))
-    assert stay == kept(
-        {t: z for t, z in likelihood.items() if not structure[t[1]] and not structure[t[2]]}
-    )
+def test_structure_has_no_relations(drawn, structure):
+    others = {t: z for t, z in drawn.items() if not (structure[t[1]] or structure[t[2]])}
+    assert kept(drawn, structure=structure) == kept(others)

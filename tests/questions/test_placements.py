@@ -1,19 +1,31 @@
-"""Placements of missing objects: the minimum of an entry, and impossible places."""
+"""Placements of missing objects, and their offsets in metres."""
 
 from __future__ import annotations
 
 import math
+from collections import namedtuple
+from dataclasses import replace
 from itertools import compress
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from app.registry import PairSlope
-from app.scene.relations import ON_TOP
+from app.questions.placements import offsets_of
+from app.registry import Offsets, PairSlope
+from app.registry.offsets import NOTHING
+from app.scene import CANONICAL, Scene, SceneObject
+from app.scene.geometry import viewer_axes
+from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP, canonicalise
 from tests.questions.answers import missing, without_minimums
-from tests.questions.artifacts import larger_artifact, scene_of
+from tests.questions.artifacts import LARGER, larger_artifact, scene_of
+
+V = LARGER["triway-local"].V
+A = len(CANONICAL)
 
 
-def test_only_likely_places_and_strong_reasons_are_listed() -> None:
+def test_only_likely_places_and_strong_reasons_are_listed():
     """Places with 3/4 of the first place's probability, and reasons that change odds threefold."""
     scene = scene_of([0, 1, 2, 3], [(2, 1, 0)])
     further_places, reasons = [], []
@@ -39,8 +51,8 @@ ARTIFACT = larger_artifact("triway-local", placement=SLOPES)
 
 
 @pytest.mark.usefixtures("without_minimums")
-def test_no_place_is_under_an_object_on_top_of_another() -> None:
-    def under(*stated: tuple[int, int, int]) -> set[int]:
+def test_no_place_is_under_an_object_on_top_of_another():
+    def under(*stated):
         entries = missing(ARTIFACT, scene_of([0, 1, 2], list(stated)), top_k=9)
         places = [place for entry in entries for place in entry.placements]
         return {place.object for place in places if place.relation == "under"}
@@ -48,3 +60,103 @@ def test_no_place_is_under_an_object_on_top_of_another() -> None:
     assert 0 in under()
     assert 0 not in under((ON_TOP, 0, 1))
     assert 1 in under((ON_TOP, 0, 1))
+
+
+def offsets_of_every_pair(V: int = V) -> Offsets:
+    """Random offsets, different for each pair of classes."""
+    rng = np.random.default_rng(0)
+    nothing = np.zeros((A, V, 6), np.float32)
+    spread = rng.uniform(0.1, 0.6, (A * V * V, 3))
+    return Offsets(
+        relation=np.concatenate([rng.normal(size=(A, 3)), np.full((A, 3), 0.25)], 1).astype("f4"),
+        relation_scenes=np.full(A, 9),
+        subject=nothing,
+        object=nothing,
+        pair=np.arange(A * V * V),
+        pair_offset=np.concatenate([rng.normal(size=(A * V * V, 3)), spread], 1).astype("f4"),
+        pair_scenes=np.arange(1, A * V * V + 1),
+    )
+
+
+Offset = namedtuple("Offset", "mean std scenes")
+OFFSETS = offsets_of_every_pair()
+VIEWER = viewer_axes()
+
+
+def offset_of(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFFSETS):
+    """The offset of one placement, or None if it is unknown."""
+    ends = (np.array([value]) for value in (relation, missing, anchor, outgoing))
+    mean, std, scenes = (values[0].tolist() for values in offsets_of(offsets, *ends, axes))
+    return None if scenes == NOTHING else Offset(tuple(mean), tuple(std), scenes)
+
+
+@given(st.integers(0, A - 1), st.integers(0, V - 1), st.integers(0, V - 1))
+def test_opposite_relations_have_negative_offsets(a, i, j):
+    """left(i, j) and right(j, i) are the same fact."""
+    to, back = offset_of(a, i, j), offset_of(a, j, i, outgoing=False)
+    assert back == to._replace(mean=tuple(-x for x in to.mean))
+
+
+@given(st.floats(-7, 7), st.booleans())
+def test_the_offset_turns_with_the_viewer(yaw, optical):
+    """Compared with turned samples from the offset of the standard viewer."""
+    plain = offset_of(LEFT, 1, 2)
+    frame = "camera_optical_frame" if optical else "map"
+    offset = offset_of(LEFT, 1, 2, axes=viewer_axes(frame, yaw))
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    if optical:
+        turn = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]]) @ turn
+    assert offset.mean == pytest.approx(turn @ plain.mean, abs=2e-3)
+    samples = np.random.default_rng(1).normal(plain.mean, plain.std, (20_000, 3))
+    # The standard error of a standard deviation is 0.5 %.
+    assert offset.std == pytest.approx((samples @ turn.T).std(axis=0), rel=0.03)
+
+
+@pytest.mark.parametrize("relation", [ON_TOP, ABOVE])
+def test_vertical_relations_have_a_vertical_offset_without_a_viewer(relation):
+    """The spread is that of samples, turned by random angles."""
+    plain, offset = offset_of(relation, 1, 2), offset_of(relation, 1, 2, axes=None)
+    rng = np.random.default_rng(1)
+    samples, angle = rng.normal(plain.mean, plain.std, (100_000, 3)), rng.uniform(0, 7e3, 100_000)
+    x = np.cos(angle) * samples[:, 0] - np.sin(angle) * samples[:, 1]
+    assert offset.mean == (0.0, 0.0, plain.mean[2])
+    assert offset.std == pytest.approx((x.std(), x.std(), plain.std[2]), rel=0.02)
+
+
+def test_unknown_offsets():
+    """Left and front without a viewer, and relations without poses in training."""
+    assert offset_of(LEFT, 1, 2, axes=None) is None
+    assert offset_of(FRONT, 1, 2, outgoing=False, axes=None) is None
+    none = {"pair": np.zeros(0, np.int64), "pair_offset": np.zeros((0, 6), "f4")}
+    counts = {"relation_scenes": np.array([1, 0, 9, 9]), "pair_scenes": np.zeros(0, np.int64)}
+    partial = replace(OFFSETS, **counts, **none)
+    assert offset_of(FRONT, 1, 2, offsets=partial) is None
+    assert offset_of(LEFT, 1, 2, offsets=partial).scenes == 0
+
+
+def test_no_zero_is_negative_and_every_spread_is_positive():
+    exact = replace(OFFSETS, pair_offset=np.tile(np.float32([0, 0, 0, 1e-6, 1, 1]), (A * V * V, 1)))
+    offset = offset_of(LEFT, 1, 2, outgoing=False, offsets=exact)
+    assert [math.copysign(1, x) for x in offset.mean] == [1, 1, 1]
+    assert offset.std[0] == 0.001
+
+
+@pytest.mark.parametrize("name", ["rbm", "triway-wide", "triway-local"])
+def test_placements_have_the_offsets_of_their_classes(name):
+    artifact = larger_artifact(name)
+    scene = Scene(
+        tuple(
+            SceneObject(str(k), "", index, position=(0.0, 0.0, 0.0))
+            for k, index in enumerate((2, 0, 8, 2, 4))
+        )
+    )
+    entries, bare = (missing(replace(artifact, offsets=some), scene) for some in (OFFSETS, None))
+    for entry, other in zip(entries, bare, strict=True):
+        assert entry.label == other.label
+        index = artifact.vocabulary.index(entry.label)
+        assert [place[:3] for place in entry.placements] == list(other.placements)
+        for place in entry.placements:
+            relation, subject, _ = canonicalise("missing", place.relation, "anchor")
+            anchor = scene.objects[place.object].class_index
+            assert place.offset == offset_of(relation, index, anchor, subject == "missing")

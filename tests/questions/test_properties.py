@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from app.questions.answer import significant
 from app.scene import (
     CANONICAL,
     OPPOSITES,
@@ -17,7 +20,7 @@ from app.scene import (
     canonicalise,
     contradiction,
 )
-from tests.questions.answers import disagreements, misplaced, missing, outliers, relations
+from tests.questions.answers import disagreements, generate, misplaced, missing, outliers, relations
 from tests.questions.artifacts import LABELS, LARGER, STRUCTURE, larger_artifact, scene_of
 
 pytestmark = pytest.mark.usefixtures("without_minimums")
@@ -289,17 +292,13 @@ def test_an_empty_scene(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_doubtful_object_weighs_less(name):
-    """Confidence 1 is presence. Near 0, the answers are those of a scene without the object."""
-    sure = scene_of([0, 1])
-    doubtful = [
-        Scene((sure.objects[0], SceneObject("lamp_1", "lamp", 1, confidence)))
-        for confidence in (1.0, 1e-6)
-    ]
-    present, certain, unlikely, absent = (
+    """Near confidence 0, the answers are those of a scene without the object."""
+    bed, lamp = scene_of([0, 1]).objects
+    doubtful = Scene((bed, replace(lamp, confidence=1e-6)))
+    present, unlikely, absent = (
         {e.label: e.log_odds for e in missing(ARTIFACTS[name], scene, candidates=range(2, 8))}
-        for scene in (sure, *doubtful, scene_of([0]))
+        for scene in (scene_of([0, 1]), doubtful, scene_of([0]))
     )
-    assert present == certain
     assert unlikely == pytest.approx(absent, abs=1e-4)
     assert present != pytest.approx(absent, abs=1e-2)
 
@@ -323,6 +322,14 @@ def test_a_doubtful_object_weighs_less(name):
         (missing, {"at": ("near", 0)}, "near"),
         (outliers, {"threshold": -0.1}, "threshold"),
         (outliers, {"threshold": math.nan}, "threshold"),
+        (generate, {"seed": 0, "count": 0}, "count"),
+        (generate, {"seed": -1}, "seed"),
+        (generate, {"seed": 0, "steps": 0}, "steps"),
+        (generate, {"seed": 0, "temperature": 0.0}, "temperature"),
+        (generate, {"seed": 0, "temperature": math.nan}, "temperature"),
+        (generate, {"seed": 0, "context": {"h3": [0]}}, "h3"),
+        (generate, {"seed": 0, "context": {"h1": [6]}}, "unit 6"),
+        (generate, {"seed": 0, "context": {"h1": [-1]}}, "unit -1"),
     ],
 )
 def test_bad_input_is_refused(question, options, message):
@@ -334,11 +341,20 @@ def test_bad_input_is_refused(question, options, message):
 def test_classes_and_rooms_must_be_known_to_the_machine(question):
     objects = scene_of([0]).objects
     for index in (None, 9):
+        scene = Scene((*objects, SceneObject("x", "x", index)))
         with pytest.raises(ValueError, match="class_index"):
-            bad = SceneObject("x", "x", index)
-            question(ARTIFACTS["triway-local"], Scene((*objects, bad)))
+            question(ARTIFACTS["triway-local"], scene)
     with pytest.raises(ValueError, match="room_type"):
         question(ARTIFACTS["triway-local"], Scene(objects, room_type=2))
+
+
+def test_numbers_have_six_significant_digits():
+    """Also numbers without an exact power of ten."""
+    numbers = [0.1 + 0.2, 123456.7, 999999.96, 1e300, -1e-300, 5e-324, 0.0]
+    assert significant(np.array(numbers)) == [float(f"{x:.6g}") for x in numbers]
+    rng = np.random.default_rng(0)
+    numbers = rng.normal(size=4096) * 10.0 ** rng.integers(-12, 4, 4096)
+    assert significant(numbers) == [float(f"{x:.6g}") for x in numbers]
 
 
 @few

@@ -1,4 +1,4 @@
-"""Coverage: how the partial posterior enters the answers about missing objects."""
+"""Coverage: the effect of other unlisted classes on the answers about missing objects."""
 
 from __future__ import annotations
 
@@ -19,9 +19,16 @@ SPECS = {
     "gbm": MachineSpec("gbm", V=9, A=4, H1=12, H2=3, T=8, N=256, form="local"),
     "triway": MachineSpec("triway", V=9, A=4, H1=90, K=3, C=2, N=256, form="local"),
 }
+SCENES = [scene_of([]), scene_of([0, 3, 3, 8]), scene_of([0, 1, 2], [(2, 1, 0), (0, 0, 2)])]
+# The model uses this coverage for larger ones. At 1, no unlisted class could be present.
+FULL = 0.999
+UNLISTED = math.log(1 - FULL)
+
+every_machine = pytest.mark.parametrize("name", SPECS)
 
 
 def sampled_artifact(name, **changes):
+    """An artifact with stored samples."""
     generator = torch.Generator().manual_seed(5)
     machine = build(SPECS[name])
     with torch.no_grad():
@@ -36,31 +43,20 @@ def sampled_artifact(name, **changes):
 
 
 def log_odds(artifact, scene, **options):
-    return {a.label: a.log_odds for a in missing(artifact, scene, top_k=9, **options)}
+    return {entry.label: entry.log_odds for entry in missing(artifact, scene, top_k=9, **options)}
 
 
-@pytest.fixture(params=SPECS)
-def name(request):
-    return request.param
-
-
-SCENES = [scene_of([]), scene_of([0, 3, 3, 8]), scene_of([0, 1, 2], [(2, 1, 0), (0, 0, 2)])]
-
-
-# A coverage from this on counts as this: at 1 no class could be there unlisted.
-FULL = 0.999
-UNLISTED = math.log(1 - FULL)
-
-
+@every_machine
 @pytest.mark.parametrize("scene", SCENES)
-def test_unlisted_classes_are_absent_at_full_coverage(name, scene):
-    """As without samples of what else may be there."""
+def test_other_unlisted_classes_are_absent_at_full_coverage(name, scene):
+    """As without samples."""
     closed = log_odds(sampled_artifact(name, coverage_weight=0.0), scene, coverage=1.0)
     for coverage in (FULL, 1.0):
         assert log_odds(sampled_artifact(name), scene, coverage=coverage) == closed
     assert log_odds(sampled_artifact(name), scene, coverage=0.5) != closed
 
 
+@every_machine
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_weight_mixes_both_posteriors(name, scene):
     closed, half, partial = (
@@ -70,13 +66,13 @@ def test_the_weight_mixes_both_posteriors(name, scene):
     full = log_odds(sampled_artifact(name), scene, coverage=1.0)
     for label, z in closed.items():
         assert z == pytest.approx(full[label] - UNLISTED + math.log(0.4), abs=1e-4)
-    for label, z in half.items():
-        assert z == pytest.approx((closed[label] + partial[label]) / 2, abs=1e-4)
-    # The constant log(1 - c) is in both: what differs is what other unlisted classes do.
+        assert half[label] == pytest.approx((z + partial[label]) / 2, abs=1e-4)
+    # Both have the constant log(1 - c). The other unlisted classes make the difference.
     assert max(abs(closed[label] - partial[label]) for label in closed) > 0.02
 
 
-def test_the_coverage_is_the_model_s_unless_a_request_says(name):
+@every_machine
+def test_the_default_is_the_coverage_of_the_model(name):
     artifact, scene = sampled_artifact(name, coverage=0.25), scene_of([0, 1])
     assert log_odds(artifact, scene) == log_odds(artifact, scene, coverage=0.25)
     assert log_odds(artifact, scene) != log_odds(artifact, scene, coverage=0.5)
@@ -84,7 +80,7 @@ def test_the_coverage_is_the_model_s_unless_a_request_says(name):
 
 
 @pytest.mark.parametrize("coverage", [0.0, 0.5, 0.9])
-def test_machines_without_samples_count_other_unlisted_classes_as_absent(coverage):
+def test_other_unlisted_classes_are_absent_without_samples(coverage):
     artifact, scene = larger_artifact("triway-wide"), scene_of([0, 1])
     assert artifact.completions is None
     full = log_odds(artifact, scene, coverage=1.0)
@@ -92,17 +88,17 @@ def test_machines_without_samples_count_other_unlisted_classes_as_absent(coverag
         assert z == pytest.approx(full[label] - UNLISTED + math.log1p(-coverage), abs=1e-4)
 
 
-def test_the_lower_the_coverage_the_likelier_an_unlisted_class(name):
-    """Of all together: the expected number of unlisted classes."""
-    artifact, scene = ARTIFACTS[name], scene_of([0])
+ARTIFACTS = {name: sampled_artifact(name) for name in SPECS}
+
+
+@every_machine
+def test_a_lower_coverage_makes_unlisted_classes_likelier(name):
+    """The expected number of unlisted classes."""
     sums = [
-        sum(a.probability for a in missing(artifact, scene, coverage=c, top_k=9))
-        for c in (0.0, 0.5, 0.9, 0.99, 1.0)
+        sum(entry.probability for entry in missing(ARTIFACTS[name], scene_of([0]), **options))
+        for options in ({"coverage": c, "top_k": 9} for c in (0.0, 0.5, 0.9, 0.99, 1.0))
     ]
     assert sums == sorted(sums, reverse=True)
-
-
-ARTIFACTS = {name: sampled_artifact(name) for name in SPECS}
 
 
 @given(
@@ -111,13 +107,14 @@ ARTIFACTS = {name: sampled_artifact(name) for name in SPECS}
     st.floats(0, 1),
     st.booleans(),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_probabilities_at_every_coverage(name, classes, coverage, placed):
-    scene = scene_of(classes)
-    at = ("on-top", 0) if placed and classes else None
-    answers = missing(ARTIFACTS[name], scene, at=at, coverage=coverage, top_k=9)
-    assert {a.label for a in answers} == set(LABELS[:8]) - {LABELS[c] for c in classes}
-    p = [a.probability for a in answers]
+    options = {"coverage": coverage, "at": ("on-top", 0) if placed and classes else None}
+    entries, again = (
+        missing(ARTIFACTS[name], scene_of(classes), top_k=9, **options) for _ in range(2)
+    )
+    assert entries == again
+    assert {entry.label for entry in entries} == set(LABELS[:8]) - {LABELS[c] for c in classes}
+    p = [entry.probability for entry in entries]
     assert p == sorted(p, reverse=True)
     assert all(0 <= value <= 1 for value in p)
-    assert answers == missing(ARTIFACTS[name], scene, at=at, coverage=coverage, top_k=9)
