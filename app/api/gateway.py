@@ -18,6 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app import errors
 from app.api.problems import answer, from_exception, report_defect
+from app.serving.models import NOTHING
 from app.serving.request import SUCCESS, Record
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -85,12 +86,13 @@ class Gateway:
     Args:
         app: the ASGI application that answers the requests.
         settings: settings of the service.
-        runtime: owner of the backlog and the metrics.
+        runtime: owner of the backlog, the metrics and the models.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings, runtime: Runtime) -> None:
         self._app = app
         self._settings = settings
+        self._runtime = runtime
         self._backlog = runtime.backlog
         self._metrics = runtime.metrics
         hosts = settings.accepted_hosts
@@ -159,6 +161,8 @@ class Gateway:
                 elif name == b"content-length":
                     size = value
             if not scope["path"].endswith(_NOT_QUEUED):
+                if self._runtime.models is NOTHING:
+                    raise errors.NotReadyError("The service is starting.")
                 seconds = self._timeout if allowed is None else self._chosen(allowed)
                 deadline = scope["state"]["deadline"] = monotonic() + seconds
                 await self._backlog.enter(seconds, deadline)

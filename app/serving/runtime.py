@@ -41,6 +41,7 @@ class Runtime:
         backlog: queue of requests that wait for admission.
         limits: limits on scenes and answers.
         metrics: metrics of the service.
+        models: current snapshot of the models; `NOTHING` before the start.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -59,19 +60,8 @@ class Runtime:
         self._poll = settings.store_poll
         self._polling: asyncio.Task[None] | None = None
         self._changing = asyncio.Lock()
-        self._models = NOTHING
+        self.models = NOTHING
         self._seen: StoreState | None = None
-
-    @property
-    def models(self) -> ServedModels:
-        """Current snapshot of the models.
-
-        Raises:
-            NotReadyError: the service has not loaded its models yet.
-        """
-        if self._models is NOTHING:
-            raise errors.NotReadyError("The service is starting.")
-        return self._models
 
     @property
     def draining(self) -> bool:
@@ -225,7 +215,7 @@ class Runtime:
         return new
 
     def _serve(self, models: ServedModels) -> None:
-        before, self._models = self._models, models
+        before, self.models = self.models, models
         for alias, target in models.store.aliases.items():
             if before is not NOTHING and before.store.aliases.get(alias) != target:
                 _logger.info("the alias %s names %s now", alias, target)
@@ -237,7 +227,7 @@ class Runtime:
         # Read the state before the files. So the next check of the store finds changes that other
         # processes make during the load.
         self._seen = self._store.state()
-        models = self._models
+        models = self.models
         with progress():
             return prepare(load_model_set(self._store, models.store), self._new_queue, models)
 

@@ -170,10 +170,12 @@ async def test_a_version_that_cannot_answer_is_refused(
     log_odds: float | None,
 ) -> None:
     def fails(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
-        entries = missing(artifact, *args, **parameters)
+        answer = missing(artifact, *args, **parameters)
         if artifact.manifest.version != "2.0.0":
-            return entries
-        return [entry._replace(log_odds=log_odds) for entry in entries] if log_odds else defect()
+            return answer
+        if log_odds is None:
+            return defect()
+        return answer | {"missing": [{"log_odds": log_odds}]}
 
     replace("missing", fails)
     async with serve(store) as client:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import re
@@ -488,16 +487,15 @@ async def test_a_defect_is_a_problem_without_details(
 
 
 async def test_an_answer_that_is_not_finite_is_a_defect(
-    client: httpx.AsyncClient, replace: Replace
+    client: httpx.AsyncClient, replace: Replace, caplog: pytest.LogCaptureFixture
 ) -> None:
     def not_finite(missing: Any, *args: Any, **parameters: Any) -> Any:
-        return tuple(
-            dataclasses.replace(entry, log_odds=math.nan) for entry in missing(*args, **parameters)
-        )
+        return missing(*args, **parameters) | {"missing": [{"log_odds": math.nan}]}
 
     replace("missing", not_finite)
     response = await client.post("/missing", json={"objects": ["bed"]})
     problem(response, 500, "internal-error")
+    assert "not finite" in caplog.text
 
 
 # ------------------------------------------------------------------------------------- pages
