@@ -102,7 +102,7 @@ class Artifact:
     @cached_property
     def completions(self) -> Completions | None:
         """Posterior of unlisted classes. None means that the machine has no stored samples."""
-        if not Completions.fits(self.weights):
+        if not Completions.supports(self.weights):
             return None
         return Completions(self.weights, self.vocabulary.structure, self.scorer)
 
@@ -233,7 +233,7 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
         weights = Weights(spec, tensors)
     except ValueError as error:
         raise ArtifactError("invalid_tensor", str(error)) from None
-    if not ClosedForm.fits(weights):
+    if not ClosedForm.supports(weights):
         raise ArtifactError("unsupported", _UNSUPPORTED)
     return weights
 

@@ -30,7 +30,7 @@ from app.scene.geometry import (
 from app.scene.relations import CANONICAL, contradiction
 
 A = len(CANONICAL)
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 Point = tuple[float, float, float]
 
 
@@ -293,7 +293,7 @@ def pool_instances(
 @compiled
 def pool_classes(
     classes: NDArray[np.int64], confidence: NDArray[np.float64]
-) -> tuple[Places, Places, Places, Places, NDArray[np.float64]]:
+) -> tuple[Indices, Indices, Indices, Indices, NDArray[np.float64]]:
     """Return the n distinct classes of N instances.
 
     Returns:
