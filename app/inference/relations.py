@@ -38,7 +38,7 @@ NEVER: Final = np.float32(-1e4)
 
 Table = tuple[NDArray[np.int32], NDArray[np.int32]]
 
-NOTHING: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
+NO_VALUES: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
 
 # The number of pairs is padded to a multiple of this number, to fill whole vector registers.
 _WHOLE: Final = 32
@@ -280,7 +280,7 @@ class RelationUnits(ABC):
         G, z = self.G, units.z
         if 2 * len(z) < G.shape[0] * G.shape[1]:
             # For a small number of units, products with U are faster than products with G.
-            G, z = NOTHING, self.rows(units)
+            G, z = NO_VALUES, self.rows(units)
         r, g = observed.r[units.kept], observed.g[units.kept]
         y, slopes = kernels.fixed_point(x, G, units.a, units.base, z, r, g, sweeps)
         return y, units, slopes
@@ -296,7 +296,7 @@ class RelationUnits(ABC):
         """Return the values `slopes`, `shift` and `apart` of `Between`."""
         observed, units, n = context.observed, context.units, len(context.classes)
         if observed is None or units is None:
-            return NOTHING, NOTHING, NOTHING
+            return NO_VALUES, NO_VALUES, NO_VALUES
         slopes, kept = np.zeros((self._A, n, n), dtype=np.float32), units.kept
         slopes[observed.a[kept], observed.i[kept], observed.j[kept]] = context.slopes
         return slopes, *self.implication_shifts(context.x, n, observed)
@@ -313,7 +313,7 @@ class RelationUnits(ABC):
         """
         weight = self.implication_weights(x)
         if not len(weight):
-            return NOTHING, NOTHING
+            return NO_VALUES, NO_VALUES
         on = (observed.r > 0) & (observed.i != observed.j)
         ends = observed.i[on], observed.j[on]
         shifts = kernels.implication_shifts(weight, n, observed.a[on], *ends)
@@ -331,7 +331,7 @@ class RelationUnits(ABC):
             beta: 1 / temperature.
         """
         del x, beta
-        return NOTHING.reshape(0, 0)
+        return NO_VALUES.reshape(0, 0)
 
     def log_odds(self, between: Between) -> Floats:
         """Return the log-odds of all relations between the n classes of a scene, (A, n, n).
@@ -482,7 +482,7 @@ class FreeUnits(RelationUnits):
 
     def __init__(self, weights: Weights, U: Floats, g: Floats | None = None) -> None:
         super().__init__(weights)
-        self.G = NOTHING
+        self.G = NO_VALUES
         self._U, self._d, self._g = U, weights["d"], g
         self._table, index = _pair_table(weights)
         self._index = np.full((len(self._table[1]) + 1, self._A), -1, np.int32)

@@ -114,8 +114,8 @@ class Artifact:
     @cached_property
     def popularity(self) -> NDArray[np.float64] | None:
         """(V,) log-odds that a training scene has each class. None means that they are unknown."""
-        found = self.calibration.popularity
-        return np.array(found) if found else None
+        popularity = self.calibration.popularity
+        return np.array(popularity) if popularity else None
 
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:
@@ -193,7 +193,7 @@ def load_artifact(
     if previous is not None and previous.digest == digest:
         return previous
     tensors = unpack(stored, manifest.tensors)
-    offsets, counts = _taken(tensors, OFFSETS), _taken(tensors, COUNTS)
+    offsets, counts = _pop_group(tensors, OFFSETS), _pop_group(tensors, COUNTS)
     weights = _weights(manifest, tensors)
     return Artifact(
         manifest=manifest,
@@ -210,7 +210,7 @@ def load_artifact(
     )
 
 
-def _taken(tensors: dict[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+def _pop_group(tensors: dict[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
     """Remove the tensors with a prefix from a dictionary, and return them."""
     return {name: tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
 
@@ -239,12 +239,7 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
 
 
 def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, str, bytes, str]:
-    """Read and verify the files of an artifact.
-
-    Args:
-        directory: directory of the artifact.
-        max_weights_bytes: maximum size of the weights file. The function checks the size before it
-            reads the file.
+    """Read and verify the files of an artifact; see `load_artifact`.
 
     Returns:
         The parsed manifest, the digest of its bytes (see `Artifact`), the bytes of the weights file
@@ -259,9 +254,7 @@ def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, st
     except FileNotFoundError:
         raise ArtifactError("missing_file", "the artifact's directory does not exist") from None
     except OSError as error:
-        raise ArtifactError(
-            "unreadable", f"the artifact's directory cannot be read: {cause(error)}"
-        ) from None
+        raise _unreadable("the artifact's directory", error) from None
     try:
         _require_no_other_file(folder)
         text = _read(folder, MANIFEST, MAX_MANIFEST_BYTES)
@@ -283,9 +276,7 @@ def _require_no_other_file(folder: int) -> None:
         with os.scandir(folder) as entries:
             extra = {entry.name for entry in entries} - {MANIFEST, WEIGHTS, CARD}
     except OSError as error:
-        raise ArtifactError(
-            "unreadable", f"the artifact's directory cannot be read: {cause(error)}"
-        ) from None
+        raise _unreadable("the artifact's directory", error) from None
     if extra:
         names = ", ".join(sorted(ascii(name) for name in extra)[:8])
         raise ArtifactError(
@@ -307,7 +298,7 @@ def _read(folder: int, name: str, limit: int) -> bytes:
     except FileNotFoundError:
         raise ArtifactError("missing_file", f"the artifact has no file {name}") from None
     except OSError as error:
-        raise ArtifactError("unreadable", f"{name} cannot be read: {cause(error)}") from None
+        raise _unreadable(name, error) from None
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
@@ -317,9 +308,13 @@ def _read(folder: int, name: str, limit: int) -> bytes:
             # size of the file plus 1, so that the buffer is not larger than needed.
             return file.read(min(status.st_size, limit) + 1)
     except OSError as error:
-        raise ArtifactError("unreadable", f"{name} cannot be read: {cause(error)}") from None
+        raise _unreadable(name, error) from None
     finally:
         os.close(descriptor)
+
+
+def _unreadable(what: str, error: OSError) -> ArtifactError:
+    return ArtifactError("unreadable", f"{what} cannot be read: {cause(error)}")
 
 
 def _read_checked(folder: int, name: str, entry: FileEntry, limit: int) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,9 @@ class PairSlope(CountSlope):
 
 
 PairSlopes = Annotated[Many[PairSlope], Field(max_length=len(CANONICAL))]
+
+PAIR_CALIBRATIONS: Final = ("relation", "relation_given", "placement", "asked_place")
+"""Fields of `Calibration` with one `PairSlope` for each canonical relation."""
 
 
 class Slope(Frozen):
@@ -172,27 +175,18 @@ class RelationSlopes:
     Each row of a table is the `PairSlope` of one relation: intercept, slope, log_count,
     log_classes, and K bends of two numbers each.
 
-    Attributes:
-        alone: table for scenes without observed relations.
-        given: table for scenes with observed relations.
-        placement: table for a missing object at its most probable places.
-        asked_place: table for a missing object at the place that a request names.
+    The tables have the names of their fields in `Calibration`.
     """
 
-    alone: Floats
-    given: Floats
+    relation: Floats
+    relation_given: Floats
     placement: Floats
     asked_place: Floats
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
         """Build the tables of a calibration."""
-        return cls(
-            _table(calibration.relation),
-            _table(calibration.relation_given),
-            _table(calibration.placement),
-            _table(calibration.asked_place),
-        )
+        return cls(*(_table(getattr(calibration, name)) for name in PAIR_CALIBRATIONS))
 
 
 def _table(entries: tuple[PairSlope, ...]) -> Floats:
@@ -335,7 +329,7 @@ class Description(Frozen):
             ("A", "vocabulary relations", len(words.relations)),
             *(
                 ("A", f"entries of calibration.{name}", len(getattr(self.calibration, name)))
-                for name in ("relation", "relation_given", "placement", "asked_place")
+                for name in PAIR_CALIBRATIONS
             ),
         ):
             if self.spec.get(name) != length:

@@ -92,7 +92,7 @@ class Manifest(Description):
                 "checksum_mismatch", f"{MANIFEST} does not match its own checksum: it was altered"
             )
         members = _parse(data, complete=trailer is not None)
-        if type(found := members.get("format")) is not int or found != FORMAT:
+        if type(version := members.get("format")) is not int or version != FORMAT:
             raise ArtifactError(
                 "unknown_format",
                 f"{MANIFEST} does not have format {FORMAT}, the only format of this release; "
@@ -126,5 +126,5 @@ def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
 def _first(error: ValidationError) -> str:
     """Return the location and message of the first validation error, without the invalid value."""
     detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
-    place = ".".join(str(part) for part in detail["loc"])
-    return f"{place}: {detail['msg']}" if place else str(detail["msg"])
+    location = ".".join(str(part) for part in detail["loc"])
+    return f"{location}: {detail['msg']}" if location else str(detail["msg"])

@@ -26,7 +26,7 @@ Ints = NDArray[np.integer[Any]]
 PREFIX: Final = "offsets."
 """Prefix of the names of offset tensors. They are in the same file as the machine's tensors."""
 
-NOTHING: Final = -1
+UNOBSERVED: Final = -1
 """Number of scenes that `Offsets.find` returns if the relation never occurred in training."""
 
 
@@ -111,11 +111,10 @@ class Offsets(Tables):
             Offsets (n, 6): mean (3) and standard deviation (3). Then, for each pair, the number of
             training scenes that contain it, (n,). For a pair without training scenes, the number is
             0. Its offset is then the sum of a term of the relation and one term of each class. If
-            the relation never occurred in training, the number is `NOTHING`.
+            the relation never occurred in training, the number is `UNOBSERVED`.
         """
-        found: tuple[NDArray[np.float64], NDArray[np.int64]]
-        found = look_up(self.tables, relation, subject, other)
-        return found
+        offsets, scenes = look_up(self.tables, relation, subject, other)
+        return offsets, scenes
 
     @cached_property
     def tables(self) -> tuple[NDArray[Any], ...]:
@@ -134,12 +133,12 @@ def look_up(tables, relation, subject, other):
     offset, scenes = np.empty((n, 6)), np.empty(n, np.int64)
     for k in range(n):
         a, i, j = relation[k], subject[k], other[k]
-        wanted = (a * V + i) * V + j
-        place = np.searchsorted(pair, wanted)
-        if place < len(pair) and pair[place] == wanted:
-            offset[k], scenes[k] = pair_offset[place], pair_scenes[place]
+        key = (a * V + i) * V + j
+        row = np.searchsorted(pair, key)
+        if row < len(pair) and pair[row] == key:
+            offset[k], scenes[k] = pair_offset[row], pair_scenes[row]
             continue
-        scenes[k] = 0 if relation_scenes[a] > 0 else NOTHING
+        scenes[k] = 0 if relation_scenes[a] > 0 else UNOBSERVED
         for axis in range(6):
             value = np.float64(usual[a, axis]) + subjects[a, i, axis] + objects[a, j, axis]
             offset[k, axis] = value if axis < 3 else math.sqrt(value)

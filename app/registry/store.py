@@ -69,8 +69,6 @@ class Store:
         self._lock_timeout = lock_timeout
         self._max_weights_bytes = max_weights_bytes
 
-    # -- reading --------------------------------------------------------------------------------
-
     def names(self) -> tuple[str, ...]:
         """Return the sorted names of models that have a version or an unreadable folder.
 
@@ -93,12 +91,12 @@ class Store:
         if not _is_directory(folder):
             return ()
         try:
-            found = [entry.name for entry in folder.iterdir() if not _is_unfinished(entry)]
+            entries = [entry.name for entry in folder.iterdir() if not _is_unfinished(entry)]
         except OSError as error:
             raise StoreError(
                 "unreadable", f"the folder of model '{name}' cannot be read: {cause(error)}"
             ) from None
-        return tuple(sorted(filter(is_version, found), key=version_key))
+        return tuple(sorted(filter(is_version, entries), key=version_key))
 
     def aliases(self) -> Mapping[str, AliasTarget]:
         """Return the target of each alias.
@@ -156,8 +154,6 @@ class Store:
                     files += [folder / file for file in (MANIFEST, WEIGHTS, CARD)]
         return tuple((str(file), *_appearance(file)) for file in files)
 
-    # -- writing --------------------------------------------------------------------------------
-
     def require_new(self, name: str, version: str, alias: str | None = None) -> None:
         """Check that a version can be published: its number is valid and new.
 
@@ -175,11 +171,11 @@ class Store:
                 "name_conflict",
                 f"'{name}' is the name of an alias, so it cannot be the name of a model",
             )
-        if version in (known := self.versions(name)):
+        if version in (published := self.versions(name)):
             raise StoreError(
                 "version_exists",
                 f"{name}@{version} is already published, and a version never changes. Choose a "
-                f"new number; the newest version is {known[-1]}",
+                f"new number; the newest version is {published[-1]}",
             )
 
     def publish(
@@ -219,8 +215,8 @@ class Store:
                 self._require_no_model(alias)
                 table = self._changed_table(alias, AliasTarget(name=name, version=version))
             folder = self._prepare_folder(name)
-            place = folder / version
-            if os.path.lexists(place):
+            path = folder / version
+            if os.path.lexists(path):
                 raise StoreError(
                     "version_exists",
                     f"{name}/{version} is a folder without a manifest. Choose a new number, or "
@@ -230,12 +226,12 @@ class Store:
             try:
                 write_artifact(temporary, description, state, storage_dtype=storage_dtype)
                 artifact = load_artifact(temporary, None, self._max_weights_bytes)
-                rename(temporary, place)
+                rename(temporary, path)
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
             if table is not None:
                 self._replace_table(table)
-        return dataclasses.replace(artifact, path=place)
+        return dataclasses.replace(artifact, path=path)
 
     def set_alias(
         self,
@@ -276,8 +272,6 @@ class Store:
             if alias not in self.aliases():
                 raise StoreError("unknown_model", f"no alias has the name '{alias}'")
             self._replace_table(self._changed_table(alias, None))
-
-    # -- inside ---------------------------------------------------------------------------------
 
     def _folders(self) -> list[str]:
         try:

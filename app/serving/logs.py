@@ -85,7 +85,7 @@ def log_config(
         style: "json" for one JSON object per line, or "plain" for text.
         secrets: keys to mask in every line.
     """
-    known = logging.getLevelNamesMapping()
+    levels = logging.getLevelNamesMapping()
     return {
         "version": 1,
         "disable_existing_loggers": False,
@@ -100,7 +100,7 @@ def log_config(
                 "filters": [_is_useful],
             },
         },
-        "root": {"handlers": ["stderr"], "level": max(known[level.upper()], logging.INFO)},
+        "root": {"handlers": ["stderr"], "level": max(levels[level.upper()], logging.INFO)},
         "loggers": {
             "app": {"level": level.upper()},
             "uvicorn.access": {"level": "CRITICAL"},

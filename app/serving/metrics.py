@@ -110,8 +110,6 @@ class Metrics:
         # The questions that each served model has answered, for the removal of its series.
         self._of_model: dict[Key, set[str]] = {}
 
-    # ---------------------------------------------------------------------------- recording
-
     def started(self) -> None:
         """Record that the process begins to load its models."""
         self._started.set(time.time())
@@ -146,12 +144,7 @@ class Metrics:
         self._reloads.labels(change, outcome).inc()
 
     def answered(
-        self,
-        route: str,
-        method: str,
-        outcome: str,
-        seconds: float,
-        serialised: float | None = None,
+        self, route: str, method: str, outcome: str, seconds: float, serialised: float | None = None
     ) -> None:
         """Count one answered request.
 
@@ -191,8 +184,6 @@ class Metrics:
         self._queue.labels(*key).observe(waited)
         self._compute.labels(*key, question).observe(seconds)
         self._rows.labels(*key, question).observe(rows)
-
-    # ---------------------------------------------------------------------------- reporting
 
     def exposition(self) -> bytes:
         """Return all metrics in the text format of Prometheus."""

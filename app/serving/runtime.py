@@ -9,6 +9,7 @@ import logging
 import sys
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Literal
 
 from app import errors
@@ -17,7 +18,7 @@ from app.questions.reading import Limits
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.serving.admission import Backlog, Threads, WorkQueue
 from app.serving.metrics import Change, Metrics
-from app.serving.models import DEFAULT, NOTHING, Key, ServedModels, prepare
+from app.serving.models import DEFAULT, NO_MODELS, Key, ServedModels, prepare
 from app.settings import Settings
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 
@@ -47,20 +48,17 @@ class Runtime:
     def __init__(self, settings: Settings) -> None:
         self.metrics = Metrics()
         self.backlog = Backlog(settings.queue_requests)
-        self._store = Store(
-            settings.store,
-            lock_timeout=_LOCK_TIMEOUT,
-            max_weights_bytes=settings.max_weights_bytes,
-        )
+        limit = settings.max_weights_bytes
+        self._store = Store(settings.store, lock_timeout=_LOCK_TIMEOUT, max_weights_bytes=limit)
         self.limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
-        self._queue_rows = settings.queue_rows
         self._threads = Threads()
+        self._new_queue = partial(WorkQueue, settings.queue_rows, self._threads, self.backlog)
         self._poll = settings.store_poll
         self._polling: asyncio.Task[None] | None = None
         self._changing = asyncio.Lock()
-        self.models = NOTHING
+        self.models = NO_MODELS
         self._seen: StoreState | None = None
 
     @property
@@ -155,14 +153,19 @@ class Runtime:
             )
 
     async def _follow(self) -> None:
-        """Check the store regularly for changes by other processes, and serve the new state."""
+        """Check the store regularly for changes by other processes, and serve the new state.
+
+        If a new version fails, the service lists this version as refused and serves the other
+        changes. If a usable version or alias would become unusable, the service serves no change.
+        """
         while True:
             await asyncio.sleep(self._poll)
             try:
                 async with self._changing:
                     changed = await asyncio.to_thread(self._store.state) != self._seen
                 if changed:
-                    await self._take_over_changes()
+                    async with self._change("poll"):
+                        await self._take_over(self.models.usable.__contains__)
             except errors.RefreshRefusedError as error:
                 for failure in error.failures:
                     _logger.error(
@@ -171,15 +174,6 @@ class Runtime:
                     )
             except Exception:
                 _logger.exception("the service could not load the changes in the store")
-
-    async def _take_over_changes(self) -> None:
-        """Serve the changes in the store, if every usable version and alias stays usable.
-
-        If a new version fails, the service lists this version as refused and serves the other
-        changes.
-        """
-        async with self._change("poll"):
-            await self._take_over(self.models.usable.__contains__)
 
     @asynccontextmanager
     async def _change(self, change: Change) -> AsyncIterator[None]:
@@ -217,10 +211,10 @@ class Runtime:
     def _serve(self, models: ServedModels) -> None:
         before, self.models = self.models, models
         for alias, target in models.store.aliases.items():
-            if before is not NOTHING and before.store.aliases.get(alias) != target:
+            if before is not NO_MODELS and before.store.aliases.get(alias) != target:
                 _logger.info("the alias %s names %s now", alias, target)
         self.metrics.serving(models)
-        if before is NOTHING or before.served != models.served:
+        if before is NO_MODELS or before.served != models.served:
             _settle_memory()
 
     def _load(self) -> ServedModels:
@@ -231,19 +225,16 @@ class Runtime:
         with progress():
             return prepare(load_model_set(self._store, models.store), self._new_queue, models)
 
-    def _new_queue(self) -> WorkQueue:
-        return WorkQueue(self._queue_rows, self._threads, self.backlog)
-
     def _target(self, reference: str) -> AliasTarget:
         try:
-            found = self.models.resolve(reference).reference
+            served = self.models.resolve(reference).reference
         except (errors.ModelUnavailableError, errors.NotReadyError):
             raise errors.ModelUnusableError(
                 f"The service refused to load {reference}; GET /models gives the reason."
             ) from None
         # If the reference is a name without a version, the alias follows the newest usable version.
-        newest = reference == found.name
-        return AliasTarget(name=found.name, version=None if newest else found.version)
+        newest = reference == served.name
+        return AliasTarget(name=served.name, version=None if newest else served.version)
 
 
 def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
