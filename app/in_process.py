@@ -18,11 +18,8 @@ from app.settings import Settings
 from scene_client.errors import InvalidRequestError
 
 
-class _Given(Settings):
-    """Settings that ignore environment variables.
-
-    Environment variables configure only services that run in a separate process.
-    """
+class _FixedSettings(Settings):
+    """Settings without environment variables, which configure only separate processes."""
 
     reads_environment = False
 
@@ -43,7 +40,7 @@ class InProcess(httpx.BaseTransport):
     def __init__(self, store: Path) -> None:
         self.admin_key = secrets.token_hex()
         try:
-            settings = _Given(
+            settings = _FixedSettings(
                 store=store,
                 admin_key=SecretStr(self.admin_key),
                 metrics=False,

@@ -61,14 +61,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.settings = settings
     app.state.runtime = runtime
     app.state.bodies = Bodies(settings)
-    _add_routes(app, settings, runtime)
+    problems.install(app)
+    app.add_middleware(Gateway, settings=settings, runtime=runtime)
+    _add_routes(app, settings)
     return app
 
 
-def _add_routes(app: FastAPI, settings: Settings, runtime: Runtime) -> None:
-    """Add the middleware and the routes to the application."""
-    problems.install(app)
-    app.add_middleware(Gateway, settings=settings, runtime=runtime)
+def _add_routes(app: FastAPI, settings: Settings) -> None:
     app.router.routes.extend((*questions.router.routes, *questions.batches.routes))
     routers = [
         # `models.administration` stands before `models.router`, because both have the same paths.

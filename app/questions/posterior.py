@@ -13,7 +13,7 @@ from app.inference.posterior import Pull, ScenePosterior
 from app.inference.relations import ObservedRelations
 from app.registry.artifact import Artifact
 from app.registry.description import EvidenceWeights
-from app.scene.scene import Scene, instance_evidence, pool_classes, pooled
+from app.scene.scene import Scene, instance_evidence, pool_classes, pool_relations
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
@@ -80,7 +80,7 @@ def given_relations(scene: Scene, present: Present, relations: int) -> ObservedR
     """
     if not relations_given(scene) and scene.poses is None:
         return None
-    on, seen = pooled(present.row, len(present.classes), *instance_evidence(scene))
+    on, seen = pool_relations(present.row, len(present.classes), *instance_evidence(scene))
     # np.stack() makes contiguous arrays. For another layout, numba would compile the loops again.
     a, i, j = np.stack(np.nonzero(seen[:relations]))
     gate = present.presence[i] * present.presence[j]

@@ -286,7 +286,7 @@ def pool_instances(
         raise ValueError(f"confidence must have the shape {(size,)}, not {confidence.shape}")
     labels = np.asarray(classes, dtype=np.int64)
     distinct, _, row, counts, present = pool_classes(labels, np.asarray(confidence, np.float64))
-    on, seen = pooled(row, len(distinct), holds, observed)
+    on, seen = pool_relations(row, len(distinct), holds, observed)
     return ClassEvidence(distinct, counts, present, on, seen, room_type)
 
 
@@ -317,7 +317,7 @@ def pool_classes(
 
 
 @compiled
-def pooled(
+def pool_relations(
     row: NDArray[np.int64], n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).

@@ -64,11 +64,6 @@ class Vocabulary:
             classes, or two room types, have names with the same `label_key`.
     """
 
-    __slots__ = (
-        *("__dict__", "_by_key", "_by_spelling", "_objects"),
-        *("_room_aliases", "_room_by_key", "_room_types"),
-    )
-
     def __init__(
         self,
         objects: Sequence[ObjectClass],
@@ -86,23 +81,25 @@ class Vocabulary:
         self._by_spelling: dict[str, int] = {}
         for index, entry in enumerate(self._objects):
             for name in (entry.label, *entry.aliases):
-                claimed = self._by_key.setdefault(label_key(name), index)
-                if claimed != index:
+                first = self._by_key.setdefault(label_key(name), index)
+                if first != index:
                     raise ValueError(
                         f"two object classes have the name {name!r}: "
-                        f"{self._objects[claimed].label!r} and {entry.label!r}"
+                        f"{self._objects[first].label!r} and {entry.label!r}"
                     )
                 self._by_spelling[name] = index
         self._room_by_key: dict[str, int] = {}
+        self._room_by_spelling: dict[str, int] = {}
         for index, room in enumerate(self._room_types):
             for name in (room, *self._room_aliases.get(room, ())):
                 if not label_key(name):
                     raise ValueError(f"a room type has an empty name: {name!r}")
-                claimed = self._room_by_key.setdefault(label_key(name), index)
-                if claimed != index:
+                first = self._room_by_key.setdefault(label_key(name), index)
+                if first != index:
                     raise ValueError(
-                        f"room types {self._room_types[claimed]!r} and {room!r} have the same name"
+                        f"room types {self._room_types[first]!r} and {room!r} have the same name"
                     )
+                self._room_by_spelling[name] = index
 
     def __len__(self) -> int:
         return len(self._objects)
@@ -163,22 +160,22 @@ class Vocabulary:
         The method accepts all spellings with the same `label_key`. For an unknown phrase such as
         "bottle of milk", it looks up the object in the phrase, a bottle (`head_of`).
         """
-        found = self._by_spelling.get(label)
-        if found is None:
-            found = self._by_key.get(label_key(label))
-        if found is None and (head := head_of(label)) is not None:
-            found = self._by_key.get(label_key(head))
-        return found
+        index = self._by_spelling.get(label)
+        if index is None:
+            index = self._by_key.get(label_key(label))
+        if index is None and (head := head_of(label)) is not None:
+            index = self._by_key.get(label_key(head))
+        return index
 
     def read(self, label: str, *, is_room: bool = False) -> Guess | None:
         """Return the class or room type that a detector's label names for certain, or None.
 
         The method reads the syntax of detectors (`readings`) if `index` does not know the label.
         """
-        index = self.room_index if is_room else self.index
+        index_of = self.room_index if is_room else self.index
         for rule, name in readings(label):
-            if (found := index(name)) is not None:
-                return Guess(found, 1.0, rule)
+            if (index := index_of(name)) is not None:
+                return Guess(index, 1.0, rule)
         return None
 
     def room_index(self, room: str) -> int | None:
@@ -194,13 +191,7 @@ class Vocabulary:
 
     @cached_property
     def _room_names(self) -> NameIndex:
-        return NameIndex(
-            [
-                (name, index)
-                for index, room in enumerate(self._room_types)
-                for name in (room, *self._room_aliases.get(room, ()))
-            ]
-        )
+        return NameIndex(list(self._room_by_spelling.items()))
 
     def nearest(self, label: str, limit: int = 3, *, is_room: bool = False) -> tuple[Match, ...]:
         """Return plausible classes or room types with similar names, most similar first.
@@ -215,9 +206,9 @@ class Vocabulary:
         The method guesses each alternative of a label, or the name in the syntax of detectors.
         """
         names = self._room_names if is_room else self._names
-        found = list(readings(label))
-        inner = [name for rule, name in found if rule == "alternative"]
-        for name in inner or [name for _, name in found][-1:] or [label]:
+        pairs = list(readings(label))
+        alternatives = [name for rule, name in pairs if rule == "alternative"]
+        for name in alternatives or [name for _, name in pairs][-1:] or [label]:
             if (guess := names.guess(name)) is not None:
                 return guess
         return None
