@@ -26,11 +26,7 @@ The figures in the examples are illustrations. Real figures depend on the model.
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
-    """Create the application of the service.
-
-    Args:
-        settings: settings of the service. None means that the function reads the settings from
-            environment variables.
+    """Create the application of the service. By default, the environment contains the settings.
 
     Raises:
         pydantic.ValidationError: an environment variable contains an invalid setting.

@@ -117,10 +117,7 @@ def _read(body: bytes, form: type[FormT]) -> tuple[Any, FormT]:
 def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> FormT:
     """Validate a JSON value. Refuse lists with too many entries before their validation.
 
-    Args:
-        value: the JSON value.
-        form: the schema.
-        at: location of ``value`` in a batch request. It is empty for other requests.
+    ``at`` is the location of the value in a batch request. It is empty for other requests.
 
     Raises:
         InvalidRequestError: the value does not match the schema.

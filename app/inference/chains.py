@@ -229,12 +229,7 @@ class ConditionedChains:
         return ObservedUnits(a, selected.z, selected.base, observed.r[selected.kept])
 
     def draw(self, steps: int, stream: np.random.Generator) -> ChainState:
-        """Run one chain and return its final state.
-
-        Args:
-            steps: number of sweeps over contexts and objects.
-            stream: random stream of this chain.
-        """
+        """Run ``steps`` sweeps of one chain with its random stream and return its final state."""
         V, H1 = self._w.W.shape
         on, mean = np.zeros(V, np.uint8), sigmoid(self._bias)
         if len(self._cumulative):
@@ -253,11 +248,7 @@ class ConditionedChains:
     ) -> ChainState:
         """Continue a chain from a state, change the state in place, and return the final state.
 
-        Args:
-            on: (V,) presence of the classes.
-            h1, h2: (H1,) and (H2,) states of the hidden units.
-            steps: number of sweeps.
-            stream: random stream of this chain.
+        The state has the presence of the classes (V,) and the hidden units h1 (H1,) and h2 (H2,).
         """
         numbers = len(on) + 2 * len(h1) + len(h2) + kernels.PROPOSALS
         while steps > 0:

@@ -225,13 +225,10 @@ def gains_without_others(y, share, W, rows, common, index, group):
     Each row of the result is a class i of ``rows``, and each column is a class j.
 
     Args:
-        y: (H1,) logits of the hidden units.
-        share: (n, H1) contribution of each class and its relations to y.
-        W: (n, H1) weights between each class and the hidden units.
+        y, share, W, group: see `gains_without`.
         rows: (N,) row of each class i in ``share`` and W.
         common: (P, H1) contribution to y of the relations between two classes, for P pairs.
         index: (n, n) row of each pair of classes in ``common``, or -1 for a pair without relations.
-        group: maximum number of factors per product; see `ContextScorer`.
     """
     n, size = share.shape
     gain, both = np.zeros((len(rows), n), np.float32), np.empty_like(y)
@@ -263,10 +260,8 @@ def reasons_for_absent(y, share, W, group):
     class.
 
     Args:
-        y: (H1,) logits of the hidden units.
-        share: (n, H1) contribution of each present class and its relations to y.
+        y, share, group: see `gains_without`.
         W: (N, H1) weights between each absent class and the hidden units.
-        group: maximum number of factors per product; see `ContextScorer`.
     """
     n, growth = len(share), _exps(W)
     change, all_of = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)

@@ -183,8 +183,8 @@ class ScenePosterior:
         The observation of a relation is not evidence for the same relation.
 
         Args:
-            relation: (E,) indices of canonical relations.
-            subject, object_: (E,) indices of the subject and object classes in the scene.
+            relation, subject, object_: (E,) indices of canonical relations, and of their subject
+                and object classes in the scene.
         """
         slopes, shift, _ = self._units.observed_effects(self.context)
         none = np.zeros(len(relation), dtype=np.float32)

@@ -254,8 +254,7 @@ def normal_without_itself(y, U, base, slopes):
         y: (H1,) logits of h1.
         U: (E, H1) weights between the units and h1.
         base: (E,) logits of the units without the term U_e·h1.
-        slopes: (E,) factor slope_e with which each unit acts on y; see
-            `RelationUnits.fixed_point`.
+        slopes: (E,) see `RelationUnits.fixed_point`.
     """
     mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
     rest, m = np.empty_like(y), np.empty_like(y)
@@ -432,8 +431,7 @@ def implication_shifts(weight, n, a, i, j):
     between the same two classes do not change each other's logits.
 
     Args:
-        weight: (F, A) weights of the F features of relations that hold; see
-            `RelationUnits.implication_weights`.
+        weight: see `_shifts`.
         n: number of classes in the scene.
         a, i, j: (E,) indices of the relations that hold, of their subject classes and of their
             object classes. Subject and object class differ.
@@ -454,8 +452,7 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
     to groups at random. But a(i, j) and a(j, i) are always in different groups.
 
     Args:
-        weight: (F, A) weights of the F features of relations that hold; see
-            `RelationUnits.implication_weights`.
+        weight: see `_shifts`.
         logits: (A, n, n) logits of the relations without the changes by other relations.
         free: (A, n, n) bool, True for relations to sample. Other relations keep their value.
         uniform: (A, n, n) random numbers in [0, 1) that decide whether each relation holds.

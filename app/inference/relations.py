@@ -304,13 +304,7 @@ class RelationUnits(ABC):
     def implication_shifts(
         self, x: Floats, n: int, observed: ObservedRelations
     ) -> tuple[Floats, Floats]:
-        """Return the values `shift` and `apart` of `Between`.
-
-        Args:
-            x: (H1,) logits of h1 given the objects.
-            n: number of classes in the scene.
-            observed: observed relations.
-        """
+        """Return `shift` and `apart` of `Between` for n classes; x (H1,) are the logits of h1."""
         weight = self.implication_weights(x)
         if not len(weight):
             return NO_VALUES, NO_VALUES
@@ -324,11 +318,8 @@ class RelationUnits(ABC):
         """Return how much each of F features of the observed relations changes a logit, (F, A).
 
         `training/machines/triway.py` defines the features. The result is empty for machines in
-        which relations do not change each other's logits directly.
-
-        Args:
-            x: (H1,) logits of h1 given the objects.
-            beta: 1 / temperature.
+        which relations do not change each other's logits directly. x (H1,) are the logits of h1
+        given the objects, and beta is 1 / temperature.
         """
         del x, beta
         return NO_VALUES.reshape(0, 0)
@@ -356,8 +347,8 @@ class RelationUnits(ABC):
 
         Args:
             context: hidden units of the scene.
-            a: (E,) indices of the relations.
-            i, j: (E,) indices of the subject and object classes in the scene.
+            a, i, j: (E,) indices of the relations, and of their subject and object classes in the
+                scene.
             slopes: (E,) factor with which each relation acts on y; see `fixed_point`.
             shift: (A, n, n) value `shift` of `Between`, or an empty array.
         """
@@ -599,12 +590,9 @@ class SharedUnits(RelationUnits):
         return mean[:, :, :P], spread[:, :, :P]
 
     def _products(self, chosen: slice, rows: Floats, columns: Floats) -> Floats:
-        """Return the product of each row with the n columns of each chosen relation, (B, R, n).
+        """Return the product of the rows (B, H1) with n columns of each chosen relation, (B, R, n).
 
-        Args:
-            chosen: slice of the R relations.
-            rows: (B, H1) rows.
-            columns: (H1, A n) columns of all A relations; see `_columns`.
+        `_columns` returns the columns (H1, A n) of all relations.
         """
         n = columns.shape[1] // self._A
         products: Floats = rows @ columns[:, chosen.start * n : chosen.stop * n]

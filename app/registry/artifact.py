@@ -180,9 +180,8 @@ def load_artifact(
 
     Args:
         directory: directory with exactly the three files of an artifact.
-        previous: an artifact that was loaded earlier. If the verified files have the same digest,
-            the function returns `previous` instead of a second copy. None means that no artifact
-            was loaded earlier.
+        previous: an artifact that was loaded earlier, or None. If the verified files have the same
+            digest, the function returns `previous` instead of a second copy.
         max_weights_bytes: maximum size of the weights file. The function checks the size before it
             reads the file.
 

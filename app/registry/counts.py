@@ -54,9 +54,6 @@ class Counts(Tables):
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], V: int, C: int) -> Self:
         """Build the counts of a model with V classes and C room types from stored tensors.
 
-        Args:
-            tensors: result of `tensors()`, read from an artifact.
-
         Raises:
             ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
                 `invalid_tensor` if a value is invalid.

@@ -99,10 +99,8 @@ def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
     The function raises no exception for errors in the store, such as invalid versions, unreadable
     aliases or a missing store. The result contains these errors.
 
-    Args:
-        store: the store.
-        previous: earlier snapshot of the store. The function verifies all files again, but reuses
-            artifacts of this snapshot whose digest is unchanged.
+    The function verifies all files, but reuses artifacts of the previous snapshot whose digest is
+    unchanged.
     """
     failure: StoreError | None = None
     aliases: Mapping[str, AliasTarget]

@@ -60,11 +60,6 @@ class Offsets(Tables):
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
         """Build the offsets of a machine with A relations and V classes from stored tensors.
 
-        Args:
-            tensors: result of `tensors()`, read from an artifact.
-            A: number of canonical relations.
-            V: number of object classes.
-
         Raises:
             ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
                 `invalid_tensor` if a value is invalid.
@@ -101,11 +96,7 @@ class Offsets(Tables):
     def find(
         self, relation: Ints, subject: Ints, other: Ints
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the offsets of n pairs of classes, each in one relation.
-
-        Args:
-            relation: (n,) indices of canonical relations.
-            subject, other: (n,) indices of the subject classes and of the object classes.
+        """Return the offsets of n pairs (relation, subject class, object class) of indices (n,).
 
         Returns:
             Offsets (n, 6): mean (3) and standard deviation (3). Then, for each pair, the number of

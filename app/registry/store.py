@@ -157,9 +157,7 @@ class Store:
     def require_new(self, name: str, version: str, alias: str | None = None) -> None:
         """Check that a version can be published: its number is valid and new.
 
-        Args:
-            name, version: name and number of the new version.
-            alias: alias that will point at the version, or None.
+        If ``alias`` is not None, this alias will point at the version.
 
         Raises:
             StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,

@@ -322,14 +322,8 @@ def pool_relations(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
 
-    Args:
-        row: (N,) index of each instance's class, from 0 to n - 1.
-        n: number of classes.
-        holds: (A, N, N) bool, True for relations between instances that hold.
-        observed: (A, N, N) bool, True for relations between instances that were observed.
-
-    Returns:
-        The arrays ``holds`` and ``observed`` of `ClassEvidence`, each (A, n, n).
+    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. `pool_instances` describes
+    ``holds`` and ``observed``. The results are these arrays of `ClassEvidence`.
     """
     size = len(row)
     on, seen = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)

@@ -78,12 +78,7 @@ def log_config(
 
     The access log of uvicorn is off, because it would contain raw paths. The service writes its own
     access log. The log level of libraries is at least `info`, because at `debug` numba would log
-    each step of a compilation.
-
-    Args:
-        level: log level of the service.
-        style: "json" for one JSON object per line, or "plain" for text.
-        secrets: keys to mask in every line.
+    each step of a compilation. Every line masks the secrets.
     """
     levels = logging.getLevelNamesMapping()
     return {

@@ -153,8 +153,7 @@ class Metrics:
             method: HTTP method, or "-" for a method that HTTP does not define.
             outcome: "success" or the slug (short name) of the problem type.
             seconds: duration of the request in seconds.
-            serialised: time in seconds from the last answer of a model to the response. It is None
-                if no model has answered.
+            serialised: see `Record.serialise_seconds`.
         """
         self._requests.labels(route, method, outcome).inc()
         self._latency.labels(route).observe(seconds)
@@ -175,8 +174,7 @@ class Metrics:
             key: name and version of the model.
             question: name of the question.
             rows: number of scenes of the question. It is 1, or the number of generated scenes.
-            waited: time in seconds that the question waited before its computation.
-            seconds: duration of the computation in seconds.
+            waited, seconds: time in seconds before the computation, and of the computation.
         """
         if key not in self._of_model:
             return

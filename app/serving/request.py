@@ -105,12 +105,7 @@ class Request(Ticket):
     async def answer(self, question: Question[RequestT], scene: RequestT) -> Fields:
         """Ask the model in the field `model` of a scene one question.
 
-        Args:
-            question: the question.
-            scene: the validated scene.
-
-        Returns:
-            The fields of `scene_client.schemas.Answer` and of the question.
+        The answer has the fields of `scene_client.schemas.Answer` and of the question.
 
         Raises:
             UnknownModelError: the model does not exist.
@@ -173,11 +168,7 @@ class Request(Ticket):
 
     @contextmanager
     def for_batch(self, references: Sequence[str]) -> Iterator[Request]:
-        """Reserve one row in the model's queue for each scene of a batch.
-
-        Args:
-            references: for each scene, the alias or name of its model. The method does not reserve
-                a row if the model is not usable.
+        """Reserve one row for each scene of a batch in the queue of its model, if it is usable.
 
         Yields:
             A copy of the request that does not reserve further rows.
