@@ -60,12 +60,8 @@ def tune() -> None:
 def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
     """Bind sockets to all addresses of a host, without listening.
 
-    Args:
-        host: host name or IP address to listen on.
-        port: TCP port to listen on. 0 means any free port.
-        send_timeout: seconds after which Linux closes a connection whose client does not
-            acknowledge the bytes sent. On other operating systems, only a proxy can limit this
-            time.
+    Linux closes a connection whose client does not acknowledge the bytes sent within
+    ``send_timeout`` seconds. On other operating systems, only a proxy can limit this time.
 
     Raises:
         OSError: the host does not have a usable address, or the port is in use.

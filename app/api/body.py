@@ -104,14 +104,14 @@ class Bodies:
         Raises:
             NotJSONError, InvalidRequestError: see `parse` and `validated`.
         """
+
+        def read() -> tuple[Any, FormT]:
+            value = parse(body)
+            return value, validated(value, form)
+
         if len(body) <= SMALL:
-            return _read(body, form)
-        return await asyncio.get_running_loop().run_in_executor(self._parser, _read, body, form)
-
-
-def _read(body: bytes, form: type[FormT]) -> tuple[Any, FormT]:
-    value = parse(body)
-    return value, validated(value, form)
+            return read()
+        return await asyncio.get_running_loop().run_in_executor(self._parser, read)
 
 
 def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> FormT:

@@ -167,13 +167,8 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     "server_metadata": {"name": "scene-boltzmann", "version": "1.0.0", "extensions": []},
     "server_live": {"live": True},
     "server_ready": {"ready": True},
-    "model_metadata": {
-        "name": "home",
-        "versions": ["1.0.0", "1.1.0"],
-        "platform": "numpy_triway",
-        "inputs": [],
-        "outputs": [],
-    },
+    "model_metadata": {"name": "home", "versions": ["1.0.0", "1.1.0"]}
+    | {"platform": "numpy_triway", "inputs": [], "outputs": []},
     "model_ready": {"name": "home", "ready": True},
     "show_metrics": (
         "# HELP scene_requests_total Requests answered\n"

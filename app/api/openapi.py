@@ -119,12 +119,12 @@ class DocumentedAPI(FastAPI):
 
 
 def _timeout_parameter(most: int) -> dict[str, Any]:
+    text = "time limit of the request in milliseconds; after this time, the service answers 504"
     return {
         "name": TIMEOUT_HEADER,
         "in": "header",
         "required": False,
-        "description": "time limit of the request in milliseconds; after this time, the service "
-        "answers 504",
+        "description": text,
         "schema": {"type": "integer", "minimum": 1, "maximum": most},
         "examples": {"second": {"summary": "one second", "value": min(1000, most)}},
     }

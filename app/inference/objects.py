@@ -136,11 +136,7 @@ def gains(x, exp_w, group, classes):
     After each group of factors, the function splits the product into mantissa and exponent, and
     adds the exponent to an integer. So one log at the end is enough.
 
-    Args:
-        x: (M, H1) logits of the hidden units.
-        exp_w: exp(W) in tiles; see `ContextScorer`.
-        group: maximum number of factors per product.
-        classes: number V of classes.
+    x (M, H1) are the logits of the hidden units; for ``exp_w`` and ``group``, see `ContextScorer`.
     """
     (tiles, units, width), M = exp_w.shape, len(x)
     gain, off, on = np.empty((M, classes), np.float32), np.empty_like(x), np.empty_like(x)
@@ -336,9 +332,7 @@ def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
         most: (V, M) limit of ``against`` for each class and completion.
         usable: (V,) bool, classes that a completion may add.
         bias: (V,) log-odds of each class without the hidden units.
-        W: (V, H1) weights between classes and hidden units.
-        exp_w: exp(W) in tiles; see `ContextScorer`.
-        group: maximum number of factors per product.
+        W, exp_w, group: see `ContextScorer`.
     """
     (V, size), M = W.shape, len(picked)
     completed, added = np.empty((M, size), np.float32), np.zeros((M, V), np.bool_)

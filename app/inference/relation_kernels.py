@@ -139,13 +139,7 @@ _TAIL = np.exp(-0.5 * (0.25 * np.arange(1, 21)) ** 2).astype(np.float32)
 
 @compiled
 def log_odds(means, spreads, least):
-    """Replace the means of E logits by log-odds in place; see `relations.to_log_odds`.
-
-    Args:
-        means: (E,) means of the logits. The function overwrites this array with the log-odds.
-        spreads: (E,) √3 σ, where σ is the standard deviation of each logit.
-        least: lower limit of the log-odds.
-    """
+    """Replace the means (E,) of logits by log-odds of at least ``least``; see `to_log_odds`."""
     wide = np.flatnonzero(spreads >= _NARROW)
     some = _wide_log_odds(means[wide], spreads[wide])
     one, four = np.float32(1.0), np.float32(4.0)
@@ -190,8 +184,7 @@ def accumulate(keys, weights, rows, size):
 
     Args:
         keys: (E,) key of each row, or (2E,) for two keys per row.
-        weights: (E,) weight of each row.
-        rows: (E, K) rows to sum.
+        weights, rows: (E,) weights, and (E, K) rows to sum.
         size: number of keys.
     """
     sums = np.zeros((size, rows.shape[1]), np.float32)

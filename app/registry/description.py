@@ -74,13 +74,8 @@ NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 class EvidenceWeights(Frozen):
     """Weights from 0 to 1 with which observed relations act on the hidden units.
 
-    Attributes:
-        relations_on_objects: weight of relations that a request states, for questions about
-            objects.
-        relations_on_relations: weight of relations that a request states, for questions about
-            relations.
-        poses_on_objects: weight of relations derived from poses, for questions about objects.
-        poses_on_relations: weight of relations derived from poses, for questions about relations.
+    A request states relations, or the service derives relations from poses. The weights are
+    different for questions about objects and for questions about relations.
     """
 
     relations_on_objects: Annotated[float, Field(ge=0, le=1)] = 1.0
@@ -240,14 +235,10 @@ class VocabularyEntry(Frozen):
 
 
 class DataSource(Frozen):
-    """One source of training scenes.
+    """One source of training scenes: its name, number of scenes and terms of use.
 
-    Attributes:
-        source: name of the source.
-        scenes: number of scenes.
-        digest: SHA-256 of the data, hexadecimal.
-        terms: terms of use.
-        research_only: whether the terms allow only research use.
+    ``digest`` is the SHA-256 of the data. ``research_only`` means that the terms allow only
+    research use.
     """
 
     source: Text
@@ -263,8 +254,6 @@ class Metric(Frozen):
     Attributes:
         task: name of the measured task, such as "T2 missing".
         source: name of the source of the test scenes.
-        metric: name of the metric.
-        value: measured value of the metric.
         low, high: limits of the 95 % confidence interval.
         n: number of measured cases, such as scenes or removed objects.
     """

@@ -184,7 +184,7 @@ class Store:
         storage_dtype: StorageDtype = "float32",
         alias: str | None = None,
     ) -> Artifact:
-        """Publish a version permanently, and optionally point an alias at it.
+        """Publish a version permanently, optionally point an alias at it, and return the artifact.
 
         The method writes the artifact to a temporary folder and loads it from there. So it never
         publishes a version that the service would refuse. Then it renames the folder and changes
@@ -193,9 +193,6 @@ class Store:
         Args:
             description, state, storage_dtype: contents of the artifact; see `write_artifact`.
             alias: name of an alias to point at this version. None means that no alias changes.
-
-        Returns:
-            The published artifact, loaded from its files.
 
         Raises:
             ArtifactError: the artifact is not valid.

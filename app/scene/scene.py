@@ -270,9 +270,7 @@ def pool_instances(
         classes: (N,) index of the class of each instance.
         confidence: (N,) probability that the instance exists. Instances count as independent
             detections, so a class exists with probability 1 - prod(1 - confidence).
-        holds: (A, N, N) bool, True for relations between instances that hold.
-        observed: (A, N, N) bool, True for relations between instances that were observed, whether
-            they hold or not.
+        holds, observed: (A, N, N) bool, see `instance_evidence`.
         room_type: index of the room type, or None if the room type is unknown.
 
     Raises:
@@ -322,8 +320,8 @@ def pool_relations(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
 
-    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. `pool_instances` describes
-    ``holds`` and ``observed``. The results are these arrays of `ClassEvidence`.
+    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are ``holds``
+    and ``observed`` of `ClassEvidence`.
     """
     size = len(row)
     on, seen = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)

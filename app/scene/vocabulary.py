@@ -51,9 +51,9 @@ class ObjectClass:
 
 
 class Vocabulary:
-    """The V object classes and C room types of a model, in a fixed order.
+    """The V object classes and C room types of a model, in a fixed order. Do not change it.
 
-    Args:
+    Attributes:
         objects: object classes. Their order defines the class indices.
         room_types: canonical names of the room types. Their order defines the room indices.
         room_aliases: maps room types to their synonyms.
@@ -72,85 +72,75 @@ class Vocabulary:
     ) -> None:
         if not objects:
             raise ValueError("a vocabulary needs at least one object class")
-        self._objects = tuple(objects)
-        self._room_types = tuple(room_types)
-        self._room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
-        if others := self._room_aliases.keys() - set(self._room_types):
+        self.objects = tuple(objects)
+        self.room_types = tuple(room_types)
+        self.room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
+        if others := self.room_aliases.keys() - set(self.room_types):
             raise ValueError(f"room_aliases names unknown room types: {sorted(others)}")
         self._by_key: dict[str, int] = {}
         self._by_spelling: dict[str, int] = {}
-        for index, entry in enumerate(self._objects):
+        for index, entry in enumerate(self.objects):
             for name in (entry.label, *entry.aliases):
                 first = self._by_key.setdefault(label_key(name), index)
                 if first != index:
                     raise ValueError(
                         f"two object classes have the name {name!r}: "
-                        f"{self._objects[first].label!r} and {entry.label!r}"
+                        f"{self.objects[first].label!r} and {entry.label!r}"
                     )
                 self._by_spelling[name] = index
         self._room_by_key: dict[str, int] = {}
         self._room_by_spelling: dict[str, int] = {}
-        for index, room in enumerate(self._room_types):
-            for name in (room, *self._room_aliases.get(room, ())):
+        for index, room in enumerate(self.room_types):
+            for name in (room, *self.room_aliases.get(room, ())):
                 if not label_key(name):
                     raise ValueError(f"a room type has an empty name: {name!r}")
                 first = self._room_by_key.setdefault(label_key(name), index)
                 if first != index:
                     raise ValueError(
-                        f"room types {self._room_types[first]!r} and {room!r} have the same name"
+                        f"room types {self.room_types[first]!r} and {room!r} have the same name"
                     )
                 self._room_by_spelling[name] = index
 
     def __len__(self) -> int:
-        return len(self._objects)
+        return len(self.objects)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Vocabulary):
             return NotImplemented
         return (
-            self._objects == other._objects
-            and self._room_types == other._room_types
-            and self._room_aliases == other._room_aliases
+            self.objects == other.objects
+            and self.room_types == other.room_types
+            and self.room_aliases == other.room_aliases
         )
 
     def __hash__(self) -> int:
-        return hash((self._objects, self._room_types))
+        return hash((self.objects, self.room_types))
 
     def __repr__(self) -> str:
-        return f"Vocabulary({len(self)} object classes, {len(self._room_types)} room types)"
-
-    @property
-    def objects(self) -> tuple[ObjectClass, ...]:
-        """The object classes in the order of their indices."""
-        return self._objects
-
-    @property
-    def room_types(self) -> tuple[str, ...]:
-        """The room types in the order of their indices."""
-        return self._room_types
+        return f"Vocabulary({len(self)} object classes, {len(self.room_types)} room types)"
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """The canonical labels in the order of the class indices."""
-        return tuple(entry.label for entry in self._objects)
+        return tuple(entry.label for entry in self.objects)
 
     @cached_property
     def longest_label(self) -> int:
         """Size in bytes of the longest label or room type in JSON."""
-        names = [*self.labels, *self._room_types]
+        names = [*self.labels, *self.room_types]
         return max(len(json.dumps(name, ensure_ascii=False).encode()) for name in names)
 
     @cached_property
     def structure(self) -> NDArray[np.bool_]:
         """(V,) True for structural classes, which a model never proposes. Read-only array."""
-        mask = np.array([entry.structure for entry in self._objects], dtype=np.bool_)
+        mask = np.array([entry.structure for entry in self.objects], dtype=np.bool_)
         mask.flags.writeable = False
         return mask
 
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
         """(V, 3) typical extents in metres, or NaN for classes of unknown size. Read-only array."""
-        sizes = np.array([entry.size or (math.nan,) * 3 for entry in self._objects])
+        sizes = np.array([entry.size or (math.nan,) * 3 for entry in self.objects])
         sizes.flags.writeable = False
         return sizes
 
@@ -215,7 +205,7 @@ class Vocabulary:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-compatible values that `from_dict` accepts."""
-        aliases = {room: list(names) for room, names in self._room_aliases.items()}
+        aliases = {room: list(names) for room, names in self.room_aliases.items()}
         return {
             "objects": [
                 {
@@ -224,9 +214,9 @@ class Vocabulary:
                     "structure": entry.structure,
                     "size": None if entry.size is None else list(entry.size),
                 }
-                for entry in self._objects
+                for entry in self.objects
             ],
-            "room_types": list(self._room_types),
+            "room_types": list(self.room_types),
         } | ({"room_aliases": aliases} if aliases else {})
 
     @classmethod
