@@ -51,10 +51,7 @@ RuntimeDep = Annotated[Runtime, Depends(_runtime)]
 router = APIRouter(prefix="/models", tags=["models"])
 administration = APIRouter(prefix="/models", tags=["administration"], dependencies=_SCHEMES)
 changes = APIRouter(
-    prefix="/models",
-    tags=["administration"],
-    route_class=AdminJSONRoute,
-    dependencies=_SCHEMES,
+    prefix="/models", tags=["administration"], route_class=AdminJSONRoute, dependencies=_SCHEMES
 )
 
 

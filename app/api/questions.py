@@ -43,7 +43,7 @@ batches = APIRouter(
 # The tests validate answers against the schemas of the routes.
 
 
-def begin(http: Request) -> serving.Request:
+def serving_request(http: Request) -> serving.Request:
     """Create the serving request of an HTTP request. It uses one snapshot of the models."""
     state, runtime = http.scope["state"], http.scope["app"].state.runtime
     return serving.Request(
@@ -58,7 +58,7 @@ def begin(http: Request) -> serving.Request:
 async def _answer_each(
     http: Request, batch: BatchRequest[RequestT], question: Question[RequestT]
 ) -> bytes:
-    request = begin(http)
+    request = serving_request(http)
 
     def count(outcome: str) -> None:
         request.metrics.entry_answered(question.name, outcome)
@@ -111,7 +111,7 @@ def _endpoints(question: Question[Any]) -> tuple[_Endpoint, _Endpoint]:
     """Create the endpoint functions of a question: for one scene, and for a batch."""
 
     async def answer(data: Any, http: Request) -> bytes:
-        return written(await begin(http).answer(question, data))
+        return written(await serving_request(http).answer(question, data))
 
     async def answer_batch(data: Any, http: Request) -> bytes:
         return await _answer_each(http, data, question)

@@ -90,11 +90,7 @@ class Completions:
     """
 
     def __init__(
-        self,
-        weights: Weights,
-        structure: Mask,
-        scorer: ContextScorer,
-        count: int = COMPLETIONS,
+        self, weights: Weights, structure: Mask, scorer: ContextScorer, count: int = COMPLETIONS
     ) -> None:
         if not self.supports(weights):
             raise ValueError(
@@ -141,9 +137,9 @@ class Completions:
         if room is not None and len(self._rooms):
             base = base + self._rooms[room]
         unlisted = np.float32(math.log1p(-coverage))
-        telling = ~self._structure[classes]
+        informative = ~self._structure[classes]
         picked = objects.resampled(
-            *(base, self._odds_against, classes[telling], presence[telling]),
+            *(base, self._odds_against, classes[informative], presence[informative]),
             *(np.float32(1 - coverage), self._noise.shape[1]),
         )
         usable = ~self._structure

@@ -310,8 +310,8 @@ def resampled(weight, against, classes, presence, closed, count):
     below[:] = np.cumsum(weight.astype(np.float64))
     picked, n = np.empty(count, np.int64), 0
     for m in range(count):
-        wanted = (m + 0.5) / count * below[-1]
-        while n < len(below) - 1 and below[n] < wanted:
+        quantile = (m + 0.5) / count * below[-1]
+        while n < len(below) - 1 and below[n] < quantile:
             n += 1
         picked[m] = n
     return picked

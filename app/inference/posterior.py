@@ -32,13 +32,7 @@ from numpy.typing import NDArray
 
 from app.inference import objects
 from app.inference.objects import group_size
-from app.inference.relations import (
-    Between,
-    Context,
-    ObservedRelations,
-    ends_of,
-    relation_units,
-)
+from app.inference.relations import Between, Context, ObservedRelations, ends_of, relation_units
 from app.inference.weights import Weights
 
 Floats = NDArray[np.float32]

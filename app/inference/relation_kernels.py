@@ -325,7 +325,7 @@ def _add_rows(weights, rows, out):
 
 
 @compiled
-def _no_steps(relations, n):
+def _empty_steps(relations, n):
     """Return the empty step tables of a scene of n classes without relations.
 
     A step leads from one class to another class along a relation that holds. A step of kind a leads
@@ -346,7 +346,7 @@ def _no_steps(relations, n):
 
 
 @compiled
-def _hold(tables, weight, a, i, j):
+def _add_relation(tables, weight, a, i, j):
     """Add the steps of relation a between classes i and j, and the new paths, to the tables."""
     # The loops use plain indices, because a slice would cost more time.
     degree, near, seen, paths = tables
@@ -380,7 +380,7 @@ def _shifts(tables, weight, direct):
     """Return how much the relations that hold change the logit of each relation, (n, n, A).
 
     Args:
-        tables: step tables of the relations that hold; see `_no_steps`.
+        tables: step tables of the relations that hold; see `_empty_steps`.
         weight: (F, A) weights of the F features of relations that hold; see
             `RelationUnits.implication_weights`.
         direct: True if relations between the same two classes change each other's logits.
@@ -429,9 +429,9 @@ def implication_shifts(weight, n, a, i, j):
         a, i, j: (E,) indices of the relations that hold, of their subject classes and of their
             object classes. Subject and object class differ.
     """
-    tables = _no_steps(weight.shape[1], n)
+    tables = _empty_steps(weight.shape[1], n)
     for e in range(len(a)):
-        _hold(tables, weight, a[e], i[e], j[e])
+        _add_relation(tables, weight, a[e], i[e], j[e])
     shifts = np.empty((2, n, n, weight.shape[1]), np.float32)
     shifts[0], shifts[1] = _shifts(tables, weight, True), _shifts(tables, weight, False)
     return shifts
@@ -453,7 +453,7 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
         r: (A, n, n) bool, True for relations that hold. The function writes the samples into r.
     """
     A, n, _ = r.shape
-    tables, group = _no_steps(A, n), np.full(r.shape, -1, np.int64)
+    tables, group = _empty_steps(A, n), np.full(r.shape, -1, np.int64)
     for a in range(A):
         for i in range(n):
             for j in range(n):
@@ -476,4 +476,4 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
             for i in range(n):
                 for j in range(n):
                     if group[a, i, j] == turn and r[a, i, j] and i != j:
-                        _hold(tables, weight, a, i, j)
+                        _add_relation(tables, weight, a, i, j)

@@ -78,11 +78,7 @@ class Triway:
         return shapes
 
 
-VARIANTS: Final[dict[str, type[RBM | Triway]]] = {
-    "rbm": RBM,
-    "gbm": GBM,
-    "triway": Triway,
-}
+VARIANTS: Final[dict[str, type[RBM | Triway]]] = {"rbm": RBM, "gbm": GBM, "triway": Triway}
 
 
 @dataclass(frozen=True, slots=True)

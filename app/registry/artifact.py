@@ -172,9 +172,7 @@ def write_artifact(
 
 
 def load_artifact(
-    directory: Path,
-    previous: Artifact | None = None,
-    max_weights_bytes: int = MAX_WEIGHTS_BYTES,
+    directory: Path, previous: Artifact | None = None, max_weights_bytes: int = MAX_WEIGHTS_BYTES
 ) -> Artifact:
     """Read and verify an artifact.
 

@@ -53,7 +53,7 @@ class Frozen(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Tables:
+class TensorGroup:
     """Base class of groups of arrays that an artifact stores beside the tensors of the machine.
 
     A subclass is a dataclass whose fields are the arrays. The names of the stored tensors begin

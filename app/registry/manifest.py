@@ -107,7 +107,7 @@ class Manifest(Description):
             return cls.model_validate(members)
         except ValidationError as error:
             raise ArtifactError(
-                "invalid_manifest", f"{MANIFEST} has an invalid field: {_first(error)}"
+                "invalid_manifest", f"{MANIFEST} has an invalid field: {_first_error(error)}"
             ) from None
 
 
@@ -123,7 +123,7 @@ def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
     return members
 
 
-def _first(error: ValidationError) -> str:
+def _first_error(error: ValidationError) -> str:
     """Return the location and message of the first validation error, without the invalid value."""
     detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
     location = ".".join(str(part) for part in detail["loc"])

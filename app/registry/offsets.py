@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.registry.errors import ArtifactError
-from app.registry.fields import Tables
+from app.registry.fields import TensorGroup
 
 Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
@@ -31,7 +31,7 @@ UNOBSERVED: Final = -1
 
 
 @dataclass(frozen=True, eq=False)
-class Offsets(Tables):
+class Offsets(TensorGroup):
     """Normal distributions of offsets, for A canonical relations, V classes and P observed pairs.
 
     Attributes:

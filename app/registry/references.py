@@ -106,9 +106,7 @@ def version_key(version: str) -> tuple[int, ...]:
 
 
 def resolve_reference(
-    reference: str,
-    aliases: Mapping[str, AliasTarget],
-    versions: Callable[[str], Sequence[str]],
+    reference: str, aliases: Mapping[str, AliasTarget], versions: Callable[[str], Sequence[str]]
 ) -> tuple[str, str]:
     """Return the (name, version) that a reference points at.
 

@@ -45,7 +45,6 @@ ALIASES: Final = "aliases.json"
 _LOCK: Final = ".lock"
 TEMPORARY: Final = ".publishing-"
 
-
 StoreState: TypeAlias = tuple[tuple[str | int, ...], ...]
 
 
@@ -152,7 +151,7 @@ class Store:
                 for version in self.versions(name):
                     folder = self.root / name / version
                     files += [folder / file for file in (MANIFEST, WEIGHTS, CARD)]
-        return tuple((str(file), *_appearance(file)) for file in files)
+        return tuple((str(file), *_file_state(file)) for file in files)
 
     def require_new(self, name: str, version: str, alias: str | None = None) -> None:
         """Check that a version can be published: its number is valid and new.
@@ -336,7 +335,7 @@ class Store:
                     entry.unlink()
 
 
-def _appearance(path: Path) -> tuple[int, ...]:
+def _file_state(path: Path) -> tuple[int, ...]:
     """Return the inode, size and modification time of a file, or () for a missing file."""
     try:
         status = path.lstat()

@@ -19,12 +19,8 @@ MAX_HEADER_BYTES: Final = 2**20
 """Maximum size in bytes of the header of the weights file. It can list about 10,000 tensors."""
 
 _DTYPES: Final = {
-    "F16": "float16",
-    "F32": "float32",
-    "I32": "int32",
-    "I64": "int64",
-    "BOOL": "bool",
-}
+    "F16": "float16", "F32": "float32", "I32": "int32", "I64": "int64", "BOOL": "bool"
+}  # fmt: skip
 
 
 def pack(

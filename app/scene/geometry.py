@@ -99,11 +99,7 @@ def to_viewer_frame(
 
 
 def derive_relations(
-    positions: Rows,
-    sizes: Rows,
-    yaws: ArrayLike | None = None,
-    *,
-    horizontal: bool = True,
+    positions: Rows, sizes: Rows, yaws: ArrayLike | None = None, *, horizontal: bool = True
 ) -> PoseRelations:
     """Derive the relations between n boxes by the rules of this module.
 

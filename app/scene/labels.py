@@ -57,7 +57,6 @@ _IRREGULAR: Final = {
 }
 _IRREGULAR_ENDINGS: Final = tuple(_IRREGULAR)
 
-
 _OF: Final = re.compile(r"[\s_\-.]+of[\s_\-.]+", re.IGNORECASE)
 # The phrase "bottle of milk" means the container, a bottle. "pile of books" means the members,
 # books.

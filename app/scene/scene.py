@@ -189,17 +189,19 @@ def observe(
     if scene.relations is not None or all(thing.position is None for thing in scene.objects):
         return scene
     if viewpoint is not None:
-        scene = replace(scene, objects=_seen_from(scene.objects, viewpoint))
+        scene = replace(scene, objects=_in_viewer_frame(scene.objects, viewpoint))
     positions = np.array([thing.position or _UNKNOWN for thing in scene.objects])
     sizes = np.array([_extent(thing, typical_sizes) for thing in scene.objects])
     yaws = np.array([thing.yaw for thing in scene.objects])
-    nobody_looks = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
-    poses = derive_relations(positions, sizes, yaws, horizontal=not nobody_looks)
+    has_no_viewer = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
+    poses = derive_relations(positions, sizes, yaws, horizontal=not has_no_viewer)
     triples = tuple(zip(*(ends.tolist() for ends in np.nonzero(poses.holds)), strict=True))
     return replace(scene, relations=triples, poses=poses)
 
 
-def _seen_from(objects: tuple[SceneObject, ...], viewpoint: Viewpoint) -> tuple[SceneObject, ...]:
+def _in_viewer_frame(
+    objects: tuple[SceneObject, ...], viewpoint: Viewpoint
+) -> tuple[SceneObject, ...]:
     positions, yaws = to_viewer_frame(
         [thing.position or _UNKNOWN for thing in objects],
         viewpoint,

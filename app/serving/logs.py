@@ -93,11 +93,8 @@ def log_config(
                 "class": "logging.StreamHandler",
                 "formatter": style,
                 "filters": [_is_useful],
-            },
+            }
         },
         "root": {"handlers": ["stderr"], "level": max(levels[level.upper()], logging.INFO)},
-        "loggers": {
-            "app": {"level": level.upper()},
-            "uvicorn.access": {"level": "CRITICAL"},
-        },
+        "loggers": {"app": {"level": level.upper()}, "uvicorn.access": {"level": "CRITICAL"}},
     }

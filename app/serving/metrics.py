@@ -102,8 +102,7 @@ class Metrics:
             "scene_start_time_seconds", "Unix time when the process began to load its models"
         )
         self._ready = gauge(
-            "scene_ready_time_seconds",
-            "Unix time when the default model first answered; 0 before",
+            "scene_ready_time_seconds", "Unix time when the default model first answered; 0 before"
         )
         self._infos: set[Info] = set()
         self._is_ready = False

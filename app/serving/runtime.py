@@ -95,7 +95,7 @@ class Runtime:
         for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
         if self._poll:
-            self._polling = asyncio.create_task(self._follow())
+            self._polling = asyncio.create_task(self._follow_store())
 
     def stop(self) -> None:
         """Stop the worker threads and drop the computations that have not started."""
@@ -114,8 +114,8 @@ class Runtime:
         """
         async with self._change("refresh"):
             # These sets contain only names, so Python can free the memory of the old snapshot.
-            failed, served = set(self.models.failures), set(self.models.served)
-            new = await self._take_over(lambda subject: subject == DEFAULT or subject not in failed)
+            accepted, served = self.models.failures.keys() - {DEFAULT}, set(self.models.served)
+            new = await self._load_and_serve(lambda subject: subject not in accepted)
             return RefreshAnswer(
                 request_id=request_id,
                 default=new.resolve(DEFAULT).reference,
@@ -152,7 +152,7 @@ class Runtime:
                 previous=None if previous is None else str(previous),
             )
 
-    async def _follow(self) -> None:
+    async def _follow_store(self) -> None:
         """Check the store regularly for changes by other processes, and serve the new state.
 
         If a new version fails, the service lists this version as refused and serves the other
@@ -165,7 +165,7 @@ class Runtime:
                     changed = await asyncio.to_thread(self._store.state) != self._seen
                 if changed:
                     async with self._change("poll"):
-                        await self._take_over(self.models.usable.__contains__)
+                        await self._load_and_serve(self.models.usable.__contains__)
             except errors.RefreshRefusedError as error:
                 for failure in error.failures:
                     _logger.error(
@@ -189,11 +189,11 @@ class Runtime:
             raise
         self.metrics.reloaded(change, "success")
 
-    async def _take_over(self, matters: Callable[[str], bool]) -> ServedModels:
+    async def _load_and_serve(self, is_fatal: Callable[[str], bool]) -> ServedModels:
         """Load the state of the store and serve it.
 
         Args:
-            matters: function from the name of an unusable entry (``name@version``, an alias or
+            is_fatal: function from the name of an unusable entry (``name@version``, an alias or
                 "store") to True, if this failure makes the service refuse the new state.
 
         Raises:
@@ -201,10 +201,10 @@ class Runtime:
         """
         # `_load` runs in a thread, so that the event loop can answer from the old snapshot.
         new = await asyncio.to_thread(self._load)
-        worse = [failure for subject, failure in new.failures.items() if matters(subject)]
-        if worse:
+        fatal = [failure for subject, failure in new.failures.items() if is_fatal(subject)]
+        if fatal:
             detail = "The service still serves the previous versions. `failures` gives the reasons."
-            raise errors.RefreshRefusedError(detail, failures=worse)
+            raise errors.RefreshRefusedError(detail, failures=fatal)
         self._serve(new)
         return new
 
@@ -215,7 +215,7 @@ class Runtime:
                 _logger.info("the alias %s names %s now", alias, target)
         self.metrics.serving(models)
         if before is NO_MODELS or before.served != models.served:
-            _settle_memory()
+            _freeze_memory()
 
     def _load(self) -> ServedModels:
         # Read the state before the files. So the next check of the store finds changes that other
@@ -272,7 +272,7 @@ def _names(keys: Iterable[Key]) -> list[str]:
     return [f"{name}@{version}" for name, version in sorted(keys)]
 
 
-def _settle_memory() -> None:
+def _freeze_memory() -> None:
     """Exclude long-lived objects from garbage collection, and release unused memory.
 
     A full collection of all objects would stop every thread for tens of milliseconds. So the
