@@ -17,19 +17,14 @@ from app.settings import Settings
 
 
 def main() -> int:
-    """Serve until the process is stopped.
-
-    Returns:
-        Exit status of the process: 2 for invalid settings, otherwise the exit status that `serve`
-        returns.
-    """
+    """Serve until the process is stopped. Return 2 for invalid settings, else as `serve`."""
     began = monotonic()
     try:
         settings = Settings()
     except ValidationError as error:
-        for fault in error.errors(include_url=False, include_input=False):
-            variable = "SCENE_" + "_".join(str(part) for part in fault["loc"]).upper()
-            sys.stderr.write(f"{variable}: {fault['msg'].removeprefix('Value error, ')}\n")
+        for detail in error.errors(include_url=False, include_input=False):
+            variable = "SCENE_" + "_".join(str(part) for part in detail["loc"]).upper()
+            sys.stderr.write(f"{variable}: {detail['msg'].removeprefix('Value error, ')}\n")
         return 2
     return serve(settings, began)
 
@@ -38,7 +33,6 @@ def main() -> int:
 # costs 4 to 8 % of a request's time. Reference counting already frees the containers of an answer
 # (about 200).
 _YOUNG = 10_000
-
 
 # The C function mallopt(3) takes these two numbers: option M_MMAP_THRESHOLD, limit in bytes.
 _M_MMAP_THRESHOLD, _LARGE = -3, 128 * 1024
@@ -53,55 +47,45 @@ def tune() -> None:
     # of the startup time. The runtime enables the garbage collector again after the start.
     gc.disable()
     gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
-    _give_back_what_is_large()
+    # Return freed blocks of 128 KiB or more to the operating system at once. By default, the C
+    # library raises this limit whenever a large block is freed. After request bodies of several
+    # megabytes, the process would then hold 20 MB of unused memory.
+    if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
+        mallopt(_M_MMAP_THRESHOLD, _LARGE)
     # A question needs only small matrix products. More threads would take cores from other
     # processes. numpy reads this variable at its import.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-def _give_back_what_is_large() -> None:
-    """Make the C library return freed blocks of 128 KiB or more to the operating system at once.
-
-    By default, the C library raises the limit of 128 KiB whenever a large block is freed. After
-    request bodies of several megabytes, the process would then hold 20 MB of unused memory.
-    """
-    if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
-        mallopt(_M_MMAP_THRESHOLD, _LARGE)
-
-
 def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
     """Bind sockets to all addresses of a host, without listening.
 
-    Args:
-        host: host name or IP address to listen on.
-        port: TCP port to listen on. 0 means any free port.
-        send_timeout: seconds after which Linux closes a connection whose client does not
-            acknowledge the bytes sent. On other operating systems, only a proxy can limit this
-            time.
+    Linux closes a connection whose client does not acknowledge the bytes sent within
+    ``send_timeout`` seconds. On other operating systems, only a proxy can limit this time.
 
     Raises:
         OSError: the host does not have a usable address, or the port is in use.
     """
     bound: list[socket.socket] = []
     problem: OSError | None = None
-    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    for family, kind, protocol, _, address in dict.fromkeys(found):
+    addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    for family, kind, protocol, _, address in dict.fromkeys(addresses):
         try:
-            place = socket.socket(family, kind, protocol)
-            place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener = socket.socket(family, kind, protocol)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if family == socket.AF_INET6:
-                place.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+                listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
             if hasattr(socket, "TCP_USER_TIMEOUT"):  # accepted connections inherit the option
                 milliseconds = int(send_timeout * 1e3)
-                place.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, milliseconds)
-            place.bind(address)
+                listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, milliseconds)
+            listener.bind(address)
         except OSError as error:
             # A name such as localhost may have an IPv6 address although the machine lacks IPv6.
             if error.errno not in {errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT}:
                 raise
             problem = error
         else:
-            bound.append(place)
+            bound.append(listener)
     if problem is not None and not bound:
         raise problem
     return bound
@@ -109,25 +93,22 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
 
 def _refuse_address(settings: Settings, error: OSError) -> int:
     """Print why the service cannot listen on its address; return the exit status."""
-    place = f"{settings.host}:{settings.port}"
+    address = f"{settings.host}:{settings.port}"
     if error.errno == errno.EADDRINUSE:
-        reason = f"SCENE_PORT: another program uses {place}; set SCENE_PORT to a free port"
+        reason = f"SCENE_PORT: another program uses {address}; set SCENE_PORT to a free port"
     else:
         variable = "SCENE_PORT" if error.errno == errno.EACCES else "SCENE_HOST"
-        reason = f"{variable}: the service cannot listen on {place}: {error.strerror or error}"
+        reason = f"{variable}: the service cannot listen on {address}: {error.strerror or error}"
     sys.stderr.write(f"{reason}\n")
     return 3
 
 
 def serve(settings: Settings, began: float) -> int:
-    """Serve from this process until it is stopped.
+    """Serve until the process is stopped. Return its exit status: 0, or 3 if it could not start.
 
     Args:
         settings: settings of the service.
         began: `time.monotonic()` at the start of the process.
-
-    Returns:
-        Exit status of the process: 0, or 3 if the service could not start.
     """
     try:
         sockets = _bind(settings.host, settings.port, settings.client_timeout)

@@ -33,11 +33,9 @@ Function: TypeAlias = Callable[..., Any]
 _logger = logging.getLogger("app.compiling")
 
 _PACKAGE: Final = Path(__file__).parent
-
 _NAMES: Final = "loops-" + 16 * "[0-9a-f]"
-
 # The digest in the name of the cache directory covers all files of these packages of `app`.
-_KERNELS: Final = ("inference", "scene")
+_PACKAGES: Final = ("inference", "scene")
 
 # Number of cache directories of other versions to keep. After a downgrade, the service can then use
 # the compiled kernels of the older version.
@@ -49,26 +47,26 @@ _RECENT: Final = 600.0
 def sources(package: Path) -> list[Path]:
     """Return the files whose code a kernel may contain.
 
-    The list contains all files of the packages in `_KERNELS`, and all modules that import
+    The list contains all files of the packages in `_PACKAGES`, and all modules that import
     `app.compiling`.
     """
     paths = sorted(package.rglob("*.py"))
     return [
         path
         for path in paths
-        if path.relative_to(package).parts[0] in _KERNELS or b"app.compiling" in path.read_bytes()
+        if path.relative_to(package).parts[0] in _PACKAGES or b"app.compiling" in path.read_bytes()
     ]
 
 
 def digest(package: Path) -> str:
     """Return a digest of the kernel sources, the compiler and the CPU: 16 hexadecimal digits."""
     versions = [version(name) for name in ("numba", "llvmlite", "numpy")]
-    found = hashlib.sha256(repr((sys.version, versions, platform.machine(), _cpu())).encode())
+    sha256 = hashlib.sha256(repr((sys.version, versions, platform.machine(), _cpu())).encode())
     for path in [*sources(package), Path(__file__)]:
         text = path.read_bytes()
-        found.update(f"{path.name} {len(text)} ".encode())
-        found.update(text)
-    return found.hexdigest()[:16]
+        sha256.update(f"{path.name} {len(text)} ".encode())
+        sha256.update(text)
+    return sha256.hexdigest()[:16]
 
 
 def _cpu() -> str:
@@ -80,15 +78,14 @@ def _cpu() -> str:
 
 
 def _prepare(root: str) -> tuple[Path | None, str]:
-    """Create the cache directory of compiled kernels.
+    """Create the cache directory of compiled kernels in the directory ``root``.
 
-    Args:
-        root: parent of the cache directory. With "", the function tries `.numba_cache` beside the
-            package `app`, then the user's cache directory.
+    With root "", the function tries `.numba_cache` beside the package `app`, then the user's cache
+    directory.
 
     Returns:
-        A pair. The first value is the cache directory, or None if no directory is usable. The
-        second value is a text with the reason for each unusable directory.
+        The cache directory, or None if no directory is usable. Then a text with the reason for each
+        unusable directory.
     """
     name, problems = f"loops-{digest(_PACKAGE)}", []
     roots = [Path(root)] if root else [_PACKAGE.parent / ".numba_cache", *_user_cache()]
@@ -107,8 +104,8 @@ def _prepare(root: str) -> tuple[Path | None, str]:
 
 
 def _user_cache() -> list[Path]:
-    if given := os.environ.get("XDG_CACHE_HOME"):
-        return [Path(given) / "scene-boltzmann"]
+    if cache := os.environ.get("XDG_CACHE_HOME"):
+        return [Path(cache) / "scene-boltzmann"]
     with suppress(RuntimeError):  # the user does not have a home directory
         return [Path.home() / ".cache" / "scene-boltzmann"]
     return []
@@ -159,16 +156,16 @@ if _FOLDER is not None:
     # numba earlier.
     config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
-_LOOPS: Final[list[Any]] = []
+_KERNELS: Final[list[Any]] = []
 
 
 def _compile(function: Function, **options: Any) -> Function:
     options |= {"cache": _FOLDER is not None, "nogil": True, "error_model": "numpy"}
     # Only Python calls the kernels, so they need no wrapper for C.
     options["no_cfunc_wrapper"] = True
-    found: Function = njit(**options)(function)
-    _LOOPS.append(found)
-    return found
+    kernel: Function = njit(**options)(function)
+    _KERNELS.append(kernel)
+    return kernel
 
 
 def compiled(function: Function) -> Function:
@@ -190,8 +187,8 @@ def inlined(function: Function) -> Function:
 
     The compiler options of the calling function then apply to the inlined code.
     """
-    found: Function = njit(inline="always", error_model="numpy")(function)
-    return found
+    kernel: Function = njit(inline="always", error_model="numpy")(function)
+    return kernel
 
 
 def check_cache() -> None:
@@ -242,13 +239,13 @@ class _Progress(event.Listener):
 
     def on_start(self, event: Any) -> None:
         """Log the start of a kernel's compilation. Ignore functions of numba itself."""
-        loop = event.data["dispatcher"]
-        if not any(loop is known for known in _LOOPS):
+        compiling = event.data["dispatcher"]
+        if not any(kernel is compiling for kernel in _KERNELS):
             return
-        self._begun.add(id(loop))
+        self._begun.add(id(compiling))
         if time.monotonic() - self._logged >= 1:
-            done = sum(bool(one.signatures) or id(one) in self._begun for one in _LOOPS)
-            _logger.info("compiling kernel %d of %d", done, len(_LOOPS))
+            done = sum(bool(k.signatures) or id(k) in self._begun for k in _KERNELS)
+            _logger.info("compiling kernel %d of %d", done, len(_KERNELS))
             self._logged = time.monotonic()
 
     def on_end(self, event: Any) -> None:

@@ -18,11 +18,8 @@ from app.settings import Settings
 from scene_client.errors import InvalidRequestError
 
 
-class _Given(Settings):
-    """Settings that ignore environment variables.
-
-    Environment variables configure only services that run in a separate process.
-    """
+class _FixedSettings(Settings):
+    """Settings without environment variables, which configure only separate processes."""
 
     reads_environment = False
 
@@ -43,7 +40,7 @@ class InProcess(httpx.BaseTransport):
     def __init__(self, store: Path) -> None:
         self.admin_key = secrets.token_hex()
         try:
-            settings = _Given(
+            settings = _FixedSettings(
                 store=store,
                 admin_key=SecretStr(self.admin_key),
                 metrics=False,
@@ -57,11 +54,11 @@ class InProcess(httpx.BaseTransport):
         self._asgi = httpx.ASGITransport(app, raise_app_exceptions=False)
         started: Future[asyncio.AbstractEventLoop] = Future()
         ending = asyncio.Event()
-        thread = Thread(target=_live, args=(app, started, ending), daemon=True, name="scene")
+        thread = Thread(target=_run, args=(app, started, ending), daemon=True, name="scene")
         thread.start()
         self._loop = started.result()
         # The finalizer ends the thread when the transport is closed or deleted, or at program exit.
-        self._finalize = weakref.finalize(self, _end, self._loop, ending, thread)
+        self._finalize = weakref.finalize(self, _stop, self._loop, ending, thread)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Send one request to the application and return its response."""
@@ -83,7 +80,7 @@ class InProcess(httpx.BaseTransport):
         self._finalize()
 
 
-def _live(app: FastAPI, started: Future[asyncio.AbstractEventLoop], ending: asyncio.Event) -> None:
+def _run(app: FastAPI, started: Future[asyncio.AbstractEventLoop], ending: asyncio.Event) -> None:
     async def live() -> None:
         async with app.router.lifespan_context(app):
             started.set_result(asyncio.get_running_loop())
@@ -97,6 +94,6 @@ def _live(app: FastAPI, started: Future[asyncio.AbstractEventLoop], ending: asyn
         started.set_exception(error)
 
 
-def _end(loop: asyncio.AbstractEventLoop, ending: asyncio.Event, thread: Thread) -> None:
+def _stop(loop: asyncio.AbstractEventLoop, ending: asyncio.Event, thread: Thread) -> None:
     loop.call_soon_threadsafe(ending.set)
     thread.join()

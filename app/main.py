@@ -26,11 +26,7 @@ The figures in the examples are illustrations. Real figures depend on the model.
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
-    """Create the application of the service.
-
-    Args:
-        settings: settings of the service. None means that the function reads the settings from
-            environment variables.
+    """Create the application of the service. By default, the environment contains the settings.
 
     Raises:
         pydantic.ValidationError: an environment variable contains an invalid setting.
@@ -61,14 +57,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.settings = settings
     app.state.runtime = runtime
     app.state.bodies = Bodies(settings)
-    _add_routes(app, settings, runtime)
+    problems.install(app)
+    app.add_middleware(Gateway, settings=settings, runtime=runtime)
+    _add_routes(app, settings)
     return app
 
 
-def _add_routes(app: FastAPI, settings: Settings, runtime: Runtime) -> None:
-    """Add the middleware and the routes to the application."""
-    problems.install(app)
-    app.add_middleware(Gateway, settings=settings, runtime=runtime)
+def _add_routes(app: FastAPI, settings: Settings) -> None:
     app.router.routes.extend((*questions.router.routes, *questions.batches.routes))
     routers = [
         # `models.administration` stands before `models.router`, because both have the same paths.

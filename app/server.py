@@ -58,11 +58,7 @@ class Server(uvicorn.Server):
     """
 
     def __init__(
-        self,
-        config: uvicorn.Config,
-        runtime: Runtime,
-        drain_seconds: float,
-        began: float,
+        self, config: uvicorn.Config, runtime: Runtime, drain_seconds: float, began: float
     ) -> None:
         super().__init__(config)
         self._runtime = runtime
@@ -88,8 +84,8 @@ class Server(uvicorn.Server):
         self._log_addresses(sockets or [])
 
     def _log_addresses(self, sockets: list[socket]) -> None:
-        places = [place.getsockname() for place in sockets]
-        pages = ", ".join(_page(host, port) for host, port, *_ in places)
+        addresses = [listener.getsockname() for listener in sockets]
+        pages = ", ".join(_page(host, port) for host, port, *_ in addresses)
         count = len(self._runtime.models.served)
         models = "1 model" if count == 1 else f"{count} models"
         details = f"{pages} ({models}, {monotonic() - self._began:.1f} s)"
@@ -117,9 +113,9 @@ class Server(uvicorn.Server):
         return await super().on_tick(counter)
 
 
-def _listens(place: socket) -> bool:
+def _listens(listener: socket) -> bool:
     try:
-        return place.getsockopt(SOL_SOCKET, SO_ACCEPTCONN) == 1
+        return listener.getsockopt(SOL_SOCKET, SO_ACCEPTCONN) == 1
     except OSError:  # the socket is closed
         return False
 
@@ -131,12 +127,7 @@ def _page(host: str, port: int) -> str:
 
 
 def build(settings: Settings, began: float) -> Server:
-    """Build the server of the service without starting it.
-
-    Args:
-        settings: settings of the service.
-        began: `time.monotonic()` at the start of the process.
-    """
+    """Build the server, without a start. ``began`` is `time.monotonic()` at the process start."""
     app = create_app(settings)
     config = uvicorn.Config(
         app,

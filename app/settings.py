@@ -21,23 +21,16 @@ from pydantic import (
     field_validator,
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    NoDecode,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-)
+from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
+from pydantic_settings import PydanticBaseSettingsSource as Source
 
 from scene_client.schemas import MAX_RELATIONS
 
 MAX_OBJECTS = 256
 """Upper limit of the setting ``SCENE_MAX_OBJECTS``."""
 
-
 _EXPORTER = ("opentelemetry.sdk.trace", "opentelemetry.exporter.otlp.proto.http")
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
-
 
 _PREFIX: Final = "SCENE_"
 # Variables of the clients, which may run in the same environment.
@@ -120,18 +113,18 @@ class _Environment(EnvSettingsSource):
         Raises:
             pydantic.ValidationError: the environment contains an unknown setting.
         """
-        known = [name.upper() for name in self.settings_cls.model_fields]
+        names = [name.upper() for name in self.settings_cls.model_fields]
         errors: list[InitErrorDetails] = []
         for variable, value in sorted(os.environ.items()):
             name = variable.upper().removeprefix(_PREFIX)
-            if name == variable.upper() or not value or name in {*known, *_OF_CLIENTS}:
+            if name == variable.upper() or not value or name in {*names, *_OF_CLIENTS}:
                 continue
             if _SERVICE_LINK.fullmatch(f"{name}={value}"):
                 continue
             message = "unknown setting; app/settings.py lists the settings"
             if name in _REMOVED:
                 message = f"this setting is removed: {_REMOVED[name]}"
-            elif similar := get_close_matches(name, known, 1):
+            elif similar := get_close_matches(name, names, 1):
                 message = f"unknown setting; did you mean {_PREFIX}{similar[0]}?"
             kind = PydanticCustomError("unknown_setting", "{message}", {"message": message})
             errors.append({"type": kind, "loc": (name.lower(),), "input": None})
@@ -226,9 +219,7 @@ class Settings(BaseSettings):
         Literal["debug", "info", "warning", "error", "critical"], BeforeValidator(_lower)
     ] = "info"
     log_format: Annotated[
-        Literal["json", "plain"],
-        BeforeValidator(_lower),
-        Field(default_factory=_format_of_stderr),
+        Literal["json", "plain"], BeforeValidator(_lower), Field(default_factory=_format_of_stderr)
     ]
     """By default, `plain` on a terminal, else `json`."""
     access_log: bool = True
@@ -236,12 +227,8 @@ class Settings(BaseSettings):
 
     @classmethod
     def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        *_: PydanticBaseSettingsSource,
-        **__: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        cls, settings_cls: type[BaseSettings], init_settings: Source, *_: Source, **__: Source
+    ) -> tuple[Source, ...]:
         """Return the sources of the settings: first arguments, then environment variables."""
         if not cls.reads_environment:
             return (init_settings,)
@@ -329,7 +316,7 @@ class Settings(BaseSettings):
 
     @field_validator("admin_key", "api_key")
     @classmethod
-    def _is_strong(cls, value: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
+    def _is_key(cls, value: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
         if value is None:
             return None
         key = value.get_secret_value()
@@ -339,14 +326,7 @@ class Settings(BaseSettings):
                 f"SCENE_{str(info.field_name).upper()} must have at least 16 printable ASCII "
                 "characters, without spaces"
             )
-        return value
-
-    @field_validator("api_key")
-    @classmethod
-    def _is_not_the_admin_key(
-        cls, value: SecretStr | None, info: ValidationInfo
-    ) -> SecretStr | None:
-        if value is not None and value == info.data.get("admin_key"):
+        if value == info.data.get("admin_key"):
             raise ValueError(
                 "SCENE_API_KEY must differ from SCENE_ADMIN_KEY, because clients must not "
                 "administer the service"

@@ -18,18 +18,8 @@ from pydantic_core import from_json
 from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
-from app.api.gateway import ADMIN_KEY, carries, too_large
-from app.errors import (
-    BadRequestError,
-    BodiesFullError,
-    InvalidRequestError,
-    Location,
-    NotJSONError,
-    RequestError,
-    RequestTimeoutError,
-    UnauthorizedError,
-    UnsupportedMediaTypeError,
-)
+from app import errors
+from app.api.gateway import ADMIN_KEY, has_key, too_large
 from app.settings import Settings
 from scene_client.schemas import FieldError
 from scene_client.schemas import Request as Form
@@ -85,7 +75,7 @@ class Bodies:
                     message = await receive()
                     if message["type"] != "http.request":
                         detail = "The connection closed before the body was complete."
-                        raise BadRequestError(detail)
+                        raise errors.BadRequestError(detail)
                     part, more = message.get("body", b""), message.get("more_body", False)
                     is_whole = not (more or body)
                     self.held += len(part)
@@ -98,11 +88,11 @@ class Bodies:
                         raise too_large(limit)
                     if self.held > self.budget and not (is_whole and len(body) <= SMALL):
                         detail = f"All bodies in progress exceed {self.budget} bytes together."
-                        raise BodiesFullError(detail)
+                        raise errors.BodiesFullError(detail)
         except TimeoutError:
             self.held -= len(body)
             detail = f"The body did not arrive within {self.patience:g} seconds."
-            raise RequestTimeoutError(detail) from None
+            raise errors.RequestTimeoutError(detail) from None
         except BaseException:
             self.held -= len(body)
             raise
@@ -114,39 +104,36 @@ class Bodies:
         Raises:
             NotJSONError, InvalidRequestError: see `parse` and `validated`.
         """
+
+        def read() -> tuple[Any, FormT]:
+            value = parse(body)
+            return value, validated(value, form)
+
         if len(body) <= SMALL:
-            return _read(body, form)
-        return await asyncio.get_running_loop().run_in_executor(self._parser, _read, body, form)
+            return read()
+        return await asyncio.get_running_loop().run_in_executor(self._parser, read)
 
 
-def _read(body: bytes, form: type[FormT]) -> tuple[Any, FormT]:
-    value = parse(body)
-    return value, validated(value, form)
-
-
-def validated(value: Any, form: type[FormT], *, at: Location = ()) -> FormT:
+def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> FormT:
     """Validate a JSON value. Refuse lists with too many entries before their validation.
 
-    Args:
-        value: the JSON value.
-        form: the schema.
-        at: location of ``value`` in a batch request. It is empty for other requests.
+    ``at`` is the location of the value in a batch request. It is empty for other requests.
 
     Raises:
         InvalidRequestError: the value does not match the schema.
     """
-    errors = [
+    too_long = [
         FieldError(pointer=pointer((*at, name)), message=f"must have at most {most} entries")
         for name, most in _most_entries(form).items()
         if isinstance(value, dict) and isinstance(value.get(name), list) and len(value[name]) > most
     ]
-    if errors:
-        raise InvalidRequestError(errors=errors)
+    if too_long:
+        raise errors.InvalidRequestError(errors=too_long)
     try:
         return form.model_validate(value)
     except ValidationError as error:
-        errors = field_errors(error, value, form, at=at)
-        raise InvalidRequestError(errors=errors) from None
+        invalid = field_errors(error, value, form, at=at)
+        raise errors.InvalidRequestError(errors=invalid) from None
 
 
 @cache
@@ -177,21 +164,21 @@ def parse(body: bytes) -> Any:
         return _DECODER.decode(body.decode())
     except _TooManyMembersError:
         detail = f"A JSON object has more than {MAX_MEMBERS} members."
-        errors = [FieldError(pointer="#", message=detail)]
-        raise InvalidRequestError(errors=errors, detail=detail) from None
+        too_many = [FieldError(pointer="#", message=detail)]
+        raise errors.InvalidRequestError(errors=too_many, detail=detail) from None
     except _RepeatedNameError as error:
         detail = f"A JSON object has two members with the same name{error}."
-        raise NotJSONError(detail) from None
+        raise errors.NotJSONError(detail) from None
     except ValueError as error:
-        errors = _not_finite(body)
+        not_finite = _not_finite(body)
         detail = "NaN and Infinity are not JSON. `errors` lists their places."
-        if not errors:
+        if not not_finite:
             # The message of the parser contains the reason and the position, but never the input.
             detail = (
                 f"The body is not valid JSON: {error}. Strings and names need double quotes. "
                 "Comments, trailing commas, NaN, None and True are not JSON."
             )
-        raise NotJSONError(detail, errors=errors) from None
+        raise errors.NotJSONError(detail, errors=not_finite) from None
 
 
 def _not_finite(body: bytes) -> list[FieldError]:
@@ -202,13 +189,13 @@ def _not_finite(body: bytes) -> list[FieldError]:
     if len(body) > SMALL or (b"NaN" not in body and b"Infinity" not in body):
         return []
     try:
-        places = islice(_constants(_LENIENT.decode(body.decode())), MAX_ERRORS)
+        constants = islice(_constants(_LENIENT.decode(body.decode())), MAX_ERRORS)
         return [
             FieldError(
                 pointer=pointer(tuple(reversed(steps))),
                 message=f"must be a finite number, not {name}",
             )
-            for name, steps in places
+            for name, steps in constants
         ]
     except (ValueError, RecursionError):
         return []
@@ -274,14 +261,14 @@ def _check_media(http: Request) -> None:
     if any(coding.lower() != "identity" for coding in headers.getlist("content-encoding")):
         detail = "The body must not be compressed: leave the header Content-Encoding out."
     if detail:
-        raise UnsupportedMediaTypeError(detail)
+        raise errors.UnsupportedMediaTypeError(detail)
 
 
 class JSONRoute(APIRoute):
     """A route that parses and validates the JSON body without FastAPI.
 
     FastAPI only documents the route, because FastAPI's JSON parser is too lenient. The endpoint
-    receives the validated body as ``asked``, the HTTP request as ``http`` and the path parameters.
+    receives the validated body as ``data``, the HTTP request as ``http`` and the path parameters.
     It returns the answer as bytes.
     """
 
@@ -298,18 +285,18 @@ class JSONRoute(APIRoute):
         self.check(http)
         if scope["query_string"]:
             detail = "This route has no query parameters. Send all fields in the JSON body."
-            raise BadRequestError(detail)
+            raise errors.BadRequestError(detail)
         _check_media(http)
         bodies: Bodies = scope["app"].state.bodies
         body = await bodies.read(receive, self.limit(scope["app"].state.settings))
         try:
             if not body:
-                raise NotJSONError("The body is empty.")
-            form: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
-            value, asked = await bodies.parse(body, form)
+                raise errors.NotJSONError("The body is empty.")
+            schema: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
+            value, data = await bodies.parse(body, schema)
             try:
-                answer: bytes = await self.endpoint(asked=asked, http=http, **scope["path_params"])
-            except RequestError as error:
+                answer: bytes = await self.endpoint(data=data, http=http, **scope["path_params"])
+            except errors.RequestError as error:
                 error.locate(value)
                 raise
             headers = [
@@ -351,5 +338,5 @@ def check_admin(http: Request) -> None:
     Raises:
         UnauthorizedError: the request lacks the key, or the service has no admin key.
     """
-    if not carries(http.headers, ADMIN_KEY, http.app.state.settings.admin_key):
-        raise UnauthorizedError("This route needs the admin key of the service.")
+    if not has_key(http.headers, ADMIN_KEY, http.app.state.settings.admin_key):
+        raise errors.UnauthorizedError("This route needs the admin key of the service.")

@@ -9,35 +9,25 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from app.errors import UnknownLabelsError
 from app.questions import QUESTIONS
 from app.questions.question import BATCH, Example
 
-_ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
+REQUEST_ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
 _MODEL: Final = {
     "name": "home",
     "version": "1.0.0",
     "variant": "triway",
     "digest": "4e706b9f30e062589ec5cace2744da497a49f08f095626ee533c50f22dad94d4",
 }
-_ENVELOPE: Final = {"model": _MODEL, "request_id": _ID, "ignored": [], "mapped": [], "warnings": []}
-
-_UNKNOWN: Final = {
-    "type": "/problems/unknown-labels",
-    "title": "The model does not know some labels or room types",
-    "status": 422,
-    "detail": "The request has 1 error, listed in `errors`. GET /models/{name}/vocabulary lists "
-    "the known names. With `unknown_labels` set to `ignore`, the service leaves unknown names "
-    "out.",
-    "instance": f"/problems/unknown-labels#{_ID}",
-    "request_id": _ID,
-    "errors": [
-        {
-            "pointer": "#/scenes/1/objects/1",
-            "message": "the model does not know this label",
-            "suggestions": ["nightstand"],
-        }
-    ],
+_ENVELOPE: Final = {
+    "model": _MODEL,
+    "request_id": REQUEST_ID,
+    "ignored": [],
+    "mapped": [],
+    "warnings": [],
 }
+
 _VERSION: Final = {
     "version": "1.0.0",
     "status": "ready",
@@ -45,24 +35,21 @@ _VERSION: Final = {
     "variant": _MODEL["variant"],
     "digest": _MODEL["digest"],
 }
-_REFUSED: Final = {
-    "version": "1.1.0",
-    "status": "refused",
-    "aliases": [],
+_CAUSE: Final = {
     "reason": "checksum_mismatch",
     "detail": "model.safetensors does not match the manifest",
 }
-_FAILURE: Final = {
-    "subject": "home@1.1.0",
-    "reason": "checksum_mismatch",
-    "detail": "model.safetensors does not match the manifest",
-}
+_REFUSED: Final = {"version": "1.1.0", "status": "refused", "aliases": [], **_CAUSE}
+_FAILURE: Final = {"subject": "home@1.1.0", **_CAUSE}
 _SUMMARY: Final = {"name": "home", "versions": [_REFUSED, _VERSION]}
 
 
 def _batch(result: dict[str, Any]) -> dict[str, Any]:
-    entries = [{"status": 200, "result": result}, {"status": 422, "problem": _UNKNOWN}]
-    return {"request_id": _ID, "results": entries}
+    (unknown,) = UnknownLabelsError.example
+    error = unknown.model_copy(update={"pointer": f"#/scenes/1{unknown.pointer[1:]}"})
+    problem = UnknownLabelsError(errors=[error]).describe(REQUEST_ID)
+    failed = {"status": 422, "problem": problem.model_dump(mode="json", exclude_none=True)}
+    return {"request_id": REQUEST_ID, "results": [{"status": 200, "result": result}, failed]}
 
 
 REQUESTS: Final[dict[str, dict[str, Example]]] = {
@@ -105,15 +92,8 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         "created": "2026-01-02T03:04:05Z",
         "parameters": 136000,
         "metrics": [
-            {
-                "task": "T2",
-                "source": "procthor",
-                "metric": "MRR",
-                "value": 0.5,
-                "low": 0.49,
-                "high": 0.51,
-                "n": 1000,
-            }
+            {"task": "T2", "source": "procthor", "metric": "MRR"}
+            | {"value": 0.5, "low": 0.49, "high": 0.51, "n": 1000}
         ],
         "data": [
             {
@@ -170,14 +150,14 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         },
     },
     "refresh_models": {
-        "request_id": _ID,
+        "request_id": REQUEST_ID,
         "default": _MODEL,
         "added": ["home@1.0.0"],
         "removed": [],
         "failures": [_FAILURE],
     },
     "move_alias": {
-        "request_id": _ID,
+        "request_id": REQUEST_ID,
         "alias": "default",
         "model": "home@1.1.0",
         "previous": "home@1.0.0",
@@ -187,13 +167,8 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     "server_metadata": {"name": "scene-boltzmann", "version": "1.0.0", "extensions": []},
     "server_live": {"live": True},
     "server_ready": {"ready": True},
-    "model_metadata": {
-        "name": "home",
-        "versions": ["1.0.0", "1.1.0"],
-        "platform": "numpy_triway",
-        "inputs": [],
-        "outputs": [],
-    },
+    "model_metadata": {"name": "home", "versions": ["1.0.0", "1.1.0"]}
+    | {"platform": "numpy_triway", "inputs": [], "outputs": []},
     "model_ready": {"name": "home", "ready": True},
     "show_metrics": (
         "# HELP scene_requests_total Requests answered\n"

@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app import errors
 from app.api.problems import answer, from_exception, report_defect
-from app.serving.models import NOTHING
+from app.serving.models import NO_MODELS
 from app.serving.request import SUCCESS, Record
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -61,10 +61,7 @@ _METHODS: Final = frozenset(
 )
 
 # These headers stop browsers from guessing the media type and from sending a Referer.
-_ALWAYS: Final = (
-    (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
-)
+_ALWAYS: Final = ((b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-referrer"))
 _POLICY: Final = (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'")
 _NOT_KEPT: Final = (b"cache-control", b"no-store")
 
@@ -108,8 +105,9 @@ class Gateway:
             return
         began = perf_counter()
         headers = scope["headers"]
-        given = next((value for name, value in headers if name == b"x-request-id"), b"")
-        request_id = given if _REQUEST_ID.fullmatch(given) else str(uuid4()).encode()
+        request_id = next((value for name, value in headers if name == b"x-request-id"), b"")
+        if not _REQUEST_ID.fullmatch(request_id):
+            request_id = str(uuid4()).encode()
         upgrades = any(name == b"upgrade" for name, _ in headers)
         record = Record()
         state = scope.setdefault("state", {})
@@ -119,7 +117,7 @@ class Gateway:
         async def send_completed(message: Message) -> None:
             if message["type"] == "http.response.start":
                 record.begin(message["status"])
-                message["headers"] = _completed(message.get("headers", ()), request_id)
+                message["headers"] = _with_defaults(message.get("headers", ()), request_id)
                 # While draining, the client's next request must go to another replica. After a
                 # request to upgrade, the parser would read its body as the next request.
                 if self._backlog.draining or upgrades:
@@ -127,7 +125,7 @@ class Gateway:
             await send(message)
 
         try:
-            if self._hosts is None or self._is_known(headers, scope["path"]):
+            if self._hosts is None or self._accepts_host(headers, scope["path"]):
                 await self._admitted(scope, receive, send_completed)
             else:
                 detail = "SCENE_ALLOWED_HOSTS does not list the name in the Host header."
@@ -140,30 +138,30 @@ class Gateway:
             record.outcome = CANCELLED
             raise
         finally:
-            self._note(scope, record, perf_counter() - began)
+            self._record(scope, record, perf_counter() - began)
 
-    def _is_known(self, headers: Sequence[tuple[bytes, bytes]], path: str) -> bool:
+    def _accepts_host(self, headers: Sequence[tuple[bytes, bytes]], path: str) -> bool:
         """Return True if the Host header names this service, or the path is a health check."""
-        given = [value for name, value in headers if name == b"host"]
-        host = _HOST.fullmatch(given[0].lower()) if len(given) == 1 else None
+        hosts = [value for name, value in headers if name == b"host"]
+        host = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
         return (host is not None and host[1] in (self._hosts or ())) or path.endswith(HEALTH)
 
     async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check the key and the size of a request, wait for admission, and answer every failure."""
         try:
-            if self._settings.api_key is not None and not self._may_enter(scope):
+            if self._settings.api_key is not None and not self._has_access(scope):
                 detail = "This service needs its API key, or the admin key for administration."
                 raise errors.UnauthorizedError(detail)
-            allowed = size = None
+            timeout = size = None
             for name, value in scope["headers"]:
                 if name == b"x-request-timeout-ms":
-                    allowed = allowed or value
+                    timeout = timeout or value
                 elif name == b"content-length":
                     size = value
             if not scope["path"].endswith(_NOT_QUEUED):
-                if self._runtime.models is NOTHING:
+                if self._runtime.models is NO_MODELS:
                     raise errors.NotReadyError("The service is starting.")
-                seconds = self._timeout if allowed is None else self._chosen(allowed)
+                seconds = self._timeout if timeout is None else self._seconds(timeout)
                 deadline = scope["state"]["deadline"] = monotonic() + seconds
                 await self._backlog.enter(seconds, deadline)
             if size is not None:
@@ -178,25 +176,23 @@ class Gateway:
         record: Record = scope["state"]["record"]
         if problem.status == 500:
             report_defect(error, scope["state"]["request_id"])
-        if not record.status:
-            await answer(problem, scope, receive, send)
-            return
-        record.outcome = problem.slug
-        # A part of the response has been sent already. The raised error makes the server close the
-        # connection.
-        record.status = 500
-        raise error
+        if record.status:
+            # A part of the response has been sent already. The raised error makes the server close
+            # the connection.
+            record.outcome, record.status = problem.slug, 500
+            raise error
+        await answer(problem, scope, receive, send)
 
-    def _may_enter(self, scope: Scope) -> bool:
+    def _has_access(self, scope: Scope) -> bool:
         path: str = scope["path"].removeprefix(scope.get("root_path", ""))
         if path in OPEN_ROUTES or path.startswith(_OPEN_FOLDERS):
             return True
         headers = Headers(scope=scope)
-        asks = carries(headers, API_KEY, self._settings.api_key)
-        administers = carries(headers, ADMIN_KEY, self._settings.admin_key)
-        return asks or administers
+        has_api_key = has_key(headers, API_KEY, self._settings.api_key)
+        has_admin_key = has_key(headers, ADMIN_KEY, self._settings.admin_key)
+        return has_api_key or has_admin_key
 
-    def _chosen(self, value: bytes) -> float:
+    def _seconds(self, value: bytes) -> float:
         longest = self._settings.max_request_timeout_ms
         if not _TIMEOUT.fullmatch(value) or int(value) > longest:
             detail = f"{TIMEOUT_HEADER} must be a whole number from 1 to {longest} (milliseconds)."
@@ -209,7 +205,7 @@ class Gateway:
         if value.isdigit() and (len(value) > 18 or int(value) > limit):
             raise too_large(limit)
 
-    def _note(self, scope: Scope, record: Record, seconds: float) -> None:
+    def _record(self, scope: Scope, record: Record, seconds: float) -> None:
         """Write the metrics and the access log of a request."""
         status = record.status or 500
         if status >= 400 and record.outcome == SUCCESS:
@@ -225,20 +221,20 @@ class Gateway:
                 "route": route,
                 "status": status,
                 "latency_ms": round(seconds * 1e3, 3),
-                **record.known(),
+                **record.log_fields(),
             }
             message = f"{method} {route} {status} {seconds * 1e3:.2f} ms"
             _access.info(message, extra={"entry": entry})
 
 
-def _completed(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) -> list[Any]:
+def _with_defaults(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) -> list[Any]:
     names = {name for name, _ in headers}
-    found = [*headers, *_ALWAYS, (b"x-request-id", request_id)]
+    completed = [*headers, *_ALWAYS, (b"x-request-id", request_id)]
     if b"content-security-policy" not in names:
-        found.append(_POLICY)
+        completed.append(_POLICY)
     if b"cache-control" not in names and b"etag" not in names:
-        found.append(_NOT_KEPT)
-    return found
+        completed.append(_NOT_KEPT)
+    return completed
 
 
 def too_large(limit: int) -> errors.BodyTooLargeError:
@@ -246,22 +242,17 @@ def too_large(limit: int) -> errors.BodyTooLargeError:
     return errors.BodyTooLargeError(f"The body must not be larger than {limit} bytes.")
 
 
-def carries(headers: Headers, name: str, expected: SecretStr | None) -> bool:
-    """Return whether a request contains the configured key.
+def has_key(headers: Headers, name: str, expected: SecretStr | None) -> bool:
+    """Return whether a request contains the expected key. The result is False if this key is None.
 
     The key may be in the header ``name`` or, without this header, in a bearer token.
-
-    Args:
-        headers: headers of the request.
-        name: name of the header for the key.
-        expected: the configured key. None means that no key is configured, and the result is False.
     """
     scheme, _, token = headers.get("authorization", "").partition(" ")
-    given = headers.get(name) or (token.strip() if scheme.lower() == "bearer" else "")
+    key = headers.get(name) or (token.strip() if scheme.lower() == "bearer" else "")
     secret = expected.get_secret_value() if expected else ""
     # The comparison always runs and takes constant time. Otherwise the response time would show
     # whether a key is configured, or how many characters match.
-    equal = hmac.compare_digest(given.encode(), secret.encode())
+    equal = hmac.compare_digest(key.encode(), secret.encode())
     return equal and bool(secret)
 
 

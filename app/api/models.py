@@ -51,10 +51,7 @@ RuntimeDep = Annotated[Runtime, Depends(_runtime)]
 router = APIRouter(prefix="/models", tags=["models"])
 administration = APIRouter(prefix="/models", tags=["administration"], dependencies=_SCHEMES)
 changes = APIRouter(
-    prefix="/models",
-    tags=["administration"],
-    route_class=AdminJSONRoute,
-    dependencies=_SCHEMES,
+    prefix="/models", tags=["administration"], route_class=AdminJSONRoute, dependencies=_SCHEMES
 )
 
 
@@ -181,12 +178,12 @@ async def move_alias(
             openapi_examples={"default": {"summary": "the default model", "value": "default"}},
         ),
     ],
-    asked: schemas.AliasRequest,
+    data: schemas.AliasRequest,
     http: Request,
 ) -> bytes:
     """Point an alias at a served version, and save the alias in the store."""
     runtime: Runtime = http.app.state.runtime
-    answer = await runtime.move_alias(alias, asked, http.state.request_id)
+    answer = await runtime.move_alias(alias, data, http.state.request_id)
     return answer.model_dump_json(exclude_none=True).encode()
 
 

@@ -17,7 +17,7 @@ from scene_client.schemas import MAX_SEED, Problem
 Responses = dict[int | str, dict[str, Any]]
 
 _REFERENCE: Final = "#/components/schemas/{model}"
-_REQUEST_ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
+
 _KEY_SCHEMES: Final = {
     "api-key": {"type": "apiKey", "in": "header", "name": API_KEY},
     "api-key-as-bearer-token": {"type": "http", "scheme": "bearer"},
@@ -45,7 +45,7 @@ def error_responses(*steps: Step) -> Responses:
             "content": {MEDIA_TYPE: {"schema": schema, "examples": {}}},
         }
         response = responses.setdefault(kind.status, empty)
-        problem = kind(detail=f"{kind.title}.", errors=kind.example).describe(_REQUEST_ID)
+        problem = kind(detail=f"{kind.title}.", errors=kind.example).describe(examples.REQUEST_ID)
         response["content"][MEDIA_TYPE]["examples"][kind.slug] = {
             "summary": kind.title,
             "value": problem.model_dump(mode="json", exclude_none=True),
@@ -119,12 +119,12 @@ class DocumentedAPI(FastAPI):
 
 
 def _timeout_parameter(most: int) -> dict[str, Any]:
+    text = "time limit of the request in milliseconds; after this time, the service answers 504"
     return {
         "name": TIMEOUT_HEADER,
         "in": "header",
         "required": False,
-        "description": "time limit of the request in milliseconds; after this time, the service "
-        "answers 504",
+        "description": text,
         "schema": {"type": "integer", "minimum": 1, "maximum": most},
         "examples": {"second": {"summary": "one second", "value": min(1000, most)}},
     }

@@ -20,8 +20,6 @@ from starlette.types import Scope
 from app.errors import ERRORS, NotFoundError
 
 STATIC: Final = Path(__file__).parents[1] / "static"
-_BOARD: Final = "board.html"
-_VENDOR: Final = "vendor/"
 
 _NO_FRAMES: Final = "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 # Policy of the API documentation. Swagger UI and Redoc need inline styles. Redoc searches in a web
@@ -99,10 +97,9 @@ class Assets(StaticFiles):
         if response.status_code in {200, 304}:
             # With "no-cache", a browser checks each file for a newer version. Otherwise the browser
             # could mix JavaScript modules of two releases.
-            kept = path.startswith(_VENDOR)
-            response.headers["Cache-Control"] = (
-                "public, max-age=31536000, immutable" if kept else "no-cache"
-            )
+            immutable = path.startswith("vendor/")
+            policy = "public, max-age=31536000, immutable" if immutable else "no-cache"
+            response.headers["Cache-Control"] = policy
         return response
 
 
@@ -120,7 +117,7 @@ def install(app: FastAPI, *, docs: bool) -> None:
 
     @app.get("/", include_in_schema=False)
     async def board(request: Request) -> Response:
-        response = await static.get_response(_BOARD, request.scope)
+        response = await static.get_response("board.html", request.scope)
         response.headers["Content-Security-Policy"] = _STRICT_POLICY
         return response
 

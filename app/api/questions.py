@@ -43,7 +43,7 @@ batches = APIRouter(
 # The tests validate answers against the schemas of the routes.
 
 
-def begin(http: Request) -> serving.Request:
+def serving_request(http: Request) -> serving.Request:
     """Create the serving request of an HTTP request. It uses one snapshot of the models."""
     state, runtime = http.scope["state"], http.scope["app"].state.runtime
     return serving.Request(
@@ -56,11 +56,9 @@ def begin(http: Request) -> serving.Request:
 
 
 async def _answer_each(
-    http: Request,
-    batch: BatchRequest[RequestT],
-    question: Question[RequestT],
+    http: Request, batch: BatchRequest[RequestT], question: Question[RequestT]
 ) -> bytes:
-    request = begin(http)
+    request = serving_request(http)
 
     def count(outcome: str) -> None:
         request.metrics.entry_answered(question.name, outcome)
@@ -68,18 +66,18 @@ async def _answer_each(
     results: list[bytes] = []
     left = request.limits.answer_bytes
     with request.for_batch([_reference(scene) for scene in batch.scenes]) as held:
-        for place, scene in enumerate(batch.scenes):
+        for number, scene in enumerate(batch.scenes):
             try:
                 held.check()
                 one = held.with_answer_bytes(left)
                 # Only this validation may fail because of the client. Any later validation error is
                 # a defect of the service.
-                asked = validated(scene, question.request, at=("scenes", place))
-                answer = written(await one.answer(question, asked))
+                data = validated(scene, question.request, at=("scenes", number))
+                answer = written(await one.answer(question, data))
                 results.append(b'{"status":200,"result":%b}' % answer)
                 count(serving.SUCCESS)
             except Exception as error:  # noqa: BLE001 — any error fails only this scene
-                outcome, failed = _failed(error, place, scene, request.id)
+                outcome, failed = _failed(error, number, scene, request.id)
                 count(outcome)
                 results.append(failed)
             left = max(0, left - len(results[-1]))
@@ -88,14 +86,14 @@ async def _answer_each(
     return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
 
 
-def _failed(error: Exception, place: int, scene: Any, request_id: str) -> tuple[str, bytes]:
+def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple[str, bytes]:
     """Return the outcome for the metrics and the answer's entry of a failed scene.
 
     This is a separate function, because an error refers to the frame of `_answer_each`. A local
     variable of that frame must not refer to the error, to avoid a reference cycle.
     """
     if isinstance(error, RequestError):
-        error.locate(scene, ("scenes", place))
+        error.locate(scene, ("scenes", number))
     failure = from_exception(error)
     if failure.status == 500:
         report_defect(error, request_id)
@@ -105,23 +103,23 @@ def _failed(error: Exception, place: int, scene: Any, request_id: str) -> tuple[
 
 def _reference(scene: Any) -> str:
     """Return the field `model` of a scene that is not validated yet, or the default model."""
-    found = scene.get("model", DEFAULT) if isinstance(scene, dict) else DEFAULT
-    return found if isinstance(found, str) else DEFAULT
+    reference = scene.get("model", DEFAULT) if isinstance(scene, dict) else DEFAULT
+    return reference if isinstance(reference, str) else DEFAULT
 
 
 def _endpoints(question: Question[Any]) -> tuple[_Endpoint, _Endpoint]:
     """Create the endpoint functions of a question: for one scene, and for a batch."""
 
-    async def answer(asked: Any, http: Request) -> bytes:
-        return written(await begin(http).answer(question, asked))
+    async def answer(data: Any, http: Request) -> bytes:
+        return written(await serving_request(http).answer(question, data))
 
-    async def answer_batch(asked: Any, http: Request) -> bytes:
-        return await _answer_each(http, asked, question)
+    async def answer_batch(data: Any, http: Request) -> bytes:
+        return await _answer_each(http, data, question)
 
     # FastAPI reads the schema of the body from the annotations.
-    answer.__annotations__ |= {"asked": question.request, "http": Request}
-    form = BatchRequest[question.request]  # type: ignore[name-defined]
-    answer_batch.__annotations__ |= {"asked": form, "http": Request}
+    answer.__annotations__ |= {"data": question.request, "http": Request}
+    schema = BatchRequest[question.request]  # type: ignore[name-defined]
+    answer_batch.__annotations__ |= {"data": schema, "http": Request}
     return answer, answer_batch
 
 

@@ -8,8 +8,7 @@ messages.
 from __future__ import annotations
 
 import os
-from collections.abc import MutableMapping
-from typing import Any, Final
+from typing import Final
 
 from fastapi.telemetry import TelemetryConfig
 
@@ -56,10 +55,5 @@ def configuration(*, enabled: bool) -> TelemetryConfig:
         # With True, FastAPI starts the exporter together with the application.
         auto_configure=True,
         tracer_provider=provider,
-        exclude=_is_untraced,
+        exclude=lambda scope: str(scope["path"]).startswith(_UNTRACED),
     )
-
-
-def _is_untraced(scope: MutableMapping[str, Any]) -> bool:
-    path: str = scope["path"]
-    return path.startswith(_UNTRACED)

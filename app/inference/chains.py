@@ -30,15 +30,16 @@ from app.inference.relation_kernels import draw_in_groups
 from app.inference.relations import (
     NEVER,
     Ends,
-    Given,
+    ObservedRelations,
     RelationUnits,
     all_pairs,
+    ends_of,
     relation_units,
 )
 from app.inference.weights import Weights, unpack_scenes
 
 Floats = NDArray[np.float32]
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Bits = NDArray[np.uint8]
 
@@ -49,14 +50,9 @@ OTHER_ROOM = np.float32(6.0)
 _AT_ONCE = 64
 
 
-def random_stream(seed: int, place: int) -> np.random.Generator:
-    """Return one of the independent random streams of a seed.
-
-    Args:
-        seed: integer from 0.
-        place: number of the stream, from 0.
-    """
-    sequence = np.random.SeedSequence(seed, spawn_key=(place,))
+def random_stream(seed: int, number: int) -> np.random.Generator:
+    """Return random stream ``number``, from 0, of a seed. The streams are independent."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(number,))
     return np.random.Generator(np.random.PCG64(sequence))
 
 
@@ -78,7 +74,7 @@ class Arrays(NamedTuple):
     directions: Floats
 
 
-class Observed(NamedTuple):
+class ObservedUnits(NamedTuple):
     """E observed relation units, each on or off.
 
     Attributes:
@@ -89,7 +85,7 @@ class Observed(NamedTuple):
         r: (E,) 1 if the relation holds, else 0.
     """
 
-    a: Places
+    a: Indices
     z: Floats
     base: Floats
     r: Floats
@@ -102,21 +98,21 @@ class Conditions:
     Attributes:
         classes: (n,) int64, distinct indices of the classes that stay present, ascending.
         log_counts: (n,) log of the number of instances of each class.
-        given: observed relations between these classes, or None without observed relations.
+        observed: observed relations between these classes, or None without observed relations.
         held, held2: distinct indices of the units of h1 and h2 that stay on.
         room: index of the room type, or None if unknown.
     """
 
-    classes: Places
+    classes: Indices
     log_counts: Floats
-    given: Given | None
-    held: Places
-    held2: Places
+    observed: ObservedRelations | None
+    held: Indices
+    held2: Indices
     room: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class ChainState:
     """The final state of a chain.
 
     Attributes:
@@ -127,9 +123,9 @@ class Drawn:
             observed.
     """
 
-    classes: Places
-    h1: Places
-    h2: Places
+    classes: Indices
+    h1: Indices
+    h2: Indices
     logits: Floats
     r: Mask
 
@@ -142,11 +138,11 @@ class SceneChains:
         units: relation units of the machine. With None, the class builds them.
 
     Raises:
-        ValueError: the class does not support the machine; see `fits`.
+        ValueError: the class does not support the machine; see `supports`.
     """
 
     def __init__(self, weights: Weights, units: RelationUnits | None = None) -> None:
-        if not self.fits(weights):
+        if not self.supports(weights):
             raise ValueError(
                 "compiled chains need a machine in the local form with float32 weights"
             )
@@ -170,12 +166,12 @@ class SceneChains:
             self.mean = sigmoid(x).astype(np.float32)
 
     @staticmethod
-    def fits(weights: Weights) -> bool:
+    def supports(weights: Weights) -> bool:
         """Return whether this module supports the machine: it needs the local form in float32."""
         return weights.spec.is_local and weights["W"].dtype == np.float32
 
-    def given(self, conditions: Conditions, temperature: float = 1.0) -> ConditionedChains:
-        """Return the chains of one request."""
+    def under(self, conditions: Conditions, temperature: float = 1.0) -> ConditionedChains:
+        """Return the chains under the conditions of one request."""
         return ConditionedChains(self, conditions, temperature)
 
     def sample_weights(self, conditions: Conditions) -> NDArray[np.float64]:
@@ -185,8 +181,8 @@ class SceneChains:
         if room is not None and spec.C:
             own = self.machine["fantasy_rooms"] == room
             total += np.where(own, 0, -OTHER_ROOM) if own.any() else self.mean @ Q[room]
-        given = conditions.classes
-        logits = self.machine["b"][given] + self.mean @ self.machine["W"][given].T
+        classes = conditions.classes
+        logits = self.machine["b"][classes] + self.mean @ self.machine["W"][classes].T
         total -= softplus(-logits).sum(1)
         total += np.log(np.maximum(self.mean[:, conditions.held], 1e-37)).sum(1)
         weight = np.exp(total - total.max()).astype(np.float64)
@@ -197,7 +193,7 @@ class SceneChains:
 class ConditionedChains:
     """Chains under the same conditions. Each chain has its own random stream.
 
-    `SceneChains.given` creates this object.
+    `SceneChains.under` creates this object.
     """
 
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
@@ -206,39 +202,34 @@ class ConditionedChains:
         self._beta = np.float32(1.0 / temperature)
         self._bias = chains.machine.room_bias(conditions.room)
         self._always, self._held, self._held2 = (
-            _marked(size, where)
+            _indicator(size, where)
             for size, where in (
                 (spec.V, conditions.classes),
                 (spec.H1, conditions.held),
                 (spec.H2, conditions.held2),
             )
         )
-        self._classes, self._given = conditions.classes, conditions.given
-        self._observed = self._observe(conditions)
+        self._classes, self._observed_relations = conditions.classes, conditions.observed
+        self._observed = self._observed_units(conditions)
         self._cumulative = np.zeros(0)
         if spec.N:
             self._cumulative = np.cumsum(chains.sample_weights(conditions))
 
-    def _observe(self, conditions: Conditions) -> Observed:
-        given, units = conditions.given, self._chains.units
-        if given is None:
+    def _observed_units(self, conditions: Conditions) -> ObservedUnits:
+        observed, units = conditions.observed, self._chains.units
+        if observed is None:
             nothing = np.zeros(0, np.float32)
             width = units.G.shape[1] if len(units.G) else self._machine.spec.H1
-            return Observed(
+            return ObservedUnits(
                 np.zeros(0, np.int64), np.zeros((0, width), np.float32), nothing, nothing
             )
-        ends = _present(conditions.classes, given.i, given.j, conditions.log_counts)
-        found = units.select(given.a, ends)
-        a = found.a if len(units.G) else np.zeros_like(found.a)
-        return Observed(a, found.z, found.base, given.r[found.place])
+        ends = _present(conditions.classes, observed.i, observed.j, conditions.log_counts)
+        selected = units.select(observed.a, ends)
+        a = selected.a if len(units.G) else np.zeros_like(selected.a)
+        return ObservedUnits(a, selected.z, selected.base, observed.r[selected.kept])
 
-    def draw(self, steps: int, stream: np.random.Generator) -> Drawn:
-        """Run one chain and return its final state.
-
-        Args:
-            steps: number of sweeps over contexts and objects.
-            stream: random stream of this chain.
-        """
+    def draw(self, steps: int, stream: np.random.Generator) -> ChainState:
+        """Run ``steps`` sweeps of one chain with its random stream and return its final state."""
         V, H1 = self._w.W.shape
         on, mean = np.zeros(V, np.uint8), sigmoid(self._bias)
         if len(self._cumulative):
@@ -252,14 +243,12 @@ class ConditionedChains:
             h2 = (stream.random(len(h2), np.float32) < m2) | self._held2
         return self.move(on | self._always, h1, h2, steps, stream)
 
-    def move(self, on: Bits, h1: Bits, h2: Bits, steps: int, stream: np.random.Generator) -> Drawn:
+    def move(
+        self, on: Bits, h1: Bits, h2: Bits, steps: int, stream: np.random.Generator
+    ) -> ChainState:
         """Continue a chain from a state, change the state in place, and return the final state.
 
-        Args:
-            on: (V,) presence of the classes.
-            h1, h2: (H1,) and (H2,) states of the hidden units.
-            steps: number of sweeps.
-            stream: random stream of this chain.
+        The state has the presence of the classes (V,) and the hidden units h1 (H1,) and h2 (H2,).
         """
         numbers = len(on) + 2 * len(h1) + len(h2) + kernels.PROPOSALS
         while steps > 0:
@@ -272,22 +261,22 @@ class ConditionedChains:
         classes = np.flatnonzero(on)
         logits = self._logits(classes, h1)
         r = self._relations(classes, logits, stream)
-        return Drawn(classes, np.flatnonzero(h1), np.flatnonzero(h2), logits, r)
+        return ChainState(classes, np.flatnonzero(h1), np.flatnonzero(h2), logits, r)
 
-    def _context_bias(self, classes: Places, beta: float = 1.0) -> tuple[Floats, Floats]:
+    def _context_bias(self, classes: Indices, beta: float = 1.0) -> tuple[Floats, Floats]:
         """Return the logits x of h1 given present classes, (H1,), and the means of h2, (H2,)."""
         base = self._bias + self._machine["W"][classes].sum(0)
         x, m2 = self._machine.with_second_layer(base[None], beta)
         return x[0].astype(np.float32), m2[0]
 
-    def _logits(self, classes: Places, h1: Bits) -> Floats:
+    def _logits(self, classes: Indices, h1: Bits) -> Floats:
         """Return the logits of the relations between classes with one instance each, (A, n, n)."""
         n, A = len(classes), self._machine.spec.A
         ends = _present(classes, *all_pairs(n), np.zeros(n, np.float32))
-        mean, _ = self._chains.units.normal(h1[None].astype(np.float32), ends, known=True)
+        mean, _ = self._chains.units.normal(h1[None].astype(np.float32), ends, certain=True)
         return mean.reshape(A, n, n)
 
-    def _relations(self, classes: Places, logits: Floats, stream: np.random.Generator) -> Mask:
+    def _relations(self, classes: Indices, logits: Floats, stream: np.random.Generator) -> Mask:
         """Sample the relations r (A, n, n) between different classes.
 
         Observed units keep their value. Relations of a class to itself are off unless observed,
@@ -295,13 +284,13 @@ class ConditionedChains:
         """
         r = np.zeros(logits.shape, np.bool_)
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
-        given = self._given
-        if given is not None:
+        observed = self._observed_relations
+        if observed is not None:
             where = np.searchsorted(classes, self._classes)
-            a, i, j = given.a, where[given.i], where[given.j]
-            known = logits[a, i, j] > NEVER / 2
-            units = a[known], i[known], j[known]
-            r[units], free[units] = given.r[known] > 0, False
+            a, i, j = observed.a, where[observed.i], where[observed.j]
+            with_unit = logits[a, i, j] > NEVER / 2
+            units = a[with_unit], i[with_unit], j[with_unit]
+            r[units], free[units] = observed.r[with_unit] > 0, False
         uniform, other = stream.random((2, *r.shape), np.float32)
         if self._machine.spec.G:
             x, _ = self._context_bias(classes, float(self._beta))
@@ -311,7 +300,7 @@ class ConditionedChains:
             r |= free & (uniform < sigmoid(self._beta * logits))
         return r
 
-    def log_score(self, drawn: Drawn, shown: Mask, kept: Mask) -> float:
+    def log_score(self, state: ChainState, shown: Mask, kept: Mask) -> float:
         """Return the log score of a sampled scene at temperature 1, up to a constant of the model.
 
             b·v + sum_k softplus(x_k) + log p(kept | v, h1)
@@ -322,27 +311,26 @@ class ConditionedChains:
         bound on the log of the sum over h2.
 
         Args:
-            drawn: the sampled scene.
+            state: final state of a chain.
             shown: (n,) bool, True for classes that count as present.
             kept: (A, n, n) bool, True for relations that count as on.
         """
-        listed = drawn.classes[shown]
+        listed = state.classes[shown]
         x, m = self._context_bias(listed)
         inner = m[(m > 0) & (m < 1)].astype(np.float64)
         entropy = -(inner * np.log(inner) + (1 - inner) * np.log1p(-inner)).sum()
-        logits = drawn.logits[:, shown][:, :, shown].astype(np.float64)
+        logits = state.logits[:, shown][:, :, shown].astype(np.float64)
         on = kept[:, shown][:, :, shown]
         score = self._machine["b"][listed].sum() + softplus(x).sum() + self._machine["c2"] @ m
         return float(score + entropy + (on * logits - softplus(logits)).sum())
 
 
-def _marked(size: int, where: Places) -> Bits:
-    found = np.zeros(size, np.uint8)
-    found[where] = 1
-    return found
+def _indicator(size: int, where: Indices) -> Bits:
+    indicator = np.zeros(size, np.uint8)
+    indicator[where] = 1
+    return indicator
 
 
-def _present(classes: Places, i: Places, j: Places, log_counts: Floats) -> Ends:
+def _present(classes: Indices, i: Indices, j: Indices, log_counts: Floats) -> Ends:
     """Return `Ends` for pairs (i, j) of indices into ``classes``, with presence 1."""
-    one = np.ones(i.shape, np.float32)
-    return Ends(classes[i], classes[j], log_counts[i], log_counts[j], one, one)
+    return ends_of(classes, np.ones(len(classes), np.float32), log_counts, i, j)

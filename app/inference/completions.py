@@ -55,7 +55,7 @@ from app.inference.objects import ContextScorer, group_size
 from app.inference.weights import Weights
 
 Floats = NDArray[np.float32]
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 COMPLETIONS = 16
@@ -90,13 +90,9 @@ class Completions:
     """
 
     def __init__(
-        self,
-        weights: Weights,
-        structure: Mask,
-        scorer: ContextScorer,
-        count: int = COMPLETIONS,
+        self, weights: Weights, structure: Mask, scorer: ContextScorer, count: int = COMPLETIONS
     ) -> None:
-        if not self.fits(weights):
+        if not self.supports(weights):
             raise ValueError(
                 "completions require a machine with stored samples and float32 weights W between "
                 "-64 and 64"
@@ -114,14 +110,14 @@ class Completions:
         self._empty = lru_cache(maxsize=_KEPT)(self._unlisted_evidence)
 
     @staticmethod
-    def fits(weights: Weights) -> bool:
+    def supports(weights: Weights) -> bool:
         """Return whether the machine stores samples and its W is float32 between -64 and 64."""
         return weights.spec.N > 0 and group_size(weights["W"]) > 0
 
     def log_odds(
         self,
         y: Floats,
-        classes: Places,
+        classes: Indices,
         presence: Floats,
         coverage: float,
         room: int | None = None,
@@ -141,18 +137,18 @@ class Completions:
         if room is not None and len(self._rooms):
             base = base + self._rooms[room]
         unlisted = np.float32(math.log1p(-coverage))
-        telling = ~self._structure[classes]
+        informative = ~self._structure[classes]
         picked = objects.resampled(
-            *(base, self._odds_against, classes[telling], presence[telling]),
+            *(base, self._odds_against, classes[informative], presence[informative]),
             *(np.float32(1 - coverage), self._noise.shape[1]),
         )
         usable = ~self._structure
         usable[classes] = False
-        found: Floats = objects.completed_log_odds(
+        log_odds: Floats = objects.completed_log_odds(
             *(y, picked, self._odds_against, np.exp(unlisted) * self._noise, usable),
             *(self._b + unlisted, self._W, self._scorer.exp_w, self._scorer.group),
         )
-        return found
+        return log_odds
 
     def _unlisted_evidence(self, coverage: float) -> Floats:
         """Return sum_i log(1 - c σ(l_i)) for each sample, (N,). The sum excludes structure."""
@@ -198,12 +194,12 @@ def _room_weights(weights: Weights, contexts: Floats) -> Floats:
     # The last column stands for "no room type".
     pull = np.concatenate([pull, np.zeros((len(pull), 1))], 1)
     rooms = weights["fantasy_rooms"]
-    drawn, sizes = np.unique(np.where(rooms < 0, spec.C, rooms), return_counts=True)
+    present, sizes = np.unique(np.where(rooms < 0, spec.C, rooms), return_counts=True)
     # share[f, s] is exp(Q[s]·h_f), divided by the largest entry of the row. With this array, both
     # sums of the iteration are matrix products. The lower limit keeps the sums above 0.
-    top = pull[:, drawn].max(1)
-    share = np.exp(np.maximum(pull[:, drawn] - top[:, None], _LEAST_PULL))
-    log_z = np.zeros(len(drawn))
+    top = pull[:, present].max(1)
+    share = np.exp(np.maximum(pull[:, present] - top[:, None], _LEAST_PULL))
+    log_z = np.zeros(len(present))
     mixture = np.ones(len(pull))
     for _ in range(_ROOM_SWEEPS):
         mixture = share @ (sizes * np.exp(-log_z))

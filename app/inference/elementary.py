@@ -37,15 +37,15 @@ _ONE_BITS = _i(0x3F800000)
 
 def sigmoid(x: Floats) -> Floats:
     """Compute 1 / (1 + e^-x). Replace x below -80 by -80, because e^89 would overflow float32."""
-    found: Floats = np.exp(np.minimum(-x, 80))
-    found += 1
-    return np.reciprocal(found, out=found)
+    y: Floats = np.exp(np.minimum(-x, 80))
+    y += 1
+    return np.reciprocal(y, out=y)
 
 
 def softplus(x: Floats) -> Floats:
     """Compute log(1 + e^x)."""
-    found: Floats = np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
-    return found
+    y: Floats = np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
+    return y
 
 
 @intrinsic

@@ -26,7 +26,7 @@ from app.inference.elementary import exp, exponent, log, mantissa, softplus
 
 Floats = NDArray[np.floating[Any]]
 Singles = NDArray[np.float32]
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 
 # Maximum |log| of a product of factors; float32 covers exp(±87).
 _LOG_RANGE = 80.0
@@ -108,12 +108,12 @@ class ContextScorer:
             raise ValueError(f"x must have the shape (..., {self.H1}), not {x.shape}")
         rows = x.reshape(-1, self.H1)
         if self.group:
-            found: Floats = gains(rows.astype(np.float32), self.exp_w, self.group, self.V)
+            gain: Floats = gains(rows.astype(np.float32), self.exp_w, self.group, self.V)
         else:
             logits = rows.astype(np.float64)[:, None]
             terms = softplus(logits + self._W) - softplus(logits)
-            found = terms.sum(2).astype(self._W.dtype)
-        return found.reshape(*x.shape[:-1], self.V)
+            gain = terms.sum(2).astype(self._W.dtype)
+        return gain.reshape(*x.shape[:-1], self.V)
 
 
 @inlined
@@ -136,21 +136,17 @@ def gains(x, exp_w, group, classes):
     After each group of factors, the function splits the product into mantissa and exponent, and
     adds the exponent to an integer. So one log at the end is enough.
 
-    Args:
-        x: (M, H1) logits of the hidden units.
-        exp_w: exp(W) in tiles; see `ContextScorer`.
-        group: maximum number of factors per product.
-        classes: number V of classes.
+    x (M, H1) are the logits of the hidden units; for ``exp_w`` and ``group``, see `ContextScorer`.
     """
     (tiles, units, width), M = exp_w.shape, len(x)
-    found, off, on = np.empty((M, classes), np.float32), np.empty_like(x), np.empty_like(x)
+    gain, off, on = np.empty((M, classes), np.float32), np.empty_like(x), np.empty_like(x)
     for m in range(M):
         _set_halves(x[m], off[m], on[m])
     product, exponents = np.empty(width, np.float32), np.empty(width, np.int32)
     for t in range(tiles):
         tile = exp_w[t]
         for m in range(M):
-            offs, ons, into = off[m], on[m], found[m, t * width :]
+            offs, ons, into = off[m], on[m], gain[m, t * width :]
             product[:], exponents[:] = _ONE, np.int32(0)
             for start in range(0, units, group):
                 end = min(start + group, units)
@@ -170,7 +166,7 @@ def gains(x, exp_w, group, classes):
                     product[i] = mantissa(product[i])
             for i in range(min(width, classes - t * width)):
                 into[i] = log(product[i]) + _LN2 * np.float32(exponents[i])
-    return found
+    return gain
 
 
 @compiled
@@ -210,12 +206,12 @@ def gains_without(y, share, W, group):
         W: (n, H1) weights between each class and the hidden units.
         group: maximum number of factors per product; see `ContextScorer`.
     """
-    found, growth = np.empty(len(W), np.float32), _exps(W)
+    gain, growth = np.empty(len(W), np.float32), _exps(W)
     off, on, product = np.empty_like(y), np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
     for i in range(len(W)):
         _set_halves(y - share[i], off, on)
-        found[i] = _gain(off, on, growth[i], group, product)
-    return found
+        gain[i] = _gain(off, on, growth[i], group, product)
+    return gain
 
 
 @compiled
@@ -225,16 +221,13 @@ def gains_without_others(y, share, W, rows, common, index, group):
     Each row of the result is a class i of ``rows``, and each column is a class j.
 
     Args:
-        y: (H1,) logits of the hidden units.
-        share: (n, H1) contribution of each class and its relations to y.
-        W: (n, H1) weights between each class and the hidden units.
+        y, share, W, group: see `gains_without`.
         rows: (N,) row of each class i in ``share`` and W.
         common: (P, H1) contribution to y of the relations between two classes, for P pairs.
         index: (n, n) row of each pair of classes in ``common``, or -1 for a pair without relations.
-        group: maximum number of factors per product; see `ContextScorer`.
     """
     n, size = share.shape
-    found, both = np.zeros((len(rows), n), np.float32), np.empty_like(y)
+    gain, both = np.zeros((len(rows), n), np.float32), np.empty_like(y)
     off, on, fall, growth = np.empty_like(y), np.empty_like(y), _exps(-share), _exps(W)
     twice, product = _exps(common), np.empty(_SIDE_BY_SIDE, np.float32)
     _set_halves(y, off, on)
@@ -251,8 +244,8 @@ def gains_without_others(y, share, W, rows, common, index, group):
                 again = twice[index[i, j]]
                 for k in range(size):
                     both[k] *= again[k]
-            found[c, j] = _gain(off, both, growth[i], group, product)
-    return found
+            gain[c, j] = _gain(off, both, growth[i], group, product)
+    return gain
 
 
 @compiled
@@ -263,13 +256,11 @@ def reasons_for_absent(y, share, W, group):
     class.
 
     Args:
-        y: (H1,) logits of the hidden units.
-        share: (n, H1) contribution of each present class and its relations to y.
+        y, share, group: see `gains_without`.
         W: (N, H1) weights between each absent class and the hidden units.
-        group: maximum number of factors per product; see `ContextScorer`.
     """
     n, growth = len(share), _exps(W)
-    found, all_of = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)
+    change, all_of = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)
     off, on, product = np.empty_like(y), np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
     _set_halves(y, off, on)
     for c in range(len(W)):
@@ -277,19 +268,19 @@ def reasons_for_absent(y, share, W, group):
     for j in range(n):
         _set_halves(y - share[j], off, on)
         for c in range(len(W)):
-            found[c, j] = all_of[c] - _gain(off, on, growth[c], group, product)
-    return found
+            change[c, j] = all_of[c] - _gain(off, on, growth[c], group, product)
+    return change
 
 
 @compiled
 def _exps(x):
     """Compute e^x for x (N, H1)."""
-    found = np.empty_like(x)
+    powers = np.empty_like(x)
     for n in range(len(x)):
-        row, into = x[n], found[n]
+        row, into = x[n], powers[n]
         for k in range(len(row)):
             into[k] = exp(row[k])
-    return found
+    return powers
 
 
 @compiled
@@ -319,8 +310,8 @@ def resampled(weight, against, classes, presence, closed, count):
     below[:] = np.cumsum(weight.astype(np.float64))
     picked, n = np.empty(count, np.int64), 0
     for m in range(count):
-        wanted = (m + 0.5) / count * below[-1]
-        while n < len(below) - 1 and below[n] < wanted:
+        quantile = (m + 0.5) / count * below[-1]
+        while n < len(below) - 1 and below[n] < quantile:
             n += 1
         picked[m] = n
     return picked
@@ -341,9 +332,7 @@ def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
         most: (V, M) limit of ``against`` for each class and completion.
         usable: (V,) bool, classes that a completion may add.
         bias: (V,) log-odds of each class without the hidden units.
-        W: (V, H1) weights between classes and hidden units.
-        exp_w: exp(W) in tiles; see `ContextScorer`.
-        group: maximum number of factors per product.
+        W, exp_w, group: see `ContextScorer`.
     """
     (V, size), M = W.shape, len(picked)
     completed, added = np.empty((M, size), np.float32), np.zeros((M, V), np.bool_)

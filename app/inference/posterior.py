@@ -32,11 +32,11 @@ from numpy.typing import NDArray
 
 from app.inference import objects
 from app.inference.objects import group_size
-from app.inference.relations import Between, Context, Ends, Given, relation_units
+from app.inference.relations import Between, Context, ObservedRelations, ends_of, relation_units
 from app.inference.weights import Weights
 
 Floats = NDArray[np.float32]
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 # Maximum |slope| of an observed relation for which a first-order formula subtracts the effect of
@@ -66,11 +66,11 @@ class ClosedForm:
     The same scene always gives bit-identical log-odds, whatever the other requests.
 
     Raises:
-        ValueError: the closed form does not apply to the machine; see `fits`.
+        ValueError: the closed form does not apply to the machine; see `supports`.
     """
 
     def __init__(self, weights: Weights) -> None:
-        if not self.fits(weights):
+        if not self.supports(weights):
             raise ValueError(
                 "the closed form requires a machine in the local form with float32 weights W "
                 "between -64 and 64"
@@ -82,7 +82,7 @@ class ClosedForm:
         self.group = group_size(self.W)
 
     @staticmethod
-    def fits(weights: Weights) -> bool:
+    def supports(weights: Weights) -> bool:
         """Return whether the machine has the local form and its W is float32 between -64 and 64."""
         return (
             weights.spec.is_local
@@ -92,11 +92,11 @@ class ClosedForm:
 
     def context(
         self,
-        classes: Places,
+        classes: Indices,
         presence: Floats,
         log_counts: Floats,
         room: int | None = None,
-        given: Given | None = None,
+        observed: ObservedRelations | None = None,
         pull: Pull = FULL,
     ) -> Context:
         """Compute the logits of h1 given the objects, the room type and the observed relations.
@@ -106,7 +106,7 @@ class ClosedForm:
             presence: (n,) probability that each class is present.
             log_counts: (n,) log of the number of instances of each class.
             room: index of the room type, or None if the room type is unknown.
-            given: observed relations, or None if the scene has no observed relations.
+            observed: observed relations, or None if the scene has no observed relations.
             pull: factors that reduce the effect of the observed relations.
         """
         x: Floats = self._c1 + presence @ self.W[classes]
@@ -116,20 +116,17 @@ class ClosedForm:
         if self._weights.spec.H2:
             x, through = self._second_layer(x, classes, presence)
         scene = classes, presence, log_counts
-        if given is None or not len(given.a):
+        if observed is None or not len(observed.a):
             none = _NO_SLOPES
             return Context(*scene, x, x, None, None, none, x, none, through)
-        i, j = given.i, given.j
-        ends = Ends(
-            *(classes[i], classes[j], log_counts[i], log_counts[j], presence[i], presence[j])
-        )
-        y, units, slopes = self.units.fixed_point(x, given, ends)
+        ends = ends_of(*scene, observed.i, observed.j)
+        y, units, slopes = self.units.fixed_point(x, observed, ends)
         object_y, object_slopes = _scaled(pull.objects, x, y, slopes)
         y, slopes = _scaled(pull.relations, x, y, slopes)
-        return Context(*scene, x, y, given, units, slopes, object_y, object_slopes, through)
+        return Context(*scene, x, y, observed, units, slopes, object_y, object_slopes, through)
 
     def _second_layer(
-        self, base: Floats, classes: Places, presence: Floats
+        self, base: Floats, classes: Indices, presence: Floats
     ) -> tuple[Floats, Floats]:
         """Return x (H1,), and the effect of each class on x through the second layer (n, H1)."""
         without = base - presence[:, None] * self.W[classes]
@@ -162,67 +159,54 @@ class ScenePosterior:
 
         The observation of a relation is not evidence for the same relation.
         """
-        found = self._units.log_odds(self._between)
-        given, units, slopes = self.context.given, self.context.units, self.context.slopes
-        if given is not None and units is not None:
+        log_odds = self._units.log_odds(self._between)
+        observed, units, slopes = self.context.observed, self.context.units, self.context.slopes
+        if observed is not None and units is not None:
             steep = np.flatnonzero(np.abs(slopes) > _GENTLE)
             if len(steep):
-                where = units.place[steep]
-                place = given.a[where], given.i[where], given.j[where]
-                found[place] = self._units.without_itself(
-                    self.context, *place, slopes[steep], self._between.shift
+                kept = units.kept[steep]
+                triples = observed.a[kept], observed.i[kept], observed.j[kept]
+                log_odds[triples] = self._units.log_odds_without_itself(
+                    self.context, *triples, slopes[steep], self._between.shift
                 )
-        return found
+        return log_odds
 
-    def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
+    def unit_log_odds(self, relation: Indices, subject: Indices, object_: Indices) -> Floats:
         """Return the log-odds of E relations, (E,).
 
         The observation of a relation is not evidence for the same relation.
 
         Args:
-            relation: (E,) indices of canonical relations.
-            subject, object_: (E,) indices of the subject and object classes in the scene.
+            relation, subject, object_: (E,) indices of canonical relations, and of their subject
+                and object classes in the scene.
         """
-        given, shift, _ = self._units.said(self.context)
+        slopes, shift, _ = self._units.observed_effects(self.context)
         none = np.zeros(len(relation), dtype=np.float32)
-        slopes = given[relation, subject, object_] if len(given) else none
-        return self._units.without_itself(self.context, relation, subject, object_, slopes, shift)
+        own = slopes[relation, subject, object_] if len(slopes) else none
+        return self._units.log_odds_without_itself(
+            self.context, relation, subject, object_, own, shift
+        )
 
-    def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
-        """Return the log-odds of all relations of P pairs of classes.
+    def log_odds_apart(self, one: Indices, other: Indices) -> tuple[Floats, Floats]:
+        """Return the log-odds (A, P) of all relations from `one` to `other`, and (A, P) back.
 
-        The observed relations of a pair are not evidence for the relations of the same pair.
-
-        Args:
-            one, other: (P,) indices of the first and second class of each pair in the scene.
-
-        Returns:
-            Log-odds (A, P) with `one` as subject, and log-odds (A, P) with `other` as subject.
+        `RelationUnits.log_odds_apart` describes the arguments.
         """
         forward, backward = self._units.log_odds_apart(self.context, self._between, one, other)
         return forward, backward
 
     def placement_log_odds(
-        self, candidates: Places, anchors: Places, only: int | None = None
+        self, candidates: Indices, anchors: Indices, only: int | None = None
     ) -> tuple[Floats, Floats]:
         """Return the log-odds of relations between absent candidate classes and anchor classes.
 
-        Each candidate is judged as if it were present. The observed relations change the result
-        only through the hidden units h1.
-
-        Args:
-            candidates: (N,) indices of absent classes.
-            anchors: (m,) indices of the anchor classes in the scene.
-            only: index of one canonical relation (R = 1), or None for all relations (R = A).
-
-        Returns:
-            Log-odds (N, R, m) with the candidate as subject, and log-odds (N, R, m) with the
-            anchor as subject.
+        The observed relations change the result only through the hidden units h1.
+        `RelationUnits.placement_log_odds` describes arguments and results.
         """
         return self._units.placement_log_odds(self.context, candidates, anchors, only)
 
     def placed_log_p(
-        self, candidates: Places, relation: int, anchor: int, *, outgoing: bool
+        self, candidates: Indices, relation: int, anchor: int, *, outgoing: bool
     ) -> Floats:
         """Return log p(relation to the anchor | candidate is present, evidence), (N,).
 
@@ -243,7 +227,7 @@ class ScenePosterior:
         """
         return self._closed.b[self.context.classes] + self._gains
 
-    def reasons(self, rows: Places) -> Floats:
+    def reasons(self, rows: Indices) -> Floats:
         """Return how much each class j changes `log_odds_given_rest` of each class i, (N, n).
 
         Each row is one of the N classes i of ``rows``. Each column is one of the n classes j of the
@@ -262,17 +246,17 @@ class ScenePosterior:
         change[np.arange(len(rows)), rows] = 0
         return change
 
-    def reasons_for_absent(self, candidates: Places) -> Floats:
+    def reasons_for_absent(self, candidates: Indices) -> Floats:
         """Return how much each class of the scene changes the log-odds of absent classes, (N, n).
 
         Each row is one of the N absent candidates. Each column is one of the n classes of the
         scene. An entry is the candidate's log-odds with the class of the scene, minus the
         candidate's log-odds without this class and its relations.
         """
-        found: Floats = objects.reasons_for_absent(
+        change: Floats = objects.reasons_for_absent(
             self.context.object_y, self._shares, self._closed.W[candidates], self._closed.group
         )
-        return found
+        return change
 
     @cached_property
     def _between(self) -> Between:
@@ -287,11 +271,11 @@ class ScenePosterior:
     @cached_property
     def _gains(self) -> Floats:
         """The change of the log-odds of each class i from b_i by the rest of the scene, (n,)."""
-        found: Floats = objects.gains_without(
+        gains: Floats = objects.gains_without(
             *(self.context.object_y, self._shares, self._closed.W[self.context.classes]),
             self._closed.group,
         )
-        return found
+        return gains
 
 
 def _scaled(pull: float, x: Floats, y: Floats, slopes: Floats) -> tuple[Floats, Floats]:

@@ -32,15 +32,15 @@ def pair_rows(start, keys, pairs):
         pairs: (E,) keys to look up. A key outside the table gets the last row, which is zero.
     """
     # Buckets are faster than binary search, because the processor cannot predict its branches.
-    found = np.empty(len(pairs), np.int64)
+    rows = np.empty(len(pairs), np.int64)
     for e in range(len(pairs)):
         pair = pairs[e]
         bucket = (pair * SPREAD >> SHIFT) & (len(start) - 2)
-        found[e] = len(keys)
+        rows[e] = len(keys)
         for row in range(start[bucket], start[bucket + 1]):
             if keys[row] == pair:
-                found[e] = row
-    return found
+                rows[e] = row
+    return rows
 
 
 @compiled_in_any_order
@@ -109,10 +109,10 @@ def spreads(C, q):
         q: (B, R, r, P) vectors q of r coordinates.
     """
     B, R, r, P = q.shape
-    found, row = np.empty((B, R, P), np.float32), np.empty(P, np.float32)
+    spread, row = np.empty((B, R, P), np.float32), np.empty(P, np.float32)
     for b in range(B):
         for c in range(R):
-            weights, rows, variance, t = C[b, c], q[b, c], found[b, c], 0
+            weights, rows, variance, t = C[b, c], q[b, c], spread[b, c], 0
             variance[:] = np.float32(0.0)
             for d in range(r):
                 row[:], this = np.float32(0.0), rows[d]
@@ -125,7 +125,7 @@ def spreads(C, q):
                     variance[p] += row[p] * this[p]
             for p in range(P):
                 variance[p] = np.sqrt(np.float32(3.0) * max(variance[p], np.float32(0.0)))
-    return found
+    return spread
 
 
 _ROOT_3 = np.float32(3.0**0.5)
@@ -139,13 +139,7 @@ _TAIL = np.exp(-0.5 * (0.25 * np.arange(1, 21)) ** 2).astype(np.float32)
 
 @compiled
 def log_odds(means, spreads, least):
-    """Replace the means of E logits by log-odds in place; see `relations.to_log_odds`.
-
-    Args:
-        means: (E,) means of the logits. The function overwrites this array with the log-odds.
-        spreads: (E,) √3 σ, where σ is the standard deviation of each logit.
-        least: lower limit of the log-odds.
-    """
+    """Replace the means (E,) of logits by log-odds of at least ``least``; see `to_log_odds`."""
     wide = np.flatnonzero(spreads >= _NARROW)
     some = _wide_log_odds(means[wide], spreads[wide])
     one, four = np.float32(1.0), np.float32(4.0)
@@ -190,31 +184,30 @@ def accumulate(keys, weights, rows, size):
 
     Args:
         keys: (E,) key of each row, or (2E,) for two keys per row.
-        weights: (E,) weight of each row.
-        rows: (E, K) rows to sum.
+        weights, rows: (E,) weights, and (E, K) rows to sum.
         size: number of keys.
     """
-    found = np.zeros((size, rows.shape[1]), np.float32)
+    sums = np.zeros((size, rows.shape[1]), np.float32)
     for n in range(len(keys)):
         if keys[n] >= 0:
             e = n % len(rows)
-            into, row, weight = found[keys[n]], rows[e], weights[e]
+            into, row, weight = sums[keys[n]], rows[e], weights[e]
             for k in range(len(row)):
                 into[k] += weight * row[k]
-    return found
+    return sums
 
 
 @compiled
 def expanded(G, a, z):
     """Compute the weights U_e = G[a_e]'z_e between each relation unit e and h1, (E, H1)."""
-    found = np.zeros((len(a), G.shape[2]), np.float32)
+    U = np.zeros((len(a), G.shape[2]), np.float32)
     for e in range(len(a)):
-        into, shared, factors = found[e], G[a[e]], z[e]
+        into, shared, factors = U[e], G[a[e]], z[e]
         for k in range(len(factors)):
             row, factor = shared[k], factors[k]
             for h in range(len(into)):
                 into[h] += factor * row[h]
-    return found
+    return U
 
 
 @compiled
@@ -254,8 +247,7 @@ def normal_without_itself(y, U, base, slopes):
         y: (H1,) logits of h1.
         U: (E, H1) weights between the units and h1.
         base: (E,) logits of the units without the term U_e·h1.
-        slopes: (E,) factor slope_e with which each unit acts on y; see
-            `RelationUnits.fixed_point`.
+        slopes: (E,) see `RelationUnits.fixed_point`.
     """
     mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
     rest, m = np.empty_like(y), np.empty_like(y)
@@ -333,7 +325,7 @@ def _add_rows(weights, rows, out):
 
 
 @compiled
-def _no_steps(relations, n):
+def _empty_steps(relations, n):
     """Return the empty step tables of a scene of n classes without relations.
 
     A step leads from one class to another class along a relation that holds. A step of kind a leads
@@ -354,10 +346,10 @@ def _no_steps(relations, n):
 
 
 @compiled
-def _hold(known, weight, a, i, j):
+def _add_relation(tables, weight, a, i, j):
     """Add the steps of relation a between classes i and j, and the new paths, to the tables."""
     # The loops use plain indices, because a slice would cost more time.
-    degree, near, seen, paths = known
+    degree, near, seen, paths = tables
     steps = len(degree)
     both = (a, i, j), (steps // 2 + a, j, i)
     for c, x, y in both:
@@ -384,16 +376,16 @@ def _add_path(seen, paths, weight, x, y, first, second):
 
 
 @compiled
-def _implied(known, weight, direct):
+def _shifts(tables, weight, direct):
     """Return how much the relations that hold change the logit of each relation, (n, n, A).
 
     Args:
-        known: step tables of the relations that hold; see `_no_steps`.
+        tables: step tables of the relations that hold; see `_empty_steps`.
         weight: (F, A) weights of the F features of relations that hold; see
             `RelationUnits.implication_weights`.
         direct: True if relations between the same two classes change each other's logits.
     """
-    degree, near, _, paths = known
+    degree, near, _, paths = tables
     (steps, n), A = degree.shape, weight.shape[1]
     shift, degrees = paths.copy(), weight[steps + steps * steps :]
     out, into = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
@@ -425,25 +417,24 @@ def _implied(known, weight, direct):
 
 
 @compiled
-def implied(weight, n, a, i, j):
+def implication_shifts(weight, n, a, i, j):
     """Return how much the relations that hold change the logit of each relation, (2, n, n, A).
 
     Index 0 of the first axis has the changes by all relations that hold. At index 1, relations
     between the same two classes do not change each other's logits.
 
     Args:
-        weight: (F, A) weights of the F features of relations that hold; see
-            `RelationUnits.implication_weights`.
+        weight: see `_shifts`.
         n: number of classes in the scene.
         a, i, j: (E,) indices of the relations that hold, of their subject classes and of their
             object classes. Subject and object class differ.
     """
-    known = _no_steps(weight.shape[1], n)
+    tables = _empty_steps(weight.shape[1], n)
     for e in range(len(a)):
-        _hold(known, weight, a[e], i[e], j[e])
-    found = np.empty((2, n, n, weight.shape[1]), np.float32)
-    found[0], found[1] = _implied(known, weight, True), _implied(known, weight, False)
-    return found
+        _add_relation(tables, weight, a[e], i[e], j[e])
+    shifts = np.empty((2, n, n, weight.shape[1]), np.float32)
+    shifts[0], shifts[1] = _shifts(tables, weight, True), _shifts(tables, weight, False)
+    return shifts
 
 
 @compiled
@@ -454,8 +445,7 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
     to groups at random. But a(i, j) and a(j, i) are always in different groups.
 
     Args:
-        weight: (F, A) weights of the F features of relations that hold; see
-            `RelationUnits.implication_weights`.
+        weight: see `_shifts`.
         logits: (A, n, n) logits of the relations without the changes by other relations.
         free: (A, n, n) bool, True for relations to sample. Other relations keep their value.
         uniform: (A, n, n) random numbers in [0, 1) that decide whether each relation holds.
@@ -463,7 +453,7 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
         r: (A, n, n) bool, True for relations that hold. The function writes the samples into r.
     """
     A, n, _ = r.shape
-    known, group = _no_steps(A, n), np.full(r.shape, -1, np.int64)
+    tables, group = _empty_steps(A, n), np.full(r.shape, -1, np.int64)
     for a in range(A):
         for i in range(n):
             for j in range(n):
@@ -475,7 +465,7 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
                     group[a, i, j] = half + np.int64(2 * _GROUPS * other[a, i, j]) % _GROUPS
     for turn in range(-1, 2 * _GROUPS):
         if turn >= 0:
-            shift = _implied(known, weight, True)
+            shift = _shifts(tables, weight, True)
             for a in range(A):
                 for i in range(n):
                     for j in range(n):
@@ -486,4 +476,4 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
             for i in range(n):
                 for j in range(n):
                     if group[a, i, j] == turn and r[a, i, j] and i != j:
-                        _hold(known, weight, a, i, j)
+                        _add_relation(tables, weight, a, i, j)

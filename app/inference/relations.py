@@ -27,7 +27,7 @@ from app.inference.elementary import sigmoid
 from app.inference.weights import SWEEPS, Weights
 
 Floats = NDArray[np.float32]
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 NO_UNIT: Final = np.float32(-30.0)
@@ -38,7 +38,7 @@ NEVER: Final = np.float32(-1e4)
 
 Table = tuple[NDArray[np.int32], NDArray[np.int32]]
 
-NOTHING: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
+NO_VALUES: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
 
 # The number of pairs is padded to a multiple of this number, to fill whole vector registers.
 _WHOLE: Final = 32
@@ -63,14 +63,14 @@ def to_log_odds(mean: Floats, spread: Floats) -> Floats:
         mean: means of the logits, an array of any shape.
         spread: √3 σ of the logits. The array has the same shape.
     """
-    found = mean.ravel().astype(np.float32)
+    log_odds = mean.ravel().astype(np.float32)
     # ravel() makes the arrays contiguous. For another layout, numba would compile the kernel again.
-    kernels.log_odds(found, spread.ravel(), NO_UNIT)
-    return found.reshape(mean.shape)
+    kernels.log_odds(log_odds, spread.ravel(), NO_UNIT)
+    return log_odds.reshape(mean.shape)
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class ObservedRelations:
     """E observed relations between the n classes of a scene. Each relation holds or does not hold.
 
     Attributes:
@@ -80,9 +80,9 @@ class Given:
         g: (E,) product of the presence of subject and object class.
     """
 
-    a: Places
-    i: Places
-    j: Places
+    a: Indices
+    i: Indices
+    j: Indices
     r: Floats
     g: Floats
 
@@ -91,14 +91,14 @@ class Units(NamedTuple):
     """The relation units that `RelationUnits.select` finds for the relations in its arguments.
 
     Attributes:
-        place: (E,) index of each unit's relation in the arguments of `select`.
+        kept: (E,) index of each unit's relation in the arguments of `select`.
         a: (E,) number of the relation (left, on top, ...) of each unit.
         base: (E,) logits ℓ_e without the term U_e·h1.
         z: (E, K') factors z_e of the weights U_e = G[a_e]'z_e. If G is empty, z_e is U_e.
     """
 
-    place: Places
-    a: Places
+    kept: Indices
+    a: Indices
     base: Floats
     z: Floats
 
@@ -113,8 +113,8 @@ class Context:
         log_counts: (n,) log of the number of instances of each class.
         x: (H1,) logits of h1 given the objects.
         y: (H1,) logits of h1 given objects and relations, for questions about relations.
-        given: observed relations, or None if the scene has no observed relations.
-        units: relation units of `given`, or None if the scene has no observed relations.
+        observed: observed relations, or None if the scene has no observed relations.
+        units: relation units of `observed`, or None if the scene has no observed relations.
         slopes: (E,) factor slope_e with which each unit of `units` acts on y, for questions about
             relations; see `RelationUnits.fixed_point`.
         object_y: (H1,) logits of h1 given objects and relations, for questions about objects.
@@ -123,22 +123,21 @@ class Context:
             machine with one layer.
     """
 
-    classes: Places
+    classes: Indices
     presence: Floats
     log_counts: Floats
     x: Floats
     y: Floats
-    given: Given | None
+    observed: ObservedRelations | None
     units: Units | None
     slopes: Floats
     object_y: Floats
     object_slopes: Floats
     through: Floats | None
 
-    def ends(self, i: Places, j: Places) -> Ends:
-        """Return the `Ends` of pairs (i, j). i and j are arrays of indices into `classes`."""
-        p, n = self.presence, self.log_counts
-        return Ends(self.classes[i], self.classes[j], n[i], n[j], p[i], p[j])
+    def ends(self, i: Indices, j: Indices) -> Ends:
+        """See `ends_of`."""
+        return ends_of(self.classes, self.presence, self.log_counts, i, j)
 
 
 class Ends(NamedTuple):
@@ -150,12 +149,18 @@ class Ends(NamedTuple):
         p_i, p_j: probability that each class in i and in j is present.
     """
 
-    i: Places
-    j: Places
+    i: Indices
+    j: Indices
     log_i: Floats
     log_j: Floats
     p_i: Floats
     p_j: Floats
+
+
+def ends_of(classes: Indices, presence: Floats, log_counts: Floats, i: Indices, j: Indices) -> Ends:
+    """Return the `Ends` of pairs (i, j). i and j are indices into the other arrays."""
+    n, p = log_counts, presence
+    return Ends(classes[i], classes[j], n[i], n[j], p[i], p[j])
 
 
 class Between(NamedTuple):
@@ -217,7 +222,7 @@ class RelationUnits(ABC):
         self._W, self._A, self._V = weights["W"], weights.spec.A, weights.spec.V
 
     @abstractmethod
-    def select(self, a: Places, ends: Ends) -> Units:
+    def select(self, a: Indices, ends: Ends) -> Units:
         """Return the units of some relations. Relations without a unit are left out.
 
         Args:
@@ -227,7 +232,7 @@ class RelationUnits(ABC):
 
     @abstractmethod
     def normal(
-        self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
+        self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
     ) -> tuple[Floats, Floats]:
         """Return the means and √3 σ of the logits of R relations for P pairs, both (B, R, P).
 
@@ -238,17 +243,17 @@ class RelationUnits(ABC):
             means: (B, H1) means of h1.
             ends: subject and object class of each pair, (B, P).
             only: index of one relation (R = 1), or None for all relations (R = A).
-            known: True if all means of h1 are 0 or 1. The variance of the logits is then 0.
+            certain: True if all means of h1 are 0 or 1. The variance of the logits is then 0.
         """
 
     def rows(self, units: Units) -> Floats:
         """Return the weights U_e between each unit and h1, (E, H1)."""
         if not len(self.G):
             return units.z
-        found: Floats = kernels.expanded(self.G, units.a, units.z)
-        return found
+        rows: Floats = kernels.expanded(self.G, units.a, units.z)
+        return rows
 
-    def rows_of(self, a: Places, i: Places, j: Places) -> Floats:
+    def rows_of(self, a: Indices, i: Indices, j: Indices) -> Floats:
         """Return the weights U_e of relations a between classes i and j, (E, H1).
 
         The result has no rows for relations without a unit.
@@ -257,7 +262,7 @@ class RelationUnits(ABC):
         return self.rows(self.select(a, Ends(i, j, none, none, none, none)))
 
     def fixed_point(
-        self, x: Floats, given: Given, ends: Ends, sweeps: int = SWEEPS
+        self, x: Floats, observed: ObservedRelations, ends: Ends, sweeps: int = SWEEPS
     ) -> tuple[Floats, Units, Floats]:
         """Compute the mean field of h1 given E observed relations.
 
@@ -271,12 +276,12 @@ class RelationUnits(ABC):
         Returns:
             The logits y (H1,), the units of the observed relations, and their slopes (E,).
         """
-        units = self.select(given.a, ends)
+        units = self.select(observed.a, ends)
         G, z = self.G, units.z
         if 2 * len(z) < G.shape[0] * G.shape[1]:
             # For a small number of units, products with U are faster than products with G.
-            G, z = NOTHING, self.rows(units)
-        r, g = given.r[units.place], given.g[units.place]
+            G, z = NO_VALUES, self.rows(units)
+        r, g = observed.r[units.kept], observed.g[units.kept]
         y, slopes = kernels.fixed_point(x, G, units.a, units.base, z, r, g, sweeps)
         return y, units, slopes
 
@@ -285,46 +290,39 @@ class RelationUnits(ABC):
         n = len(context.classes)
         mean, spread = self.normal(sigmoid(context.y)[None], context.ends(*all_pairs(n)))
         shape = self._A, n, n
-        return Between(mean.reshape(shape), spread.reshape(shape), *self.said(context))
+        return Between(mean.reshape(shape), spread.reshape(shape), *self.observed_effects(context))
 
-    def said(self, context: Context) -> tuple[Floats, Floats, Floats]:
+    def observed_effects(self, context: Context) -> tuple[Floats, Floats, Floats]:
         """Return the values `slopes`, `shift` and `apart` of `Between`."""
-        given, units, n = context.given, context.units, len(context.classes)
-        if given is None or units is None:
-            return NOTHING, NOTHING, NOTHING
-        slopes = np.zeros((self._A, n, n), dtype=np.float32)
-        where = units.place
-        slopes[given.a[where], given.i[where], given.j[where]] = context.slopes
-        return slopes, *self.implied(context.x, n, given)
+        observed, units, n = context.observed, context.units, len(context.classes)
+        if observed is None or units is None:
+            return NO_VALUES, NO_VALUES, NO_VALUES
+        slopes, kept = np.zeros((self._A, n, n), dtype=np.float32), units.kept
+        slopes[observed.a[kept], observed.i[kept], observed.j[kept]] = context.slopes
+        return slopes, *self.implication_shifts(context.x, n, observed)
 
-    def implied(self, x: Floats, n: int, given: Given) -> tuple[Floats, Floats]:
-        """Return the values `shift` and `apart` of `Between`.
-
-        Args:
-            x: (H1,) logits of h1 given the objects.
-            n: number of classes in the scene.
-            given: observed relations.
-        """
+    def implication_shifts(
+        self, x: Floats, n: int, observed: ObservedRelations
+    ) -> tuple[Floats, Floats]:
+        """Return `shift` and `apart` of `Between` for n classes; x (H1,) are the logits of h1."""
         weight = self.implication_weights(x)
         if not len(weight):
-            return NOTHING, NOTHING
-        on = (given.r > 0) & (given.i != given.j)
-        found = kernels.implied(weight, n, given.a[on], given.i[on], given.j[on])
-        shift, apart = np.ascontiguousarray(found.transpose(0, 3, 1, 2))
+            return NO_VALUES, NO_VALUES
+        on = (observed.r > 0) & (observed.i != observed.j)
+        ends = observed.i[on], observed.j[on]
+        shifts = kernels.implication_shifts(weight, n, observed.a[on], *ends)
+        shift, apart = np.ascontiguousarray(shifts.transpose(0, 3, 1, 2))
         return shift, apart
 
     def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
         """Return how much each of F features of the observed relations changes a logit, (F, A).
 
         `training/machines/triway.py` defines the features. The result is empty for machines in
-        which relations do not change each other's logits directly.
-
-        Args:
-            x: (H1,) logits of h1 given the objects.
-            beta: 1 / temperature.
+        which relations do not change each other's logits directly. x (H1,) are the logits of h1
+        given the objects, and beta is 1 / temperature.
         """
         del x, beta
-        return NOTHING.reshape(0, 0)
+        return NO_VALUES.reshape(0, 0)
 
     def log_odds(self, between: Between) -> Floats:
         """Return the log-odds of all relations between the n classes of a scene, (A, n, n).
@@ -339,8 +337,8 @@ class RelationUnits(ABC):
             mean = mean + between.shift
         return to_log_odds(mean, spread)
 
-    def without_itself(
-        self, context: Context, a: Places, i: Places, j: Places, slopes: Floats, shift: Floats
+    def log_odds_without_itself(
+        self, context: Context, a: Indices, i: Indices, j: Indices, slopes: Floats, shift: Floats
     ) -> Floats:
         """Return the log-odds of E relations without the effect of each relation on itself, (E,).
 
@@ -349,23 +347,23 @@ class RelationUnits(ABC):
 
         Args:
             context: hidden units of the scene.
-            a: (E,) indices of the relations.
-            i, j: (E,) indices of the subject and object classes in the scene.
+            a, i, j: (E,) indices of the relations, and of their subject and object classes in the
+                scene.
             slopes: (E,) factor with which each relation acts on y; see `fixed_point`.
             shift: (A, n, n) value `shift` of `Between`, or an empty array.
         """
         units = self.select(a, context.ends(i, j))
         mean, spread = kernels.normal_without_itself(
-            context.y, self.rows(units), units.base, slopes[units.place]
+            context.y, self.rows(units), units.base, slopes[units.kept]
         )
         if len(shift):
-            mean += shift[a, i, j][units.place]
-        found = np.full(len(a), NO_UNIT)
-        found[units.place] = to_log_odds(mean, spread)
-        return found
+            mean += shift[a, i, j][units.kept]
+        log_odds = np.full(len(a), NO_UNIT)
+        log_odds[units.kept] = to_log_odds(mean, spread)
+        return log_odds
 
     @abstractmethod
-    def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
+    def log_odds_apart(self, context: Context, between: Between, i: Indices, j: Indices) -> Floats:
         """Return the log-odds of all relations of P pairs of classes, (2, A, P).
 
         Index 0 of the first axis has the relations from i to j. Index 1 has the relations from j to
@@ -378,7 +376,7 @@ class RelationUnits(ABC):
         """
 
     def placement_log_odds(
-        self, context: Context, candidates: Places, anchors: Places, only: int | None = None
+        self, context: Context, candidates: Indices, anchors: Indices, only: int | None = None
     ) -> tuple[Floats, Floats]:
         """Return the log-odds of relations between absent candidate classes and anchor classes.
 
@@ -405,20 +403,20 @@ class RelationUnits(ABC):
         p_j[:, :m] = p_i[:, m:] = context.presence[anchors]
         both = Ends(i, j, log_i, log_j, p_i, p_j)
         means = sigmoid(context.y + self._W[candidates])
-        found = to_log_odds(*self.normal(means, both, only))
-        return found[:, :, :m], found[:, :, m:]
+        log_odds = to_log_odds(*self.normal(means, both, only))
+        return log_odds[:, :, :m], log_odds[:, :, m:]
 
     def shares(self, context: Context) -> Floats:
         """Return the contribution of each class and its relations to `object_y`, (n, H1)."""
-        found: Floats = context.presence[:, None] * self._W[context.classes]
-        given, units = context.given, context.units
-        if given is not None and units is not None:
-            i, j = given.i[units.place], given.j[units.place]
+        shares: Floats = context.presence[:, None] * self._W[context.classes]
+        observed, units = context.observed, context.units
+        if observed is not None and units is not None:
+            i, j = observed.i[units.kept], observed.j[units.kept]
             keys = np.stack([i, np.where(i == j, -1, j)])
-            found += self._sums(units, keys, context.object_slopes, len(context.classes))
-        return found
+            shares += self._sums(units, keys, context.object_slopes, len(context.classes))
+        return shares
 
-    def common(self, context: Context) -> tuple[Floats, Places]:
+    def common(self, context: Context) -> tuple[Floats, Indices]:
         """Return the contribution of the observed relations of each pair of classes to `object_y`.
 
         Returns:
@@ -427,21 +425,21 @@ class RelationUnits(ABC):
             observed relations.
         """
         n = len(context.classes)
-        given, units = context.given, context.units
+        observed, units = context.observed, context.units
         index = np.full((n, n), -1)
-        if given is None or units is None:
+        if observed is None or units is None:
             return np.zeros((0, self._W.shape[1]), np.float32), index
-        i, j = given.i[units.place], given.j[units.place]
+        i, j = observed.i[units.kept], observed.j[units.kept]
         keys = np.where(i == j, -1, np.minimum(i, j) * n + np.maximum(i, j))
         filled = np.zeros(n * n, np.bool_)
         filled[keys[keys >= 0]] = True
         pairs = np.flatnonzero(filled)
         index.reshape(-1)[pairs] = np.arange(len(pairs))
         rows = np.where(keys < 0, -1, index.reshape(-1)[keys])
-        found = self._sums(units, rows, context.object_slopes, len(pairs))
-        return found, np.maximum(index, index.T)
+        contributions = self._sums(units, rows, context.object_slopes, len(pairs))
+        return contributions, np.maximum(index, index.T)
 
-    def _sums(self, units: Units, keys: Places, slopes: Floats, size: int) -> Floats:
+    def _sums(self, units: Units, keys: Indices, slopes: Floats, size: int) -> Floats:
         """Return the sum of slope_e U_e over the units of each key, (size, H1).
 
         Args:
@@ -452,13 +450,12 @@ class RelationUnits(ABC):
             size: number of keys. The keys are 0 to size - 1.
         """
         if not len(self.G):
-            summed: Floats = kernels.accumulate(keys.reshape(-1), slopes, units.z, size)
-            return summed
+            sums: Floats = kernels.accumulate(keys.reshape(-1), slopes, units.z, size)
+            return sums
         A, K, H1 = self.G.shape
         keys = np.where(keys < 0, -1, keys * A + units.a).reshape(-1)
         factors = kernels.accumulate(keys, slopes, units.z, size * A).reshape(size, A * K)
-        found: Floats = factors @ self.G.reshape(A * K, H1)
-        return found
+        return np.asarray(factors @ self.G.reshape(A * K, H1))
 
 
 class FreeUnits(RelationUnits):
@@ -476,57 +473,57 @@ class FreeUnits(RelationUnits):
 
     def __init__(self, weights: Weights, U: Floats, g: Floats | None = None) -> None:
         super().__init__(weights)
-        self.G = NOTHING
+        self.G = NO_VALUES
         self._U, self._d, self._g = U, weights["d"], g
         self._table, index = _pair_table(weights)
         self._index = np.full((len(self._table[1]) + 1, self._A), -1, np.int32)
         self._index[index] = np.arange(len(U))
 
-    def select(self, a: Places, ends: Ends) -> Units:
+    def select(self, a: Indices, ends: Ends) -> Units:
         """See `RelationUnits`."""
         rows = self._index[kernels.pair_rows(*self._table, ends.i * self._V + ends.j), a]
-        place = np.flatnonzero(rows >= 0)
-        rows = rows[place]
+        kept = np.flatnonzero(rows >= 0)
+        rows = rows[kept]
         base = self._d[rows]
         if self._g is not None:
-            base = base + self._g[rows, 0] * ends.p_i[place] + self._g[rows, 1] * ends.p_j[place]
-        return Units(place, a[place], base.astype(np.float32), self._U[rows])
+            base = base + self._g[rows, 0] * ends.p_i[kept] + self._g[rows, 1] * ends.p_j[kept]
+        return Units(kept, a[kept], base.astype(np.float32), self._U[rows])
 
     def normal(
-        self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
+        self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
     ) -> tuple[Floats, Floats]:
         """See `RelationUnits`."""
-        del known  # unused: the formula gives variance 0 for means of 0 and 1
-        asked = _asked(self._A, only)
-        shape = len(means), asked.stop - asked.start, ends.i.shape[1]
+        del certain  # unused: the formula gives variance 0 for means of 0 and 1
+        chosen = _chosen_relations(self._A, only)
+        shape = len(means), chosen.stop - chosen.start, ends.i.shape[1]
         b, a, p = (part.reshape(-1) for part in np.indices(shape))
-        units = self.select(asked.start + a, Ends(*(end[b, p] for end in ends)))
+        units = self.select(chosen.start + a, Ends(*(end[b, p] for end in ends)))
         mean, spread = np.full(shape, NEVER), np.zeros(shape, np.float32)
-        U, place = units.z, units.place
+        U, kept = units.z, units.kept
         if len(means) == 1:
             m = means[0]
             logits, variance = U @ m, (U * U) @ (m * (1 - m))
         else:
-            m = means[b[place]]
+            m = means[b[kept]]
             logits = np.einsum("eh,eh->e", U, m)
             m *= 1 - m
             variance = np.einsum("eh,eh->e", U * U, m)
-        mean.reshape(-1)[place] = units.base + logits
-        spread.reshape(-1)[place] = np.sqrt(3 * variance)
+        mean.reshape(-1)[kept] = units.base + logits
+        spread.reshape(-1)[kept] = np.sqrt(3 * variance)
         return mean, spread
 
-    def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
+    def log_odds_apart(self, context: Context, between: Between, i: Indices, j: Indices) -> Floats:
         """See `RelationUnits`. The result is exact."""
         del between
         ends = context.ends(np.stack([i, j], 1), np.stack([j, i], 1))
         y = np.tile(context.y, (len(i), 1))
-        given, units, n = context.given, context.units, len(context.classes)
-        if given is not None and units is not None:
-            keys = given.i[units.place] * n + given.j[units.place]
+        observed, units, n = context.observed, context.units, len(context.classes)
+        if observed is not None and units is not None:
+            keys = observed.i[units.kept] * n + observed.j[units.kept]
             pulls = kernels.accumulate(keys, context.slopes, units.z, n * n)
             y -= pulls[i * n + j] + np.where((i != j)[:, None], pulls[j * n + i], 0)
-        found = to_log_odds(*self.normal(sigmoid(y), ends))
-        return np.ascontiguousarray(found.transpose(2, 1, 0))
+        log_odds = to_log_odds(*self.normal(sigmoid(y), ends))
+        return np.ascontiguousarray(log_odds.transpose(2, 1, 0))
 
 
 class SharedUnits(RelationUnits):
@@ -570,39 +567,36 @@ class SharedUnits(RelationUnits):
             gamma[:, range(A), range(A)] = 0
             self._gamma = gamma.reshape(len(gamma), -1)
 
-    def select(self, a: Places, ends: Ends) -> Units:
+    def select(self, a: Indices, ends: Ends) -> Units:
         """See `RelationUnits`."""
         base, z = kernels.unit_terms(self._w, self._g, a, ends)
         return Units(np.arange(len(a)), a, base, z)
 
     def normal(
-        self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
+        self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
     ) -> tuple[Floats, Floats]:
         """See `RelationUnits`."""
-        asked, (B, P) = _asked(self._A, only), ends.i.shape
-        Y = self._Y[asked]
+        chosen, (B, P) = _chosen_relations(self._A, only), ends.i.shape
+        Y = self._Y[chosen]
         width = -(-P // _WHOLE) * _WHOLE
         z = np.zeros((B, Y.shape[2], width), np.float32)
         mean = np.zeros((B, len(Y), width), np.float32)
-        kernels.pair_terms(self._w, asked.start, ends, z, mean)
-        mean += (self._of(asked, means, self._GT) + self._g[asked]) @ z
-        if known:
+        kernels.pair_terms(self._w, chosen.start, ends, z, mean)
+        mean += (self._products(chosen, means, self._GT) + self._g[chosen]) @ z
+        if certain:
             return mean[:, :, :P], np.zeros((B, len(Y), P), np.float32)
         q = (Y.reshape(-1, Y.shape[2]) @ z).reshape(B, *Y.shape[:2], width)
-        spread = kernels.spreads(self._of(asked, means * (1 - means), self._FF), q)
+        spread = kernels.spreads(self._products(chosen, means * (1 - means), self._FF), q)
         return mean[:, :, :P], spread[:, :, :P]
 
-    def _of(self, asked: slice, rows: Floats, columns: Floats) -> Floats:
-        """Return the product of each row with the n columns of each asked relation, (B, R, n).
+    def _products(self, chosen: slice, rows: Floats, columns: Floats) -> Floats:
+        """Return the product of the rows (B, H1) with n columns of each chosen relation, (B, R, n).
 
-        Args:
-            asked: slice of the R relations.
-            rows: (B, H1) rows.
-            columns: (H1, A n) columns of all A relations; see `_columns`.
+        `_columns` returns the columns (H1, A n) of all relations.
         """
         n = columns.shape[1] // self._A
-        found: Floats = rows @ columns[:, asked.start * n : asked.stop * n]
-        return found.reshape(len(rows), -1, n)
+        products: Floats = rows @ columns[:, chosen.start * n : chosen.stop * n]
+        return products.reshape(len(rows), -1, n)
 
     def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
         """See `RelationUnits`.
@@ -615,7 +609,7 @@ class SharedUnits(RelationUnits):
         weight: Floats = (np.float32(beta) * scale) @ self._gamma
         return weight.reshape(-1, self._A)
 
-    def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
+    def log_odds_apart(self, context: Context, between: Between, i: Indices, j: Indices) -> Floats:
         """See `RelationUnits`. The result is correct to first order.
 
         The observed units e' of the pair, in both directions, change the mean of the logit ℓ_e by
@@ -637,8 +631,8 @@ class SharedUnits(RelationUnits):
             mean -= (q * back.reshape(P, A, -1)).sum(3).reshape(2 * P, A).T
         if len(between.apart):
             mean += between.apart[:, start, end]
-        found = to_log_odds(mean, spread).reshape(A, 2, P)
-        return np.ascontiguousarray(found.swapaxes(0, 1))
+        log_odds = to_log_odds(mean, spread).reshape(A, 2, P)
+        return np.ascontiguousarray(log_odds.swapaxes(0, 1))
 
 
 def relation_units(weights: Weights) -> RelationUnits:
@@ -649,7 +643,7 @@ def relation_units(weights: Weights) -> RelationUnits:
 
 
 @lru_cache(maxsize=128)
-def all_pairs(n: int) -> tuple[Places, Places]:
+def all_pairs(n: int) -> tuple[Indices, Indices]:
     """Return all n² pairs of n classes: the indices of first and second classes, each (1, n²)."""
     every = np.arange(n)
     return np.repeat(every, n)[None], np.tile(every, n)[None]
@@ -663,7 +657,7 @@ def _columns(matrices: Floats) -> Floats:
     return np.ascontiguousarray(matrices.reshape(-1, matrices.shape[2]).T)
 
 
-def _asked(relations: int, only: int | None) -> slice:
+def _chosen_relations(relations: int, only: int | None) -> slice:
     """Return a slice that selects the relation `only`, or all relations if `only` is None.
 
     Indexing with a slice does not copy the array.
@@ -671,7 +665,7 @@ def _asked(relations: int, only: int | None) -> slice:
     return slice(0, relations) if only is None else slice(only, only + 1)
 
 
-def _pair_table(weights: Weights) -> tuple[Table, tuple[Places, Places]]:
+def _pair_table(weights: Weights) -> tuple[Table, tuple[Indices, Indices]]:
     """Build the look-up table of `pair_rows`.
 
     The table contains each pair of classes that occurs in `Weights` as part of a triple.

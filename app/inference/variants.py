@@ -68,21 +68,17 @@ class Triway:
     def shapes(spec: MachineSpec) -> Shapes:
         """See `RBM`."""
         V, A, K, H1 = spec.V, spec.A, spec.K, spec.H1
-        found: Shapes = {
+        shapes: Shapes = {
             "d": (A,), "s": (A, V), "o": (A, V), "S": (V, K), "O": (V, K), "R": (A, K),
             "M": (A, K, H1), "P": (A, H1), "n": (A, 2), "usual": (V,), "residual": (spec.T,),
             "kappa": (A,),
         }  # fmt: skip
         if spec.G:
-            found |= {"gamma": (1 + spec.G, A, feature_count(A)), "B": (spec.G, H1)}
-        return found
+            shapes |= {"gamma": (1 + spec.G, A, feature_count(A)), "B": (spec.G, H1)}
+        return shapes
 
 
-VARIANTS: Final[dict[str, type[RBM | Triway]]] = {
-    "rbm": RBM,
-    "gbm": GBM,
-    "triway": Triway,
-}
+VARIANTS: Final[dict[str, type[RBM | Triway]]] = {"rbm": RBM, "gbm": GBM, "triway": Triway}
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,8 +158,8 @@ class MachineSpec:
         Raises:
             ValueError: a name is unknown or missing, or a value is invalid.
         """
-        known = {field.name for field in fields(cls)}
-        if unknown := sorted(set(values) - known):
+        names = {field.name for field in fields(cls)}
+        if unknown := sorted(set(values) - names):
             raise ValueError(f"a machine spec has unknown fields: {unknown}")
         try:
             return cls(**values)

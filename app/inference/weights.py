@@ -72,11 +72,11 @@ class Weights:
 
     def __post_init__(self) -> None:
         expected = {name: shape for name, (_, shape) in layout(self.spec).items()}
-        found = {name: array.shape for name, array in self.arrays.items()}
-        for name in sorted(expected.keys() | found.keys()):
-            if found.get(name) != expected.get(name):
+        shapes = {name: array.shape for name, array in self.arrays.items()}
+        for name in sorted(expected.keys() | shapes.keys()):
+            if shapes.get(name) != expected.get(name):
                 raise ValueError(
-                    f"array {name} has the shape {found.get(name)}, but the spec needs the shape "
+                    f"array {name} has the shape {shapes.get(name)}, but the spec needs the shape "
                     f"{expected.get(name)} (None means that the array does not exist)"
                 )
         table = self["triples"].astype(np.int64)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.errors import InvalidRequestError
 from app.inference import MachineSpec, Weights
-from app.inference.chains import ConditionedChains, Conditions, Drawn, random_stream
+from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.elementary import softplus
 from app.questions.answer import (
     OBJECT_BYTES,
@@ -121,7 +121,7 @@ def generate(
     if not temperature > 0:
         raise ValueError(f"temperature must be positive, not {temperature}")
     conditions = _conditions(artifact, scene, context or {})
-    conditioned = artifact.scene_chains.given(conditions, temperature)
+    conditioned = artifact.scene_chains.under(conditions, temperature)
     shown = ~artifact.vocabulary.structure
     shown[conditions.classes] = True
     of = [thing.class_index or 0 for thing in scene.objects]
@@ -176,7 +176,7 @@ def _conditions(
 def _scene(
     artifact: Artifact,
     chains: ConditionedChains,
-    drawn: Drawn,
+    drawn: ChainState,
     shown: NDArray[np.bool_],
     evidence: set[Triple],
 ) -> Fields:

@@ -19,7 +19,7 @@ from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior, placement_log_p
 from app.questions.ranking import likeliest_places
 from app.registry.artifact import Artifact
-from app.registry.offsets import NOTHING, Offsets, look_up
+from app.registry.offsets import UNOBSERVED, Offsets, look_up
 from app.scene.geometry import Axes
 from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP, RELATIONS, canonicalise, opposite
 from app.scene.scene import Scene
@@ -170,7 +170,7 @@ def _offset_fields(
         x, y, z, dx, dy, dz = vectors
         yield (
             None
-            if count == NOTHING
+            if count == UNOBSERVED
             else {
                 "mean": {"x": x, "y": y, "z": z},
                 "std": {"x": dx, "y": dy, "z": dz},
@@ -201,8 +201,8 @@ def offsets_of(
 
     Returns:
         Mean (n, 3) and standard deviation (n, 3) along x, y and z. Then the number of training
-        scenes that contain the two classes in this relation, (n,). It is `NOTHING` for an unknown
-        offset.
+        scenes that contain the two classes in this relation, (n,). It is `UNOBSERVED` for an
+        unknown offset.
     """
     ends = (relation, missing, anchor, outgoing)
     turn = _UNTURNED if axes is None else np.array(axes)
@@ -238,7 +238,7 @@ def _lay(
                     spread[k, to] += axes[axis, to] ** 2 * square
         else:
             if relation[k] == LEFT or relation[k] == FRONT:
-                scenes[k] = NOTHING
+                scenes[k] = UNOBSERVED
             mean[k, 2], spread[k, 2] = offset[k, 2], offset[k, 5] ** 2
             for axis in range(2):
                 square = (offset[k, axis] ** 2 + offset[k, 3 + axis] ** 2) / 2

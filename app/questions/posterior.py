@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from app.inference import MachineSpec
 from app.inference.posterior import Pull, ScenePosterior
-from app.inference.relations import Given
+from app.inference.relations import ObservedRelations
 from app.questions.ranking import bend
 from app.registry.artifact import Artifact
 from app.registry.description import Calibration, CountSlope, EvidenceWeights, Slope
-from app.scene.scene import Scene, instance_evidence, pool_classes, pooled
+from app.scene.scene import Scene, instance_evidence, pool_classes, pool_relations
 
 Floats = NDArray[np.floating[Any]]
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 
 FULL: Final = 0.999
 """Coverage from which on the model assumes that the scene lists every present class.
@@ -40,10 +40,10 @@ class Present(NamedTuple):
         log_counts: (n,) float32, log of `counts`.
     """
 
-    classes: Places
-    counts: Places
-    row: Places
-    first: Places
+    classes: Indices
+    counts: Indices
+    row: Indices
+    first: Indices
     presence: NDArray[np.float32]
     log_counts: NDArray[np.float32]
 
@@ -69,7 +69,7 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
     return Present(classes, counts, row, first, presence.astype(np.float32), log_counts)
 
 
-def given_relations(scene: Scene, present: Present, relations: int) -> Given | None:
+def given_relations(scene: Scene, present: Present, relations: int) -> ObservedRelations | None:
     """Return the observed relations between the classes of a scene.
 
     The result is None if the scene has neither relations nor poses.
@@ -81,11 +81,11 @@ def given_relations(scene: Scene, present: Present, relations: int) -> Given | N
     """
     if not relations_given(scene) and scene.poses is None:
         return None
-    on, seen = pooled(present.row, len(present.classes), *instance_evidence(scene))
+    on, seen = pool_relations(present.row, len(present.classes), *instance_evidence(scene))
     # np.stack() makes contiguous arrays. For another layout, numba would compile the loops again.
     a, i, j = np.stack(np.nonzero(seen[:relations]))
     gate = present.presence[i] * present.presence[j]
-    return Given(a, i, j, on[a, i, j].astype(np.float32), gate)
+    return ObservedRelations(a, i, j, on[a, i, j].astype(np.float32), gate)
 
 
 def relations_given(scene: Scene) -> bool:
@@ -121,7 +121,7 @@ class Posterior(ScenePosterior):
         )
         super().__init__(artifact.closed_form, context)
 
-    def absent_log_odds(self, absent: Places) -> Floats:
+    def absent_log_odds(self, absent: Indices) -> Floats:
         """Return the log-odds of presence of N absent classes, (N,).
 
         The relations of these classes are unobserved. All other absent classes count as absent.
@@ -130,7 +130,7 @@ class Posterior(ScenePosterior):
         log_odds: Floats = self._closed.b + gain
         return log_odds[absent]
 
-    def absent_posterior(self, absent: Places, coverage: float) -> Floats:
+    def absent_posterior(self, absent: Indices, coverage: float) -> Floats:
         """Return the log-odds that each of N unlisted classes is present, (N,).
 
         Args:
@@ -152,7 +152,7 @@ def posterior_of(artifact: Artifact, scene: Scene) -> Posterior:
 def with_unlisted(
     artifact: Artifact,
     log_odds: Floats,
-    absent: Places,
+    absent: Indices,
     y: NDArray[np.float32],
     present: Present,
     room: int | None,

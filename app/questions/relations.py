@@ -92,7 +92,7 @@ def relations(
     # rounded probabilities.
     least = min_probability * (1 - 1e-5)
     *columns, probabilities = likeliest_relations(
-        slopes.given if relations_given(scene) else slopes.alone,
+        slopes.relation_given if relations_given(scene) else slopes.relation,
         *(posterior.relation_log_odds(), present.log_counts, present.row, judged),
         *(least, include_opposites, top_k),
     )
@@ -170,7 +170,7 @@ def _disagreements(
         return []
     one, other = present.row[subjects], present.row[objects]
     where, expected, p, observed_p = disagreeing(
-        *(artifact.relation_slopes.given, *posterior.log_odds_apart(one, other)),
+        *(artifact.relation_slopes.relation_given, *posterior.log_odds_apart(one, other)),
         *(present.log_counts[one] + present.log_counts[other], len(present.classes)),
         *(holds, of_classes, max(least, EXPECTED), top_k),
     )

@@ -18,7 +18,7 @@ from app.registry.description import (
 from app.registry.errors import ArtifactError, RegistryError, StoreError
 from app.registry.examples import Example
 from app.registry.manifest import Manifest
-from app.registry.models import ArtifactFailure, ModelSet, load_model_set
+from app.registry.model_set import ArtifactFailure, ModelSet, load_model_set
 from app.registry.offsets import Offsets
 from app.registry.references import AliasTarget
 from app.registry.store import Store, StoreState

@@ -19,27 +19,27 @@ _STORE: Final = "model_store"  # as `Settings.store`
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command. Return the exit status: 0, or 1 after an error."""
-    asked = _parser().parse_args(arguments)
+    options = _parser().parse_args(arguments)
     # The messages of this command contain the errors.
     logging.getLogger("app.registry").addHandler(logging.NullHandler())
-    root = asked.store or os.environ.get("SCENE_STORE") or _STORE
+    root = options.store or os.environ.get("SCENE_STORE") or _STORE
     try:
         if not Path(root).is_dir():  # `Store` would create it
             raise StoreError("unreadable", f"there is no folder {root}")
-        _run(asked, Store(root))
+        _run(options, Store(root))
     except RegistryError as error:
         sys.stderr.write(f"store {root}: {error.reason}\n")
         return 1
     return 0
 
 
-def _run(asked: argparse.Namespace, store: Store) -> None:
-    if asked.command == "alias":
-        store.set_alias(asked.alias, _target(asked.target))
-        _say(f"alias '{asked.alias}' points at {asked.target}")
-    elif asked.command == "remove-alias":
-        store.remove_alias(asked.alias)
-        _say(f"alias '{asked.alias}' is removed")
+def _run(options: argparse.Namespace, store: Store) -> None:
+    if options.command == "alias":
+        store.set_alias(options.alias, _target(options.target))
+        _print(f"alias '{options.alias}' points at {options.target}")
+    elif options.command == "remove-alias":
+        store.remove_alias(options.alias)
+        _print(f"alias '{options.alias}' is removed")
     else:
         _list(store)
 
@@ -49,9 +49,9 @@ def _list(store: Store) -> None:
     for name, version in models.entries:
         failure = models.failures.get((name, version))
         state = "" if failure is None else f"  refused: {failure.code}: {failure.reason}"
-        _say(f"{name}@{version}{state}")
+        _print(f"{name}@{version}{state}")
     for alias, target in models.aliases.items():
-        _say(f"{alias} -> {target}")
+        _print(f"{alias} -> {target}")
 
 
 def _target(reference: str) -> AliasTarget:
@@ -78,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     sys.stdout.write(f"{line}\n")
 
 

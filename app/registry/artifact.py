@@ -102,7 +102,7 @@ class Artifact:
     @cached_property
     def completions(self) -> Completions | None:
         """Posterior of unlisted classes. None means that the machine has no stored samples."""
-        if not Completions.fits(self.weights):
+        if not Completions.supports(self.weights):
             return None
         return Completions(self.weights, self.vocabulary.structure, self.scorer)
 
@@ -114,8 +114,8 @@ class Artifact:
     @cached_property
     def popularity(self) -> NDArray[np.float64] | None:
         """(V,) log-odds that a training scene has each class. None means that they are unknown."""
-        found = self.calibration.popularity
-        return np.array(found) if found else None
+        popularity = self.calibration.popularity
+        return np.array(popularity) if popularity else None
 
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:
@@ -172,17 +172,14 @@ def write_artifact(
 
 
 def load_artifact(
-    directory: Path,
-    previous: Artifact | None = None,
-    max_weights_bytes: int = MAX_WEIGHTS_BYTES,
+    directory: Path, previous: Artifact | None = None, max_weights_bytes: int = MAX_WEIGHTS_BYTES
 ) -> Artifact:
     """Read and verify an artifact.
 
     Args:
         directory: directory with exactly the three files of an artifact.
-        previous: an artifact that was loaded earlier. If the verified files have the same digest,
-            the function returns `previous` instead of a second copy. None means that no artifact
-            was loaded earlier.
+        previous: an artifact that was loaded earlier, or None. If the verified files have the same
+            digest, the function returns `previous` instead of a second copy.
         max_weights_bytes: maximum size of the weights file. The function checks the size before it
             reads the file.
 
@@ -193,7 +190,7 @@ def load_artifact(
     if previous is not None and previous.digest == digest:
         return previous
     tensors = unpack(stored, manifest.tensors)
-    offsets, counts = _taken(tensors, OFFSETS), _taken(tensors, COUNTS)
+    offsets, counts = _pop_group(tensors, OFFSETS), _pop_group(tensors, COUNTS)
     weights = _weights(manifest, tensors)
     return Artifact(
         manifest=manifest,
@@ -210,7 +207,7 @@ def load_artifact(
     )
 
 
-def _taken(tensors: dict[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+def _pop_group(tensors: dict[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
     """Remove the tensors with a prefix from a dictionary, and return them."""
     return {name: tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
 
@@ -233,18 +230,13 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
         weights = Weights(spec, tensors)
     except ValueError as error:
         raise ArtifactError("invalid_tensor", str(error)) from None
-    if not ClosedForm.fits(weights):
+    if not ClosedForm.supports(weights):
         raise ArtifactError("unsupported", _UNSUPPORTED)
     return weights
 
 
 def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, str, bytes, str]:
-    """Read and verify the files of an artifact.
-
-    Args:
-        directory: directory of the artifact.
-        max_weights_bytes: maximum size of the weights file. The function checks the size before it
-            reads the file.
+    """Read and verify the files of an artifact; see `load_artifact`.
 
     Returns:
         The parsed manifest, the digest of its bytes (see `Artifact`), the bytes of the weights file
@@ -259,9 +251,7 @@ def read_verified(directory: Path, max_weights_bytes: int) -> tuple[Manifest, st
     except FileNotFoundError:
         raise ArtifactError("missing_file", "the artifact's directory does not exist") from None
     except OSError as error:
-        raise ArtifactError(
-            "unreadable", f"the artifact's directory cannot be read: {cause(error)}"
-        ) from None
+        raise _unreadable("the artifact's directory", error) from None
     try:
         _require_no_other_file(folder)
         text = _read(folder, MANIFEST, MAX_MANIFEST_BYTES)
@@ -283,9 +273,7 @@ def _require_no_other_file(folder: int) -> None:
         with os.scandir(folder) as entries:
             extra = {entry.name for entry in entries} - {MANIFEST, WEIGHTS, CARD}
     except OSError as error:
-        raise ArtifactError(
-            "unreadable", f"the artifact's directory cannot be read: {cause(error)}"
-        ) from None
+        raise _unreadable("the artifact's directory", error) from None
     if extra:
         names = ", ".join(sorted(ascii(name) for name in extra)[:8])
         raise ArtifactError(
@@ -307,7 +295,7 @@ def _read(folder: int, name: str, limit: int) -> bytes:
     except FileNotFoundError:
         raise ArtifactError("missing_file", f"the artifact has no file {name}") from None
     except OSError as error:
-        raise ArtifactError("unreadable", f"{name} cannot be read: {cause(error)}") from None
+        raise _unreadable(name, error) from None
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
@@ -317,9 +305,13 @@ def _read(folder: int, name: str, limit: int) -> bytes:
             # size of the file plus 1, so that the buffer is not larger than needed.
             return file.read(min(status.st_size, limit) + 1)
     except OSError as error:
-        raise ArtifactError("unreadable", f"{name} cannot be read: {cause(error)}") from None
+        raise _unreadable(name, error) from None
     finally:
         os.close(descriptor)
+
+
+def _unreadable(what: str, error: OSError) -> ArtifactError:
+    return ArtifactError("unreadable", f"{what} cannot be read: {cause(error)}")
 
 
 def _read_checked(folder: int, name: str, entry: FileEntry, limit: int) -> bytes:

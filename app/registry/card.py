@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import prod
 
 from app.registry.counts import PREFIX as COUNTS
-from app.registry.description import Calibration, DataSource, Description
+from app.registry.description import DataSource, Description
 from app.registry.manifest import TensorEntry, of_machine
 from app.registry.offsets import PREFIX as OFFSETS
 
@@ -143,14 +143,14 @@ def _metrics(description: Description) -> str:
         [(*name, *(cells.get(source, "") for source in sources)) for name, cells in rows.items()],
     )
     where = f"\n\n{_OFFSETS}" if any(m.task == "Offsets" for m in description.metrics) else ""
-    parts = [_MEASURED, table, _PROBABILITIES, *_unjudged(description.calibration)]
+    calibration = description.calibration
+    unjudged = [
+        f"`/outliers` judges no {part}, because the calibration had too few scenes."
+        for part, entry in (("objects", calibration.outlier), ("relations", calibration.misplaced))
+        if entry is None
+    ]
+    parts = [_MEASURED, table, _PROBABILITIES, *unjudged]
     return "\n\n".join(parts) + where
-
-
-def _unjudged(calibration: Calibration) -> Iterable[str]:
-    for part, entry in (("objects", calibration.outlier), ("relations", calibration.misplaced)):
-        if entry is None:
-            yield f"`/outliers` judges no {part}, because the calibration had too few scenes."
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

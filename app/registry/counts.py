@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.registry.errors import ArtifactError
-from app.registry.fields import Tables
+from app.registry.fields import TensorGroup
 
 Table = NDArray[np.float32]
 
@@ -30,7 +30,7 @@ _MOST: Final = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Counts(Tables):
+class Counts(TensorGroup):
     """Counts of K of a model's V classes. `app.questions.counts` has the formula.
 
     Attributes:
@@ -53,9 +53,6 @@ class Counts(Tables):
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], V: int, C: int) -> Self:
         """Build the counts of a model with V classes and C room types from stored tensors.
-
-        Args:
-            tensors: result of `tensors()`, read from an artifact.
 
         Raises:
             ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,9 @@ class PairSlope(CountSlope):
 
 PairSlopes = Annotated[Many[PairSlope], Field(max_length=len(CANONICAL))]
 
+PAIR_CALIBRATIONS: Final = ("relation", "relation_given", "placement", "asked_place")
+"""Fields of `Calibration` with one `PairSlope` for each canonical relation."""
+
 
 class Slope(Frozen):
     """Calibration of a logit z that does not depend on counts: log-odds = intercept + slope·z."""
@@ -71,13 +74,8 @@ NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 class EvidenceWeights(Frozen):
     """Weights from 0 to 1 with which observed relations act on the hidden units.
 
-    Attributes:
-        relations_on_objects: weight of relations that a request states, for questions about
-            objects.
-        relations_on_relations: weight of relations that a request states, for questions about
-            relations.
-        poses_on_objects: weight of relations derived from poses, for questions about objects.
-        poses_on_relations: weight of relations derived from poses, for questions about relations.
+    A request states relations, or the service derives relations from poses. The weights are
+    different for questions about objects and for questions about relations.
     """
 
     relations_on_objects: Annotated[float, Field(ge=0, le=1)] = 1.0
@@ -172,27 +170,18 @@ class RelationSlopes:
     Each row of a table is the `PairSlope` of one relation: intercept, slope, log_count,
     log_classes, and K bends of two numbers each.
 
-    Attributes:
-        alone: table for scenes without observed relations.
-        given: table for scenes with observed relations.
-        placement: table for a missing object at its most probable places.
-        asked_place: table for a missing object at the place that a request names.
+    The tables have the names of their fields in `Calibration`.
     """
 
-    alone: Floats
-    given: Floats
+    relation: Floats
+    relation_given: Floats
     placement: Floats
     asked_place: Floats
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
         """Build the tables of a calibration."""
-        return cls(
-            _table(calibration.relation),
-            _table(calibration.relation_given),
-            _table(calibration.placement),
-            _table(calibration.asked_place),
-        )
+        return cls(*(_table(getattr(calibration, name)) for name in PAIR_CALIBRATIONS))
 
 
 def _table(entries: tuple[PairSlope, ...]) -> Floats:
@@ -246,14 +235,10 @@ class VocabularyEntry(Frozen):
 
 
 class DataSource(Frozen):
-    """One source of training scenes.
+    """One source of training scenes: its name, number of scenes and terms of use.
 
-    Attributes:
-        source: name of the source.
-        scenes: number of scenes.
-        digest: SHA-256 of the data, hexadecimal.
-        terms: terms of use.
-        research_only: whether the terms allow only research use.
+    ``digest`` is the SHA-256 of the data. ``research_only`` means that the terms allow only
+    research use.
     """
 
     source: Text
@@ -269,8 +254,6 @@ class Metric(Frozen):
     Attributes:
         task: name of the measured task, such as "T2 missing".
         source: name of the source of the test scenes.
-        metric: name of the metric.
-        value: measured value of the metric.
         low, high: limits of the 95 % confidence interval.
         n: number of measured cases, such as scenes or removed objects.
     """
@@ -335,7 +318,7 @@ class Description(Frozen):
             ("A", "vocabulary relations", len(words.relations)),
             *(
                 ("A", f"entries of calibration.{name}", len(getattr(self.calibration, name)))
-                for name in ("relation", "relation_given", "placement", "asked_place")
+                for name in PAIR_CALIBRATIONS
             ),
         ):
             if self.spec.get(name) != length:

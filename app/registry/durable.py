@@ -60,15 +60,10 @@ def rename(source: Path, target: Path) -> None:
 
 
 def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
-    """Replace the contents of a file atomically.
+    """Create a file, or replace its contents atomically.
 
-    The function writes the new contents to a temporary file in the same directory. Then it renames
-    the temporary file to `path`.
-
-    Args:
-        path: the file to replace or create.
-        data: the new contents.
-        prefix: start of the temporary file's name.
+    The function writes a temporary file in the same directory, whose name starts with ``prefix``.
+    Then it renames the temporary file.
     """
     temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}")
     try:
@@ -84,12 +79,10 @@ def exclusive(path: Path, timeout: float) -> Iterator[None]:
 
     The kernel releases the lock when the process ends, even after a crash.
 
-    Args:
-        path: the lock file. The function creates it if it is missing, and never removes it.
-        timeout: time in seconds to wait for another process that holds the lock.
+    The function creates the file if it is missing, and never removes it.
 
     Raises:
-        StoreError: `locked`, if another process still holds the lock after ``timeout``.
+        StoreError: `locked`, if another process still holds the lock after ``timeout`` seconds.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
     try:
@@ -106,11 +99,9 @@ def _wait(descriptor: int, timeout: float) -> None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() >= deadline:
-                waited = (
-                    f"another process still holds the lock of the store after {timeout:g} s; try "
-                    "again later"
-                )
-                raise StoreError("locked", waited) from None
+                holder = "another process still holds the lock of the store"
+                detail = f"{holder} after {timeout:g} s; try again later"
+                raise StoreError("locked", detail) from None
             time.sleep(0.01)
         else:
             return

@@ -39,7 +39,6 @@ StoreCode = Literal[
     "locked",
 ]
 
-
 CodeT = TypeVar("CodeT", bound=str)
 
 

@@ -53,7 +53,7 @@ class Frozen(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Tables:
+class TensorGroup:
     """Base class of groups of arrays that an artifact stores beside the tensors of the machine.
 
     A subclass is a dataclass whose fields are the arrays. The names of the stored tensors begin
@@ -70,11 +70,7 @@ class Tables:
     def read(
         cls, tensors: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]
     ) -> Self:
-        """Build the group from all stored tensors whose names begin with the prefix.
-
-        Args:
-            tensors: result of `tensors()`, read from an artifact.
-            shapes: maps the name of each field to its required shape.
+        """Build the group from stored tensors. ``shapes`` has the required shape of each field.
 
         Raises:
             ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape.

@@ -92,7 +92,7 @@ class Manifest(Description):
                 "checksum_mismatch", f"{MANIFEST} does not match its own checksum: it was altered"
             )
         members = _parse(data, complete=trailer is not None)
-        if type(found := members.get("format")) is not int or found != FORMAT:
+        if type(version := members.get("format")) is not int or version != FORMAT:
             raise ArtifactError(
                 "unknown_format",
                 f"{MANIFEST} does not have format {FORMAT}, the only format of this release; "
@@ -107,7 +107,7 @@ class Manifest(Description):
             return cls.model_validate(members)
         except ValidationError as error:
             raise ArtifactError(
-                "invalid_manifest", f"{MANIFEST} has an invalid field: {_first(error)}"
+                "invalid_manifest", f"{MANIFEST} has an invalid field: {_first_error(error)}"
             ) from None
 
 
@@ -123,8 +123,8 @@ def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
     return members
 
 
-def _first(error: ValidationError) -> str:
+def _first_error(error: ValidationError) -> str:
     """Return the location and message of the first validation error, without the invalid value."""
     detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
-    place = ".".join(str(part) for part in detail["loc"])
-    return f"{place}: {detail['msg']}" if place else str(detail["msg"])
+    location = ".".join(str(part) for part in detail["loc"])
+    return f"{location}: {detail['msg']}" if location else str(detail["msg"])

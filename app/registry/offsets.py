@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.registry.errors import ArtifactError
-from app.registry.fields import Tables
+from app.registry.fields import TensorGroup
 
 Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
@@ -26,12 +26,12 @@ Ints = NDArray[np.integer[Any]]
 PREFIX: Final = "offsets."
 """Prefix of the names of offset tensors. They are in the same file as the machine's tensors."""
 
-NOTHING: Final = -1
+UNOBSERVED: Final = -1
 """Number of scenes that `Offsets.find` returns if the relation never occurred in training."""
 
 
 @dataclass(frozen=True, eq=False)
-class Offsets(Tables):
+class Offsets(TensorGroup):
     """Normal distributions of offsets, for A canonical relations, V classes and P observed pairs.
 
     Attributes:
@@ -59,11 +59,6 @@ class Offsets(Tables):
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
         """Build the offsets of a machine with A relations and V classes from stored tensors.
-
-        Args:
-            tensors: result of `tensors()`, read from an artifact.
-            A: number of canonical relations.
-            V: number of object classes.
 
         Raises:
             ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
@@ -101,21 +96,16 @@ class Offsets(Tables):
     def find(
         self, relation: Ints, subject: Ints, other: Ints
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the offsets of n pairs of classes, each in one relation.
-
-        Args:
-            relation: (n,) indices of canonical relations.
-            subject, other: (n,) indices of the subject classes and of the object classes.
+        """Return the offsets of n pairs (relation, subject class, object class) of indices (n,).
 
         Returns:
             Offsets (n, 6): mean (3) and standard deviation (3). Then, for each pair, the number of
             training scenes that contain it, (n,). For a pair without training scenes, the number is
             0. Its offset is then the sum of a term of the relation and one term of each class. If
-            the relation never occurred in training, the number is `NOTHING`.
+            the relation never occurred in training, the number is `UNOBSERVED`.
         """
-        found: tuple[NDArray[np.float64], NDArray[np.int64]]
-        found = look_up(self.tables, relation, subject, other)
-        return found
+        offsets, scenes = look_up(self.tables, relation, subject, other)
+        return offsets, scenes
 
     @cached_property
     def tables(self) -> tuple[NDArray[Any], ...]:
@@ -134,12 +124,12 @@ def look_up(tables, relation, subject, other):
     offset, scenes = np.empty((n, 6)), np.empty(n, np.int64)
     for k in range(n):
         a, i, j = relation[k], subject[k], other[k]
-        wanted = (a * V + i) * V + j
-        place = np.searchsorted(pair, wanted)
-        if place < len(pair) and pair[place] == wanted:
-            offset[k], scenes[k] = pair_offset[place], pair_scenes[place]
+        key = (a * V + i) * V + j
+        row = np.searchsorted(pair, key)
+        if row < len(pair) and pair[row] == key:
+            offset[k], scenes[k] = pair_offset[row], pair_scenes[row]
             continue
-        scenes[k] = 0 if relation_scenes[a] > 0 else NOTHING
+        scenes[k] = 0 if relation_scenes[a] > 0 else UNOBSERVED
         for axis in range(6):
             value = np.float64(usual[a, axis]) + subjects[a, i, axis] + objects[a, j, axis]
             offset[k, axis] = value if axis < 3 else math.sqrt(value)

@@ -84,27 +84,20 @@ _TABLE: Final = TypeAdapter(dict[ModelName, AliasTarget])
 
 
 def check_name(text: str, what: str = "model name") -> str:
-    """Return ``text`` if it is a valid name.
-
-    Raises:
-        StoreError: `invalid_reference` if ``text`` is not a valid name.
-    """
-    try:
-        return _require_name(text)
-    except ValueError as error:
-        raise StoreError("invalid_reference", f"a {what} {error}") from None
+    """Return a valid name unchanged. Raise StoreError `invalid_reference` for another text."""
+    return _checked(_require_name, text, what)
 
 
 def check_version(text: str) -> str:
-    """Return ``text`` if it is a valid version.
+    """Return a valid version unchanged. Raise StoreError `invalid_reference` for another text."""
+    return _checked(_require_version, text, "version")
 
-    Raises:
-        StoreError: `invalid_reference` if ``text`` is not a valid version.
-    """
+
+def _checked(require: Callable[[str], str], text: str, what: str) -> str:
     try:
-        return _require_version(text)
+        return require(text)
     except ValueError as error:
-        raise StoreError("invalid_reference", f"a version {error}") from None
+        raise StoreError("invalid_reference", f"a {what} {error}") from None
 
 
 def version_key(version: str) -> tuple[int, ...]:
@@ -113,9 +106,7 @@ def version_key(version: str) -> tuple[int, ...]:
 
 
 def resolve_reference(
-    reference: str,
-    aliases: Mapping[str, AliasTarget],
-    versions: Callable[[str], Sequence[str]],
+    reference: str, aliases: Mapping[str, AliasTarget], versions: Callable[[str], Sequence[str]]
 ) -> tuple[str, str]:
     """Return the (name, version) that a reference points at.
 
@@ -147,11 +138,11 @@ def resolve_reference(
 
 
 def _pick(target: AliasTarget, versions: Callable[[str], Sequence[str]]) -> tuple[str, str]:
-    if not (known := versions(target.name)):
+    if not (published := versions(target.name)):
         raise StoreError("unknown_model", f"no model or alias has the name '{target.name}'")
     if target.version is None:
-        return target.name, known[-1]
-    if target.version not in known:
+        return target.name, published[-1]
+    if target.version not in published:
         raise StoreError(
             "unknown_version", f"model '{target.name}' does not have version {target.version}"
         )

@@ -45,7 +45,6 @@ ALIASES: Final = "aliases.json"
 _LOCK: Final = ".lock"
 TEMPORARY: Final = ".publishing-"
 
-
 StoreState: TypeAlias = tuple[tuple[str | int, ...], ...]
 
 
@@ -69,8 +68,6 @@ class Store:
         self._lock_timeout = lock_timeout
         self._max_weights_bytes = max_weights_bytes
 
-    # -- reading --------------------------------------------------------------------------------
-
     def names(self) -> tuple[str, ...]:
         """Return the sorted names of models that have a version or an unreadable folder.
 
@@ -93,12 +90,12 @@ class Store:
         if not _is_directory(folder):
             return ()
         try:
-            found = [entry.name for entry in folder.iterdir() if not _is_unfinished(entry)]
+            entries = [entry.name for entry in folder.iterdir() if not _is_unfinished(entry)]
         except OSError as error:
             raise StoreError(
                 "unreadable", f"the folder of model '{name}' cannot be read: {cause(error)}"
             ) from None
-        return tuple(sorted(filter(is_version, found), key=version_key))
+        return tuple(sorted(filter(is_version, entries), key=version_key))
 
     def aliases(self) -> Mapping[str, AliasTarget]:
         """Return the target of each alias.
@@ -154,16 +151,12 @@ class Store:
                 for version in self.versions(name):
                     folder = self.root / name / version
                     files += [folder / file for file in (MANIFEST, WEIGHTS, CARD)]
-        return tuple((str(file), *_appearance(file)) for file in files)
-
-    # -- writing --------------------------------------------------------------------------------
+        return tuple((str(file), *_file_state(file)) for file in files)
 
     def require_new(self, name: str, version: str, alias: str | None = None) -> None:
         """Check that a version can be published: its number is valid and new.
 
-        Args:
-            name, version: name and number of the new version.
-            alias: alias that will point at the version, or None.
+        If ``alias`` is not None, this alias will point at the version.
 
         Raises:
             StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
@@ -175,11 +168,11 @@ class Store:
                 "name_conflict",
                 f"'{name}' is the name of an alias, so it cannot be the name of a model",
             )
-        if version in (known := self.versions(name)):
+        if version in (published := self.versions(name)):
             raise StoreError(
                 "version_exists",
                 f"{name}@{version} is already published, and a version never changes. Choose a "
-                f"new number; the newest version is {known[-1]}",
+                f"new number; the newest version is {published[-1]}",
             )
 
     def publish(
@@ -190,7 +183,7 @@ class Store:
         storage_dtype: StorageDtype = "float32",
         alias: str | None = None,
     ) -> Artifact:
-        """Publish a version permanently, and optionally point an alias at it.
+        """Publish a version permanently, optionally point an alias at it, and return the artifact.
 
         The method writes the artifact to a temporary folder and loads it from there. So it never
         publishes a version that the service would refuse. Then it renames the folder and changes
@@ -199,9 +192,6 @@ class Store:
         Args:
             description, state, storage_dtype: contents of the artifact; see `write_artifact`.
             alias: name of an alias to point at this version. None means that no alias changes.
-
-        Returns:
-            The published artifact, loaded from its files.
 
         Raises:
             ArtifactError: the artifact is not valid.
@@ -219,8 +209,8 @@ class Store:
                 self._require_no_model(alias)
                 table = self._changed_table(alias, AliasTarget(name=name, version=version))
             folder = self._prepare_folder(name)
-            place = folder / version
-            if os.path.lexists(place):
+            path = folder / version
+            if os.path.lexists(path):
                 raise StoreError(
                     "version_exists",
                     f"{name}/{version} is a folder without a manifest. Choose a new number, or "
@@ -230,12 +220,12 @@ class Store:
             try:
                 write_artifact(temporary, description, state, storage_dtype=storage_dtype)
                 artifact = load_artifact(temporary, None, self._max_weights_bytes)
-                rename(temporary, place)
+                rename(temporary, path)
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
             if table is not None:
                 self._replace_table(table)
-        return dataclasses.replace(artifact, path=place)
+        return dataclasses.replace(artifact, path=path)
 
     def set_alias(
         self,
@@ -276,8 +266,6 @@ class Store:
             if alias not in self.aliases():
                 raise StoreError("unknown_model", f"no alias has the name '{alias}'")
             self._replace_table(self._changed_table(alias, None))
-
-    # -- inside ---------------------------------------------------------------------------------
 
     def _folders(self) -> list[str]:
         try:
@@ -347,7 +335,7 @@ class Store:
                     entry.unlink()
 
 
-def _appearance(path: Path) -> tuple[int, ...]:
+def _file_state(path: Path) -> tuple[int, ...]:
     """Return the inode, size and modification time of a file, or () for a missing file."""
     try:
         status = path.lstat()

@@ -19,12 +19,8 @@ MAX_HEADER_BYTES: Final = 2**20
 """Maximum size in bytes of the header of the weights file. It can list about 10,000 tensors."""
 
 _DTYPES: Final = {
-    "F16": "float16",
-    "F32": "float32",
-    "I32": "int32",
-    "I64": "int64",
-    "BOOL": "bool",
-}
+    "F16": "float16", "F32": "float32", "I32": "int32", "I64": "int64", "BOOL": "bool"
+}  # fmt: skip
 
 
 def pack(
@@ -75,38 +71,29 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
         stored = dict(deserialize(data))  # type: ignore[no-untyped-call]
     except SafetensorError:
         raise ArtifactError("not_safetensors", f"{WEIGHTS} is not a safetensors file") from None
-    found = {name: (_DTYPES.get(e["dtype"]), tuple(e["shape"])) for name, e in stored.items()}
-    promised = {name: (entry.dtype, entry.shape) for name, entry in entries.items()}
-    require_equal(found, promised, f"{WEIGHTS} has", "but the manifest has")
+    actual = {name: (_DTYPES.get(e["dtype"]), tuple(e["shape"])) for name, e in stored.items()}
+    expected = {name: (entry.dtype, entry.shape) for name, entry in entries.items()}
+    require_equal(actual, expected, f"{WEIGHTS} has", "but the manifest has")
     return {
         name: _loaded(name, entry["data"], entries[name]) for name, entry in sorted(stored.items())
     }
 
 
 def require_equal(
-    found: Mapping[str, object], expected: Mapping[str, object], holds: str, says: str
+    actual: Mapping[str, object], expected: Mapping[str, object], has: str, needs: str
 ) -> None:
-    """Require that ``found`` and ``expected`` have the same names, dtypes and shapes of tensors.
+    """Require that ``actual`` and ``expected`` are equal maps of tensor names to dtype and shape.
 
-    Args:
-        found: maps the name of each found tensor to its dtype and shape.
-        expected: maps the name of each expected tensor to its dtype and shape.
-        holds: words of the error message before the found tensor.
-        says: words of the error message before the expected tensor.
+    ``has`` and ``needs`` are the words of the error message before the actual tensor and before the
+    expected tensor.
 
     Raises:
         ArtifactError: `wrong_shape` for the first tensor that differs.
     """
-    for name in sorted(found.keys() | expected.keys()):
-        if found.get(name) != expected.get(name):
-            raise ArtifactError(
-                "wrong_shape",
-                f"tensor '{name}': {holds} {_words(found, name)}, {says} {_words(expected, name)}",
-            )
-
-
-def _words(tensors: Mapping[str, object], name: str) -> str:
-    return str(tensors[name]) if name in tensors else "none"
+    for name in sorted(actual.keys() | expected.keys()):
+        one, other = actual.get(name, "none"), expected.get(name, "none")
+        if one != other:
+            raise ArtifactError("wrong_shape", f"tensor '{name}': {has} {one}, {needs} {other}")
 
 
 def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray[Any]:

@@ -30,10 +30,8 @@ def overlap_and_gap(
 ) -> tuple[Array, Array]:
     """Compute overlap and gap of P pairs of rectangles a and b.
 
-    Args:
-        centre_a, centre_b: (P, 2) centres (x, y) in metres.
-        size_a, size_b: (P, 2) extents in metres along the rectangle's own axes.
-        yaw_a, yaw_b: (P,) rotations in radians.
+    Centres (P, 2) and sizes (P, 2) along the rectangle's own axes are in metres, yaws (P,) in
+    radians.
 
     Returns:
         Overlap of each pair, (P,): area of the intersection divided by the smaller area.

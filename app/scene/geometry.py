@@ -99,11 +99,7 @@ def to_viewer_frame(
 
 
 def derive_relations(
-    positions: Rows,
-    sizes: Rows,
-    yaws: ArrayLike | None = None,
-    *,
-    horizontal: bool = True,
+    positions: Rows, sizes: Rows, yaws: ArrayLike | None = None, *, horizontal: bool = True
 ) -> PoseRelations:
     """Derive the relations between n boxes by the rules of this module.
 
@@ -304,14 +300,10 @@ def body_pose(
 
 
 def viewer_axes(frame_id: str | None = None, yaw: float | None = None) -> Axes | None:
-    """Return the viewer's axes (x away, y left, z up) as vectors of a frame.
+    """Return the viewer's axes (x away, y left, z up) as vectors of a frame, or None.
 
-    Args:
-        frame_id: name of the frame, or None for body axes.
-        yaw: viewing direction in radians. None means the direction of the x axis.
-
-    Returns:
-        The three axes, or None for a world-fixed frame without a viewing direction.
+    The result is None for a world-fixed frame without a viewing direction. Without a name, the
+    frame has body axes. The viewing direction is ``yaw`` in radians, or else the x axis.
     """
     if frame_id is not None and yaw is None and is_world_fixed(frame_id):
         return None

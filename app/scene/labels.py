@@ -57,7 +57,6 @@ _IRREGULAR: Final = {
 }
 _IRREGULAR_ENDINGS: Final = tuple(_IRREGULAR)
 
-
 _OF: Final = re.compile(r"[\s_\-.]+of[\s_\-.]+", re.IGNORECASE)
 # The phrase "bottle of milk" means the container, a bottle. "pile of books" means the members,
 # books.
@@ -166,18 +165,18 @@ def readings(label: str, depth: int = 2) -> Iterator[tuple[Rule, str]]:
         depth: maximum number of rules in sequence. For example, "a photo of a sofa/couch" needs
             two rules. The pair contains the first rule.
     """
-    found = [(rule, name) for rule, read in _RULES.items() for name in read(label)]
-    yield from found
+    pairs = [(rule, name) for rule, read in _RULES.items() for name in read(label)]
+    yield from pairs
     if depth > 1:
-        for rule, name in found:
+        for rule, name in pairs:
             yield from ((rule, inner) for _, inner in readings(name, depth - 1))
 
 
 def _qualifier(label: str) -> list[str]:
     """Return name and qualifier together in both orders, and the name alone."""
-    if (found := _QUALIFIED.fullmatch(label)) is None:
+    if (match := _QUALIFIED.fullmatch(label)) is None:
         return []
-    name, qualifier = found.groups()
+    name, qualifier = match.groups()
     return [f"{qualifier} {name}", f"{name} {qualifier}", name]
 
 
@@ -193,8 +192,8 @@ def _alternative(label: str) -> list[str]:
 
 def _matched(pattern: re.Pattern[str]) -> Callable[[str], list[str]]:
     def read(label: str) -> list[str]:
-        found = pattern.fullmatch(label)
-        return [] if found is None or found[1] == label else [found[1]]
+        match = pattern.fullmatch(label)
+        return [] if match is None or match[1] == label else [match[1]]
 
     return read
 

@@ -111,8 +111,8 @@ class NameIndex:
         self._keys = ["".join(words) for words in self._words]
         self._by_key = dict(zip(self._keys, self._entries, strict=True))
         self._by_head: dict[str, list[int]] = {}
-        for place, words in enumerate(self._words):
-            self._by_head.setdefault(words[-1], []).append(place)
+        for row, words in enumerate(self._words):
+            self._by_head.setdefault(words[-1], []).append(row)
         self._known_words = {word for words in self._words for word in words}
         self._lexicon: dict[int, list[str]] = {}  # by length
         for word in sorted({*self._known_words, *self._keys}):
@@ -127,8 +127,8 @@ class NameIndex:
         corrections = {word: [(word, 0)] for word in words}
         if len(unknown) <= _MOST_MISSPELT:
             corrections |= {word: self._corrections(word) for word in unknown}
-        if (found := self._spelt(words, corrections)) is not None:
-            return found
+        if (guess := self._spelt(words, corrections)) is not None:
+            return guess
         cut = next((k for k, word in enumerate(words) if k and word in _PREPOSITIONS), len(words))
         if _TOGETHER & {*words[cut : cut + 1]} and self._spelt(words[cut + 1 :], corrections):
             return None
@@ -145,17 +145,17 @@ class NameIndex:
         self, words: Sequence[str], corrections: Mapping[str, Sequence[tuple[str, int]]]
     ) -> Guess | None:
         """Return the entry whose name is the phrase, perhaps with misspelt words."""
-        found: dict[int, tuple[int, int]] = {}
+        costs: dict[int, tuple[int, int]] = {}
         for spelling in itertools.product(*(corrections[word] for word in words)):
             entry = self._by_key.get("".join(known for known, _ in spelling))
             if entry is not None:
                 allowed = sum(_allowed(known) for known, cost in spelling if cost)
                 more = _BY_PHRASE if allowed and len(words) > 1 else 0
                 cost = sum(cost for _, cost in spelling)
-                found[entry] = min((cost, allowed + more), found.get(entry, (cost, allowed + more)))
-        if not found:
+                costs[entry] = min((cost, allowed + more), costs.get(entry, (cost, allowed + more)))
+        if not costs:
             return None
-        (entry, (cost, allowed)), *others = sorted(found.items(), key=lambda match: match[1])
+        (entry, (cost, allowed)), *others = sorted(costs.items(), key=lambda match: match[1])
         if cost > allowed or (others and others[0][1][0] - cost <= _MARGIN):
             return None
         return Guess(entry, round(1 - cost / 10 / len("".join(words)), 3), "spelling")
@@ -170,38 +170,38 @@ class NameIndex:
             word, lexicon, scorer=OSA.distance, limit=None, score_cutoff=_MOST_EDITS
         )
         costs = [(known, _cost(word, known, count)) for known, count, _ in edits]
-        return sorted(costs, key=lambda found: found[1])[:_MOST_CORRECTIONS] or [(word, 0)]
+        return sorted(costs, key=lambda pair: pair[1])[:_MOST_CORRECTIONS] or [(word, 0)]
 
     def nearest(self, name: str, limit: int) -> tuple[Match, ...]:
         """Return at most ``limit`` plausible entries, most similar first."""
         words = split_words(name)
-        found: list[tuple[float, int]] = []
+        candidates: list[tuple[float, int]] = []
         joined = "".join(words)
         if len(joined) <= LONGEST:
-            for key, similarity, place in _alike(joined, self._keys):
+            for key, similarity, row in _alike(joined, self._keys):
                 factor = 1 if key[:1] == joined[:1] else _BY_REST
-                found.append((similarity * factor, self._entries[place]))
-        for place in self._by_head.get(words[-1], ()) if words else ():
-            common = len({*words} & {*self._words[place]}) / len({*words, *self._words[place]})
-            found.append((0.5 + common / 2, self._entries[place]))
-        best = {entry: similarity for similarity, entry in sorted(found)}
+                candidates.append((similarity * factor, self._entries[row]))
+        for row in self._by_head.get(words[-1], ()) if words else ():
+            common = len({*words} & {*self._words[row]}) / len({*words, *self._words[row]})
+            candidates.append((0.5 + common / 2, self._entries[row]))
+        best = {entry: similarity for similarity, entry in sorted(candidates)}
         ranked = sorted(best.items(), key=lambda entry: (-entry[1], entry[0]))[:limit]
         least = max(_LEAST, ranked[0][1] - _FARTHER) if ranked else 0.0
         return tuple(Match(*entry) for entry in ranked if entry[1] >= least)
 
 
-def spelt_alike(name: str, known: Sequence[str], limit: int = 3) -> list[str]:
-    """Return known names with a similar spelling, most similar first, without reading words."""
-    found = _alike(name[:LONGEST], [other[:LONGEST] for other in known], limit)
-    return [known[place] for _, _, place in found]
+def spelt_alike(name: str, names: Sequence[str], limit: int = 3) -> list[str]:
+    """Return the names with a similar spelling, most similar first, without reading words."""
+    matches = _alike(name[:LONGEST], [other[:LONGEST] for other in names], limit)
+    return [names[row] for _, _, row in matches]
 
 
 def _alike(
-    name: str, known: Sequence[str], limit: int | None = None
+    name: str, names: Sequence[str], limit: int | None = None
 ) -> list[tuple[str, float, int]]:
-    """Return triples (known name, similarity, index of the name), most similar first."""
+    """Return triples (similar name, similarity, index of the name), most similar first."""
     similarity = OSA.normalized_similarity
-    return process.extract(name, known, scorer=similarity, limit=limit, score_cutoff=_LEAST)
+    return process.extract(name, names, scorer=similarity, limit=limit, score_cutoff=_LEAST)
 
 
 def _allowed(known: str) -> int:
@@ -225,7 +225,6 @@ def _edit_cost(word: str, known: str, kind: str, here: int, there: int) -> int:
         if not here:
             return _FIRST
         return _EDIT if {(old, new), (new, old)} & _NEIGHBOURS else _OTHER
-    text, place = (word, here) if kind == "delete" else (known, there)
-    letter = text[place]
-    is_double = letter in (text[place - 1 : place], text[place + 1 : place + 2])
-    return _SLIP if is_double else _EDIT if place else _OTHER
+    text, at = (word, here) if kind == "delete" else (known, there)
+    is_double = text[at] in (text[at - 1 : at], text[at + 1 : at + 2])
+    return _SLIP if is_double else _EDIT if at else _OTHER

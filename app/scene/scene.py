@@ -30,7 +30,7 @@ from app.scene.geometry import (
 from app.scene.relations import CANONICAL, contradiction
 
 A = len(CANONICAL)
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 Point = tuple[float, float, float]
 
 
@@ -189,17 +189,19 @@ def observe(
     if scene.relations is not None or all(thing.position is None for thing in scene.objects):
         return scene
     if viewpoint is not None:
-        scene = replace(scene, objects=_seen_from(scene.objects, viewpoint))
+        scene = replace(scene, objects=_in_viewer_frame(scene.objects, viewpoint))
     positions = np.array([thing.position or _UNKNOWN for thing in scene.objects])
     sizes = np.array([_extent(thing, typical_sizes) for thing in scene.objects])
     yaws = np.array([thing.yaw for thing in scene.objects])
-    nobody_looks = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
-    poses = derive_relations(positions, sizes, yaws, horizontal=not nobody_looks)
+    has_no_viewer = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
+    poses = derive_relations(positions, sizes, yaws, horizontal=not has_no_viewer)
     triples = tuple(zip(*(ends.tolist() for ends in np.nonzero(poses.holds)), strict=True))
     return replace(scene, relations=triples, poses=poses)
 
 
-def _seen_from(objects: tuple[SceneObject, ...], viewpoint: Viewpoint) -> tuple[SceneObject, ...]:
+def _in_viewer_frame(
+    objects: tuple[SceneObject, ...], viewpoint: Viewpoint
+) -> tuple[SceneObject, ...]:
     positions, yaws = to_viewer_frame(
         [thing.position or _UNKNOWN for thing in objects],
         viewpoint,
@@ -270,9 +272,7 @@ def pool_instances(
         classes: (N,) index of the class of each instance.
         confidence: (N,) probability that the instance exists. Instances count as independent
             detections, so a class exists with probability 1 - prod(1 - confidence).
-        holds: (A, N, N) bool, True for relations between instances that hold.
-        observed: (A, N, N) bool, True for relations between instances that were observed, whether
-            they hold or not.
+        holds, observed: (A, N, N) bool, see `instance_evidence`.
         room_type: index of the room type, or None if the room type is unknown.
 
     Raises:
@@ -286,14 +286,14 @@ def pool_instances(
         raise ValueError(f"confidence must have the shape {(size,)}, not {confidence.shape}")
     labels = np.asarray(classes, dtype=np.int64)
     distinct, _, row, counts, present = pool_classes(labels, np.asarray(confidence, np.float64))
-    on, seen = pooled(row, len(distinct), holds, observed)
+    on, seen = pool_relations(row, len(distinct), holds, observed)
     return ClassEvidence(distinct, counts, present, on, seen, room_type)
 
 
 @compiled
 def pool_classes(
     classes: NDArray[np.int64], confidence: NDArray[np.float64]
-) -> tuple[Places, Places, Places, Places, NDArray[np.float64]]:
+) -> tuple[Indices, Indices, Indices, Indices, NDArray[np.float64]]:
     """Return the n distinct classes of N instances.
 
     Returns:
@@ -317,19 +317,13 @@ def pool_classes(
 
 
 @compiled
-def pooled(
+def pool_relations(
     row: NDArray[np.int64], n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
 
-    Args:
-        row: (N,) index of each instance's class, from 0 to n - 1.
-        n: number of classes.
-        holds: (A, N, N) bool, True for relations between instances that hold.
-        observed: (A, N, N) bool, True for relations between instances that were observed.
-
-    Returns:
-        The arrays ``holds`` and ``observed`` of `ClassEvidence`, each (A, n, n).
+    ``row`` (N,) is the index of each instance's class, from 0 to n - 1. The results are ``holds``
+    and ``observed`` of `ClassEvidence`.
     """
     size = len(row)
     on, seen = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)

@@ -51,9 +51,9 @@ class ObjectClass:
 
 
 class Vocabulary:
-    """The V object classes and C room types of a model, in a fixed order.
+    """The V object classes and C room types of a model, in a fixed order. Do not change it.
 
-    Args:
+    Attributes:
         objects: object classes. Their order defines the class indices.
         room_types: canonical names of the room types. Their order defines the room indices.
         room_aliases: maps room types to their synonyms.
@@ -64,11 +64,6 @@ class Vocabulary:
             classes, or two room types, have names with the same `label_key`.
     """
 
-    __slots__ = (
-        *("__dict__", "_by_key", "_by_spelling", "_objects"),
-        *("_room_aliases", "_room_by_key", "_room_types"),
-    )
-
     def __init__(
         self,
         objects: Sequence[ObjectClass],
@@ -77,83 +72,75 @@ class Vocabulary:
     ) -> None:
         if not objects:
             raise ValueError("a vocabulary needs at least one object class")
-        self._objects = tuple(objects)
-        self._room_types = tuple(room_types)
-        self._room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
-        if others := self._room_aliases.keys() - set(self._room_types):
+        self.objects = tuple(objects)
+        self.room_types = tuple(room_types)
+        self.room_aliases = {room: tuple(names) for room, names in room_aliases.items()}
+        if others := self.room_aliases.keys() - set(self.room_types):
             raise ValueError(f"room_aliases names unknown room types: {sorted(others)}")
         self._by_key: dict[str, int] = {}
         self._by_spelling: dict[str, int] = {}
-        for index, entry in enumerate(self._objects):
+        for index, entry in enumerate(self.objects):
             for name in (entry.label, *entry.aliases):
-                claimed = self._by_key.setdefault(label_key(name), index)
-                if claimed != index:
+                first = self._by_key.setdefault(label_key(name), index)
+                if first != index:
                     raise ValueError(
                         f"two object classes have the name {name!r}: "
-                        f"{self._objects[claimed].label!r} and {entry.label!r}"
+                        f"{self.objects[first].label!r} and {entry.label!r}"
                     )
                 self._by_spelling[name] = index
         self._room_by_key: dict[str, int] = {}
-        for index, room in enumerate(self._room_types):
-            for name in (room, *self._room_aliases.get(room, ())):
+        self._room_by_spelling: dict[str, int] = {}
+        for index, room in enumerate(self.room_types):
+            for name in (room, *self.room_aliases.get(room, ())):
                 if not label_key(name):
                     raise ValueError(f"a room type has an empty name: {name!r}")
-                claimed = self._room_by_key.setdefault(label_key(name), index)
-                if claimed != index:
+                first = self._room_by_key.setdefault(label_key(name), index)
+                if first != index:
                     raise ValueError(
-                        f"room types {self._room_types[claimed]!r} and {room!r} have the same name"
+                        f"room types {self.room_types[first]!r} and {room!r} have the same name"
                     )
+                self._room_by_spelling[name] = index
 
     def __len__(self) -> int:
-        return len(self._objects)
+        return len(self.objects)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Vocabulary):
             return NotImplemented
         return (
-            self._objects == other._objects
-            and self._room_types == other._room_types
-            and self._room_aliases == other._room_aliases
+            self.objects == other.objects
+            and self.room_types == other.room_types
+            and self.room_aliases == other.room_aliases
         )
 
     def __hash__(self) -> int:
-        return hash((self._objects, self._room_types))
+        return hash((self.objects, self.room_types))
 
     def __repr__(self) -> str:
-        return f"Vocabulary({len(self)} object classes, {len(self._room_types)} room types)"
-
-    @property
-    def objects(self) -> tuple[ObjectClass, ...]:
-        """The object classes in the order of their indices."""
-        return self._objects
-
-    @property
-    def room_types(self) -> tuple[str, ...]:
-        """The room types in the order of their indices."""
-        return self._room_types
+        return f"Vocabulary({len(self)} object classes, {len(self.room_types)} room types)"
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """The canonical labels in the order of the class indices."""
-        return tuple(entry.label for entry in self._objects)
+        return tuple(entry.label for entry in self.objects)
 
     @cached_property
     def longest_label(self) -> int:
         """Size in bytes of the longest label or room type in JSON."""
-        names = [*self.labels, *self._room_types]
+        names = [*self.labels, *self.room_types]
         return max(len(json.dumps(name, ensure_ascii=False).encode()) for name in names)
 
     @cached_property
     def structure(self) -> NDArray[np.bool_]:
         """(V,) True for structural classes, which a model never proposes. Read-only array."""
-        mask = np.array([entry.structure for entry in self._objects], dtype=np.bool_)
+        mask = np.array([entry.structure for entry in self.objects], dtype=np.bool_)
         mask.flags.writeable = False
         return mask
 
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
         """(V, 3) typical extents in metres, or NaN for classes of unknown size. Read-only array."""
-        sizes = np.array([entry.size or (math.nan,) * 3 for entry in self._objects])
+        sizes = np.array([entry.size or (math.nan,) * 3 for entry in self.objects])
         sizes.flags.writeable = False
         return sizes
 
@@ -163,22 +150,22 @@ class Vocabulary:
         The method accepts all spellings with the same `label_key`. For an unknown phrase such as
         "bottle of milk", it looks up the object in the phrase, a bottle (`head_of`).
         """
-        found = self._by_spelling.get(label)
-        if found is None:
-            found = self._by_key.get(label_key(label))
-        if found is None and (head := head_of(label)) is not None:
-            found = self._by_key.get(label_key(head))
-        return found
+        index = self._by_spelling.get(label)
+        if index is None:
+            index = self._by_key.get(label_key(label))
+        if index is None and (head := head_of(label)) is not None:
+            index = self._by_key.get(label_key(head))
+        return index
 
     def read(self, label: str, *, is_room: bool = False) -> Guess | None:
         """Return the class or room type that a detector's label names for certain, or None.
 
         The method reads the syntax of detectors (`readings`) if `index` does not know the label.
         """
-        index = self.room_index if is_room else self.index
+        index_of = self.room_index if is_room else self.index
         for rule, name in readings(label):
-            if (found := index(name)) is not None:
-                return Guess(found, 1.0, rule)
+            if (index := index_of(name)) is not None:
+                return Guess(index, 1.0, rule)
         return None
 
     def room_index(self, room: str) -> int | None:
@@ -194,13 +181,7 @@ class Vocabulary:
 
     @cached_property
     def _room_names(self) -> NameIndex:
-        return NameIndex(
-            [
-                (name, index)
-                for index, room in enumerate(self._room_types)
-                for name in (room, *self._room_aliases.get(room, ()))
-            ]
-        )
+        return NameIndex(list(self._room_by_spelling.items()))
 
     def nearest(self, label: str, limit: int = 3, *, is_room: bool = False) -> tuple[Match, ...]:
         """Return plausible classes or room types with similar names, most similar first.
@@ -215,16 +196,16 @@ class Vocabulary:
         The method guesses each alternative of a label, or the name in the syntax of detectors.
         """
         names = self._room_names if is_room else self._names
-        found = list(readings(label))
-        inner = [name for rule, name in found if rule == "alternative"]
-        for name in inner or [name for _, name in found][-1:] or [label]:
+        pairs = list(readings(label))
+        alternatives = [name for rule, name in pairs if rule == "alternative"]
+        for name in alternatives or [name for _, name in pairs][-1:] or [label]:
             if (guess := names.guess(name)) is not None:
                 return guess
         return None
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-compatible values that `from_dict` accepts."""
-        aliases = {room: list(names) for room, names in self._room_aliases.items()}
+        aliases = {room: list(names) for room, names in self.room_aliases.items()}
         return {
             "objects": [
                 {
@@ -233,9 +214,9 @@ class Vocabulary:
                     "structure": entry.structure,
                     "size": None if entry.size is None else list(entry.size),
                 }
-                for entry in self._objects
+                for entry in self.objects
             ],
-            "room_types": list(self._room_types),
+            "room_types": list(self.room_types),
         } | ({"room_aliases": aliases} if aliases else {})
 
     @classmethod

@@ -78,14 +78,9 @@ def log_config(
 
     The access log of uvicorn is off, because it would contain raw paths. The service writes its own
     access log. The log level of libraries is at least `info`, because at `debug` numba would log
-    each step of a compilation.
-
-    Args:
-        level: log level of the service.
-        style: "json" for one JSON object per line, or "plain" for text.
-        secrets: keys to mask in every line.
+    each step of a compilation. Every line masks the secrets.
     """
-    known = logging.getLevelNamesMapping()
+    levels = logging.getLevelNamesMapping()
     return {
         "version": 1,
         "disable_existing_loggers": False,
@@ -98,11 +93,8 @@ def log_config(
                 "class": "logging.StreamHandler",
                 "formatter": style,
                 "filters": [_is_useful],
-            },
+            }
         },
-        "root": {"handlers": ["stderr"], "level": max(known[level.upper()], logging.INFO)},
-        "loggers": {
-            "app": {"level": level.upper()},
-            "uvicorn.access": {"level": "CRITICAL"},
-        },
+        "root": {"handlers": ["stderr"], "level": max(levels[level.upper()], logging.INFO)},
+        "loggers": {"app": {"level": level.upper()}, "uvicorn.access": {"level": "CRITICAL"}},
     }

@@ -102,15 +102,12 @@ class Metrics:
             "scene_start_time_seconds", "Unix time when the process began to load its models"
         )
         self._ready = gauge(
-            "scene_ready_time_seconds",
-            "Unix time when the default model first answered; 0 before",
+            "scene_ready_time_seconds", "Unix time when the default model first answered; 0 before"
         )
         self._infos: set[Info] = set()
         self._is_ready = False
         # The questions that each served model has answered, for the removal of its series.
         self._of_model: dict[Key, set[str]] = {}
-
-    # ---------------------------------------------------------------------------- recording
 
     def started(self) -> None:
         """Record that the process begins to load its models."""
@@ -146,12 +143,7 @@ class Metrics:
         self._reloads.labels(change, outcome).inc()
 
     def answered(
-        self,
-        route: str,
-        method: str,
-        outcome: str,
-        seconds: float,
-        serialised: float | None = None,
+        self, route: str, method: str, outcome: str, seconds: float, serialised: float | None = None
     ) -> None:
         """Count one answered request.
 
@@ -160,8 +152,7 @@ class Metrics:
             method: HTTP method, or "-" for a method that HTTP does not define.
             outcome: "success" or the slug (short name) of the problem type.
             seconds: duration of the request in seconds.
-            serialised: time in seconds from the last answer of a model to the response. It is None
-                if no model has answered.
+            serialised: see `Record.serialise_seconds`.
         """
         self._requests.labels(route, method, outcome).inc()
         self._latency.labels(route).observe(seconds)
@@ -182,8 +173,7 @@ class Metrics:
             key: name and version of the model.
             question: name of the question.
             rows: number of scenes of the question. It is 1, or the number of generated scenes.
-            waited: time in seconds that the question waited before its computation.
-            seconds: duration of the computation in seconds.
+            waited, seconds: time in seconds before the computation, and of the computation.
         """
         if key not in self._of_model:
             return
@@ -191,8 +181,6 @@ class Metrics:
         self._queue.labels(*key).observe(waited)
         self._compute.labels(*key, question).observe(seconds)
         self._rows.labels(*key, question).observe(rows)
-
-    # ---------------------------------------------------------------------------- reporting
 
     def exposition(self) -> bytes:
         """Return all metrics in the text format of Prometheus."""

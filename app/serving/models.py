@@ -28,7 +28,7 @@ from app.questions import QUESTIONS
 from app.questions.answer import written
 from app.questions.contexts import contexts
 from app.registry import AliasTarget, Artifact, ArtifactError, ArtifactFailure, ModelSet, StoreError
-from app.registry.models import EMPTY
+from app.registry.model_set import EMPTY
 from app.scene.nearest import spelt_alike
 from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
@@ -106,20 +106,18 @@ class ServedModels:
                 the alias.
             NotReadyError: the default model is not usable.
         """
-        found = self._resolved.get(reference)
-        if found is not None:
-            return found
+        if (cached := self._resolved.get(reference)) is not None:
+            return cached
         try:
-            artifact = self.store.resolve(reference)
-            found = self.served[artifact.manifest.name, artifact.manifest.version]
-            self._resolved[reference] = found
-            return found
+            manifest = self.store.resolve(reference).manifest
         except (StoreError, ArtifactError) as error:
             if reference == DEFAULT:
                 raise NotReadyError("The default model is not usable.") from None
             if isinstance(error, StoreError) and error.code in _UNKNOWN:
                 raise self.unknown(reference) from None
             raise ModelUnavailableError("The service refused to load this model.") from None
+        model = self._resolved[reference] = self.served[manifest.name, manifest.version]
+        return model
 
     def unknown(self, reference: str) -> UnknownModelError:
         """Return the error for a reference to nothing. The error lists the known names."""
@@ -151,11 +149,11 @@ class ServedModels:
     @cached_property
     def aliases(self) -> Mapping[Key, list[str]]:
         """Maps each served model to the sorted aliases that point at it."""
-        found: dict[Key, list[str]] = {key: [] for key in self.served}
+        aliases: dict[Key, list[str]] = {key: [] for key in self.served}
         for alias in sorted(self.store.aliases):
             with suppress(ServiceError):
-                found[self.resolve(alias).key].append(alias)
-        return found
+                aliases[self.resolve(alias).key].append(alias)
+        return aliases
 
     @cached_property
     def usable(self) -> frozenset[str]:
@@ -178,29 +176,24 @@ class ServedModels:
     @cached_property
     def failures(self) -> Mapping[str, Failure]:
         """Maps each unusable entry (``name@version``, an alias or "store") to its failure."""
-        found = {
-            f"{name}@{version}": Failure(
-                subject=f"{name}@{version}", reason=refused.code, detail=refused.reason
-            )
-            for (name, version), refused in self.store.failures.items()
+        causes: dict[str, ArtifactFailure | ArtifactError | StoreError] = {
+            "@".join(key): failure for key, failure in self.store.failures.items()
         }
         for alias in sorted({DEFAULT, *self.store.aliases}):
             try:
                 self.store.resolve(alias)
             except (StoreError, ArtifactError) as error:
-                found[alias] = Failure(subject=alias, reason=error.code, detail=error.reason)
+                causes[alias] = error
         if self.store.failure is not None:
-            found["store"] = Failure(
-                subject="store", reason=self.store.failure.code, detail=self.store.failure.reason
-            )
-        return found
+            causes["store"] = self.store.failure
+        return {
+            subject: Failure(subject=subject, reason=cause.code, detail=cause.reason)
+            for subject, cause in causes.items()
+        }
 
 
-NOTHING: Final = ServedModels(EMPTY, MappingProxyType({}))
+NO_MODELS: Final = ServedModels(EMPTY, MappingProxyType({}))
 """The snapshot before the service has loaded its models."""
-
-
-# ------------------------------------------------------------------------------------- warm-up
 
 
 def prepare(
@@ -243,9 +236,8 @@ def warm_up(artifact: Artifact) -> None:
     related = _scene(artifact.vocabulary)
     bare = replace(related, relations=None)
     posed = observe(bare, typical_sizes=artifact.vocabulary.sizes)
-    scenes = related, bare, posed
     for question in QUESTIONS:
-        for answer in question.warm_up(artifact, scenes):
+        for answer in question.warm_up(artifact, (related, bare, posed)):
             written(answer)
 
 
@@ -253,7 +245,7 @@ def _scene(vocabulary: Vocabulary) -> Scene:
     """Return a scene of up to three objects in a row. The third object is on top of the second."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
-        SceneObject(str(place), vocabulary.labels[index], index, position=(1.0, 0.5 * place, 0.5))
-        for place, index in enumerate((proposable or [0])[:3])
+        SceneObject(str(k), vocabulary.labels[index], index, position=(1.0, 0.5 * k, 0.5))
+        for k, index in enumerate((proposable or [0])[:3])
     )
     return Scene(objects, ((2, 1, 0),) if len(objects) > 1 else None)

@@ -64,7 +64,7 @@ class Record:
         if self.answered_at is not None and status < 400:
             self.serialise_seconds = perf_counter() - self.answered_at
 
-    def known(self) -> dict[str, str | float]:
+    def log_fields(self) -> dict[str, str | float]:
         """Return the fields for the access log line, with times in milliseconds.
 
         The dictionary contains the model only if the request used exactly one model.
@@ -105,12 +105,7 @@ class Request(Ticket):
     async def answer(self, question: Question[RequestT], scene: RequestT) -> Fields:
         """Ask the model in the field `model` of a scene one question.
 
-        Args:
-            question: the question.
-            scene: the validated scene.
-
-        Returns:
-            The fields of `scene_client.schemas.Answer` and of the question.
+        The answer has the fields of `scene_client.schemas.Answer` and of the question.
 
         Raises:
             UnknownModelError: the model does not exist.
@@ -137,7 +132,7 @@ class Request(Ticket):
                 done = await model.queue.run(ask, self, kind=kind, size=size)
         finally:
             model.queue.give_back(held)
-        self._note(model, question.name, rows, done)
+        self._record(model, question.name, rows, done)
         answer = envelope(scene, self.id, model.reference, reading)
         warnings = [*reading.warnings, *done.result.pop("warnings", ())]
         return answer | done.result | {"warnings": warnings}
@@ -146,14 +141,8 @@ class Request(Ticket):
         self, model: ServedModel, scene: SceneRequest, *, may_be_empty: bool
     ) -> Reading:
         """Return a scene converted for a model. The queue of the model reads large scenes."""
-        read = partial(
-            read_scene,
-            scene,
-            model.vocabulary,
-            self.limits,
-            self.look_ups,
-            may_be_empty=may_be_empty,
-        )
+        arguments = scene, model.vocabulary, self.limits, self.look_ups
+        read = partial(read_scene, *arguments, may_be_empty=may_be_empty)
         relations = len(scene.relations or ())
         if len(scene.objects) <= MANY_OBJECTS and relations <= MANY_RELATIONS:
             return read()
@@ -161,15 +150,11 @@ class Request(Ticket):
             not isinstance(thing, str) and thing.position is not None for thing in scene.objects
         )
         # The time for the relations from poses grows with the number of pairs of objects.
-        done = await model.queue.run(
-            read,
-            self,
-            kind=f"read {posed.bit_length()}",
-            size=len(scene.objects) + relations + posed**2,
-        )
-        return done.result
+        size = len(scene.objects) + relations + posed**2
+        kind = f"read {posed.bit_length()}"
+        return (await model.queue.run(read, self, kind=kind, size=size)).result
 
-    def _note(self, model: ServedModel, name: str, rows: int, done: Done[Any]) -> None:
+    def _record(self, model: ServedModel, name: str, rows: int, done: Done[Any]) -> None:
         """Record the times of a computation, for log and metrics."""
         record = self.record
         record.queue_seconds = (record.queue_seconds or 0.0) + done.waited
@@ -183,11 +168,7 @@ class Request(Ticket):
 
     @contextmanager
     def for_batch(self, references: Sequence[str]) -> Iterator[Request]:
-        """Reserve one row in the model's queue for each scene of a batch.
-
-        Args:
-            references: for each scene, the alias or name of its model. The method does not reserve
-                a row if the model is not usable.
+        """Reserve one row for each scene of a batch in the queue of its model, if it is usable.
 
         Yields:
             A copy of the request that does not reserve further rows.

@@ -9,6 +9,7 @@ import logging
 import sys
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Literal
 
 from app import errors
@@ -17,7 +18,7 @@ from app.questions.reading import Limits
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.serving.admission import Backlog, Threads, WorkQueue
 from app.serving.metrics import Change, Metrics
-from app.serving.models import DEFAULT, NOTHING, Key, ServedModels, prepare
+from app.serving.models import DEFAULT, NO_MODELS, Key, ServedModels, prepare
 from app.settings import Settings
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 
@@ -41,26 +42,23 @@ class Runtime:
         backlog: queue of requests that wait for admission.
         limits: limits on scenes and answers.
         metrics: metrics of the service.
-        models: current snapshot of the models; `NOTHING` before the start.
+        models: current snapshot of the models; `NO_MODELS` before the start.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.metrics = Metrics()
         self.backlog = Backlog(settings.queue_requests)
-        self._store = Store(
-            settings.store,
-            lock_timeout=_LOCK_TIMEOUT,
-            max_weights_bytes=settings.max_weights_bytes,
-        )
+        limit = settings.max_weights_bytes
+        self._store = Store(settings.store, lock_timeout=_LOCK_TIMEOUT, max_weights_bytes=limit)
         self.limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
-        self._queue_rows = settings.queue_rows
         self._threads = Threads()
+        self._new_queue = partial(WorkQueue, settings.queue_rows, self._threads, self.backlog)
         self._poll = settings.store_poll
         self._polling: asyncio.Task[None] | None = None
         self._changing = asyncio.Lock()
-        self.models = NOTHING
+        self.models = NO_MODELS
         self._seen: StoreState | None = None
 
     @property
@@ -97,7 +95,7 @@ class Runtime:
         for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
         if self._poll:
-            self._polling = asyncio.create_task(self._follow())
+            self._polling = asyncio.create_task(self._follow_store())
 
     def stop(self) -> None:
         """Stop the worker threads and drop the computations that have not started."""
@@ -116,8 +114,8 @@ class Runtime:
         """
         async with self._change("refresh"):
             # These sets contain only names, so Python can free the memory of the old snapshot.
-            failed, served = set(self.models.failures), set(self.models.served)
-            new = await self._take_over(lambda subject: subject == DEFAULT or subject not in failed)
+            accepted, served = self.models.failures.keys() - {DEFAULT}, set(self.models.served)
+            new = await self._load_and_serve(lambda subject: subject not in accepted)
             return RefreshAnswer(
                 request_id=request_id,
                 default=new.resolve(DEFAULT).reference,
@@ -154,15 +152,20 @@ class Runtime:
                 previous=None if previous is None else str(previous),
             )
 
-    async def _follow(self) -> None:
-        """Check the store regularly for changes by other processes, and serve the new state."""
+    async def _follow_store(self) -> None:
+        """Check the store regularly for changes by other processes, and serve the new state.
+
+        If a new version fails, the service lists this version as refused and serves the other
+        changes. If a usable version or alias would become unusable, the service serves no change.
+        """
         while True:
             await asyncio.sleep(self._poll)
             try:
                 async with self._changing:
                     changed = await asyncio.to_thread(self._store.state) != self._seen
                 if changed:
-                    await self._take_over_changes()
+                    async with self._change("poll"):
+                        await self._load_and_serve(self.models.usable.__contains__)
             except errors.RefreshRefusedError as error:
                 for failure in error.failures:
                     _logger.error(
@@ -171,15 +174,6 @@ class Runtime:
                     )
             except Exception:
                 _logger.exception("the service could not load the changes in the store")
-
-    async def _take_over_changes(self) -> None:
-        """Serve the changes in the store, if every usable version and alias stays usable.
-
-        If a new version fails, the service lists this version as refused and serves the other
-        changes.
-        """
-        async with self._change("poll"):
-            await self._take_over(self.models.usable.__contains__)
 
     @asynccontextmanager
     async def _change(self, change: Change) -> AsyncIterator[None]:
@@ -195,11 +189,11 @@ class Runtime:
             raise
         self.metrics.reloaded(change, "success")
 
-    async def _take_over(self, matters: Callable[[str], bool]) -> ServedModels:
+    async def _load_and_serve(self, is_fatal: Callable[[str], bool]) -> ServedModels:
         """Load the state of the store and serve it.
 
         Args:
-            matters: function from the name of an unusable entry (``name@version``, an alias or
+            is_fatal: function from the name of an unusable entry (``name@version``, an alias or
                 "store") to True, if this failure makes the service refuse the new state.
 
         Raises:
@@ -207,21 +201,21 @@ class Runtime:
         """
         # `_load` runs in a thread, so that the event loop can answer from the old snapshot.
         new = await asyncio.to_thread(self._load)
-        worse = [failure for subject, failure in new.failures.items() if matters(subject)]
-        if worse:
+        fatal = [failure for subject, failure in new.failures.items() if is_fatal(subject)]
+        if fatal:
             detail = "The service still serves the previous versions. `failures` gives the reasons."
-            raise errors.RefreshRefusedError(detail, failures=worse)
+            raise errors.RefreshRefusedError(detail, failures=fatal)
         self._serve(new)
         return new
 
     def _serve(self, models: ServedModels) -> None:
         before, self.models = self.models, models
         for alias, target in models.store.aliases.items():
-            if before is not NOTHING and before.store.aliases.get(alias) != target:
+            if before is not NO_MODELS and before.store.aliases.get(alias) != target:
                 _logger.info("the alias %s names %s now", alias, target)
         self.metrics.serving(models)
-        if before is NOTHING or before.served != models.served:
-            _settle_memory()
+        if before is NO_MODELS or before.served != models.served:
+            _freeze_memory()
 
     def _load(self) -> ServedModels:
         # Read the state before the files. So the next check of the store finds changes that other
@@ -231,19 +225,16 @@ class Runtime:
         with progress():
             return prepare(load_model_set(self._store, models.store), self._new_queue, models)
 
-    def _new_queue(self) -> WorkQueue:
-        return WorkQueue(self._queue_rows, self._threads, self.backlog)
-
     def _target(self, reference: str) -> AliasTarget:
         try:
-            found = self.models.resolve(reference).reference
+            served = self.models.resolve(reference).reference
         except (errors.ModelUnavailableError, errors.NotReadyError):
             raise errors.ModelUnusableError(
                 f"The service refused to load {reference}; GET /models gives the reason."
             ) from None
         # If the reference is a name without a version, the alias follows the newest usable version.
-        newest = reference == found.name
-        return AliasTarget(name=found.name, version=None if newest else found.version)
+        newest = reference == served.name
+        return AliasTarget(name=served.name, version=None if newest else served.version)
 
 
 def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
@@ -281,7 +272,7 @@ def _names(keys: Iterable[Key]) -> list[str]:
     return [f"{name}@{version}" for name, version in sorted(keys)]
 
 
-def _settle_memory() -> None:
+def _freeze_memory() -> None:
     """Exclude long-lived objects from garbage collection, and release unused memory.
 
     A full collection of all objects would stop every thread for tens of milliseconds. So the

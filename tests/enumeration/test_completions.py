@@ -146,9 +146,9 @@ def test_a_doubtful_class_weighs_less():
 
 
 def test_other_machines_have_no_completions():
-    assert not Completions.fits(weights_of(build(SPEC)))
+    assert not Completions.supports(weights_of(build(SPEC)))
     heavy = machine_of(4)
     heavy.W.data[0, 0] = 100.0
-    assert not Completions.fits(weights_of(heavy))
+    assert not Completions.supports(weights_of(heavy))
     with pytest.raises(ValueError, match="stored samples"):
         prepared(heavy, NOTHING)

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from app.inference.chains import Conditions, SceneChains, random_stream
-from app.inference.relations import Given
+from app.inference.relations import ObservedRelations
 from tests.enumeration.small_machines import (
     SMALL,
     check_frequencies,
@@ -38,7 +38,7 @@ def conditions(classes=(), relations=(), held=(), room=None):
     return Conditions(
         classes=np.array(classes, dtype=np.int64),
         log_counts=np.zeros(len(classes), dtype=np.float32),
-        given=Given(a, i, j, r.astype(np.float32), np.ones(len(r), np.float32)),
+        observed=ObservedRelations(a, i, j, r.astype(np.float32), np.ones(len(r), np.float32)),
         held=np.array(held, dtype=np.int64),
         held2=NOTHING,
         room=room,
@@ -86,7 +86,7 @@ def check_stationary(name, condition, given, room=None, beta=1.0):
     joint = enumerate_joint(double if beta == 1 else double.scaled(beta), room)
     where = given(joint)
     keys, p = law(joint, where)
-    chains = SceneChains(weights_of(single)).given(condition, 1 / beta)
+    chains = SceneChains(weights_of(single)).under(condition, 1 / beta)
     q = torch.where(where, joint.p, 0.0)
     picked = q.multinomial(CHAINS, True, generator=torch.Generator().manual_seed(1))
     starts = (units[picked].numpy().astype(np.uint8) for units in (joint.v, joint.h1, joint.h2))
@@ -150,20 +150,20 @@ def torch_clamp(machine, rows, condition):
     held = torch.zeros(machine.spec.H1, dtype=torch.bool)
     held[torch.from_numpy(condition.held)] = True
     room = None if condition.room is None else torch.full((rows,), condition.room)
-    given = condition.given
-    if not len(given.a):
+    observed = condition.observed
+    if not len(observed.a):
         return mask, Clamp(v=mask, h1=held, room=room)
     shape = (machine.spec.A, len(condition.classes), len(condition.classes))
-    observed, r = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape)
-    for a, i, j, on in zip(given.a, given.i, given.j, given.r, strict=True):
-        observed[a, i, j], r[a, i, j] = True, float(on)
+    seen, r = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape)
+    for a, i, j, on in zip(observed.a, observed.i, observed.j, observed.r, strict=True):
+        seen[a, i, j], r[a, i, j] = True, float(on)
     edges = machine.edges(classes)
     return mask, Clamp(
         v=mask,
         h1=held,
         edges=edges,
         r=r.view(1, -1).expand(rows, -1),
-        observed=observed.view(1, -1).expand(rows, -1),
+        observed=seen.view(1, -1).expand(rows, -1),
         room=room,
     )
 
@@ -204,7 +204,7 @@ def test_long_chains_agree_with_those_of_tensors(wide, name, temperature):
     off = state.edges.subjects.unsqueeze(2) != state.edges.subjects.unsqueeze(1)
     counts = (grid * off.unsqueeze(1)).sum((2, 3))
     expected = torch.cat([state.v, state.h1, counts], 1).double().numpy()
-    chains = SceneChains(weights_of(wide)).given(condition, temperature)
+    chains = SceneChains(weights_of(wide)).under(condition, temperature)
     found = np.zeros_like(expected)
     for chain, row in enumerate(found):
         drawn = chains.draw(6, random_stream(9, chain))
@@ -234,7 +234,7 @@ def test_relations_that_imply_each_other_are_drawn_as_by_tensors(layers, tempera
     machine.kappa.zero_()
     v, h1 = torch.ones(rows, 3), torch.tensor([[1.0, 0, 1]]).expand(rows, -1)
     _, r = sample_relations(machine.scaled(1 / temperature), v, h1, generator)
-    chains = SceneChains(weights_of(machine)).given(conditions(), temperature)
+    chains = SceneChains(weights_of(machine)).under(conditions(), temperature)
     on, second = np.array([1, 0, 1], np.uint8), np.zeros(layers, np.uint8)
     off = ~np.eye(3, dtype=bool)
     bits = 1 << np.arange(6)
@@ -258,7 +258,7 @@ def test_relations_that_imply_each_other_are_drawn_as_by_tensors(layers, tempera
 
 def test_logits_are_those_of_the_machine(wide):
     chains = SceneChains(weights_of(wide))
-    drawn = chains.given(conditions([3, 17, 30])).draw(3, random_stream(0, 0))
+    drawn = chains.under(conditions([3, 17, 30])).draw(3, random_stream(0, 0))
     v, h1 = torch.zeros(1, 40), torch.zeros(1, 70)
     v[0, drawn.classes], h1[0, drawn.h1] = 1, 1
     edges = wide.edges(present_classes(v))
@@ -269,6 +269,6 @@ def test_logits_are_those_of_the_machine(wide):
 def test_other_machines_are_refused():
     for machine in (small_machine("triway-seed").float(), small_machine("triway-local")):
         weights = weights_of(machine)
-        assert not SceneChains.fits(weights)
+        assert not SceneChains.supports(weights)
         with pytest.raises(ValueError, match="local form with float32 weights"):
             SceneChains(weights)

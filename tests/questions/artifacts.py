@@ -65,7 +65,7 @@ def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:
         digest="",
         card="",
         path=Path(),
-        oracle=None if ClosedForm.fits(weights) else DrawnPosterior,
+        oracle=None if ClosedForm.supports(weights) else DrawnPosterior,
     )
 
 

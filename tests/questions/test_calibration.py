@@ -27,7 +27,9 @@ def test_a_line_bends_at_the_bends_of_its_entry(bends, log_odds):
     """The entry of the other relation has no bends."""
     entry = PairSlope(intercept=0.5, slope=0.8, bends=tuple(bends))
     neutral = Calibration.neutral(2)
-    slopes = RelationSlopes.of(neutral.model_copy(update={"relation": (entry, PairSlope())})).alone
+    slopes = RelationSlopes.of(
+        neutral.model_copy(update={"relation": (entry, PairSlope())})
+    ).relation
     values = np.array([[log_odds, log_odds]])
     p = relation_probability(slopes, values, np.zeros(len(log_odds)), 1)[0]
     for k, z in enumerate(log_odds):

@@ -198,9 +198,9 @@ def test_machines_without_closed_form(largest: float) -> None:
     machine = build(MachineSpec("triway", V=5, A=2, H1=70, K=2, form="local"))
     with torch.no_grad():
         machine.W[1, 2] = largest
-    assert ClosedForm.fits(weights_of(machine)) == (largest < 64)
-    assert not ClosedForm.fits(weights_of(machine.double()))
+    assert ClosedForm.supports(weights_of(machine)) == (largest < 64)
+    assert not ClosedForm.supports(weights_of(machine.double()))
     seed = weights_of(build(MachineSpec("rbm", V=5, A=2, H1=70)))
-    assert not ClosedForm.fits(seed)
+    assert not ClosedForm.supports(seed)
     with pytest.raises(ValueError, match="local form"):
         ClosedForm(seed)

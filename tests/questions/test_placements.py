@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from app.questions.placements import offsets_of
 from app.registry import Offsets, PairSlope
-from app.registry.offsets import NOTHING
+from app.registry.offsets import UNOBSERVED
 from app.scene import CANONICAL, Scene, SceneObject
 from app.scene.geometry import viewer_axes
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP, canonicalise
@@ -87,7 +87,7 @@ def offset_of(relation, missing, anchor, outgoing=True, axes=VIEWER, offsets=OFF
     """The offset of one placement, or None if it is unknown."""
     ends = (np.array([value]) for value in (relation, missing, anchor, outgoing))
     mean, std, scenes = (values[0].tolist() for values in offsets_of(offsets, *ends, axes))
-    return None if scenes == NOTHING else Offset(tuple(mean), tuple(std), scenes)
+    return None if scenes == UNOBSERVED else Offset(tuple(mean), tuple(std), scenes)
 
 
 @given(st.integers(0, A - 1), st.integers(0, V - 1), st.integers(0, V - 1))

@@ -119,7 +119,7 @@ def test_concurrent_publishers_and_readers(publishers: Publishers, tmp_path: Pat
         publishers.start("race", root=str(root), results=str(path), versions=versions)
         for path in results
     ]
-    models, highest = None, 0
+    models, highest = ModelSet({}, {}), 0
     deadline = time.monotonic() + 60
     while not all(path.exists() for path in results):
         assert time.monotonic() < deadline

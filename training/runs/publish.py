@@ -252,7 +252,7 @@ def draft_artifact(
         digest="",
         card="",
         path=Path(),
-        oracle=None if ClosedForm.fits(weights_of(machine)) else DrawnPosterior,
+        oracle=None if ClosedForm.supports(weights_of(machine)) else DrawnPosterior,
     )
 
 

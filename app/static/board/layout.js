@@ -1,4 +1,4 @@
-/** Places for objects without a position, from the relations between them. */
+/** Indices for objects without a position, from the relations between them. */
 
 import { halves, round } from './geometry.js';
 
@@ -59,7 +59,7 @@ function beside(triples, nodes) {
 }
 
 /**
- * Places `free` boxes among `fixed` boxes.
+ * Indices `free` boxes among `fixed` boxes.
  * @param {object[]} fixed
  * @param {object[]} free boxes; given x and y are the start of the search
  * @param {{subject: string, relation: string, object: string}[]} relations by id

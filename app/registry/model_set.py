@@ -6,6 +6,8 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Final
 
@@ -47,10 +49,10 @@ class ModelSet:
     @cached_property
     def versions(self) -> Mapping[str, tuple[str, ...]]:
         """Maps each model to its versions in ascending order, including unusable versions."""
-        found: dict[str, list[str]] = {}
-        for name, version in sorted(self.entries, key=lambda key: (key[0], version_key(key[1]))):
-            found.setdefault(name, []).append(version)
-        return MappingProxyType({name: tuple(versions) for name, versions in found.items()})
+        keys = sorted(self.entries, key=lambda key: (key[0], version_key(key[1])))
+        return MappingProxyType(
+            {name: tuple(v for _, v in group) for name, group in groupby(keys, itemgetter(0))}
+        )
 
     @cached_property
     def failures(self) -> Mapping[tuple[str, str], ArtifactFailure]:
@@ -97,10 +99,8 @@ def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
     The function raises no exception for errors in the store, such as invalid versions, unreadable
     aliases or a missing store. The result contains these errors.
 
-    Args:
-        store: the store.
-        previous: earlier snapshot of the store. The function verifies all files again, but reuses
-            artifacts of this snapshot whose digest is unchanged.
+    The function verifies all files, but reuses artifacts of the previous snapshot whose digest is
+    unchanged.
     """
     failure: StoreError | None = None
     aliases: Mapping[str, AliasTarget]
@@ -124,10 +124,10 @@ def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
 
 
 def _load(
-    store: Store, name: str, version: str, known: Artifact | ArtifactFailure | None
+    store: Store, name: str, version: str, previous: Artifact | ArtifactFailure | None
 ) -> Artifact | ArtifactFailure:
     try:
-        return store.load(name, version, known if isinstance(known, Artifact) else None)
+        return store.load(name, version, previous if isinstance(previous, Artifact) else None)
     except ArtifactError as error:
         return ArtifactFailure(error.code, error.reason)
     except StoreError as error:  # for example, the version was removed after it was listed
