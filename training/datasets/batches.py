@@ -44,11 +44,11 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         """Return the batch on a device."""
-        return Batch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return Batch(*(tensor.to(device) for tensor in vars(self).values()))
 
     def rows(self, index: Tensor) -> Batch:
         """Return the scenes at the given indices. A mask selects the scenes where it is True."""
-        return Batch(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return Batch(*(tensor[index] for tensor in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -88,23 +88,15 @@ class SceneTensors:
         chosen = [self.scenes[k].evidence for k in index.tolist()]
         n = max([width, *(len(e.classes) for e in chosen)])
         relations = self.scenes[0].evidence.holds.shape[0] if self.scenes else 0
-        classes = np.full((len(chosen), n), -1, dtype=np.int64)
-        counts = np.ones((len(chosen), n), dtype=np.int64)
-        holds = np.zeros((len(chosen), relations, n, n), dtype=np.float32)
-        observed = np.zeros((len(chosen), relations, n, n), dtype=np.bool_)
+        shape = (len(chosen), relations, n, n)
+        classes, counts = np.full(shape[::3], -1), np.ones(shape[::3], dtype=np.int64)
+        holds, observed = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.bool_)
         for row, e in enumerate(chosen):
             m = len(e.classes)
             classes[row, :m], counts[row, :m] = e.classes, e.counts
             holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
-        return Batch(
-            v=self.v[index],
-            classes=torch.from_numpy(classes),
-            counts=torch.from_numpy(counts),
-            holds=torch.from_numpy(holds),
-            observed=torch.from_numpy(observed),
-            room=self.room[index],
-            source=self.source[index],
-        )
+        tables = map(torch.from_numpy, (classes, counts, holds, observed))
+        return Batch(self.v[index], *tables, self.room[index], self.source[index])
 
 
 def scene_tensors(

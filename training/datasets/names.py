@@ -63,41 +63,43 @@ class Names:
 
     def canonical(self, label: str) -> str:
         """Return the curated name of a label, or the label in lower case with single spaces."""
-        found = self._by_key.get(label_key(label))
-        if found is not None:
-            return found
+        if (name := self._by_key.get(label_key(label))) is not None:
+            return name
         if (head := head_of(label)) is not None:
             return self.canonical(head)
-        return " ".join(label.casefold().replace("_", " ").split())
+        return _plain(label)
 
     def canonical_room(self, room: str | None) -> str | None:
         """Return the canonical spelling of a room type, or None if the name means no room type."""
         if room is None:
             return None
-        found = self._rooms_by_key.get(label_key(room))
-        if found is None:
-            found = " ".join(room.casefold().replace("_", " ").split())
-        return found or None
+        name = self._rooms_by_key.get(label_key(room))
+        return (_plain(room) if name is None else name) or None
 
     @cached_property
     def _by_key(self) -> dict[str, str]:
-        keys = {
-            label_key(other): name
-            for name, others in self.aliases.items()
-            for other in (name, *others)
-        }
+        keys = _by_any_name(self.aliases)
         for name in (*self.base, *self.household, *self.structure, *self.surroundings):
             keys.setdefault(label_key(name), name)
         return keys
 
     @cached_property
     def _rooms_by_key(self) -> dict[str, str]:
-        return {
-            label_key(other): name
-            for name, others in self.rooms.items()
-            for other in (name, *others)
-            if other
-        }
+        return _by_any_name(self.rooms)
+
+
+def _plain(name: str) -> str:
+    return " ".join(name.casefold().replace("_", " ").split())
+
+
+def _by_any_name(table: dict[str, tuple[str, ...]]) -> dict[str, str]:
+    """Map the key of each name in a table, except "", to the name whose entry contains it."""
+    return {
+        label_key(other): name
+        for name, others in table.items()
+        for other in (name, *others)
+        if other
+    }
 
 
 @cache
@@ -108,10 +110,10 @@ def curated_names() -> Names:
         ValueError: the file gives two meanings to one name.
     """
     values: dict[str, Any] = tomllib.loads(NAMES_FILE.read_text(encoding="utf-8"))
-    found: dict[str, Any] = {
+    tables: dict[str, Any] = {
         name: {key: tuple(others) for key, others in entry.items()}
         if isinstance(entry, dict)
         else tuple(entry)
         for name, entry in values.items()
     }
-    return Names(**found)
+    return Names(**tables)

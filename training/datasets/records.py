@@ -68,12 +68,9 @@ class AnnotatedObject:
         _check_numbers("box2d", self.id, self.box2d, 4)
         if self.size is not None and min(self.size) < 0:
             raise ValueError(f"size of {self.id!r} must not be negative, but is {self.size}")
-        if self.box2d is not None and (
-            self.box2d[0] > self.box2d[2] or self.box2d[1] > self.box2d[3]
-        ):
-            raise ValueError(
-                f"box2d of {self.id!r} must be (xmin, ymin, xmax, ymax), not {self.box2d}"
-            )
+        if self.box2d and (self.box2d[0] > self.box2d[2] or self.box2d[1] > self.box2d[3]):
+            corners = "(xmin, ymin, xmax, ymax)"
+            raise ValueError(f"box2d of {self.id!r} must be {corners}, not {self.box2d}")
         if not math.isfinite(self.yaw):
             raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
         if not 1 <= self.count <= MAX_COUNT:
@@ -118,14 +115,14 @@ class AnnotatedScene:
                     f"supported_by of {thing.id!r} is {thing.supported_by!r}, which is no object "
                     "of the scene"
                 )
+        size = len(self.objects)
         for subject, relation, anchor in (*(self.relations or ()), *self.false_relations):
             if relation not in RELATIONS:
                 raise ValueError(f"unknown relation {relation!r}")
             for end in (subject, anchor):
-                if not 0 <= end < len(self.objects):
+                if not 0 <= end < size:
                     raise ValueError(
-                        f"a relation has object index {end}, "
-                        f"but the scene has {len(self.objects)} objects"
+                        f"a relation has object index {end}, but the scene has {size} objects"
                     )
 
 

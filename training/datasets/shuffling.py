@@ -12,6 +12,7 @@ randomization" (ACM TKDD, 2007).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
@@ -67,21 +68,19 @@ def _exchange(owner: Ints, classes: Ints, rng: Rng) -> Ints:
     if not len(classes):
         return classes
     label, scene = classes.tolist(), owner.tolist()
-    there: dict[int, set[int]] = {}
+    classes_of: defaultdict[int, set[int]] = defaultdict(set)
     for s, c in zip(scene, label, strict=True):
-        there.setdefault(s, set()).add(c)
+        classes_of[s].add(c)
     drawn = rng.integers(len(label), size=(2, _STEPS_PER_MENTION * len(label)))
     # Each exchange depends on the earlier exchanges, so lists and sets are faster than arrays.
     for i, j in zip(*drawn.tolist(), strict=True):
         c, d = label[i], label[j]
-        first, second = there[scene[i]], there[scene[j]]
+        first, second = classes_of[scene[i]], classes_of[scene[j]]
         if first is not second:
             if d in first or c in second:
                 continue
-            first.remove(c)
-            first.add(d)
-            second.remove(d)
-            second.add(c)
+            first ^= {c, d}
+            second ^= {c, d}
         label[i], label[j] = d, c
     return np.array(label, dtype=np.int64)
 

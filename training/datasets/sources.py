@@ -24,7 +24,7 @@ objects on the same support, so left and front of distant pairs are unobserved.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from app.scene import CANONICAL, RELATIONS
@@ -65,9 +65,8 @@ BOXES: Final = Meaning(lateral="off for neighbours")
 """Meaning for relations derived from boxes. Without sizes, on-top and above are unobserved."""
 
 _CENTRES: Final = Meaning(on_top="unobserved", above="unobserved")
-_MENTIONS: Final = Meaning(
-    on_top="unobserved", above="unobserved", lateral="unobserved", complete_objects=False
-)
+_SELECTED: Final = Meaning(on_top="unobserved", above="unobserved", lateral="unobserved")
+_MENTIONS: Final = replace(_SELECTED, complete_objects=False)
 
 _THE_EIGHT: Final = {name: name for name in RELATIONS}
 # Relation of each predicate of 3DSSG. All kinds of support become on-top.
@@ -189,9 +188,7 @@ SOURCES: Final[dict[str, Source]] = {
         "ALFRED (Shridhar et al., CVPR 2020): AI2-THOR rooms and triples from instructions; MIT",
         # Thousands of episodes show only about a hundred rooms, so all episodes of a room together
         # have the weight of three scenes.
-        meaning=Meaning(
-            on_top="unobserved", above="unobserved", lateral="unobserved", scenes_per_group=3.0
-        ),
+        meaning=replace(_SELECTED, scenes_per_group=3.0),
         predicates=_THE_EIGHT,
         counts_movables=True,
     ),

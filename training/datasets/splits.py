@@ -72,11 +72,11 @@ def split(
 
 def stable_part(group: str, seed: int) -> Part:
     """Return the part of a group in the ``stable`` protocol. It depends on no other scenes."""
-    place = int.from_bytes(_rank(seed, group)[:8], "big") / 2**64
+    fraction = int.from_bytes(_rank(seed, group)[:8], "big") / 2**64
     for part, share in FRACTIONS["stable"].items():
-        if place < share:
+        if fraction < share:
             return part
-        place -= share
+        fraction -= share
     return "train"
 
 
@@ -152,9 +152,9 @@ def _assign(
     return part_of
 
 
-def _lack(share: float, given: int, total: int) -> float:
+def _lack(share: float, assigned: int, total: int) -> float:
     """Return the number of additional scenes with which a part reaches its target share."""
-    return share * total - given
+    return share * total - assigned
 
 
 def _rank(seed: int, unit: str) -> bytes:

@@ -50,7 +50,7 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
         DatasetError: the file does not have the official format, or has more than `MAX_BYTES`.
     """
     scenes: list[AnnotatedScene] = []
-    taken: Counter[str] = Counter()
+    frames: Counter[str] = Counter()
     for number, frame in enumerate(_structs(_load(path))):
         where = f"SUNRGBDMeta({number + 1})"
         name = _text(path, where, frame, "sequenceName").strip("/")
@@ -58,24 +58,16 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
         if "sun3ddata" in name:
             group = "sunrgbd-" + "/".join(name.split("/")[:4])
         else:
-            group = f"sunrgbd-{collection}-{taken[collection] // _BLOCK}"
-        taken[collection] += 1
+            group = f"sunrgbd-{collection}-{frames[collection] // _BLOCK}"
+        frames[collection] += 1
         boxes = _structs(take(path, where, frame, "groundtruth3DBB", object))
         objects = tuple(
-            _box(path, f"{where}.groundtruth3DBB({position + 1})", position, box)
-            for position, box in enumerate(boxes)
+            _box(path, f"{where}.groundtruth3DBB({index + 1})", index, box)
+            for index, box in enumerate(boxes)
         )
         if objects:
-            scenes.append(
-                AnnotatedScene(
-                    scene_id=name,
-                    source=SOURCE,
-                    group=group,
-                    room_type=_room_type(path.parent / name / "scene.txt"),
-                    objects=objects,
-                    viewer_frame=True,
-                )
-            )
+            room = _room_type(path.parent / name / "scene.txt")
+            scenes.append(AnnotatedScene(name, SOURCE, group, room, objects, viewer_frame=True))
     return scenes
 
 

@@ -6,6 +6,7 @@ int8 and the scalar ``scale``. The vector of a word is its row of ``vectors`` ti
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
 import zlib
@@ -88,12 +89,12 @@ def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, 
         True for classes with a vector. The vector of any other class is zero.
     """
     vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
-    found = np.zeros(len(vocabulary), dtype=np.bool_)
+    known = np.zeros(len(vocabulary), dtype=np.bool_)
     for index, entry in enumerate(vocabulary.objects):
         named = map(words.of, (entry.label, *entry.aliases))
         if (vector := next((one for one in named if one is not None), None)) is not None:
-            vectors[index], found[index] = vector, True
-    return vectors, found
+            vectors[index], known[index] = vector, True
+    return vectors, known
 
 
 def read_word_vectors(path: Path) -> WordVectors:
@@ -137,9 +138,7 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
             raise DatasetError(path, name, f"has the unsupported .npy version {version}")
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, _, dtype = read(file)
-        size = dtype.itemsize
-        for length in shape:
-            size *= length
+        size = dtype.itemsize * math.prod(shape)
         if dtype.hasobject or size > MAX_BYTES:
             raise DatasetError(
                 path, name, f"must be a plain array of at most {MAX_BYTES // 2**20} MiB"

@@ -42,12 +42,12 @@ from training.datasets.cases import (
     RIDGE,
     Triple,
     altered_scene,
-    known_relations,
+    annotated_relations,
     logistic,
+    observed_pairs,
+    removed_class,
     scene_of,
     stated_relations,
-    taken_away,
-    told_pairs,
 )
 from training.datasets.sources import meaning_of
 from training.evaluation.outlier_tasks import kept_in_each_source
@@ -147,7 +147,7 @@ def _asked_pairs(
         asked = np.ones((len(encoded.instance_classes),) * 2, dtype=np.bool_)
         told: list[Triple] = []
         if rng is not None:
-            asked, told = told_pairs(encoded, artifact.vocabulary.structure, rng)
+            asked, told = observed_pairs(encoded, artifact.vocabulary.structure, rng)
             if not told:
                 continue
         scene = replace(scene_of(encoded, range(len(asked)), told), room_type=None)
@@ -174,7 +174,7 @@ def fit_placements(
     sources = sorted({encoded.source for encoded in scenes})
     blocks: list[Floats] = []
     for number, encoded in enumerate([*scenes] * _PLACEMENT_CASES):
-        taken = taken_away(encoded, structure, rng)
+        taken = removed_class(encoded, structure, rng)
         if taken is None:
             continue
         target, kept = taken
@@ -185,7 +185,7 @@ def fit_placements(
         both = given.placement_log_odds(np.array([target]), anchors)
         other = np.array(kept)[present.first[anchors]]
         own = np.full_like(other, gone)
-        holds, known = encoded.instance_holds, known_relations(encoded)
+        holds, known = encoded.instance_holds, annotated_relations(encoded)
         for values, ends in zip(both, ((own, other), (other, own)), strict=True):
             truth = np.where(known[:, *ends], holds[:, *ends], _UNKNOWN)
             a, place = map(np.ravel, np.indices(truth.shape))
@@ -360,7 +360,7 @@ def _instance_pairs(
     logs = np.log(evidence.counts[place])
     usable = ~structure[scene.instance_classes]
     pair = asked & usable[:, None] & usable[None, :] & ~np.eye(len(place), dtype=np.bool_)
-    known, every = known_relations(scene)[: len(values)], values[:, place[:, None], place]
+    known, every = annotated_relations(scene)[: len(values)], values[:, place[:, None], place]
     least = np.array([_so_many_best(own[pair], _LISTED) for own in every])
     of = pair & (known | (every >= least[:, None, None]))
     relation, i, j = np.nonzero(of)

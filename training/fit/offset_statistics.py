@@ -30,7 +30,7 @@ from app.registry import Offsets
 from app.scene import CANONICAL
 from training.datasets import EncodedScene
 from training.datasets.array_types import Floats, Ints
-from training.datasets.offsets import Seen, seen_offsets
+from training.datasets.offsets import Seen, observed_offsets
 
 # Shrinkage of the class effects u and v. It acts like `LAMBDA` additional pairs with effect 0.
 LAMBDA: Final = 4.0
@@ -51,7 +51,7 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     each other. All data sources have the same total weight, because boxes of one source are
     similar.
     """
-    seen = seen_offsets(scenes)
+    seen = observed_offsets(scenes)
     if not len(seen.offset):
         return None
     A = len(CANONICAL)
