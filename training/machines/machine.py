@@ -109,8 +109,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
         Args:
             by_relation: log-odds that an observed relation holds, (relations,).
-            by_unit: log-odds that a triple of the table holds in a scene with annotated relations,
-                (triples,).
+            by_unit: log-odds that a triple holds in a scene with annotated relations, (triples,).
             usual: mean log number of instances of each class, (classes,).
         """
 
@@ -133,48 +132,41 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """Find the machine's unit for each relation in `pairs`.
+        """Return the units, the index of the unit of each relation in `pairs`, and its existence.
 
-        Returns:
-            Three values: the units of the machine, the index of the unit of each relation, and True
-            where the machine has a unit for the relation. The last two have the shape (scenes,
-            relations of `pairs`). Where the last value is False, the index is arbitrary.
+        The last two have the shape (scenes, relations of `pairs`). Without a unit, the index is
+        arbitrary.
         """
 
     @abstractmethod
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relations between classes in the layout of this machine.
+        """Return the relations between classes in the layout of this machine: edges, r, observed.
 
-        The result is (edges, r, observed): layout, values and observed flags of the relation units.
         In an RBM or GBM, the units of absent classes are 0. They count as observed if the scene has
         any annotated relation.
 
         Args:
             classes, counts: class indices and numbers of instances, (scenes, n), as in `edges`.
-            holds: values of the relations between the classes, (scenes, relations, n, n).
-            observed: True where the relation is observed, (scenes, relations, n, n).
+            holds, observed: value of each relation between the classes, and True where it is
+                observed, (scenes, relations, n, n).
         """
 
     @abstractmethod
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
+        self, v: Tensor, observed: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relation units that can be 1 given the objects v.
-
-        r contains the values of the given units.
+        """Return edges, r and observed of the relation units that can be 1 given the objects v.
 
         Args:
+            observed: observed relations, whose values r contains.
             least: least number of classes between which there are units, with padding.
         """
 
     @abstractmethod
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the gate of each unit, (..., scenes, units).
-
-        The gate is 1 if the unit can be 1 given the objects v, else 0.
-        """
+        """Return 1 for each unit that can be 1 given v, else 0, (..., scenes, units)."""
 
     @abstractmethod
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
@@ -186,39 +178,29 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """Return sum_e weight_e U_e, the input of relations to h1, (..., scenes, hidden units).
-
-        Args:
-            weight: factor of each relation unit, (..., scenes, units).
-        """
+        """Return sum_e weight_e U_e for weights (..., scenes, units), (..., scenes, H1)."""
 
     def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sum_e r_e ℓ_e(v, 0) and sum_e r_e U_e over relation units e.
-
-        The shapes are (..., scenes) and (..., scenes, hidden units).
-        """
+        """Return sum_e r_e ℓ_e(v, 0), (..., scenes), and sum_e r_e U_e, (..., scenes, H1)."""
         bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
         return (r * bare).sum(-1), self.hidden_input(edges, r)
 
-    def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """Return the change of each relation logit due to the given relations, (scenes, units).
+    def implied(self, edges: Edges, observed: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
+        """Return the change of each relation logit due to observed relations, (scenes, units).
 
         The change is zero in a machine without implication weights (`training.machines.triway`).
 
         Args:
-            given: given relations, (scenes, units). 1 means that the relation holds.
+            observed: observed relations, (scenes, units). 1 means that the relation holds.
             h1: means of the hidden units given the objects, (scenes, hidden units).
             apart: True leaves out the effects between relations of the same two classes.
         """
         del edges, h1, apart
-        return torch.zeros_like(given)
+        return torch.zeros_like(observed)
 
     @abstractmethod
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return the weights U_e between each relation unit e and the hidden units h1.
-
-        The result has the shape (scenes or 1, units, hidden units). It is large, so pass few units.
-        """
+        """Return the weights U_e to h1 of few units, (scenes or 1, units, hidden units)."""
 
     @abstractmethod
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
@@ -226,7 +208,6 @@ class BoltzmannMachine(nn.Module, ABC):
 
         Args:
             v: presence of objects, (..., scenes, classes). Each candidate counts as absent.
-            h1: hidden units, (..., scenes, hidden units).
             edges: relation units of the scene. The units of a candidate are unobserved.
             candidates: class indices, (scenes or 1, candidates) int64.
 
@@ -238,10 +219,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return values of relation units as a table over pairs of n classes.
-
-        The table has the shape (scenes, relations, n, n). The value of a relation without a unit is
-        -inf.
+        """Return values of the units as a table, (scenes, relations, n, n); -inf without unit.
 
         Args:
             edges: the relation units between `classes`.
@@ -366,27 +344,8 @@ class BoltzmannMachine(nn.Module, ABC):
         return -(v @ self.b + h2 @ self.c2 + context + ((h1 @ self.J) * h2).sum(-1))
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the sum of κ_a over relation units with an open gate, (..., scenes).
-
-        The sum is 0 in a machine without κ.
-        """
+        """Return the sum of κ_a over units with an open gate, (..., scenes); 0 without κ."""
         return v.new_zeros(v.shape[:-1])
-
-    def hidden_logits(
-        self,
-        v: Tensor,
-        r: Tensor,
-        edges: Edges,
-        h2: Tensor | None = None,
-        room: Tensor | None = None,
-    ) -> Tensor:
-        """Return the logits x = c1 + v'W + sum_e r_e U_e + J h2 of the hidden units h1.
-
-        In the seed form p(h1 = 1 | v, r, h2) = sigmoid(x). In the local form, pass zeros for r:
-        `draw_hidden` accounts for relations by weights of the draws.
-        """
-        x = self.context_bias(room) + v @ self.W + self.hidden_input(edges, r)
-        return x if h2 is None else x + h2 @ self.J.T
 
     def free_energy(
         self,
@@ -449,8 +408,5 @@ class BoltzmannMachine(nn.Module, ABC):
         return self.c2 + h1 @ self.J
 
     def object_logits(self, h1: Tensor) -> Tensor:
-        """Return the log-odds b + W h1 of each object given h1, (..., scenes, classes).
-
-        The contributions of relations are left out.
-        """
+        """Return the log-odds b + W h1 of each object without relations, (..., scenes, classes)."""
         return self.b + h1 @ self.W.T

@@ -90,12 +90,13 @@ def mean_field(
         pull: weight of the observed relations. The result interpolates between the fixed point
             without relations (0) and the fixed point with all relations (1).
     """
-    if pull < 1 and evidence.relations(machine) is not None:
-        without = mean_field(machine, unobserved(evidence), iterations=iterations, damping=damping)
-        with_all = mean_field(machine, evidence, iterations=iterations, damping=damping)
-        pairs = (
-            (getattr(field, name) for field in (without, with_all)) for name in ("y", "x", "h2")
+    if pull < 1 and evidence.observed is not None and evidence.relations(machine) is not None:
+        nothing = torch.zeros_like(evidence.observed)
+        without, with_all = (
+            mean_field(machine, one, iterations=iterations, damping=damping)
+            for one in (replace(evidence, observed=nothing), evidence)
         )
+        pairs = zip(vars(without).values(), vars(with_all).values(), strict=True)
         return MeanField(*(torch.lerp(one, other, pull) for one, other in pairs))
     base = x = machine.context_bias(evidence.room) + evidence.v @ machine.W
     relations = evidence.relations(machine)
@@ -126,10 +127,3 @@ def mean_field(
             h2 = machine.second_layer_logits((x + added).sigmoid()).sigmoid()
             x = torch.addmm(base, h2, machine.J.T)
     return MeanField(x + added, x, h2)
-
-
-def unobserved(evidence: Evidence) -> Evidence:
-    """Return a copy of the evidence in which every relation is unobserved."""
-    if evidence.observed is None:
-        return evidence
-    return replace(evidence, observed=torch.zeros_like(evidence.observed))

@@ -113,10 +113,7 @@ def reverse_ais(
     generator: torch.Generator,
     base: BoltzmannMachine | None = None,
 ) -> LogPartition:
-    """Run reverse AIS. The chains start at `state`, which contains samples of the machine.
-
-    Pass `betas` in increasing order, as for `ais`.
-    """
+    """Run reverse AIS from samples of the machine, with `betas` in increasing order as in `ais`."""
     _check(betas)
     base = independent_base(machine) if base is None else base
     log_weight = torch.zeros(len(state.v), dtype=torch.float64)
