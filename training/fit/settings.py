@@ -134,7 +134,7 @@ class ObjectsConfig(_Section):
     batch_size: int = Field(default=32, ge=1)
 
 
-class PolishConfig(_Section):
+class FineTuneConfig(_Section):
     """The last training phase, which fine-tunes the weights of objects by persistent chains.
 
     The phase needs a machine of the local form (`training.machines.machine`).
@@ -187,7 +187,7 @@ class Config(_Section):
     objective: ObjectiveConfig
     training: TrainingConfig = TrainingConfig()
     objects: ObjectsConfig = ObjectsConfig()
-    polish: PolishConfig = PolishConfig()
+    polish: FineTuneConfig = FineTuneConfig()
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
@@ -199,32 +199,32 @@ class Config(_Section):
                     f"machine.without: a {self.machine.variant} has no weights "
                     f"{', '.join(unknown)}, only {', '.join(names)}"
                 )
-        kind = VARIANTS[self.machine.variant]
-        if self.machine.H2 and not kind.two_layers:
-            raise ValueError(
-                "machine.H2 must be 0, because this machine.variant has one hidden layer"
-            )
-        local = self.machine.form == "local"
-        if self.machine.G and not (local and kind.implications):
-            raise ValueError(
-                "machine.G is defined for the local form of the Triway only: it must be 0"
-            )
-        if self.machine.N and not local:
-            raise ValueError("machine.N is defined for the local form only: it must be 0")
-        if "rooms" in self.data.sources and not self.data.rooms:
-            raise ValueError("data.rooms must be at least 1, because `rooms` is a source")
-        if self.objective.generative_weight and not local:
-            raise ValueError(
-                "objective.generative_weight is defined for the local form only: it must be 0"
-            )
-        if self.objects.epochs and not local:
-            raise ValueError("objects.epochs is defined for the local form only: it must be 0")
-        if self.objective.name == "relations" and not self.objects.epochs:
-            raise ValueError(
-                "objects.epochs must be at least 1: the objective `relations` trains no objects"
-            )
-        if self.polish.updates and not local:
-            raise ValueError("polish.updates is defined for the local form only: it must be 0")
+        kind, local = VARIANTS[self.machine.variant], self.machine.form == "local"
+        local_only = {
+            "machine.N": self.machine.N,
+            "objective.generative_weight": self.objective.generative_weight,
+            "objects.epochs": self.objects.epochs,
+            "polish.updates": self.polish.updates,
+        }
+        rules = {
+            "machine.H2 must be 0, because this machine.variant has one hidden layer": (
+                self.machine.H2 and not kind.two_layers
+            ),
+            "machine.G is defined for the local form of the Triway only: it must be 0": (
+                self.machine.G and not (local and kind.implications)
+            ),
+            "data.rooms must be at least 1, because `rooms` is a source": (
+                "rooms" in self.data.sources and not self.data.rooms
+            ),
+            "objects.epochs must be at least 1: the objective `relations` trains no objects": (
+                self.objective.name == "relations" and not self.objects.epochs
+            ),
+        } | {
+            f"{name} is defined for the local form only: it must be 0": value and not local
+            for name, value in local_only.items()
+        }
+        if broken := next((message for message, breaks in rules.items() if breaks), None):
+            raise ValueError(broken)
         return self
 
     @property
@@ -234,7 +234,7 @@ class Config(_Section):
 
 
 def first_error(error: ValidationError) -> str:
-    """Return the place and the message of the first invalid entry."""
+    """Return the path and the message of the first invalid entry."""
     first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"]) or "the file"
-    return f"{place}: {first['msg']}"
+    path = ".".join(str(part) for part in first["loc"]) or "the file"
+    return f"{path}: {first['msg']}"

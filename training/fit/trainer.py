@@ -44,16 +44,15 @@ _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
 # Attributes of the trainer that a checkpoint stores as they are.
 _COUNTERS = ("objects_trained", "best_epoch", "best_score", "updates", "seconds")
-# Function that is called in the first training phase (objects only) with the finished share of it.
+# Function that is called in the first training phase (objects only) with its finished share.
 ObjectProgress = Callable[[float], None]
 # Names of the weights with the full learning rate. The setting `relation_rate` can lower the rate
 # of all other weights. Relation weights can overfit within one epoch.
 _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
-# Function that is called after every update. The arguments are the epoch, the finished share of the
-# epoch and the mean loss in the epoch so far.
+# Function that is called after every update with the epoch, its finished share and its mean loss.
 Progress = Callable[[int, float, float], None]
-# Function that is called with the figures of every finished epoch.
+# Function that is called after every epoch.
 Ended = Callable[[Epoch], None]
 
 
@@ -63,18 +62,10 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
     spec = MachineSpec(
-        variant=shape.variant,
-        V=V,
-        A=data.relations,
-        H1=shape.H1,
-        H2=shape.H2,
-        C=data.room_types,
-        K=shape.K if VARIANTS[shape.variant].factorised else 0,
-        T=len(triples),
-        G=shape.G,
-        N=shape.N,
-        form=shape.form,
-    )
+        shape.variant, V=V, A=data.relations, H1=shape.H1, H2=shape.H2, C=data.room_types,
+        K=shape.K if VARIANTS[shape.variant].factorised else 0, T=len(triples), G=shape.G,
+        N=shape.N, form=shape.form,
+    )  # fmt: skip
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
     with torch.no_grad():
         annotated = data.train.annotated_classes[data.train.source].sum(0)
@@ -105,8 +96,8 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
         classes = torch.from_numpy(e.classes)
         relation, subject, object_ = torch.from_numpy(e.holds).nonzero(as_tuple=True)
         keys = triple_keys(relation, classes[subject], classes[object_], V)
-        place, found = find_triples(machine.triple_keys, keys)
-        per_unit[place[found]] += 1
+        index, exists = find_triples(machine.triple_keys, keys)
+        per_unit[index[exists]] += 1
         logs[classes] += torch.from_numpy(e.counts).log()
         times[classes] += 1
     machine.start_relations(
@@ -276,13 +267,9 @@ class Trainer:
         self.machine.cpu().index_triples()
         machine = self.objective.finish(self.machine, self.train)
         if not self.config.objects.epochs:
-            fine_tune(
-                self.machine,
-                self.data.train,
-                self.config.polish,
-                self.config.objective.room_dropout,
-                self.config.training.seed,
-            )
+            training, dropout = self.config.training, self.config.objective.room_dropout
+            data = self.data.train
+            fine_tune(self.machine, data, self.config.polish, dropout, training.seed)
         return TrainingResult(machine, self.epochs, self.best_epoch, self.seconds)
 
     def _fit_objects(self, progress: ObjectProgress) -> dict[str, Tensor]:

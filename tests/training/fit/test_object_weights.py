@@ -13,7 +13,7 @@ from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from tests.training.fit.test_trainer import small_config
 from training.fit import object_weights as objects
 from training.fit.object_weights import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
-from training.fit.settings import ObjectsConfig, PolishConfig
+from training.fit.settings import FineTuneConfig, ObjectsConfig
 from training.fit.trainer import Trainer
 from training.machines import MachineSpec, build
 from training.machines.chain_samples import unpack_scenes
@@ -205,7 +205,7 @@ def wide_machine(N, variant="triway", form="local", scale=0.5):
 
 
 def store(machine, scenes, seed):
-    fine_tune(machine, scenes, PolishConfig(updates=0, chains=1), 0.5, seed)
+    fine_tune(machine, scenes, FineTuneConfig(updates=0, chains=1), 0.5, seed)
 
 
 def stored(machine):
@@ -256,7 +256,7 @@ def test_chains_come_to_the_data(variant):
         machine.b.fill_(1.0)
         machine.requires_grad_()
         start = machine.W.detach().clone()
-        fine_tune(machine, data, PolishConfig(learning_rate=0.05, **changes), 0.5, 1)
+        fine_tune(machine, data, FineTuneConfig(learning_rate=0.05, **changes), 0.5, 1)
         return machine, float((machine.W.detach() - start).abs().mean())
 
     (before, none), (after, much), (held, little) = (

@@ -64,8 +64,8 @@ def test_the_posterior_and_the_likelihood_are_the_integrals():
     evidence = integral(np.ones_like(MEANS))
     mean = integral(MEANS) / evidence
     second = integral(VARIANCES + np.square(MEANS)) / evidence
-    found, variance = posterior(*PRIOR, *moments(VALUES))
-    assert log_likelihood(*PRIOR, *moments(VALUES)) == pytest.approx(np.log(evidence), abs=1e-4)
+    found, variance = posterior(PRIOR, *moments(VALUES))
+    assert log_likelihood(PRIOR, *moments(VALUES)) == pytest.approx(np.log(evidence), abs=1e-4)
     assert found == pytest.approx(mean, abs=1e-4)
     assert variance == pytest.approx(second - mean**2, rel=2e-3)
 

@@ -14,7 +14,7 @@ from training.datasets.batches import relation_units
 from training.fit.objectives.relation_likelihood import (
     RelationLikelihood,
     bake_word_prior,
-    partly_shown,
+    hide_objects,
     with_counted_residuals,
 )
 from training.fit.settings import ObjectiveConfig
@@ -146,7 +146,7 @@ def test_unknown_units_do_not_change_the_loss(machine):
 def test_the_context_sees_a_share_of_the_objects_uniform_over_scenes():
     """Of 2,000 scenes of 40 objects; five standard errors of the mean and of the spread."""
     v = (torch.rand(2000, 50, generator=torch.Generator().manual_seed(1)) < 0.8).float()
-    shown = partly_shown(v, torch.Generator().manual_seed(0))
+    shown = hide_objects(v, torch.Generator().manual_seed(0))
     assert bool((shown <= v).all())
     share = shown.sum(1) / v.sum(1)
     assert float(share.mean()) == pytest.approx(0.5, abs=5 * 0.3 / 2000**0.5)
@@ -156,7 +156,7 @@ def test_the_context_sees_a_share_of_the_objects_uniform_over_scenes():
 
 def test_the_loss_is_the_mean_over_scenes_and_the_prior_of_one(monkeypatch):
     """With a context that sees all objects."""
-    monkeypatch.setattr("training.fit.objectives.relation_likelihood.partly_shown", lambda v, _: v)
+    monkeypatch.setattr("training.fit.objectives.relation_likelihood.hide_objects", lambda v, _: v)
     scenes, machine = scenes_of({"captions": 0.5}), machine_of("triway")
     batch = whole(scenes)
     nothing = replace(batch, observed=torch.zeros_like(batch.observed))
@@ -252,7 +252,7 @@ def listed_scenes():
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (0.5, 2.0)])
 def test_residuals_maximise_the_likelihood_of_triples_under_a_normal_prior(monkeypatch, weights):
     """At the mode the slope of the log-likelihood is τ δ, with one precision τ for all triples."""
-    monkeypatch.setattr("training.fit.objectives.relation_likelihood.partly_shown", lambda v, _: v)
+    monkeypatch.setattr("training.fit.objectives.relation_likelihood.hide_objects", lambda v, _: v)
     scenes, machine = listed_scenes(), machine_of("triway")
     with torch.no_grad():
         machine.residual.copy_(torch.linspace(-0.3, 0.3, 6))

@@ -67,8 +67,7 @@ class Objective(ABC):
 
 def withhold_rooms(batch: Batch, share: float, generator: torch.Generator) -> Tensor:
     """Return the room types of the batch, (B,), with a share of them hidden (-1)."""
-    hidden = uniform((len(batch),), generator) < share
-    return torch.where(hidden, -1, batch.room)
+    return torch.where(uniform((len(batch),), generator) < share, -1, batch.room)
 
 
 def withhold_counts(batch: Batch, share: float, generator: torch.Generator) -> Batch:
@@ -103,9 +102,9 @@ def relation_nll(
     if not machine.spec.G:
         return nll
     share = uniform((len(r), 1), generator)
-    given = r * observed * (uniform(r.shape, generator) < share)
-    shifted = logits + machine.implied(edges, given, h1)
-    return nll + bernoulli_nll(shifted, r, weight * (1 - given)).sum()
+    condition = r * observed * (uniform(r.shape, generator) < share)
+    shifted = logits + machine.implied(edges, condition, h1)
+    return nll + bernoulli_nll(shifted, r, weight * (1 - condition)).sum()
 
 
 def bernoulli_nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:

@@ -156,9 +156,8 @@ class CompositeLikelihood(Objective):
         """Return the weighted sum of the terms, averaged over the scenes of the batch."""
         total = machine.b.sum() * 0.0
         if self.config.relation_weight:
-            total = total + self.config.relation_weight * self.relation_part(
-                machine, batch, generator
-            )
+            relations = self.relation_part(machine, batch, generator)
+            total = total + self.config.relation_weight * relations
         if self.config.generative_weight:
             room = withhold_rooms(batch, self.config.room_dropout, generator)
             chains = self.chains.loss(machine, batch.v, room, generator)
@@ -175,10 +174,7 @@ class CompositeLikelihood(Objective):
         return total + mean_part(ranking + self.config.presence_weight * presence)
 
     def _log_odds(
-        self,
-        machine: BoltzmannMachine,
-        masked: Masked,
-        generator: torch.Generator,
+        self, machine: BoltzmannMachine, masked: Masked, generator: torch.Generator
     ) -> Tensor:
         """Return the log-odds of each class given the other classes, (scenes, classes)."""
         v, batch = masked.v, masked.batch
