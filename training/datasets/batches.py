@@ -95,8 +95,8 @@ class SceneTensors:
             m = len(e.classes)
             classes[row, :m], counts[row, :m] = e.classes, e.counts
             holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
-        tables = map(torch.from_numpy, (classes, counts, holds, observed))
-        return Batch(self.v[index], *tables, self.room[index], self.source[index])
+        tensors = [torch.from_numpy(table) for table in (classes, counts, holds, observed)]
+        return Batch(self.v[index], *tensors, self.room[index], self.source[index])
 
 
 def scene_tensors(

@@ -114,7 +114,8 @@ def _pairs(observed: ObservedOffsets) -> Pairs:
     mean = _sums(pair, weights * observed.offset, P) / n
     squares = np.square(observed.offset - mean[pair]) + _RESOLUTION**2
     scenes = np.bincount(pair[first], minlength=P)
-    return Pairs(*distinct.T, scenes, n, mean, _sums(pair, weights * squares, P))
+    subject, other = distinct.T
+    return Pairs(subject, other, scenes, n, mean, _sums(pair, weights * squares, P))
 
 
 def _sums(group: Ints, values: Floats, groups: int) -> Floats:
