@@ -95,17 +95,14 @@ class SceneTensors:
             m = len(e.classes)
             classes[row, :m], counts[row, :m] = e.classes, e.counts
             holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
-        tensors = [torch.from_numpy(table) for table in (classes, counts, holds, observed)]
-        return Batch(self.v[index], *tensors, self.room[index], self.source[index])
+        tables = map(torch.from_numpy, (classes, counts, holds, observed))
+        return Batch(*(self.v[index], *tables, self.room[index], self.source[index]))
 
 
 def scene_tensors(
     scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], size: int
 ) -> SceneTensors:
-    """Return encoded scenes as tensors.
-
-    Args:
-        annotated: maps the name of a data source to the classes that it mentions, (classes,) bool.
+    """Return encoded scenes as tensors. `annotated` has the classes, (classes,), of each source.
 
     Raises:
         ValueError: `annotated` has no entry for the source of a scene.

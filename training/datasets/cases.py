@@ -154,10 +154,8 @@ def occupied_place(
     """Draw a place that is related to a shown object and contains another object.
 
     The draw ignores whether the object at the place is shown or hidden. If only places of hidden
-    objects were drawn, a missing object would seem more likely at every place.
-
-    Args:
-        shown: True for shown objects, (instances,) bool.
+    objects were drawn, a missing object would seem more likely at every place. `shown` is True for
+    shown objects, (instances,).
 
     Returns:
         The canonical relation of the place, and the index of the shown object, which is the object
@@ -177,10 +175,10 @@ def occupied_place(
 def altered_case(
     encoded: EncodedScene, structure: Flags, rng: Rng
 ) -> tuple[Scene, Triple | None] | None:
-    """Return a scene with observed relations, of which one may be false, and the false relation.
+    """Return a scene with observed relations, and their false triple (relation, subject, object).
 
-    Half of the scenes have a false triple (relation, subject, object) in place of a true triple. In
-    the other half, all triples are true, and the false triple is None.
+    Half of the scenes have a false triple in place of a true triple. In the other half, all triples
+    are true, and the false triple is None.
     """
     triples = stated_relations(encoded, structure, rng)
     if triples is None:
@@ -226,10 +224,8 @@ def logistic(
 ) -> list[float]:
     """Return the coefficients and then the intercept of a logistic regression.
 
-    Args:
-        weight: weight of each example, (examples,). None means equal weights.
-        C: inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
-            unweighted examples are separable.
+    C is the inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
+    examples without `weight`, (examples,), are separable.
     """
     fit = LogisticRegression(C=C, max_iter=1000).fit(features, truth, weight)
     return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]

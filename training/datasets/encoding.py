@@ -43,20 +43,16 @@ class EncodedScene:
     """One scene, encoded with a vocabulary.
 
     Attributes:
-        scene_id, source, group: id, data source and group of near-duplicates of the annotated
-            scene.
+        scene_id, source, group: as in the annotated scene.
         room_type: index of the room type. -1 means that the room type is unknown.
         evidence: classes of the scene, and relations between classes.
         instance_classes: class index of each object instance, (instances,) int64.
-        instance_holds: True where a relation between two instances holds, (relations, instances,
-            instances) bool.
-        instance_observed: True where the truth of the relation is known, shaped like
-            `instance_holds`.
-        unknown: distinct labels outside the vocabulary, sorted. Objects with such a label are left
-            out.
-        instance_positions: centres of the instances in metres, (instances, 3). The axes are the
-            viewer axes from which relations were derived. NaN means an unknown centre. None means
-            that the relations do not come from positions.
+        instance_holds, instance_observed: True where a relation between two instances holds, and
+            where its truth is known, (relations, instances, instances) bool.
+        unknown: distinct labels outside the vocabulary, sorted. Their objects are left out.
+        instance_positions: centres of the instances in metres, (instances, 3), in the viewer axes
+            from which relations were derived. NaN means an unknown centre. None means that the
+            relations do not come from positions.
         weight: weight of the scene in the training of objects.
         complete: True if the object list of the scene is nearly complete; see `Meaning`.
     """
@@ -255,11 +251,9 @@ def _add_supports(relations: PoseRelations, objects: Sequence[AnnotatedObject]) 
 def room_viewpoint(scene_id: str, positions: Floats) -> Viewpoint:
     """Return a viewpoint at the middle of one side of the room, facing inwards.
 
-    The room is the bounding box of the object centres. A hash of the scene id selects the side, so
-    the viewpoint of a scene never changes. Over many scenes, all four sides occur.
-
-    Args:
-        positions: centres of the objects in metres, (objects, 3). Rows with NaN are ignored.
+    The room is the bounding box of the object centres in metres, (objects, 3). Centres with NaN are
+    ignored. A hash of the scene id selects the side, so the viewpoint of a scene never changes.
+    Over many scenes, all four sides occur.
 
     Raises:
         ValueError: no object has a position.

@@ -18,18 +18,17 @@ class Names:
     """The content of `vocabularies/names.toml`. Each attribute is a table or list of the file.
 
     Attributes:
-        base: common classes, which every indoor vocabulary contains.
-        household: rare household objects, which every indoor vocabulary also contains.
+        base, household: common classes, and rare household objects. Every indoor vocabulary
+            contains them.
         structure: classes such as walls. The service accepts these classes in requests but never
             proposes them.
         not_objects: labels that never become a class.
-        surroundings: outdoor structures such as buildings. Indoor vocabularies exclude them.
-        outdoor: outdoor objects. Indoor vocabularies exclude them.
+        surroundings, outdoor: outdoor structures such as buildings, and outdoor objects. Indoor
+            vocabularies exclude them.
         aliases: maps each class to its other names.
         kinds: maps each class to more specific names. If a vocabulary lacks a specific name, the
             name can become an alias of the class.
-        rooms: maps each room type to its other names. The key "" lists names that mean no room
-            type.
+        rooms: maps each room type to its other names. The key "" lists names without a room type.
     """
 
     base: tuple[str, ...] = ()

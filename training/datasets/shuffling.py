@@ -34,9 +34,7 @@ def shuffle_objects(
     """Permute classes between scenes of all data sources, and room types between scenes.
 
     Structure classes are exchanged only with structure classes, because their relations are
-    unobserved. Counts, confidences and relations stay with their slots. Room types are permuted
-    among the scenes with a room type. Scene ids, sources, groups and unknown labels
-    stay unchanged.
+    unobserved. Room types are permuted among the scenes with a room type.
 
     Raises:
         ValueError: a class index of a scene exceeds the length of `structure`.

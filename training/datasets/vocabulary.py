@@ -36,11 +36,9 @@ def build_vocabulary(
     """Collect the frequent classes of scenes with their aliases, most frequent class first.
 
     A label counts for its curated name. The base and household classes of ``names`` are always
-    included. Labels in ``names.not_objects`` are always excluded.
-
-    Args:
-        minimum_rooms: minimum number of scenes of a room type. The default is ``minimum``.
-        outdoor: True includes the labels in ``names.outdoor`` and ``names.surroundings``.
+    included. Labels in ``names.not_objects`` are always excluded, and those in ``names.outdoor``
+    and ``names.surroundings`` unless ``outdoor`` is True. ``minimum_rooms`` is the minimum number
+    of scenes of a room type, by default ``minimum``.
 
     Raises:
         ValueError: every class has fewer objects than the minimum.
@@ -105,8 +103,7 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
 def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
     """Return the vocabulary with the curated synonyms of its classes, and of kinds that it lacks.
 
-    The classes, their order and their sizes stay the same. The default of `names` is
-    `vocabularies/names.toml`.
+    The classes, their order and their sizes stay the same.
     """
     names = names or curated_names()
     objects = []
@@ -132,7 +129,7 @@ def with_room_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Voc
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
-    """Read a vocabulary from a JSON file. `vocabulary_json` returns the format.
+    """Read a vocabulary from a JSON file in the format of `vocabulary_json`.
 
     Raises:
         OSError: the file cannot be read.
@@ -149,11 +146,10 @@ def indoor_vocabulary() -> Vocabulary:
 def source_vocabulary(
     scenes: Iterable[AnnotatedScene], *, minimum: int = MINIMUM_MENTIONS
 ) -> Vocabulary:
-    """Build a vocabulary that contains only classes of the scenes, without the base classes.
+    """Build a vocabulary of the classes of one data source, without the base classes.
 
-    The vocabulary is for models trained on one data source, such as ProcTHOR or VRD. Because it has
-    few classes, more specific names become aliases. For example, "dining table" becomes an alias of
-    "table".
+    Because it has few classes, more specific names become aliases. For example, "dining table"
+    becomes an alias of "table".
     """
     names = curated_names()
     # An empty entry preserves the curated spelling of a class without aliases.
@@ -173,15 +169,12 @@ def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> Obj
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
-    """Add the typical size of each class, the median size of its boxes.
+    """Add the typical size of each class, the median size of its boxes in the scenes.
 
     The service uses the typical size for objects without a size, whose yaw is also unknown. The
     typical footprint is therefore a square. The side of the square is the median of sqrt(dx * dy),
-    which preserves the area.
-
-    Args:
-        vocabulary: the classes. A class with fewer than `MINIMUM_BOXES` boxes stays unchanged.
-        scenes: the scenes. Objects without a size and flat objects are skipped.
+    which preserves the area. A class with fewer than `MINIMUM_BOXES` boxes stays unchanged. Objects
+    without a size and flat objects are skipped.
     """
     boxes: dict[int, list[tuple[float, float]]] = {}
     index_of = cache(vocabulary.index)
@@ -202,8 +195,7 @@ def coverage(
 ) -> float:
     """Return the share of the objects in scenes whose label is in a vocabulary.
 
-    Args:
-        structure: True also counts objects of structure classes such as walls.
+    Objects of structure classes such as walls count only if `structure` is True.
 
     Raises:
         ValueError: the scenes contain no objects.

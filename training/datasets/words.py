@@ -79,14 +79,10 @@ class WordVectors:
 
 
 def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, Flags]:
-    """Return the word vectors of the classes of a vocabulary.
+    """Return the unit vectors of the classes, (classes, dimensions), and a mask of known vectors.
 
     The vector of a class is the vector of its label. If the label has no vector, the vector of the
-    first alias with a vector is used.
-
-    Returns:
-        Vectors of length 1, (classes, dimensions) float32, and a mask (classes,) bool. The mask is
-        True for classes with a vector. The vector of any other class is zero.
+    first alias with a vector is used. The vector of any other class is zero.
     """
     vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
     known = np.zeros(len(vocabulary), dtype=np.bool_)
@@ -126,10 +122,7 @@ def read_word_vectors(path: Path) -> WordVectors:
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """Read one array of the archive, after a check of its declared size.
-
-    Pickled arrays are refused, because unpickling can run code of the file.
-    """
+    """Read one array of at most `MAX_BYTES`. Unpickling can run code, so pickles are refused."""
     if f"{name}.npy" not in archive.namelist():
         raise DatasetError(path, name, "is missing")
     with archive.open(f"{name}.npy") as file:

@@ -89,11 +89,7 @@ def calibrate(
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> Calibration:
-    """Fit every entry of the calibration.
-
-    Args:
-        chosen: a calibration from which some values are copied; see `calibrate_objects`.
-    """
+    """Fit every entry of the calibration. `calibrate_objects` copies some values of `chosen`."""
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     objects = calibrate_objects(artifact, scenes, train, structure, seed, chosen)
     artifact = replace(artifact, calibration=objects)
@@ -239,8 +235,7 @@ def _fit_curve(
     """Fit one rising curve from logits to log-odds, for all relations, to the listed examples.
 
     The curve makes the mean probability equal to the share of true relations over all data sources.
-    A rising curve keeps the ranking of relations. The ranking comes from `slopes`, a fit in which
-    sources have similar weights.
+    It keeps the ranking by `slopes`, a fit in which sources have similar weights.
     """
     best = _among_best(examples, slopes, listed) & (examples[:, _TRUTH] != _UNKNOWN)
     examples = examples[best]
@@ -263,8 +258,8 @@ def rising_curve(
     A penalty on changes of slope stabilises the curve where examples are few.
 
     Returns:
-        Intercept and slope of the line at the lowest logits, and the bends of the curve. A bend is
-        a pair (logit, change of slope); see `PairSlope`.
+        Intercept and slope of the line at the lowest logits, and the bends (logit, change of slope)
+        of the curve; see `PairSlope`.
     """
     at = np.quantile(logits, np.linspace(0, 1, _BENDS + 2)[1:-1])
     edges = np.concatenate([[-np.inf], at, [np.inf]])

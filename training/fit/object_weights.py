@@ -63,11 +63,7 @@ _FINE_TUNED_SWEEPS = 50
 
 @dataclass
 class _Chains:
-    """Persistent Gibbs chains.
-
-    The fields are the presence of objects (chains, classes), the two layers of hidden units and the
-    index of the room type of each chain.
-    """
+    """Objects, (chains, classes), hidden units of both layers and room types of Gibbs chains."""
 
     v: Tensor
     h1: Tensor
@@ -82,12 +78,9 @@ def fit_objects(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> None:
-    """Train the object weights b, c1, c2, W, J and Q of a machine of the local form, in place.
+    """Train b, c1, c2, W, J and Q of a machine of the local form, in place; not with 0 epochs.
 
-    Args:
-        train: training scenes. Scenes with incomplete object lists are left out.
-        config: epochs, learning rate, number of chains and batch size. With 0 epochs, the machine
-            stays unchanged.
+    Scenes with incomplete object lists are left out.
 
     Raises:
         FloatingPointError: a weight became infinite or NaN.
@@ -155,10 +148,8 @@ def store_samples(
 ) -> None:
     """Store samples in the machine: the final states of N long Gibbs chains.
 
-    Each chain starts at a training scene, and its sample has the room type of that scene.
-
-    Args:
-        room_dropout: share of the chains that run without a room type.
+    Each chain starts at a training scene, and its sample has the room type of that scene. A share
+    of the chains, `room_dropout`, runs without a room type.
     """
     if not machine.spec.N:
         return
@@ -264,9 +255,8 @@ def fine_tune(
     keeps the conditionals accurate. The function then stores N samples. They come from chains with
     the averaged weights, and each sample has the room type of the scene where its chain started.
 
-    Args:
-        config: number of updates and chains. With 0 updates and N = 0, the machine stays unchanged.
-        room_dropout: share of chains and scenes without a room type.
+    With 0 updates and N = 0, the machine stays unchanged. A share of the chains and scenes,
+    `room_dropout`, has no room type.
     """
     if not config.updates and not machine.spec.N:
         return

@@ -66,8 +66,7 @@ class Clamp:
     """Units that a Gibbs chain keeps at their value, and observed relations.
 
     Attributes:
-        v, h1, h2: bool masks of the clamped units, broadcastable to v, h1 and h2 of `State`. None
-            clamps no unit.
+        v, h1, h2: bool masks of the clamped units, broadcastable to `State`; None clamps no unit.
         edges, r, observed: observed relations, as in `Evidence`. In a Triway machine, both objects
             of an observed relation must be clamped as present.
         room: index of the room type of each chain, (chains,) int64.
@@ -101,10 +100,7 @@ FREE = Clamp()
 def initial_state(
     machine: BoltzmannMachine, v: Tensor, generator: torch.Generator, clamp: Clamp = FREE
 ) -> State:
-    """Return a start state with the objects v.
-
-    The hidden units h1 and h2 are sampled from their biases, and the relations r given v and h1.
-    """
+    """Return the objects v, h1 and h2 sampled from their biases, and relations given v and h1."""
     rows = len(v)
     h1 = bernoulli(machine.context_bias(clamp.room).sigmoid().expand(rows, -1), generator)
     h2 = bernoulli(machine.c2.sigmoid().expand(rows, -1), generator)
@@ -236,8 +232,8 @@ def sample_relations(
     """Sample the relations r given v and h1. Observed relations keep their value.
 
     Returns:
-        The layout of the relation units that can be 1 given v, and their values r, (chains, units).
-        In a Triway machine, the units between the classes of `clamp.edges` come first.
+        The units that can be 1 given v, and their values r, (chains, units). In a Triway machine,
+        the units between the classes of `clamp.edges` come first.
     """
     edges, r, observed = machine.open_units(v, clamp.relations, widest(v, generator))
     logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)

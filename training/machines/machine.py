@@ -206,15 +206,13 @@ class BoltzmannMachine(nn.Module, ABC):
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
         """Return the part of each candidate's log-odds that comes from its unobserved relations.
 
+        For candidate i, the part is log sum_{R_i} exp(-E) at v_i = 1 minus the same at v_i = 0,
+        given h1. R_i are the relations of i. The terms b_i + W_i·h1 are left out.
+
         Args:
             v: presence of objects, (..., scenes, classes). Each candidate counts as absent.
             edges: relation units of the scene. The units of a candidate are unobserved.
             candidates: class indices, (scenes or 1, candidates) int64.
-
-        Returns:
-            Part of the log-odds of each candidate i, (..., scenes, candidates). The part is
-            log sum_{R_i} exp(-E) at v_i = 1 minus log sum_{R_i} exp(-E) at v_i = 0, given h1. R_i
-            are the relations of i. The terms b_i + W_i·h1 are left out.
         """
 
     @abstractmethod
@@ -285,14 +283,11 @@ class BoltzmannMachine(nn.Module, ABC):
     # -- the relation part ----------------------------------------------------------------------
 
     def relation_term(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Return the term of each relation unit in log sum_{unobserved r} exp(-E), given h1.
-
-        The result has the shape (..., scenes, units).
+        """Return the term of each unit in log sum_{unobserved r} exp(-E), (..., scenes, units).
 
         Args:
             logits, gate: logit ℓ_e and gate of each relation unit, (..., scenes, units).
-            r: values of the observed relations. Values of unobserved relations are ignored.
-            observed: bool, broadcastable to `logits`.
+            r, observed: values and bool mask of the observed relations, broadcastable to `logits`.
         """
         summed = softplus(logits)
         if not self.relations_act:
@@ -311,8 +306,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def context_bias(self, room: Tensor | None) -> Tensor:
         """Return the bias c1 + Q[t] of the hidden units, (scenes or 1, hidden units).
 
-        Args:
-            room: index t of the room type of each scene, (scenes,) int64. -1 means unknown.
+        The room type t of a scene is its entry of `room`, (scenes,) int64. -1 means unknown.
         """
         if room is None or not self.spec.C:
             return self.c1.unsqueeze(0)
@@ -327,10 +321,7 @@ class BoltzmannMachine(nn.Module, ABC):
         edges: Edges,
         room: Tensor | None = None,
     ) -> Tensor:
-        """Return the energy E(v, r, h1, h2), (..., scenes).
-
-        The energy is +inf if a relation unit with gate 0 is 1.
-        """
+        """Return the energy E(v, r, h1, h2), (..., scenes); +inf if a unit with gate 0 is 1."""
         gate = self.gate(edges, v)
         logits = self.relation_logits(edges, v, h1)
         observed = torch.ones_like(gate, dtype=torch.bool)
@@ -388,12 +379,9 @@ class BoltzmannMachine(nn.Module, ABC):
     def free_energy_given(
         self, v: Tensor, context: Tensor, h2: Tensor | None = None, room: Tensor | None = None
     ) -> Tensor:
-        """Return the free energy of the object part, (..., scenes).
+        """Return -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k, (..., scenes).
 
-        The value is -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k.
-
-        Args:
-            context: addition to the logits of the hidden units h1, (..., scenes, hidden units).
+        The context is an addition to the logits of h1, (..., scenes, hidden units).
         """
         free = -(v @ self.b)
         x = self.context_bias(room) + v @ self.W + context

@@ -32,11 +32,11 @@ class LogPartition:
     """An estimate of log Z.
 
     Attributes:
-        log_z: estimate of log Z. Forward runs use the log of the mean weight w over chains. Reverse
-            runs use minus the log of the mean inverse weight.
+        log_z: log of the mean weight w over chains in forward runs, and minus the log of the mean
+            inverse weight in reverse runs.
         standard_error: standard error of log_z, by the delta method over chains.
-        bound: mean of log w over chains. In expectation, it is a lower bound of log Z for forward
-            runs, and an upper bound for reverse runs.
+        bound: mean of log w. In expectation, it is a lower bound of log Z for forward runs, and an
+            upper bound for reverse runs.
     """
 
     log_z: float
@@ -60,13 +60,10 @@ class LogPartition:
 
 
 def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> BoltzmannMachine:
-    """Return the base machine at beta = 0, which has independent objects.
+    """Return the base machine at beta = 0, with independent objects of log-odds b, (classes,).
 
     The relation units of an RBM or GBM keep their bias d. The relation units of a Triway contribute
     a factor of one to Z.
-
-    Args:
-        b: log-odds of the objects, (classes,). The default is the bias b of the machine.
     """
     base = build(machine.spec).to(machine.b.dtype).requires_grad_(False)
     with torch.no_grad():
