@@ -9,7 +9,7 @@ from torch import Tensor
 
 from app.inference.variants import VARIANTS
 from training.machines import BoltzmannMachine, MachineSpec, build
-from training.machines.gibbs import State
+from training.machines.machine import State
 
 TRIPLES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 1, 0)]
 

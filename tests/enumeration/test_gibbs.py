@@ -16,7 +16,8 @@ import torch
 
 from tests.enumeration.small_machines import SMALL, draw_states, enumerate_joint, small_machine
 from training.machines.edges import present_classes
-from training.machines.gibbs import FREE, Clamp, State, gibbs_step, initial_state
+from training.machines.gibbs import FREE, Clamp, gibbs_step, initial_state
+from training.machines.machine import State
 
 CHAINS = 60_000
 

@@ -51,7 +51,7 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
             continue
         if not all(map(label_key, names)) or label_key(names[0]) == label_key(names[1]):
             continue
-        things = tuple(AnnotatedObject(str(place), name) for place, name in enumerate(names))
+        things = tuple(AnnotatedObject(str(index), name) for index, name in enumerate(names))
         group = " ".join(names)
         listed = ((0, relation, 1),)
         scenes.append(AnnotatedScene(where, SOURCE, group, None, things, listed))

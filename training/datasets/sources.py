@@ -224,9 +224,9 @@ def meaning_of(source: str, *, listed: bool = True) -> Meaning:
         listed: True if the scene lists relations. Only unknown sources, and sources without a fixed
             meaning, depend on this argument.
     """
-    known = SOURCES.get(source)
-    if known is not None and known.meaning is not None:
-        return known.meaning
+    entry = SOURCES.get(source)
+    if entry is not None and entry.meaning is not None:
+        return entry.meaning
     return LISTS if listed else BOXES
 
 
@@ -236,9 +236,9 @@ def relation_of(source: str, predicate: str) -> str | None:
     Raises:
         ValueError: the predicate is unknown, and the data source has no table of predicates.
     """
-    known = SOURCES.get(source)
-    if known is not None and known.predicates is not None and predicate not in RELATIONS:
-        return known.predicates.get(predicate)
+    entry = SOURCES.get(source)
+    if entry is not None and entry.predicates is not None and predicate not in RELATIONS:
+        return entry.predicates.get(predicate)
     if predicate not in RELATIONS:
         raise ValueError(f"unknown relation {predicate!r}: must be one of {', '.join(RELATIONS)}")
     return predicate

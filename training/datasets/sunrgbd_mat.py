@@ -42,9 +42,9 @@ _BLOCK = 20
 def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
     """Read all camera frames with boxes as scenes.
 
-    The file ``<sequenceName>/scene.txt`` gives the room type, if the image folders are in the same
-    folder as the MATLAB file. Frames of one SUN3D place are in one group. Other frames form groups
-    of 20 consecutive frames from one sensor and collection.
+    ``<sequenceName>/scene.txt`` in the folder of the MATLAB file gives the room type. Frames of one
+    SUN3D place are in one group. Other frames form groups of 20 consecutive frames from one sensor
+    and collection.
 
     Raises:
         DatasetError: the file does not have the official format, or has more than `MAX_BYTES`.

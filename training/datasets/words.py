@@ -79,18 +79,18 @@ class WordVectors:
 
 
 def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, Flags]:
-    """Return the unit vectors of the classes, (classes, dimensions), and a mask of known vectors.
+    """Return the unit vectors of the classes, (classes, dimensions), and a mask of known ones.
 
     The vector of a class is the vector of its label. If the label has no vector, the vector of the
     first alias with a vector is used. The vector of any other class is zero.
     """
     vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
-    known = np.zeros(len(vocabulary), dtype=np.bool_)
+    has_vector = np.zeros(len(vocabulary), dtype=np.bool_)
     for index, entry in enumerate(vocabulary.objects):
         named = map(words.of, (entry.label, *entry.aliases))
         if (vector := next((one for one in named if one is not None), None)) is not None:
-            vectors[index], known[index] = vector, True
-    return vectors, known
+            vectors[index], has_vector[index] = vector, True
+    return vectors, has_vector
 
 
 def read_word_vectors(path: Path) -> WordVectors:

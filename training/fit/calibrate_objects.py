@@ -60,8 +60,7 @@ EVIDENCE_WEIGHTS = (0.0, 0.1, 0.2, 0.5, 1.0)
 LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
 # Lists of up to `_SHORT_LISTS` classes have separate thresholds, until the threshold of whole
 # scenes raises alarms in at most `_ENOUGH` times the target share of the shortened lists. Each
-# threshold is fitted to at least `_SHORTENED` shortened lists; few scenes are shortened several
-# times.
+# threshold is fitted to at least `_SHORTENED` lists; few scenes are shortened several times.
 _SHORT_LISTS = 8
 _ENOUGH = 1.5
 _SHORTENED = 200

@@ -136,8 +136,7 @@ class _Cases:
 
     Attributes:
         index: (N,) the class.
-        listed: (N,) number of listed instances, from 1 to `number`.
-        number: (N,) number of instances in the scene.
+        listed, number: (N,) numbers of instances, listed (from 1 to `number`) and in the scene.
         features: (N, 3 + C + V) features of the listed part, in the columns of `Counts.weights`.
         weight: (N,) weight that balances the data sources.
     """
@@ -159,9 +158,9 @@ class _Cases:
         for row, scene in enumerate(scenes):
             counted, source = counting[scene.source], names.index(scene.source)
             for seed in range(_DRAWS):
-                part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
-                rows += [_features(part, k, start) for k in asked.tolist()]
-                numbers = np.stack([part.classes, part.listed, part.number])[:, asked]
+                part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
+                rows += [_features(part, k, start) for k in indices.tolist()]
+                numbers = np.stack([part.classes, part.listed, part.number])[:, indices]
                 cases += [(*case, row, source) for case in numbers.T.tolist()]
         index, listed, number, scene_rows, sources = np.array(cases, dtype=np.int64).T
         columns, values = (np.concatenate(some) for some in zip(*rows, strict=True))
@@ -241,17 +240,17 @@ def _better_than_mean(
         for scene in test:
             for seed in range(_DRAWS):
                 counted = counting[scene.source]
-                part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
-                classes, change = _changes(counts, part, asked, len(vocabulary))
+                part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
+                classes, change = _changes(counts, part, indices, len(vocabulary))
                 gain[classes] -= change
     return gain > 0
 
 
-def _changes(counts: Counts, part: Part, asked: NDArray[np.intp], V: int) -> tuple[Ints, Floats]:
+def _changes(counts: Counts, part: Part, indices: NDArray[np.intp], V: int) -> tuple[Ints, Floats]:
     """Return classes (k,), and error of the expected number minus error of the mean."""
     room = part.room if part.room >= 0 else None
     which, p = distribution(counts, V, part.classes, part.listed, room)
-    usable = np.isin(which, asked)
+    usable = np.isin(which, indices)
     which, expected = which[usable], p[usable] @ np.arange(1, MOST + 1)
     classes, number = part.classes[which], part.number[which]
     mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[which])

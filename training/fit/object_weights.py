@@ -36,7 +36,8 @@ from training.fit.settings import FineTuneConfig, ObjectsConfig
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
 from training.machines.chain_samples import pack_scenes
-from training.machines.gibbs import Clamp, State, initial_state, run
+from training.machines.gibbs import Clamp, initial_state, run
+from training.machines.machine import State
 from training.machines.mean_field import Evidence, mean_field
 
 OBJECT_WEIGHTS = ("b", "c1", "c2", "W", "J", "Q")

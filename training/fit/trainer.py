@@ -147,7 +147,7 @@ class Trainer:
         self.optimiser = self._optimiser()
         self.steps_per_epoch = math.ceil(len(self.train) / config.training.batch_size)
         self.scheduler = self._scheduler()
-        self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
+        self.average = self._copies()
         self.updates = 0
         self.epochs: list[Epoch] = []
         self.best: dict[str, Tensor] = {}
@@ -155,6 +155,9 @@ class Trainer:
         self.seconds = 0.0
         self.objects_trained = not config.objects.epochs
         self._drawn = -math.inf
+
+    def _copies(self) -> dict[str, Tensor]:
+        return {name: p.detach().clone() for name, p in self.machine.named_parameters()}
 
     def _placed(self) -> torch.device | nullcontext[None]:
         """Return a context in which new tensors are on the device."""
@@ -170,30 +173,28 @@ class Trainer:
 
     def _optimiser(self) -> torch.optim.Optimizer:
         t = self.config.training
-        matrices: list[Tensor] = []
-        biases: list[Tensor] = []
-        relations: list[Tensor] = []
+        groups: tuple[list[Tensor], list[Tensor], list[Tensor]] = ([], [], [])
+        matrices, biases, relations = groups
         for name, parameter in self.machine.named_parameters():
             if not parameter.requires_grad:
                 continue
             group = matrices if parameter.dim() > 1 else biases
             (group if name in _FULL_RATE else relations).append(parameter)
-        rate = t.learning_rate * t.relation_rate
         biases += self.objective.parameters()
-        groups = [
-            {"params": matrices, "weight_decay": t.weight_decay, "lr": t.learning_rate},
-            {"params": biases, "weight_decay": 0.0, "lr": t.learning_rate},
-            {"params": relations, "weight_decay": t.relation_decay, "lr": rate},
+        decays = t.weight_decay, 0.0, t.relation_decay
+        rates = t.learning_rate, t.learning_rate, t.learning_rate * t.relation_rate
+        settings = [
+            {"params": group, "weight_decay": decay, "lr": rate}
+            for group, decay, rate in zip(groups, decays, rates, strict=True)
         ]
-        if t.optimiser == "sgd":
-            return torch.optim.SGD(groups, lr=t.learning_rate, fused=True)
-        return torch.optim.AdamW(groups, lr=t.learning_rate, fused=True)
+        kind = torch.optim.SGD if t.optimiser == "sgd" else torch.optim.AdamW
+        return kind(settings, lr=t.learning_rate, fused=True)
 
     def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
         """Return the schedule of the learning rate.
 
-        In the one-cycle schedule, the rate rises linearly over the first tenth of the updates. It
-        then falls to 0 along a cosine.
+        In the one-cycle schedule, it rises over the first tenth of the updates, and then falls to 0
+        along a cosine.
         """
         t = self.config.training
         if t.schedule == "constant":
@@ -251,7 +252,7 @@ class Trainer:
             state = distributed.on_first(partial(self._fit_objects, objects))
             self.machine.load_state_dict(state)
             self.objects_trained = True
-            self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
+            self.average = self._copies()
             self.seconds += time.perf_counter() - began
             self._save()
         while len(self.epochs) < self.config.training.epochs and not self._out_of_patience():
@@ -260,10 +261,9 @@ class Trainer:
             if ended is not None:
                 ended(self.epochs[-1])
         self._draw()
-        parameters = dict(self.machine.named_parameters())
         with torch.no_grad():
             for name, value in self.best.items():
-                parameters[name].copy_(value)
+                self.machine.get_parameter(name).copy_(value)
         self.machine.cpu().index_triples()
         machine = self.objective.finish(self.machine, self.train)
         if not self.config.objects.epochs:
@@ -328,8 +328,7 @@ class Trainer:
     @torch.no_grad()
     def _close_epoch(self, number: int, loss: float, began: float) -> None:
         """Evaluate the weights, or their average, on validation scenes. Keep the best weights."""
-        parameters = dict(self.machine.named_parameters())
-        current = {name: p.detach().clone() for name, p in parameters.items()}
+        parameters, current = dict(self.machine.named_parameters()), self._copies()
         if self.config.training.averaging:
             for name, p in parameters.items():
                 p.copy_(self.average[name])
@@ -344,7 +343,7 @@ class Trainer:
         score = mrr + (0.0 if math.isnan(precision) else precision)
         if score > self.best_score or self.objective.keeps_last:
             self.best_score, self.best_epoch = score, number
-            self.best = {name: p.detach().clone() for name, p in parameters.items()}
+            self.best = self._copies()
         for name, p in parameters.items():
             p.copy_(current[name])
         seconds = time.perf_counter() - began

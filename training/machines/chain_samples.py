@@ -32,8 +32,8 @@ from torch.nn.functional import logsigmoid
 from app.inference import weights
 from app.inference.chains import OTHER_ROOM
 from training.machines.bernoulli import bernoulli
-from training.machines.gibbs import FREE, Clamp, State, bare_state, initial_state
-from training.machines.machine import BoltzmannMachine
+from training.machines.gibbs import FREE, Clamp, bare_state, initial_state
+from training.machines.machine import BoltzmannMachine, State
 from training.machines.mean_field import Evidence, mean_field
 
 

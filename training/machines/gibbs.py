@@ -31,7 +31,7 @@ from torch.nn.functional import embedding_bag
 from training.machines.bernoulli import bernoulli, integers, uniform
 from training.machines.distributed import widest
 from training.machines.edges import Edges
-from training.machines.machine import BoltzmannMachine
+from training.machines.machine import BoltzmannMachine, State
 from training.machines.mean_field import Evidence, mean_field
 
 _PROPOSAL_BLOCKS = 8
@@ -41,24 +41,6 @@ _RELATION_GROUPS = 4
 # objects exceeds _PRESENT.
 _CHAINS = 16
 _PRESENT = 0.12
-
-
-@dataclass(frozen=True)
-class State:
-    """The state of several Gibbs chains.
-
-    Attributes:
-        v: presence of objects, (chains, classes).
-        h1, h2: hidden units of each layer, (chains, hidden units).
-        r: values of the relation units, (chains, units).
-        edges: layout of the relation units in r.
-    """
-
-    v: Tensor
-    h1: Tensor
-    h2: Tensor
-    r: Tensor
-    edges: Edges
 
 
 @dataclass(frozen=True)
@@ -154,9 +136,7 @@ def reconstruct(
     if machine.spec.H2:
         drawn = bernoulli(machine.second_layer_logits(h1).sigmoid(), generator)
         h2 = _keep(clamp.h2, h2, drawn)
-    v = machine.sample_objects(
-        *(state.v, h1, state.r, state.edges, generator), held=clamp.v, collapsed=collapsed
-    )
+    v = machine.sample_objects(state, generator, held=clamp.v, collapsed=collapsed)
     v = _keep(clamp.v, state.v, v)
     if not relations:
         return replace(state, v=v, h2=h2)

@@ -22,6 +22,7 @@ Tensor dimensions: "..." stands for samples. They come first, then scenes, then 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Self
 
 import torch
@@ -31,6 +32,24 @@ from torch.nn.functional import softplus
 from app.inference.variants import MachineSpec
 from training.machines.bernoulli import bernoulli
 from training.machines.edges import Edges, PairEdges, triple_keys
+
+
+@dataclass(frozen=True)
+class State:
+    """The state of several Gibbs chains.
+
+    Attributes:
+        v: presence of objects, (chains, classes).
+        h1, h2: hidden units of each layer, (chains, hidden units).
+        r: values of the relation units, (chains, units).
+        edges: layout of the relation units in r.
+    """
+
+    v: Tensor
+    h1: Tensor
+    h2: Tensor
+    r: Tensor
+    edges: Edges
 
 
 class BoltzmannMachine(nn.Module, ABC):
@@ -240,26 +259,16 @@ class BoltzmannMachine(nn.Module, ABC):
         return None
 
     def sample_objects(
-        self,
-        v: Tensor,
-        h1: Tensor,
-        r: Tensor,
-        edges: Edges,
-        generator: torch.Generator,
-        *,
-        held: Tensor | None = None,
-        collapsed: bool = True,
+        self, state: State, generator: torch.Generator, *, held: Tensor | None, collapsed: bool
     ) -> Tensor:
-        """Sample the objects v given the hidden units h1, (scenes, classes); see `gibbs`.
-
-        In some forms of the energy, v also depends on the relations r.
+        """Sample the objects v given the other units, (scenes, classes); see `gibbs`.
 
         Args:
             held: bool, broadcastable to v. True marks objects that keep their value.
             collapsed: True sums out the unobserved relations that affect objects.
         """
-        del v, r, edges, held, collapsed
-        return bernoulli(self._object_input(h1).sigmoid_(), generator)
+        del held, collapsed
+        return bernoulli(self._object_input(state.h1).sigmoid_(), generator)
 
     def _object_input(self, h1: Tensor) -> Tensor:
         # addmm adds the bias within the product, because memory access limits the speed of a sweep.

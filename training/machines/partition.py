@@ -23,8 +23,8 @@ from torch.nn.functional import softplus
 
 from training.machines import build
 from training.machines.bernoulli import bernoulli
-from training.machines.gibbs import State, gibbs_step, initial_state
-from training.machines.machine import BoltzmannMachine
+from training.machines.gibbs import gibbs_step, initial_state
+from training.machines.machine import BoltzmannMachine, State
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from training.machines.edges import (
     triple_edges,
     triple_keys,
 )
-from training.machines.machine import BoltzmannMachine
+from training.machines.machine import BoltzmannMachine, State
 
 
 class RBM(BoltzmannMachine):
@@ -135,17 +135,9 @@ class GBM(RBM):
         return super().relation_logits(edges, v, h1) + two_way
 
     def sample_objects(
-        self,
-        v: Tensor,
-        h1: Tensor,
-        r: Tensor,
-        edges: Edges,
-        generator: torch.Generator,
-        *,
-        held: Tensor | None = None,
-        collapsed: bool = True,
+        self, state: State, generator: torch.Generator, *, held: Tensor | None, collapsed: bool
     ) -> Tensor:
-        logits = self._object_input(h1)
+        logits, r, edges = self._object_input(state.h1), state.r, state.edges
         if self.relations_act:
             # Class i receives sum_t r_t (g_t [i = subject of t] + g'_t [i = object of t]).
             active = r.new_zeros(*r.shape[:-1], self.spec.V)

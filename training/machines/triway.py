@@ -56,7 +56,7 @@ from training.machines.edges import (
     present_classes,
     triple_keys,
 )
-from training.machines.machine import BoltzmannMachine
+from training.machines.machine import BoltzmannMachine, State
 from training.machines.rbm import scale
 
 # Maximum of a degree feature. Degrees are capped, because more neighbours add little information.
@@ -269,15 +269,7 @@ class Triway(BoltzmannMachine):
         return edges, r, is_observed
 
     def sample_objects(
-        self,
-        v: Tensor,
-        h1: Tensor,
-        r: Tensor,
-        edges: Edges,
-        generator: torch.Generator,
-        *,
-        held: Tensor | None = None,
-        collapsed: bool = True,
+        self, state: State, generator: torch.Generator, *, held: Tensor | None, collapsed: bool
     ) -> Tensor:
         """Sample the objects v given the hidden units h1, (scenes, classes).
 
@@ -288,16 +280,16 @@ class Triway(BoltzmannMachine):
             ValueError: `collapsed` is False in a seed-form machine with κ.
         """
         if not self.relations_act:
-            return super().sample_objects(v, h1, r, edges, generator)
+            return super().sample_objects(state, generator, held=held, collapsed=collapsed)
         if collapsed:
-            return self._collapsed_sweep(v.clone(), h1, held, generator)
+            return self._collapsed_sweep(state.v.clone(), state.h1, held, generator)
         if bool(self.kappa.any()):
             raise ValueError(
                 "collapsed=False needs a machine with κ = 0; with κ, the objects depend on each "
                 "other even given h1 and r"
             )
-        drawn = super().sample_objects(v, h1, r, edges, generator)
-        return drawn.maximum(self.held_objects(edges, r))
+        drawn = super().sample_objects(state, generator, held=held, collapsed=collapsed)
+        return drawn.maximum(self.held_objects(state.edges, state.r))
 
     def _collapsed_sweep(
         self, v: Tensor, h1: Tensor, held: Tensor | None, generator: torch.Generator

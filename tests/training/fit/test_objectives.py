@@ -28,8 +28,8 @@ from training.fit.objectives.composite import mask_one_class, unlisted_off
 from training.fit.objectives.contrastive import centre_gradients, energy_difference
 from training.fit.settings import ObjectiveConfig
 from training.machines import build
-from training.machines.gibbs import State
 from training.machines.log_odds import object_log_odds
+from training.machines.machine import State
 from training.machines.mean_field import Evidence
 
 SAMPLES = 200_000

@@ -30,7 +30,8 @@ from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
 from training.machines.distributed import anywhere, gather, mean_part, share, total
 from training.machines.edges import Edges
-from training.machines.gibbs import Clamp, State, gibbs_step, initial_state, reconstruct, sample_h1
+from training.machines.gibbs import Clamp, gibbs_step, initial_state, reconstruct, sample_h1
+from training.machines.machine import State
 from training.machines.mean_field import Evidence, mean_field
 
 _OFFSETS = ("offset_v", "offset_h1", "offset_h2")
