@@ -51,6 +51,17 @@ def small_machine(name: str, seed: int = 0, scale: float = 0.8) -> BoltzmannMach
     return machine.requires_grad_(False)
 
 
+def random_weights(
+    machine: BoltzmannMachine, generator: torch.Generator, scale: float = 1.0
+) -> BoltzmannMachine:
+    """The machine with every weight but κ drawn from N(0, scale²)."""
+    machine.requires_grad_(False)
+    for name, parameter in machine.named_parameters():
+        if name != "kappa":
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
+    return machine
+
+
 def binary(units: int) -> Tensor:
     """All 2^units binary vectors, (2^units, units) float64."""
     codes = torch.arange(2**units).unsqueeze(1)

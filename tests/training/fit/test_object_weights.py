@@ -10,7 +10,7 @@ import torch
 
 from tests.enumeration.small_machines import binary
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
-from tests.training.fit.test_trainer import small_config
+from tests.training.fit.test_trainer import same, small_config, weights
 from training.fit import object_weights as objects
 from training.fit.object_weights import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
 from training.fit.settings import FineTuneConfig, ObjectsConfig
@@ -77,14 +77,6 @@ def independent(p):
     share = (p @ EVERY.double()).clamp(1e-6, 1 - 1e-6)
     log_q = (EVERY.double() * share.log() + (1 - EVERY.double()) * (1 - share).log()).sum(1)
     return float((p * (p.log() - log_q)).sum())
-
-
-def weights(machine):
-    return {name: p.detach().clone() for name, p in machine.named_parameters()}
-
-
-def same(first, second):
-    return all(torch.equal(first[name], second[name]) for name in first)
 
 
 def test_an_update_is_the_likelihood_s_gradient():

@@ -39,19 +39,27 @@ def machine_of(name, seed=0):
     return machine.initialise(torch.Generator().manual_seed(seed), 0.1)
 
 
+def annotated(triple, *, holds, source):
+    """A scene of all classes, which observes one relation."""
+    one = toy([0, 1, 2, 3, 4], [triple] if holds else [], source=source)
+    observed = np.zeros_like(one.evidence.observed)
+    observed[triple] = True
+    return replace(one, evidence=replace(one.evidence, observed=observed))
+
+
 def scenes_of(shares, count=40):
-    """Scenes of all classes, by source. Of each, left(1, 2) or left(3, 4) is known, and listed in
-    a share of them."""
-    every = []
-    for source, share in shares.items():
-        for k in range(count):
-            i, j = (1, 2) if k % 2 else (3, 4)
-            listed = [(0, i, j)] if k // 2 < share * count / 2 else []
-            one = toy([0, 1, 2, 3, 4], listed, source=source)
-            observed = np.zeros_like(one.evidence.observed)
-            observed[0, i, j] = True
-            every.append(replace(one, evidence=replace(one.evidence, observed=observed)))
-    return tensors(every)
+    """Scenes by source. Each observes left(1, 2) or left(3, 4), and a share of them lists it."""
+    return tensors(
+        [
+            annotated(
+                (0, 1, 2) if k % 2 else (0, 3, 4),
+                holds=k // 2 < share * count / 2,
+                source=source,
+            )
+            for source, share in shares.items()
+            for k in range(count)
+        ]
+    )
 
 
 def whole(scenes):
@@ -237,16 +245,14 @@ LISTED = {(0, 1, 2): (18, 2), (0, 3, 4): (4, 8), (1, 0, 3): (0, 12)}
 
 def listed_scenes():
     """Scenes of two sources; each observes one triple of `LISTED`."""
-    every = []
-    for (a, i, j), counts in LISTED.items():
-        for holds, count in zip((True, False), counts, strict=True):
-            for k in range(count):
-                source = "captions" if k % 2 else "rooms"
-                one = toy([0, 1, 2, 3, 4], [(a, i, j)] if holds else [], source=source)
-                observed = np.zeros_like(one.evidence.observed)
-                observed[a, i, j] = True
-                every.append(replace(one, evidence=replace(one.evidence, observed=observed)))
-    return tensors(every)
+    return tensors(
+        [
+            annotated(triple, holds=holds, source="captions" if k % 2 else "rooms")
+            for triple, counts in LISTED.items()
+            for holds, count in zip((True, False), counts, strict=True)
+            for k in range(count)
+        ]
+    )
 
 
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (0.5, 2.0)])
