@@ -16,7 +16,7 @@ from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import frequencies, presence, random_scenes
 from training.datasets.batches import Batch
-from training.fit.objectives import ContrastiveDivergence
+from training.fit.objectives.contrastive import ContrastiveDivergence
 from training.fit.settings import ObjectiveConfig
 from training.machines import MachineSpec, build
 

@@ -159,8 +159,7 @@ class TrainingData:
     """Scenes of the train, validation and test part, and data for the sizes of the machine.
 
     Attributes:
-        digest: digest of the scenes, their vocabulary and split. A run resumes only if the digest
-            is unchanged.
+        digest: digest of the scenes, their vocabulary and split, for the resumption of a run.
         words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
         vocabulary: the object classes and room types; None if the classes have no names.
     """
@@ -177,11 +176,7 @@ class TrainingData:
 
     @property
     def classes(self) -> Vocabulary:
-        """The object classes and room types.
-
-        Raises:
-            ValueError: the classes have no names.
-        """
+        """The object classes and room types, or a ValueError if the classes have no names."""
         if self.vocabulary is None:
             raise ValueError("the classes of the training scenes have no names")
         return self.vocabulary

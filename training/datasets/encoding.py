@@ -282,9 +282,7 @@ def side_viewpoints(x0: float, y0: float, x1: float, y1: float) -> tuple[Viewpoi
 def derive_from_boxes(boxes: ArrayLike) -> PoseRelations:
     """Derive the relations left and above between image boxes (`scene_client.image_plane`).
 
-    Args:
-        boxes: box (xmin, ymin, xmax, ymax) of each object, with y downwards, (objects, 4). NaN
-            means that the object has no box.
+    The boxes (xmin, ymin, xmax, ymax) have y downwards, (objects, 4). NaN means no box.
 
     Raises:
         ValueError: ``boxes`` has a wrong shape.

@@ -46,11 +46,7 @@ _VIEWER_SOURCES = frozenset({"sunrgbd-bedroom-3d"})
 
 
 def read_jsonl(path: Path) -> list[AnnotatedScene]:
-    """Read all scenes of a ``.jsonl`` or ``.jsonl.gz`` file.
-
-    Raises:
-        DatasetError: the file cannot be read, or a line is not a valid scene.
-    """
+    """Read all scenes of a ``.jsonl`` or ``.jsonl.gz`` file, or raise the first error."""
     scenes: list[AnnotatedScene] = []
     for entry in scan_jsonl(path):
         if isinstance(entry, DatasetError):
@@ -60,11 +56,7 @@ def read_jsonl(path: Path) -> list[AnnotatedScene]:
 
 
 def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
-    """Yield a scene for each valid line and an error for each invalid line. Skip blank lines.
-
-    Raises:
-        DatasetError: the file cannot be read.
-    """
+    """Yield a scene for each valid line and an error for each invalid line. Skip blank lines."""
     seen: dict[tuple[str, str], int] = {}
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         if not line.strip():

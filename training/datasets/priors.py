@@ -38,9 +38,6 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
 
     Rows of other sources are skipped. All scenes have the source name `SOURCE`. Rows about the same
     pair of objects are in one group.
-
-    Raises:
-        DatasetError: the file is missing, invalid or too large.
     """
     scenes = []
     for where, (source, subject, relation, anchor, _, _) in _rows(path):

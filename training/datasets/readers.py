@@ -7,6 +7,8 @@ the labels and divide scans into splits of at most nine objects. ``3RScan.json``
 lists the scans of each room.
 
 COCO instance annotations (Lin et al., ECCV 2014): ``instances*.json``.
+
+A reader raises a DatasetError if a file is missing or does not have the official format.
 """
 
 from __future__ import annotations
@@ -27,9 +29,6 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
     """Read the scans, or splits of scans, in a relationships file of 3DSSG as scenes.
 
     All scans of a room are in one group. The official files contain no room types and no poses.
-
-    Raises:
-        DatasetError: a file is missing or does not have the official format.
     """
     scans = _entries(path, "", load_json(path), "scans")
     rooms = _rooms(path.with_name("3RScan.json"))
@@ -115,9 +114,6 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
 
     Boxes around crowds are also skipped, because they contain several objects. Boxes are in the
     image plane. Encoding later derives the relations left and above from boxes.
-
-    Raises:
-        DatasetError: the file does not have the COCO format.
     """
     content = load_json(path)
     categories: dict[int, str] = {}

@@ -19,11 +19,7 @@ MAX_PROBLEM: Final = 500
 
 
 class DatasetError(ValueError):
-    """A data file cannot be read or has invalid content.
-
-    Args:
-        where: position in the file, such as ``line 3`` or ``scans[0].objects[2]``.
-    """
+    """A data file cannot be read or has invalid content at a position, such as ``line 3``."""
 
     def __init__(self, path: Path, where: str, problem: str) -> None:
         if len(problem) > MAX_PROBLEM:  # the text can contain a value of several megabytes

@@ -41,13 +41,7 @@ Candidate = Literal["left", "right", "front", "around"]
 
 @dataclass(frozen=True, slots=True)
 class Small:
-    """A small object on a piece of furniture.
-
-    Attributes:
-        size: mean extents of the object.
-        chance: probability that an object is added in each of ``most`` attempts.
-        most: maximum number of objects of this kind on the piece.
-    """
+    """A small object on furniture, added with a probability in each of ``most`` attempts."""
 
     label: str
     size: Size
@@ -59,10 +53,8 @@ class Small:
 class Beside:
     """A piece of furniture beside a main piece, such as a nightstand left of a bed.
 
-    Attributes:
-        piece: adjacent piece with the objects on it. Its ``chance`` applies to each side.
-        side: side of the main piece, as seen from the wall behind it. ``around`` means all four
-            sides.
+    The side of the main piece is seen from the wall behind it; ``around`` means all four sides. The
+    ``chance`` of the adjacent piece applies to each side.
     """
 
     piece: Piece
@@ -71,15 +63,12 @@ class Beside:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A piece of furniture.
+    """A piece of furniture, added to the room with a probability in each of ``most`` attempts.
 
     Attributes:
         size: mean extents of the piece.
-        chance: probability that a piece is added to the room in each of ``most`` attempts.
         where: place of the piece: at a wall, in the centre, hung on a wall, or under the ceiling.
-        most: maximum number of pieces of this kind in the room.
-        carries: small objects that can stand on the piece.
-        beside: pieces that can stand beside the piece.
+        carries, beside: small objects that can stand on the piece, and pieces beside it.
     """
 
     label: str

@@ -85,9 +85,8 @@ def _families(
 ) -> list[dict[str, Counter[str]]]:
     """Count the room types of each unit (group or scene), for each set of connected data sources.
 
-    Data sources are connected if they have common units. A unit is counted only in the largest
-    source that contains the unit. A small source therefore cannot change the parts of a large
-    source.
+    Data sources are connected if they have common units. A unit is counted only in its largest
+    source, so that a small source cannot change the parts of a large source.
     """
     sources_of: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter()

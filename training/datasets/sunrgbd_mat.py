@@ -44,10 +44,7 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
 
     ``<sequenceName>/scene.txt`` in the folder of the MATLAB file gives the room type. Frames of one
     SUN3D place are in one group. Other frames form groups of 20 consecutive frames from one sensor
-    and collection.
-
-    Raises:
-        DatasetError: the file does not have the official format, or has more than `MAX_BYTES`.
+    and collection. The file may have at most `MAX_BYTES`.
     """
     scenes: list[AnnotatedScene] = []
     frames: Counter[str] = Counter()

@@ -188,8 +188,8 @@ class _PartialList:
 
     Attributes:
         closed: log-odds of the unlisted classes if the list were complete, (unlisted classes,).
-        partial: maps an assumed coverage to the log-odds of the unlisted classes, (unlisted
-            classes,). The log-odds allow for an incomplete list.
+        partial: log-odds that allow for an incomplete list, (unlisted classes,), by assumed
+            coverage.
         hidden: True for unlisted classes that are in the scene, (unlisted classes,) bool.
         share: share of listed classes as text, such as "75 %".
         weight: number of scenes of the data source that this sampled scene represents.

@@ -48,8 +48,7 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     """Fit the distribution of offsets. Return None if no scene has poses.
 
     All offsets of a pair of classes in one scene have a total weight of 1, because they depend on
-    each other. All data sources have the same total weight, because boxes of one source are
-    similar.
+    each other. All data sources have the same total weight.
     """
     observed = observed_offsets(scenes)
     if not len(observed.offset):
@@ -126,11 +125,9 @@ def _sums(group: Ints, values: Floats, groups: int) -> Floats:
 
 
 def source_weights(source: Ints, scene: Ints) -> Floats:
-    """Return weights of N items, (N,), that balance large and small data sources.
+    """Return weights, (N,), that balance large and small data sources.
 
-    Args:
-        source: (N,) index of the data source of each item.
-        scene: (N,) index of the scene of each item.
+    The arguments are the indices of the data source and the scene of each item, (N,).
     """
     count = np.array([len(np.unique(scene[source == s])) for s in range(source.max() + 1)])
     least = count[count >= _FEW].min(initial=count.max())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from operator import not_
 from pathlib import Path
 from typing import Literal
 
@@ -49,11 +50,9 @@ class DataConfig(_Section):
     words: str = Field(
         default="", description="file of word vectors in the data folder; empty: no vectors"
     )
-    # An empty value is left out of the dump, so that digests of earlier runs stay valid.
-    terms: str = Field(
-        default="", exclude_if=lambda words: not words, description="terms of use of own files"
-    )
-    research_only: bool = Field(default=False, exclude_if=lambda only: not only)
+    # A value that `exclude_if` leaves out of the dump preserves the digests of earlier runs.
+    terms: str = Field(default="", exclude_if=not_, description="terms of use of own files")
+    research_only: bool = Field(default=False, exclude_if=not_)
 
     @model_validator(mode="after")
     def _distinct(self) -> DataConfig:
@@ -84,9 +83,8 @@ class MachineConfig(_Section):
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
     initial_c1: float = 0.0
-    # An empty value is left out of the dump, so that digests of earlier runs stay valid.
     without: tuple[str, ...] = Field(
-        default=(), exclude_if=lambda names: not names, description="names of weights held at zero"
+        default=(), exclude_if=not_, description="names of weights held at zero"
     )
 
 
@@ -162,7 +160,6 @@ class TrainingConfig(_Section):
     patience: int | None = Field(default=None, ge=1)
     seed: int = 0
     threads: int = Field(default=1, ge=1)
-    # Left out of the dump when auto, so that digests of earlier runs stay valid.
     device: Literal["auto", "cpu", "cuda"] = Field(
         default="auto",
         exclude_if=lambda device: device == "auto",
@@ -175,10 +172,9 @@ class Config(_Section):
 
     name: str = Field(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")
     description: str = ""
-    # An empty value is left out of the dump, so that digests of earlier runs stay valid.
     examples: str = Field(
         default="",
-        exclude_if=lambda name: not name,
+        exclude_if=not_,
         description="example scenes for the visual page: indoor, or a file in the data folder that "
         "ends in .json; empty: none",
     )

@@ -123,9 +123,7 @@ class _Loss(nn.Module):
 class Trainer:
     """Train one configuration on one set of scenes.
 
-    Args:
-        folder: folder of `checkpoint.pt`, `curve.csv` and `curve.png`; None writes no files. Only
-            the first process writes.
+    The first process writes `checkpoint.pt`, `curve.csv` and `curve.png` into the folder, if any.
     """
 
     def __init__(self, config: Config, data: TrainingData, folder: Path | None = None) -> None:
@@ -243,9 +241,8 @@ class Trainer:
     ) -> TrainingResult:
         """Run the first training phase (objects only) if there is one, then all epochs.
 
-        Training ends after the last epoch. It ends earlier if the validation score does not improve
-        for `training.patience` epochs. After a KeyboardInterrupt, the checkpoint of the last
-        finished epoch is on disk.
+        Training ends earlier if the validation score does not improve for `training.patience`
+        epochs. After a KeyboardInterrupt, the checkpoint of the last finished epoch is on disk.
         """
         if not self.objects_trained:
             began = time.perf_counter()

@@ -159,9 +159,9 @@ def pair_edges(
     """Return the relation units between the given classes.
 
     Args:
-        subjects: class indices of the subjects, (scenes, n) int64. Padding is -1.
+        subjects, objects: class indices, (scenes, n) and (scenes, m) int64. Padding is -1. The
+            default of the objects is `subjects`.
         relations: number of canonical relations A.
-        objects: class indices of the objects, (scenes, m) int64. The default is `subjects`.
         log_subjects, log_objects: log of the number of instances of each class, shaped like the
             classes. The default is one instance of each class.
     """
@@ -178,11 +178,7 @@ def pair_edges(
 
 
 def triple_edges(triples: Tensor) -> TripleEdges:
-    """Return the relation units of a table of triples, which apply to all scenes.
-
-    Args:
-        triples: triples (relation a, subject class i, object class j), (triples, 3).
-    """
+    """Return the units of a table of triples (a, i, j), (triples, 3), which apply to all scenes."""
     relation, subject, object_ = triples.long().T.unsqueeze(1).unbind(0)
     return TripleEdges(relation, subject, object_, torch.ones_like(subject, dtype=torch.bool))
 

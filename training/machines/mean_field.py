@@ -64,10 +64,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class MeanField:
-    """The mean-field fixed point of the hidden units.
-
-    y contains the logits of h1, x the logits of h1 without relations, and h2 the means of h2.
-    """
+    """The mean-field fixed point: logits y of h1, logits x without relations, and means h2."""
 
     y: Tensor
     x: Tensor
@@ -87,8 +84,8 @@ def mean_field(
     Args:
         iterations: number of sweeps over both hidden layers.
         damping: share of the previous slope_e that remains after a sweep; see the module.
-        pull: weight of the observed relations. The result interpolates between the fixed point
-            without relations (0) and the fixed point with all relations (1).
+        pull: weight of the observed relations. Below 1, the result is an interpolation to the fixed
+            point without relations.
     """
     if pull < 1 and evidence.observed is not None and evidence.relations(machine) is not None:
         nothing = torch.zeros_like(evidence.observed)

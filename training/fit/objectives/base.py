@@ -94,8 +94,7 @@ def relation_nll(
     on a random share of the observed relations of each scene and sums over the other relations.
 
     Args:
-        logits, r, observed, weight: logit, value, observed flag and weight of each relation unit,
-            all (scenes, units).
+        logits, r, observed, weight: tensors over the relation units, (scenes, units).
         h1: means of the hidden units given the objects, (scenes, hidden units).
     """
     nll = bernoulli_nll(logits, r, weight).sum()

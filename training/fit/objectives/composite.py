@@ -52,7 +52,7 @@ class Masked:
         batch: the complete scenes.
         v: presence of objects without the removed class, (scenes, classes).
         target: index of the removed class, (scenes,).
-        absent: True for absent classes, which include the removed class, (scenes, classes).
+        absent: True for absent classes and the removed class, (scenes, classes).
         removable: number of classes that can be removed, (scenes,).
     """
 
@@ -66,11 +66,8 @@ class Masked:
 def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) -> Masked | None:
     """Remove one random class from each scene that has at least two removable classes.
 
-    The result is None if the scenes of all processes have fewer.
-
-    Args:
-        structure: True for structure classes such as walls, (classes,) bool. Structure classes are
-            never removed or ranked.
+    The result is None if the scenes of all processes have fewer. Structure classes such as walls,
+    (classes,) bool, are never removed or ranked.
     """
     removable = batch.v * ~structure
     enough = removable.sum(1) >= 2
@@ -95,9 +92,6 @@ class ObjectChains:
     the data therefore have the same distribution of room types.
 
     Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
-
-    Args:
-        steps: number of Gibbs steps before each update of the weights.
     """
 
     def __init__(self, count: int, steps: int) -> None:
@@ -145,11 +139,9 @@ class CompositeLikelihood(Objective):
         self.chains = ObjectChains(config.chains, config.k)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the persistent chains."""
         return {name: gather(block) for name, block in self.chains.blocks.items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the persistent chains."""
         self.chains.blocks = {name: share(block) for name, block in state.items()}
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:

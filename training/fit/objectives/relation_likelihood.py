@@ -68,11 +68,9 @@ _BATCH = 64
 
 
 class WordPrior(nn.Module):
-    """Add a trained linear map of word vectors to the weights of classes.
+    """Add a trained linear map of scaled word vectors, (classes, dimensions), to class weights.
 
-    Args:
-        words: scaled word vectors, (classes, dimensions).
-        columns: True if the weights have the shape (width, classes), False for (classes, width).
+    The weights have the shape (width, classes) with `columns`, and (classes, width) without.
     """
 
     def __init__(self, words: Tensor, width: int, *, columns: bool) -> None:
@@ -83,7 +81,6 @@ class WordPrior(nn.Module):
         self.map = nn.Parameter(torch.zeros(words.shape[1], width))
 
     def forward(self, deviation: Tensor) -> Tensor:
-        """Return the weights of all classes: the map of the word vectors plus the deviations."""
         shared = self.words @ self.map
         return deviation + (shared.T if self.columns else shared)
 
@@ -91,11 +88,8 @@ class WordPrior(nn.Module):
 class RelationLikelihood(Objective):
     """The negative conditional log-likelihood of annotated relations, plus priors.
 
-    Args:
-        machine: the machine to train. The constructor adds the word prior to its weights.
-        train: the training scenes. They give the names of the sources and the number of scenes.
-        words: word vectors of the classes with length 1, (classes, dimensions). None means no word
-            prior.
+    The constructor adds a word prior to the machine if there are word vectors of the classes with
+    length 1, (classes, dimensions).
     """
 
     keeps_last = True
