@@ -54,9 +54,8 @@ def energy_by_hand(machine, edges, v, r, h1, h2, counts, room):
     c1 = p["c1"] if room is None else p["c1"] + p["Q"][room]
     total = -float(p["b"] @ v + c1 @ h1 + p["c2"] @ h2 + v @ p["W"] @ h1 + h1 @ p["J"] @ h2)
     gated = spec.variant == "triway"
-    for unit, (a, i, j) in enumerate(
-        zip(*(x[0].tolist() for x in (edges.relation, edges.subject, edges.object)), strict=True)
-    ):
+    ends = (x[0].tolist() for x in (edges.relation, edges.subject, edges.object))
+    for unit, (a, i, j) in enumerate(zip(*ends, strict=True)):
         active = bool(v[i] * v[j]) or not gated
         if r[unit] and not active:
             return math.inf

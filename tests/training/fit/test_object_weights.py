@@ -251,11 +251,9 @@ def test_chains_come_to_the_data(variant):
         fine_tune(machine, data, FineTuneConfig(learning_rate=0.05, **changes), 0.5, 1)
         return machine, float((machine.W.detach() - start).abs().mean())
 
-    (before, none), (after, much), (held, little) = (
-        fine_tuned(updates=0),
-        fine_tuned(updates=400, anchor=0.0),
-        fine_tuned(updates=400, anchor=10.0),
-    )
+    before, none = fine_tuned(updates=0)
+    after, much = fine_tuned(updates=400, anchor=0.0)
+    held, little = fine_tuned(updates=400, anchor=10.0)
     assert none == 0
     assert distance(after) < 0.5 * distance(before)
     assert 0 < little < 0.2 * much
