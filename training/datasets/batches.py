@@ -25,8 +25,8 @@ class Batch:
         classes: indices of the n classes present in a scene, (scenes, n) int64. Padding is -1.
         counts: number of instances of each class in `classes`, (scenes, n) int64. 0 means that the
             data source gives no number.
-        holds: value of each relation between two classes of `classes`, (scenes, relations, n, n).
-        observed: True where the relation is annotated, shaped like `holds`.
+        holds, observed: value of each relation between two classes of `classes`, and True where it
+            is annotated, (scenes, relations, n, n).
         room: index of the room type, (scenes,) int64. -1 means unknown.
         source: index of the data source in `SceneTensors.source_names`, (scenes,) int64.
     """

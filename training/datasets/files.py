@@ -25,12 +25,9 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
     The lines are not decoded, so that invalid UTF-8 affects one line only. Without the limits, a
     small compressed file could fill the memory.
 
-    Args:
-        limit: maximum length of a line in bytes, including the line end.
-
     Raises:
-        DatasetError: the file cannot be read, a line exceeds the limit, or all lines exceed
-            `MAX_BYTES`.
+        DatasetError: the file cannot be read, a line has more bytes than the limit with its line
+            end, or all lines exceed `MAX_BYTES`.
     """
     opener = gzip.open if path.suffix == ".gz" else open
     try:

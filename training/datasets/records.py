@@ -36,8 +36,7 @@ class AnnotatedObject:
 
     Attributes:
         id: id of the object, distinct within the scene.
-        position: centre (x, y, z) of the object in metres.
-        size: extents (x, y, z) of the object in metres, before rotation by the yaw.
+        position, size: centre, and extents before rotation by the yaw, (x, y, z) in metres.
         yaw: rotation of the object about the z axis in radians.
         supported_by: id of the object that supports this object.
         box2d: box (xmin, ymin, xmax, ymax) in the image, with y downwards.
@@ -75,21 +74,18 @@ class AnnotatedObject:
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedScene:
-    """One annotated scene.
+    """One annotated scene, whose id is distinct within its data source.
 
     Attributes:
-        scene_id: id of the scene, distinct within its data source.
         group: name of a group of near-duplicate scenes, such as frames of one place.
         room_type: room type in the data set. None means unknown.
-        relations: triples (subject index, relation, object index). The indices refer to
-            ``objects``. None means that relations were not annotated.
+        relations, false_relations: triples (subject index, relation, object index) that hold, and
+            that an annotator marked as false. Without annotated relations, `relations` is None.
         viewer_frame: True if positions are in viewer axes. Otherwise left and front are undefined
             until a viewpoint is chosen.
-        false_relations: triples that an annotator marked as false, in the form of ``relations``.
 
     Raises:
-        ValueError: two objects have the same id, or a support link or relation refers to an
-            unknown object.
+        ValueError: two objects have the same id, or a link or relation names an unknown object.
     """
 
     scene_id: str

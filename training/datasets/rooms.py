@@ -135,13 +135,10 @@ class _Box:
 
 
 def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[AnnotatedScene]:
-    """Generate scenes. The same seed gives the same scenes.
+    """Generate scenes. The same seed gives the same scenes. `DOMAINS` has other rooms.
 
     Positions are in viewer axes. Objects have sizes, yaws, and the id of the furniture below them
     (``supported_by``). ``relations`` is None, because encoding derives the relations.
-
-    Args:
-        rooms: pieces of furniture by room type. `DOMAINS` has the rooms of other domains.
 
     Raises:
         ValueError: ``count`` is negative.

@@ -109,11 +109,9 @@ class Source:
             other predicates, such as "inside" and "wear". None means that another predicate is an
             error. Names of relations are predicates of every source.
         left_out: labels that are ignored because their annotation is too incomplete.
-        open_vocabulary: True if annotators used free words. An unlisted class is then absent.
-            Otherwise annotators chose labels from a list, and a class outside the list is
-            unobserved.
-        counts_movables: True if the source counts only movable objects. Other classes occur once
-            in each scene that lists them.
+        open_vocabulary: True if annotators used free words, so that an unlisted class is absent.
+            Otherwise a class outside their list of labels is unobserved.
+        counts_movables: True if only movable objects are counted. Others occur once in a scene.
         of_one_view: True if a scene is one camera frame. A frame does not show how many objects are
             in the room, so statistics of counts do not learn from it.
     """

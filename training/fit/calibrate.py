@@ -159,11 +159,9 @@ def fit_placements(
 ) -> dict[str, tuple[PairSlope, ...]]:
     """Fit the probability of relations between a removed object and the objects of its scene.
 
-    Returns:
-        The entries `placement` and `asked_place`. `placement` is fitted to the likeliest places,
-        because an answer lists the likeliest places. `asked_place` is fitted to all places with
-        equal weight, because a request can name any place. `asked_place` leaves out data sources
-        that never annotate false relations, such as people's sentences.
+    The entry `placement` is fitted to the likeliest places, because an answer lists these places.
+    `asked_place` is fitted to all places with equal weight, because a request can name any place.
+    It leaves out data sources that never annotate false relations, such as people's sentences.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure

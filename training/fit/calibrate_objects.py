@@ -113,10 +113,8 @@ def calibrate_objects(
 ) -> Calibration:
     """Return the model's calibration with newly fitted entries about objects.
 
-    Args:
-        train: training scenes. They give the frequency of each class, and limits for room types.
-        chosen: a calibration that was fitted on other validation scenes. Its coverage, coverage
-            weight, weights of evidence and alpha are copied. None chooses new values.
+    The training scenes give the frequency of each class, and limits for room types. The coverage,
+    coverage weight, weights of evidence and alpha of a `chosen` calibration are copied.
     """
     scenes = complete_scenes(validation, seed)
     if not len(scenes):

@@ -255,9 +255,7 @@ def fine_tune(
     removes the bias. It changes only b, c1, c2, W and Q. The penalty anchor · sum (θ - θ_before)²
     keeps the conditionals accurate. The function then stores N samples. They come from chains with
     the averaged weights, and each sample has the room type of the scene where its chain started.
-
-    With 0 updates and N = 0, the machine stays unchanged. A share of the chains and scenes,
-    `room_dropout`, has no room type.
+    A share of the chains and scenes, `room_dropout`, has no room type.
     """
     if not config.updates and not machine.spec.N:
         return

@@ -85,11 +85,9 @@ class PairEdges(Edges):
 
     Attributes:
         relations: number of canonical relations A.
-        subjects: class indices of the subjects, (scenes, n) int64. Padding is 0.
-        objects: class indices of the objects, (scenes, m) int64. Padding is 0.
+        subjects, objects: class indices, (scenes, n) and (scenes, m) int64. Padding is 0.
         valid_subjects, valid_objects: bool, shaped like the classes. False marks padding.
-        log_subjects, log_objects: log of the number of instances of each class, shaped like the
-            classes.
+        log_subjects, log_objects: log of the number of instances, shaped like the classes.
     """
 
     relations: int

@@ -81,7 +81,6 @@ def object_log_odds(
     is differentiable.
 
     Args:
-        evidence: observed units of the scenes. The candidates must be absent in `evidence.v`.
         candidates: class indices, (scenes or 1, candidates) int64. The default is all classes.
         pull: weight of the observed relations, from 0 to 1; see `mean_field`.
     """
@@ -111,13 +110,10 @@ def presence_log_odds(
 
         log-odds_i = b_i + G_i + log E_w[exp(W_i·h1 + attraction_i)] - log mean exp(W_i·h1)
 
-    E_w is the weighted mean over draws of h1. G_i = log E_q[exp(W_i·h1)] has a closed form, because
-    the draws come from the factorial distribution q. The last term estimates G_i from the
-    unweighted draws. G_i and its estimate are a control variate: their difference cancels a part of
-    the sampling error of E_w.
-
-    Args:
-        draws: draws of h1 given the evidence. The default is 64 new draws.
+    E_w is the weighted mean over `draws` of h1, by default 64. G_i = log E_q[exp(W_i·h1)] has a
+    closed form, because the draws come from the factorial distribution q. The last term estimates
+    G_i from the unweighted draws. G_i and its estimate are a control variate: their difference
+    cancels a part of the sampling error of E_w.
     """
     if not machine.relations_act and evidence.edges is None:
         return object_log_odds(machine, evidence, candidates=candidates)
@@ -140,10 +136,7 @@ def weights_with(
 
     The weights of a candidate sum to 1.
 
-    Args:
-        evidence: the observed units of one scene.
-        draws: draws of h1 given the evidence.
-        candidates: class indices of the added objects, (candidates,) int64.
+    The evidence has one scene, and the candidates are class indices, (candidates,) int64.
     """
     row = candidates.unsqueeze(0)
     gain = _object_input(machine, draws.h1, row) + _attraction(machine, evidence, draws, row)

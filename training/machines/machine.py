@@ -143,10 +143,8 @@ class BoltzmannMachine(nn.Module, ABC):
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
         """Return the relation units between the given classes of each scene.
 
-        Args:
-            classes: class indices, (scenes, n) int64. Padding is -1.
-            counts: number of instances of each class, (scenes, n). 0 means that the number is
-                unknown. The default is one instance of each class.
+        The class indices are (scenes, n) int64, with padding -1. The counts are the numbers of
+        instances, 0 where unknown. The default is one instance of each class.
         """
 
     @abstractmethod
@@ -238,10 +236,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
         """Return values of the units as a table, (scenes, relations, n, n); -inf without unit.
 
-        Args:
-            edges: the relation units between `classes`.
-            values: values of the relation units, (scenes, units).
-            classes: class indices, (scenes, n) int64. Padding is -1.
+        The units are those between the classes, (scenes, n) int64. Padding is -1.
         """
 
     @property

@@ -31,10 +31,9 @@ class Evidence:
     Attributes:
         v: presence of objects, (scenes, classes).
         edges: layout of the relation units that can be 1.
-        r: values of the observed relations, (scenes, units). Unobserved relations are 0.
-        observed: True where a relation is observed, (scenes, units) bool.
-        room: index of each scene's room type, (scenes,) int64. -1 means unknown. None means that
-            all room types are unknown.
+        r, observed: values, and bool mask, of the observed relations, (scenes, units). Unobserved
+            relations are 0.
+        room: index of each scene's room type, (scenes,) int64. None or -1 means unknown.
     """
 
     v: Tensor

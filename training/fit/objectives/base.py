@@ -41,8 +41,7 @@ class Objective(ABC):
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return a scalar whose gradient is the update direction.
 
-        In several processes, the batch is a share of the global batch. The sum of their losses is
-        the loss of the global batch.
+        In several processes, the losses of the shares of a batch add up to the loss of the batch.
         """
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:  # noqa: B027
