@@ -17,7 +17,7 @@ from benchmarks.timing import interleave
 from benchmarks.yardsticks import frequencies, presence, random_scenes
 from training.datasets.batches import Batch
 from training.fit.configuration import ObjectiveConfig
-from training.fit.objectives import ContrastiveDivergence
+from training.fit.objectives.contrastive import ContrastiveDivergence
 from training.machines import MachineSpec, build
 
 OURS, LOCAL, DENSE = "ours, seed form", "ours, local form", "dense Triway"

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from app.inference.variants import VARIANTS
 from training.machines import BoltzmannMachine, MachineSpec, build
-from training.machines.gibbs import State
+from training.machines.machine import State
 
 TRIPLES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 1, 0)]
 
@@ -51,6 +51,17 @@ def small_machine(name: str, seed: int = 0, scale: float = 0.8) -> BoltzmannMach
         if spec.variant == "triway" and spec.form == "local":
             machine.kappa.zero_()
     return machine.requires_grad_(False)
+
+
+def random_weights(
+    machine: BoltzmannMachine, generator: torch.Generator, scale: float = 1.0
+) -> BoltzmannMachine:
+    """The machine with every weight but κ drawn from N(0, scale²)."""
+    machine.requires_grad_(False)
+    for name, parameter in machine.named_parameters():
+        if name != "kappa":
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
+    return machine
 
 
 def binary(units: int) -> Tensor:

@@ -22,7 +22,8 @@ from tests.enumeration.small_machines import (
     small_machine,
 )
 from training.machines.edges import present_classes
-from training.machines.gibbs import FREE, Clamp, State, gibbs_step, initial_state
+from training.machines.gibbs import FREE, Clamp, gibbs_step, initial_state
+from training.machines.machine import State
 
 CHAINS = 60_000
 

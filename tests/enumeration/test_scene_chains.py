@@ -19,6 +19,7 @@ from tests.enumeration.small_machines import (
     SMALL,
     check_frequencies,
     enumerate_joint,
+    random_weights,
     small_machine,
 )
 from training.machines import MachineSpec, build
@@ -228,10 +229,7 @@ def test_relations_that_imply_each_other_are_drawn_as_by_tensors(layers, tempera
     rows = 16_000
     spec = MachineSpec("triway", V=3, A=1, H1=3, H2=layers, K=2, G=2, form="local")
     generator = torch.Generator().manual_seed(4)
-    machine = build(spec).requires_grad_(False)
-    for parameter in machine.parameters():
-        parameter.copy_(torch.randn(parameter.shape, generator=generator))
-    machine.kappa.zero_()
+    machine = random_weights(build(spec), generator)
     v, h1 = torch.ones(rows, 3), torch.tensor([[1.0, 0, 1]]).expand(rows, -1)
     _, r = sample_relations(machine.scaled(1 / temperature), v, h1, generator)
     chains = SceneChains(weights_of(machine)).under(conditions(), temperature)

@@ -9,6 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.enumeration.small_machines import random_weights
 from training.machines import MachineSpec, build
 from training.machines.chain_samples import ChainSamples, pack_scenes, unpack_scenes, words
 from training.machines.gibbs import FREE, Clamp, initial_state
@@ -30,22 +31,18 @@ def test_scenes_are_read_back_from_their_bits(scenes, classes, seed):
 def machine_of(N=6, H2=0, form="local", seed=0):
     """Every weight from N(0, 1); distinct random samples."""
     spec = MachineSpec("triway", V=V, A=1, H1=4, H2=H2, K=2, C=2, N=N, form=form)
-    machine = build(spec).double()
     generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for name, parameter in machine.named_parameters():
-            if name != "kappa":
-                parameter.copy_(torch.randn(parameter.shape, generator=generator))
-        if N:
-            stored = (torch.rand(N, V, generator=generator) < 0.4).float()
-            assert len(stored.unique(dim=0)) == N
-            machine.fantasies.copy_(pack_scenes(stored))
-            machine.fantasy_rooms.copy_(torch.arange(N) % 3 - 1)
-    return machine.requires_grad_(False)
+    machine = random_weights(build(spec).double(), generator)
+    if N:
+        stored = (torch.rand(N, V, generator=generator) < 0.4).float()
+        assert len(stored.unique(dim=0)) == N
+        machine.fantasies.copy_(pack_scenes(stored))
+        machine.fantasy_rooms.copy_(torch.arange(N) % 3 - 1)
+    return machine
 
 
-def start_chains(machine, given, generator, clamp=FREE):
-    return ChainSamples(machine).start(given, generator, clamp)
+def start_chains(machine, observed, generator, clamp=FREE):
+    return ChainSamples(machine).start(observed, generator, clamp)
 
 
 def evidence(*classes, chains=CHAINS):
@@ -54,29 +51,15 @@ def evidence(*classes, chains=CHAINS):
     return v
 
 
-def log_sigmoid(x):
-    return -math.log1p(math.exp(-x))
-
-
 def by_formula(machine, classes, room=None, held=()):
     """Share of chains that start at each sample, by the module's docstring, one layer."""
-    weights = []
-    stored = zip(
-        unpack_scenes(machine.fantasies, V).double(), machine.fantasy_rooms.tolist(), strict=True
-    )
-    for v, own in stored:
-        x = [float(machine.c1[k] + v @ machine.W[:, k]) for k in range(4)]
-        h1 = [1 / (1 + math.exp(-value)) for value in x]
-        log_w = 0.0
-        for i in classes:
-            log_w += log_sigmoid(
-                float(machine.b[i]) + sum(float(machine.W[i, k]) * h1[k] for k in range(4))
-            )
-        if room is not None:
-            log_w -= 6.0 if own != room else 0.0
-        log_w += sum(log_sigmoid(x[k]) for k in held)
-        weights.append(math.exp(log_w))
-    return [weight / sum(weights) for weight in weights]
+    stored = unpack_scenes(machine.fantasies, V).double()
+    x = machine.c1 + stored @ machine.W
+    log_p = (machine.b + x.sigmoid() @ machine.W.T).sigmoid().log()
+    log_w = log_p[:, list(classes)].sum(1) + x[:, list(held)].sigmoid().log().sum(1)
+    if room is not None:
+        log_w = log_w - 6.0 * (machine.fantasy_rooms != room)
+    return log_w.softmax(0).tolist()
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from app.inference.variants import feature_count
 from tests.enumeration.implied import features_by_hand, implied_by_hand
+from tests.enumeration.small_machines import random_weights
 from training.machines import MachineSpec, Triway, build
 from training.machines.draws import draw_hidden
 from training.machines.gibbs import Clamp, sample_relations
@@ -61,12 +62,7 @@ def test_a_relation_says_nothing_of_itself(grid):
 def machine_of(G=2, A=1, V=4, seed=0):
     """A local Triway of one layer, every weight from N(0, 1)."""
     machine = build(MachineSpec("triway", V=V, A=A, H1=3, K=2, C=2, G=G, form="local")).double()
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for name, parameter in machine.named_parameters():
-            if name != "kappa":
-                parameter.copy_(torch.randn(parameter.shape, generator=generator))
-    return machine.requires_grad_(False)
+    return random_weights(machine, torch.Generator().manual_seed(seed))
 
 
 def without(machine: Triway) -> Triway:

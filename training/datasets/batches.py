@@ -25,8 +25,8 @@ class Batch:
         classes: indices of the n classes present in a scene, (scenes, n) int64. Padding is -1.
         counts: number of instances of each class in `classes`, (scenes, n) int64. 0 means that the
             data source gives no number.
-        holds: value of each relation between two classes of `classes`, (scenes, relations, n, n).
-        observed: True where the relation is annotated, shaped like `holds`.
+        holds, observed: value of each relation between two classes of `classes`, and True where it
+            is annotated, (scenes, relations, n, n).
         room: index of the room type, (scenes,) int64. -1 means unknown.
         source: index of the data source in `SceneTensors.source_names`, (scenes,) int64.
     """
@@ -44,11 +44,11 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         """Return the batch on a device."""
-        return Batch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return Batch(*(tensor.to(device) for tensor in vars(self).values()))
 
     def rows(self, index: Tensor) -> Batch:
         """Return the scenes at the given indices. A mask selects the scenes where it is True."""
-        return Batch(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return Batch(*(tensor[index] for tensor in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -88,32 +88,21 @@ class SceneTensors:
         chosen = [self.scenes[k].evidence for k in index.tolist()]
         n = max([width, *(len(e.classes) for e in chosen)])
         relations = self.scenes[0].evidence.holds.shape[0] if self.scenes else 0
-        classes = np.full((len(chosen), n), -1, dtype=np.int64)
-        counts = np.ones((len(chosen), n), dtype=np.int64)
-        holds = np.zeros((len(chosen), relations, n, n), dtype=np.float32)
-        observed = np.zeros((len(chosen), relations, n, n), dtype=np.bool_)
+        shape = (len(chosen), relations, n, n)
+        classes, counts = np.full(shape[::3], -1), np.ones(shape[::3], dtype=np.int64)
+        holds, observed = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.bool_)
         for row, e in enumerate(chosen):
             m = len(e.classes)
             classes[row, :m], counts[row, :m] = e.classes, e.counts
             holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
-        return Batch(
-            v=self.v[index],
-            classes=torch.from_numpy(classes),
-            counts=torch.from_numpy(counts),
-            holds=torch.from_numpy(holds),
-            observed=torch.from_numpy(observed),
-            room=self.room[index],
-            source=self.source[index],
-        )
+        tables = map(torch.from_numpy, (classes, counts, holds, observed))
+        return Batch(*(self.v[index], *tables, self.room[index], self.source[index]))
 
 
 def scene_tensors(
     scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], size: int
 ) -> SceneTensors:
-    """Return encoded scenes as tensors.
-
-    Args:
-        annotated: maps the name of a data source to the classes that it mentions, (classes,) bool.
+    """Return encoded scenes as tensors. `annotated` has the classes, (classes,), of each source.
 
     Raises:
         ValueError: `annotated` has no entry for the source of a scene.
@@ -170,8 +159,7 @@ class TrainingData:
     """Scenes of the train, validation and test part, and data for the sizes of the machine.
 
     Attributes:
-        digest: digest of the scenes, their vocabulary and split. A run resumes only if the digest
-            is unchanged.
+        digest: digest of the scenes, their vocabulary and split, for the resumption of a run.
         words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
         vocabulary: the object classes and room types; None if the classes have no names.
     """
@@ -188,11 +176,7 @@ class TrainingData:
 
     @property
     def classes(self) -> Vocabulary:
-        """The object classes and room types.
-
-        Raises:
-            ValueError: the classes have no names.
-        """
+        """The object classes and room types, or a ValueError if the classes have no names."""
         if self.vocabulary is None:
             raise ValueError("the classes of the training scenes have no names")
         return self.vocabulary

@@ -25,7 +25,7 @@ from training.datasets.sources import SOURCES, meaning_of
 Triple: TypeAlias = tuple[int, int, int]
 
 MOST: Final = 12
-"""Largest number of instances that is told apart. It stands for larger numbers too."""
+"""Maximum distinguished number of instances. It also stands for larger numbers."""
 
 RIDGE: Final = 1.0
 """`C` of `logistic` for a few unweighted examples, such as those of 20 validation scenes."""
@@ -46,8 +46,8 @@ def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> Scene
     """
     if limit is None or len(scenes) <= limit:
         return scenes
-    place = [crc32(f"{seed} {scene.source} {scene.scene_id}".encode()) for scene in scenes.scenes]
-    return subset(scenes, torch.from_numpy(np.sort(np.argsort(place, kind="stable")[:limit])))
+    order = [crc32(f"{seed} {scene.source} {scene.scene_id}".encode()) for scene in scenes.scenes]
+    return subset(scenes, torch.from_numpy(np.sort(np.argsort(order, kind="stable")[:limit])))
 
 
 def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Triple]) -> Scene:
@@ -60,8 +60,8 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
     return Scene(objects, tuple(triples) or None, room_type=room if room >= 0 else None)
 
 
-def known_relations(encoded: EncodedScene) -> Flags:
-    """Return a mask of the relations whose truth is known without selection bias.
+def annotated_relations(encoded: EncodedScene) -> Flags:
+    """Return a mask of the relations whose truth is annotated without selection bias.
 
     The mask has the shape (relations, instances, instances). Some data sources list `left` and
     `front` only occasionally and never as false. Such sources do not show how often these two
@@ -69,19 +69,21 @@ def known_relations(encoded: EncodedScene) -> Flags:
     these pairs, an unlisted `left` or `front` is false.
     """
     unlisted = meaning_of(encoded.source).unlisted
-    known, holds = encoded.instance_observed.copy(), encoded.instance_holds
+    annotated, holds = encoded.instance_observed.copy(), encoded.instance_holds
     stacked = holds[_VERTICAL].any(0)
     stacked |= stacked.T
-    for a in range(min(len(known), len(unlisted))):
-        off = known[a] & ~holds[a]
+    for a in range(min(len(annotated), len(unlisted))):
+        off = annotated[a] & ~holds[a]
         # Without poses, the "neighbours" are the pairs of objects that an annotator selected.
         chosen = unlisted[a] == "off for neighbours" and encoded.instance_positions is None
         if chosen or (unlisted[a] == "unobserved" and not (off & ~stacked).any()):
-            known[a] &= stacked & off.any()
-    return known
+            annotated[a] &= stacked & off.any()
+    return annotated
 
 
-def taken_away(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[int, list[int]] | None:
+def removed_class(
+    encoded: EncodedScene, structure: Flags, rng: Rng
+) -> tuple[int, list[int]] | None:
     """Draw a class to remove. Return its index and the indices of the remaining instances.
 
     Structure classes such as walls stay in the scene. The result is None if the scene has fewer
@@ -95,7 +97,7 @@ def taken_away(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[int, 
     return target, [k for k, c in enumerate(encoded.instance_classes) if c != target]
 
 
-def told_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Flags, list[Triple]]:
+def observed_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Flags, list[Triple]]:
     """Draw half of the object pairs of a scene as observed pairs.
 
     The draw ignores whether a pair has relations. If relations were drawn instead of pairs, pairs
@@ -107,10 +109,10 @@ def told_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Flags
     """
     size = len(encoded.instance_classes)
     half = np.triu(rng.random((size, size)) < 0.5, 1)
-    told = half | half.T
+    observed = half | half.T
     plain = ~structure[encoded.instance_classes]
-    triples = np.argwhere(encoded.instance_holds & told & plain[:, None] & plain).tolist()
-    return ~told, [(int(a), int(x), int(y)) for a, x, y in triples]
+    triples = np.argwhere(encoded.instance_holds & observed & plain[:, None] & plain).tolist()
+    return ~observed, [(int(a), int(x), int(y)) for a, x, y in triples]
 
 
 class Part(NamedTuple):
@@ -147,25 +149,22 @@ def some_instances(encoded: EncodedScene, structure: Flags, rng: Rng) -> Part:
 
 
 def occupied_place(
-    encoded: EncodedScene,
-    structure: Flags,
-    shown: Flags,
-    rng: Rng,
+    encoded: EncodedScene, structure: Flags, shown: Flags, rng: Rng
 ) -> tuple[int, int] | None:
     """Draw a place that is related to a shown object and contains another object.
 
     The draw ignores whether the object at the place is shown or hidden. If only places of hidden
-    objects were drawn, a missing object would seem more likely at every place.
-
-    Args:
-        shown: True for shown objects, (instances,) bool.
+    objects were drawn, a missing object would seem more likely at every place. `shown` is True for
+    shown objects, (instances,).
 
     Returns:
         The canonical relation of the place, and the index of the shown object, which is the object
         of the relation. None means that the scene has no such place.
     """
     usable = ~structure[encoded.instance_classes]
-    stands = encoded.instance_holds & known_relations(encoded) & usable[:, None] & (usable & shown)
+    stands = (
+        encoded.instance_holds & annotated_relations(encoded) & usable[:, None] & (usable & shown)
+    )
     places = np.argwhere(stands.any(1))
     if not len(places):
         return None
@@ -176,10 +175,10 @@ def occupied_place(
 def altered_case(
     encoded: EncodedScene, structure: Flags, rng: Rng
 ) -> tuple[Scene, Triple | None] | None:
-    """Return a scene with observed relations, of which one may be false, and the false relation.
+    """Return a scene with observed relations, and their false triple (relation, subject, object).
 
-    Half of the scenes have a false triple (relation, subject, object) in place of a true triple. In
-    the other half, all triples are true, and the false triple is None.
+    Half of the scenes have a false triple in place of a true triple. In the other half, all triples
+    are true, and the false triple is None.
     """
     triples = stated_relations(encoded, structure, rng)
     if triples is None:
@@ -201,40 +200,32 @@ def stated_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> list[
 
 
 def altered_scene(
-    encoded: EncodedScene,
-    structure: Flags,
-    triples: Sequence[Triple],
-    rng: Rng,
+    encoded: EncodedScene, structure: Flags, triples: Sequence[Triple], rng: Rng
 ) -> tuple[Scene, Triple] | None:
     """Replace one of `triples` by a false triple. Return the scene and this triple, or None."""
     usable = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds
-    place = int(rng.integers(len(triples)))
+    index = int(rng.integers(len(triples)))
     for _ in range(50):
-        a, i, j = triples[place]
+        a, i, j = triples[index]
         if rng.random() < 0.5:
             a = int(rng.integers(len(CANONICAL)))
         else:
             j = int(rng.integers(len(usable)))
         if i == j or not usable[j] or holds[a, i, j] or holds[a, j, i]:
             continue
-        altered = [*triples[:place], (a, i, j), *triples[place + 1 :]]
+        altered = [*triples[:index], (a, i, j), *triples[index + 1 :]]
         return scene_of(encoded, range(len(usable)), altered), (a, i, j)
     return None
 
 
 def logistic(
-    features: Floats,
-    truth: Flags,
-    weight: Floats | None = None,
-    C: float = 1e6,
+    features: Floats, truth: Flags, weight: Floats | None = None, C: float = 1e6
 ) -> list[float]:
     """Return the coefficients and then the intercept of a logistic regression.
 
-    Args:
-        weight: weight of each example, (examples,). None means equal weights.
-        C: inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
-            unweighted examples are separable.
+    C is the inverse of the ridge penalty on the coefficients. `RIDGE` keeps them finite if a few
+    examples without `weight`, (examples,), are separable.
     """
     fit = LogisticRegression(C=C, max_iter=1000).fit(features, truth, weight)
     return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]
@@ -253,9 +244,7 @@ def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> d
     plain = ~vocabulary.structure
     entries, several = Counter[str](), Counter[str]()
     repeated: dict[str, Flags] = {}
-    for scene in scenes:
-        if not scene.complete:
-            continue
+    for scene in (scene for scene in scenes if scene.complete):
         evidence = scene.evidence
         usable = plain[evidence.classes]
         entries[scene.source] += int(usable.sum())
@@ -270,6 +259,6 @@ def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> d
 def listed_cases(
     scene: EncodedScene, counted: Flags, structure: Flags, seed: int
 ) -> tuple[Part, NDArray[np.intp]]:
-    """Return a listed part of a scene, and the places of its classes that the source counts."""
+    """Return a listed part of a scene, and the indices of its classes that the source counts."""
     part = some_instances(scene, structure, scene_rng(scene, seed))
     return part, np.flatnonzero(counted[part.classes])

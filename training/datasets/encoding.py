@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -42,20 +43,16 @@ class EncodedScene:
     """One scene, encoded with a vocabulary.
 
     Attributes:
-        scene_id, source, group: id, data source and group of near-duplicates of the annotated
-            scene.
+        scene_id, source, group: as in the annotated scene.
         room_type: index of the room type. -1 means that the room type is unknown.
         evidence: classes of the scene, and relations between classes.
         instance_classes: class index of each object instance, (instances,) int64.
-        instance_holds: True where a relation between two instances holds, (relations, instances,
-            instances) bool.
-        instance_observed: True where the truth of the relation is known, shaped like
-            `instance_holds`.
-        unknown: distinct labels outside the vocabulary, sorted. Objects with such a label are left
-            out.
-        instance_positions: centres of the instances in metres, (instances, 3). The axes are the
-            viewer axes from which relations were derived. NaN means an unknown centre. None means
-            that the relations do not come from positions.
+        instance_holds, instance_observed: True where a relation between two instances holds, and
+            where its truth is known, (relations, instances, instances) bool.
+        unknown: distinct labels outside the vocabulary, sorted. Their objects are left out.
+        instance_positions: centres of the instances in metres, (instances, 3), in the viewer axes
+            from which relations were derived. NaN means an unknown centre. None means that the
+            relations do not come from positions.
         weight: weight of the scene in the training of objects.
         complete: True if the object list of the scene is nearly complete; see `Meaning`.
     """
@@ -109,12 +106,12 @@ def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) ->
     annotated: dict[str, Flags] = {}
     for scene in scenes:
         if scene.source not in annotated:
-            known = SOURCES.get(scene.source)
-            start = known is not None and known.open_vocabulary
+            source = SOURCES.get(scene.source)
+            start = source is not None and source.open_vocabulary
             annotated[scene.source] = np.full(len(vocabulary), start)
         annotated[scene.source][scene.instance_classes] = True
-    for source, classes in annotated.items():
-        classes[_left_out(source, vocabulary)] = False
+    for name, classes in annotated.items():
+        classes[_left_out(name, vocabulary)] = False
     return annotated
 
 
@@ -142,14 +139,17 @@ class _Encoder:
         # Relations of structure classes are uninformative: every room has walls on all sides.
         structure = self.vocabulary.structure[instance_classes]
         for array in (holds, observed):
-            array[:, structure] = False
-            array[:, :, structure] = False
+            array[:, structure] = array[:, :, structure] = False
         room = self.names.canonical_room(scene.room_type)
         room_type = None if room is None else self.vocabulary.room_index(room)
         evidence = pool_instances(instance_classes, np.ones(len(kept)), holds, observed, room_type)
         if any(thing.count > 1 for thing in scene.objects):
-            alike = [scene.objects[i].count for i in kept]
-            evidence = replace(evidence, counts=_counts(evidence, instance_classes, alike))
+            # One object entry can mean several instances.
+            index = np.searchsorted(evidence.classes, instance_classes)
+            counts = np.zeros_like(evidence.counts)
+            np.add.at(counts, index, [scene.objects[i].count for i in kept])
+            evidence = replace(evidence, counts=counts)
+        labels = [thing.label for thing in scene.objects if self.index(thing.label) is None]
         share = (meaning.scenes_per_group or group_size) / group_size
         return EncodedScene(
             scene_id=scene.scene_id,
@@ -160,48 +160,31 @@ class _Encoder:
             instance_classes=instance_classes,
             instance_holds=holds,
             instance_observed=observed,
-            unknown=self._unknown(scene, classes),
+            # One spelling of each label without a class.
+            unknown=tuple(sorted({label_key(label): label for label in labels}.values())),
             instance_positions=None if positions is None else positions[kept],
             weight=min(1.0, share),
             complete=meaning.complete_objects,
         )
 
-    def _unknown(self, scene: AnnotatedScene, classes: list[int | None]) -> tuple[str, ...]:
-        """Return the labels of the objects without a class, one spelling of each."""
-        outside = [
-            thing.label
-            for thing, index in zip(scene.objects, classes, strict=True)
-            if index is None
-        ]
-        return tuple(sorted({label_key(label): label for label in outside}.values()))
-
-
-def _counts(evidence: ClassEvidence, classes: Ints, alike: Sequence[int]) -> Ints:
-    """Return the number of instances of each class. One object entry can mean several instances."""
-    counts = np.zeros_like(evidence.counts)
-    np.add.at(counts, np.searchsorted(evidence.classes, classes), alike)
-    return counts
-
 
 def _relations(scene: AnnotatedScene, meaning: Meaning) -> tuple[PoseRelations, Floats | None]:
     """Derive all relations, as `encode` describes. Return them and their positions, or None."""
-    positions = None
+    n, positions = len(scene.objects), None
     if scene.relations is not None:
         return _from_lists(scene, scene.relations, meaning), None
     if any(thing.position is not None for thing in scene.objects):
-        found, positions = _from_poses(scene)
-        _close_poses(found, scene.objects, meaning)
+        relations, positions = _from_poses(scene)
+        _apply_rules(relations, scene.objects, meaning)
     elif any(thing.box2d is not None for thing in scene.objects):
-        boxes = [thing.box2d or (math.nan,) * 4 for thing in scene.objects]
-        found = derive_from_boxes(boxes)
+        relations = derive_from_boxes([thing.box2d or (math.nan,) * 4 for thing in scene.objects])
     else:
-        nothing = np.zeros((A, len(scene.objects), len(scene.objects)), dtype=np.bool_)
-        found = PoseRelations(nothing, nothing.copy())
-    _add_supports(found, scene.objects)
+        relations = PoseRelations(*np.zeros((2, A, n, n), dtype=np.bool_))
+    _add_supports(relations, scene.objects)
     for subject, relation, anchor in scene.false_relations:
         denied = canonicalise(subject, relation, anchor)
-        found.holds[denied], found.observed[denied] = False, True
-    return found, positions
+        relations.holds[denied], relations.observed[denied] = False, True
+    return relations, positions
 
 
 def _from_lists(
@@ -228,19 +211,19 @@ def _from_lists(
     return PoseRelations(holds, observed & ~contradicted & ~np.eye(n, dtype=np.bool_))
 
 
-def _close_poses(
-    found: PoseRelations, objects: Sequence[AnnotatedObject], meaning: Meaning
+def _apply_rules(
+    relations: PoseRelations, objects: Sequence[AnnotatedObject], meaning: Meaning
 ) -> None:
     """Apply the data source's rule for unlisted relations to relations derived from positions."""
     located = np.array([thing.position is not None for thing in objects])
     sized = located & np.array([thing.size is not None for thing in objects])
     for relation, unlisted in enumerate(meaning.unlisted):
         if unlisted == "off":
-            known = sized if relation in _VERTICAL else located
-            pairs = known[:, None] & known & ~np.eye(len(objects), dtype=np.bool_)
-            found.observed[relation] |= pairs
+            annotated = sized if relation in _VERTICAL else located
+            pairs = annotated[:, None] & annotated & ~np.eye(len(objects), dtype=np.bool_)
+            relations.observed[relation] |= pairs
         elif unlisted == "unobserved":
-            found.observed[relation] &= found.holds[relation]
+            relations.observed[relation] &= relations.holds[relation]
 
 
 def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, Floats]:
@@ -254,51 +237,52 @@ def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, Floats]:
     return derive_relations(positions, sizes, yaws), positions
 
 
-def _add_supports(found: PoseRelations, objects: Sequence[AnnotatedObject]) -> None:
+def _add_supports(relations: PoseRelations, objects: Sequence[AnnotatedObject]) -> None:
     """Set the relation on-top for each support link, also for an object inside its support."""
-    place = {thing.id: index for index, thing in enumerate(objects)}
+    index_of = {thing.id: index for index, thing in enumerate(objects)}
     for index, thing in enumerate(objects):
-        if thing.supported_by is None or (support := place[thing.supported_by]) == index:
+        if thing.supported_by is None or (support := index_of[thing.supported_by]) == index:
             continue
-        for i, j in ((index, support), (support, index)):
-            found.holds[:, i, j] = False
-            found.observed[:, i, j] = True
-        found.holds[_ON_TOP, index, support] = True
+        pair = [index, support], [support, index]
+        relations.holds[:, *pair], relations.observed[:, *pair] = False, True
+        relations.holds[_ON_TOP, index, support] = True
 
 
 def room_viewpoint(scene_id: str, positions: Floats) -> Viewpoint:
     """Return a viewpoint at the middle of one side of the room, facing inwards.
 
-    The room is the bounding box of the object centres. A hash of the scene id selects the side, so
-    the viewpoint of a scene never changes. Over many scenes, all four sides occur.
-
-    Args:
-        positions: centres of the objects in metres, (objects, 3). Rows with NaN are ignored.
+    The room is the bounding box of the object centres in metres, (objects, 3). Centres with NaN are
+    ignored. A hash of the scene id selects the side, so the viewpoint of a scene never changes.
+    Over many scenes, all four sides occur.
 
     Raises:
         ValueError: no object has a position.
     """
-    known = positions[np.isfinite(positions).all(axis=1), :2]
-    if not len(known):
+    centres = positions[np.isfinite(positions).all(axis=1), :2]
+    if not len(centres):
         raise ValueError(
             f"scene {scene_id!r} has no object with a position; a viewpoint needs at least one"
         )
-    (x0, y0), (x1, y1) = known.min(axis=0).tolist(), known.max(axis=0).tolist()
+    (x0, y0), (x1, y1) = centres.min(axis=0).tolist(), centres.max(axis=0).tolist()
+    side = hashlib.sha256(scene_id.encode()).digest()[0] % 4
+    return side_viewpoints(x0, y0, x1, y1)[side]
+
+
+def side_viewpoints(x0: float, y0: float, x1: float, y1: float) -> tuple[Viewpoint, ...]:
+    """Return the viewpoints at the middle of the four sides of a room, facing inwards."""
     x, y = (x0 + x1) / 2, (y0 + y1) / 2
     return (
         Viewpoint(x0, y, 0.0),
         Viewpoint(x, y0, math.pi / 2),
         Viewpoint(x1, y, math.pi),
         Viewpoint(x, y1, -math.pi / 2),
-    )[hashlib.sha256(scene_id.encode()).digest()[0] % 4]
+    )
 
 
 def derive_from_boxes(boxes: ArrayLike) -> PoseRelations:
     """Derive the relations left and above between image boxes (`scene_client.image_plane`).
 
-    Args:
-        boxes: box (xmin, ymin, xmax, ymax) of each object, with y downwards, (objects, 4). NaN
-            means that the object has no box.
+    The boxes (xmin, ymin, xmax, ymax) have y downwards, (objects, 4). NaN means no box.
 
     Raises:
         ValueError: ``boxes`` has a wrong shape.
@@ -308,13 +292,11 @@ def derive_from_boxes(boxes: ArrayLike) -> PoseRelations:
     if corners.shape != (n, 4) and n:
         raise ValueError(f"boxes has shape {corners.shape}, must be {(n, 4)}")
     rows = [tuple(row) for row in corners.tolist()]
-    holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
-    observed = np.zeros_like(holds)
-    for i in range(n):
-        for j in range(i + 1, n):
-            if not are_neighbours(rows[i], rows[j]):
-                continue
-            observed[_IN_THE_IMAGE, i, j] = observed[_IN_THE_IMAGE, j, i] = True
-            if (relation := relation_between(rows[i], rows[j])) is not None:
-                holds[canonicalise(i, relation, j)] = True
+    holds, observed = np.zeros((2, A, n, n), dtype=np.bool_)
+    for i, j in itertools.combinations(range(n), 2):
+        if not are_neighbours(rows[i], rows[j]):
+            continue
+        observed[_IN_THE_IMAGE, i, j] = observed[_IN_THE_IMAGE, j, i] = True
+        if (relation := relation_between(rows[i], rows[j])) is not None:
+            holds[canonicalise(i, relation, j)] = True
     return PoseRelations(holds, observed)

@@ -15,6 +15,8 @@ from training.datasets.records import DatasetError
 MAX_BYTES: Final = 2**30
 """Maximum size of a text file in bytes, after decompression."""
 MAX_DIGITS: Final = 30
+DATA: Final = Path("../shared/data")
+"""Default folder of the shipped data sources."""
 
 
 def read_lines(path: Path, limit: int) -> Iterator[bytes]:
@@ -23,12 +25,9 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
     The lines are not decoded, so that invalid UTF-8 affects one line only. Without the limits, a
     small compressed file could fill the memory.
 
-    Args:
-        limit: maximum length of a line in bytes, including the line end.
-
     Raises:
-        DatasetError: the file cannot be read, a line exceeds the limit, or all lines exceed
-            `MAX_BYTES`.
+        DatasetError: the file cannot be read, a line has more bytes than the limit with its line
+            end, or all lines exceed `MAX_BYTES`.
     """
     opener = gzip.open if path.suffix == ".gz" else open
     try:
@@ -53,11 +52,7 @@ def check_size(path: Path, size: int, limit: int) -> None:
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        DatasetError: the file cannot be read, has more than `MAX_BYTES`, or is not JSON.
-    """
+    """Read a JSON file of at most `MAX_BYTES`, or raise a DatasetError."""
     try:
         check_size(path, path.stat().st_size, MAX_BYTES)
         return json.loads(path.read_text(encoding="utf-8"), parse_int=bounded_int)
@@ -72,12 +67,7 @@ def load_json(path: Path) -> Any:
 
 
 def bounded_int(digits: str) -> int:
-    """Parse an integer of a JSON file, for the argument ``parse_int`` of `json.loads`.
-
-    Raises:
-        ValueError: the integer has more than `MAX_DIGITS` digits. Such integers could overflow on
-            conversion to float.
-    """
+    """Parse an integer for `json.loads`. Above `MAX_DIGITS` digits, float() could overflow."""
     if len(digits.lstrip("-")) > MAX_DIGITS:
         raise ValueError(f"an integer of {len(digits)} digits is too long: {digits[:10]}…")
     return int(digits)
@@ -95,11 +85,7 @@ def located(path: Path, where: str) -> Iterator[None]:
 
 
 def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Check the type of the field ``name`` of a JSON object, and return its value.
-
-    Raises:
-        DatasetError: the field is missing or has another type.
-    """
+    """Return the field ``name`` of a JSON object, or raise a DatasetError if its type differs."""
     if not isinstance(values, dict):
         raise DatasetError(path, where, f"must be an object, not {type(values).__name__}")
     if name not in values:
@@ -109,7 +95,3 @@ def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type
         names = kind.__name__ if isinstance(kind, type) else " or ".join(k.__name__ for k in kind)
         raise DatasetError(path, where, f"{name!r} must be of type {names}, not {value!r}")
     return value
-
-
-DATA = Path("../shared/data")
-"""Default folder of the shipped data sources."""

@@ -46,25 +46,17 @@ _VIEWER_SOURCES = frozenset({"sunrgbd-bedroom-3d"})
 
 
 def read_jsonl(path: Path) -> list[AnnotatedScene]:
-    """Read all scenes of a ``.jsonl`` or ``.jsonl.gz`` file.
-
-    Raises:
-        DatasetError: the file cannot be read, or a line is not a valid scene.
-    """
+    """Read all scenes of a ``.jsonl`` or ``.jsonl.gz`` file, or raise the first error."""
     scenes: list[AnnotatedScene] = []
-    for found in scan_jsonl(path):
-        if isinstance(found, DatasetError):
-            raise found
-        scenes.append(found)
+    for entry in scan_jsonl(path):
+        if isinstance(entry, DatasetError):
+            raise entry
+        scenes.append(entry)
     return scenes
 
 
 def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
-    """Yield a scene for each valid line and an error for each invalid line. Skip blank lines.
-
-    Raises:
-        DatasetError: the file cannot be read.
-    """
+    """Yield a scene for each valid line and an error for each invalid line. Skip blank lines."""
     seen: dict[tuple[str, str], int] = {}
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         if not line.strip():
@@ -72,17 +64,15 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
         where = f"line {number}"
         try:
             scene = _scene(json.loads(line, parse_int=bounded_int), f"{path.name}:{number}")
+            first = seen.setdefault((scene.source, scene.scene_id), number)
+            if first != number:
+                raise ValueError(f"scene {scene.scene_id!r} is on line {first} already")
         except json.JSONDecodeError as error:
             yield DatasetError(path, where, f"the line is not JSON: {error}")
         except (ValueError, RecursionError) as error:
             yield DatasetError(path, where, str(error))
         else:
-            first = seen.setdefault((scene.source, scene.scene_id), number)
-            if first == number:
-                yield scene
-            else:
-                problem = f"scene {scene.scene_id!r} is on line {first} already"
-                yield DatasetError(path, where, problem)
+            yield scene
 
 
 def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
@@ -95,25 +85,19 @@ def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
 
 def _values(scene: AnnotatedScene) -> dict[str, Any]:
     ids = [thing.id for thing in scene.objects]
-    relations = scene.relations
-    values: dict[str, Any] = {
-        "scene_id": scene.scene_id,
-        "source": scene.source,
-        "group": scene.group,
-        "room_type": scene.room_type,
-        "objects": [
-            # Fields with an unknown value are left out.
-            {
-                name: value
-                for name, value in asdict(thing).items()
-                if value is not None and name != "count"
-            }
-            for thing in scene.objects
-        ],
-        "relations": None if relations is None else [[ids[s], r, ids[o]] for s, r, o in relations],
-    }
+
+    def with_ids(relations: Iterable[tuple[int, str, int]]) -> list[list[str]]:
+        return [[ids[s], r, ids[o]] for s, r, o in relations]
+
+    values = {name: getattr(scene, name) for name in ("scene_id", "source", "group", "room_type")}
+    # Fields with an unknown value are left out.
+    values["objects"] = [
+        {name: x for name, x in asdict(thing).items() if x is not None and name != "count"}
+        for thing in scene.objects
+    ]
+    values["relations"] = None if scene.relations is None else with_ids(scene.relations)
     if scene.false_relations:
-        values["false_relations"] = [[ids[s], r, ids[o]] for s, r, o in scene.false_relations]
+        values["false_relations"] = with_ids(scene.false_relations)
     if counts := {thing.label: thing.count for thing in scene.objects if thing.count > 1}:
         values["counts"] = counts
     return values | ({"viewer_frame": True} if scene.viewer_frame else {})
@@ -130,18 +114,19 @@ def _scene(values: Any, default_id: str) -> AnnotatedScene:
     if not isinstance(viewer_frame, bool):
         raise ValueError(f"viewer_frame must be true or false, not {viewer_frame!r}")
     room_type = values.get("room_type")
+    relations, false_relations = (
+        _relations(name, values.get(name), source, objects)
+        for name in ("relations", "false_relations")
+    )
     return AnnotatedScene(
         scene_id=scene_id,
         source=source,
         group=_text("group", values.get("group", scene_id)),
         room_type=None if room_type is None else _text("room_type", room_type),
         objects=objects,
-        relations=_relations("relations", values.get("relations"), source, objects),
+        relations=relations,
         viewer_frame=viewer_frame,
-        false_relations=_relations(
-            "false_relations", values.get("false_relations"), source, objects
-        )
-        or (),
+        false_relations=false_relations or (),
     )
 
 
@@ -166,20 +151,19 @@ def _objects(entries: list[Any]) -> tuple[AnnotatedObject, ...]:
     things = [{"label": entry} if isinstance(entry, str) else entry for entry in entries]
     for thing in things:
         _check_fields("an object", thing, {"label"}, _OBJECT_FIELDS)
-    nameless = [thing for thing in things if thing.get("id") is None]
-    repeats = Counter(_text("label", thing["label"]) for thing in nameless)
+    nameless = Counter(_text("label", t["label"]) for t in things if t.get("id") is None)
     taken = {_id(thing["id"]) for thing in things if thing.get("id") is not None}
-    found = []
+    objects = []
     for thing in things:
         name, number = thing.get("id"), 0
         if name is None:
             name = label = thing["label"]
-            while name in taken or (not number and repeats[label] > 1):
+            while name in taken or (not number and nameless[label] > 1):
                 number += 1
                 name = f"{label}_{number}"
             taken.add(name)
-        found.append(_object(thing, _id(name)))
-    return tuple(found)
+        objects.append(_object(thing, _id(name)))
+    return tuple(objects)
 
 
 def _object(values: Mapping[str, Any], name: str) -> AnnotatedObject:
@@ -208,9 +192,9 @@ def _relations(
     if not isinstance(values, list):
         raise ValueError(f"{name} must be a list or null")
     labels = Counter(thing.label for thing in objects)
-    place = {t.label: index for index, t in enumerate(objects) if labels[t.label] == 1}
-    place |= {thing.id: index for index, thing in enumerate(objects)}
-    found: dict[tuple[int, str, int], None] = {}
+    index_of = {t.label: index for index, t in enumerate(objects) if labels[t.label] == 1}
+    index_of |= {thing.id: index for index, thing in enumerate(objects)}
+    relations: dict[tuple[int, str, int], None] = {}
     for entry in values:
         if isinstance(entry, dict) and set(entry) == {"subject", "relation", "object"}:
             entry = [entry["subject"], entry["relation"], entry["object"]]
@@ -219,22 +203,22 @@ def _relations(
                 "a relation is a list [subject, relation, object] or an object with these fields, "
                 f"not {entry!r}"
             )
-        subject, anchor = place.get(_id(entry[0])), place.get(_id(entry[2]))
+        subject, anchor = index_of.get(_id(entry[0])), index_of.get(_id(entry[2]))
         if subject is None or anchor is None:
             raise ValueError(f"relation {entry!r} names an object that is not in the scene")
         relation = relation_of(source, _text("predicate", entry[1]))
         # Some image annotators relate an object to itself. Such relations are skipped.
         if relation is not None and subject != anchor:
-            found[subject, relation, anchor] = None
-    return tuple(found)
+            relations[subject, relation, anchor] = None
+    return tuple(relations)
 
 
-def _check_fields(what: str, values: Any, needed: set[str], known: set[str]) -> None:
+def _check_fields(what: str, values: Any, needed: set[str], allowed: set[str]) -> None:
     if not isinstance(values, Mapping):
         raise ValueError(f"{what} must be a JSON object, not {type(values).__name__}")
     if missing := sorted(needed - set(values)):
         raise ValueError(f"{what} lacks {', '.join(missing)}")
-    if unknown := sorted(set(values) - known):
+    if unknown := sorted(set(values) - allowed):
         raise ValueError(f"{what} has unknown fields: {', '.join(unknown)}")
 
 

@@ -18,18 +18,17 @@ class Names:
     """The content of `vocabularies/names.toml`. Each attribute is a table or list of the file.
 
     Attributes:
-        base: common classes, which every indoor vocabulary contains.
-        household: rare household objects, which every indoor vocabulary also contains.
+        base, household: common classes, and rare household objects. Every indoor vocabulary
+            contains them.
         structure: classes such as walls. The service accepts these classes in requests but never
             proposes them.
         not_objects: labels that never become a class.
-        surroundings: outdoor structures such as buildings. Indoor vocabularies exclude them.
-        outdoor: outdoor objects. Indoor vocabularies exclude them.
+        surroundings, outdoor: outdoor structures such as buildings, and outdoor objects. Indoor
+            vocabularies exclude them.
         aliases: maps each class to its other names.
         kinds: maps each class to more specific names. If a vocabulary lacks a specific name, the
             name can become an alias of the class.
-        rooms: maps each room type to its other names. The key "" lists names that mean no room
-            type.
+        rooms: maps each room type to its other names. The key "" lists names without a room type.
     """
 
     base: tuple[str, ...] = ()
@@ -63,41 +62,43 @@ class Names:
 
     def canonical(self, label: str) -> str:
         """Return the curated name of a label, or the label in lower case with single spaces."""
-        found = self._by_key.get(label_key(label))
-        if found is not None:
-            return found
+        if (name := self._by_key.get(label_key(label))) is not None:
+            return name
         if (head := head_of(label)) is not None:
             return self.canonical(head)
-        return " ".join(label.casefold().replace("_", " ").split())
+        return _plain(label)
 
     def canonical_room(self, room: str | None) -> str | None:
         """Return the canonical spelling of a room type, or None if the name means no room type."""
         if room is None:
             return None
-        found = self._rooms_by_key.get(label_key(room))
-        if found is None:
-            found = " ".join(room.casefold().replace("_", " ").split())
-        return found or None
+        name = self._rooms_by_key.get(label_key(room))
+        return (_plain(room) if name is None else name) or None
 
     @cached_property
     def _by_key(self) -> dict[str, str]:
-        keys = {
-            label_key(other): name
-            for name, others in self.aliases.items()
-            for other in (name, *others)
-        }
+        keys = _by_any_name(self.aliases)
         for name in (*self.base, *self.household, *self.structure, *self.surroundings):
             keys.setdefault(label_key(name), name)
         return keys
 
     @cached_property
     def _rooms_by_key(self) -> dict[str, str]:
-        return {
-            label_key(other): name
-            for name, others in self.rooms.items()
-            for other in (name, *others)
-            if other
-        }
+        return _by_any_name(self.rooms)
+
+
+def _plain(name: str) -> str:
+    return " ".join(name.casefold().replace("_", " ").split())
+
+
+def _by_any_name(table: dict[str, tuple[str, ...]]) -> dict[str, str]:
+    """Map the key of each name in a table, except "", to the name whose entry contains it."""
+    return {
+        label_key(other): name
+        for name, others in table.items()
+        for other in (name, *others)
+        if other
+    }
 
 
 @cache
@@ -108,10 +109,10 @@ def curated_names() -> Names:
         ValueError: the file gives two meanings to one name.
     """
     values: dict[str, Any] = tomllib.loads(NAMES_FILE.read_text(encoding="utf-8"))
-    found: dict[str, Any] = {
+    tables: dict[str, Any] = {
         name: {key: tuple(others) for key, others in entry.items()}
         if isinstance(entry, dict)
         else tuple(entry)
         for name, entry in values.items()
     }
-    return Names(**found)
+    return Names(**tables)

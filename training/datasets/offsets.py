@@ -12,7 +12,7 @@ from training.datasets.array_types import Flags, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ObservedOffsets:
     """Observed offsets between related objects.
 
     Attributes:
@@ -30,23 +30,23 @@ class Seen:
     scene: Ints
     source: Ints
 
-    def some(self, some: Flags) -> Seen:
-        """Return the offsets where the mask `some`, (offsets,), is True."""
-        return Seen(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
+    def rows(self, mask: Flags) -> ObservedOffsets:
+        """Return the offsets where the mask, (offsets,), is True."""
+        return ObservedOffsets(*(getattr(self, name)[mask] for name in self.__dataclass_fields__))
 
 
-def seen_offsets(scenes: Sequence[EncodedScene]) -> Seen:
+def observed_offsets(scenes: Sequence[EncodedScene]) -> ObservedOffsets:
     """Return the offsets between all related objects in all scenes with poses."""
     sources = sorted({scene.source for scene in scenes})
     offsets, rows = [np.zeros((0, 3))], [np.zeros((0, 5), dtype=np.int64)]
-    for place, scene in enumerate(scenes):
+    for number, scene in enumerate(scenes):
         if scene.instance_positions is None:
             continue
         relation, i, j = np.nonzero(scene.instance_holds)
         offset = scene.instance_positions[i] - scene.instance_positions[j]
-        known = np.isfinite(offset).all(axis=1)
+        finite = np.isfinite(offset).all(axis=1)
         classes = scene.instance_classes
-        where = np.full(len(i), place), np.full(len(i), sources.index(scene.source))
-        offsets.append(offset[known])
-        rows.append(np.stack([relation, classes[i], classes[j], *where], axis=1)[known])
-    return Seen(np.concatenate(offsets), *np.concatenate(rows).T)
+        where = np.full(len(i), number), np.full(len(i), sources.index(scene.source))
+        offsets.append(offset[finite])
+        rows.append(np.stack([relation, classes[i], classes[j], *where], axis=1)[finite])
+    return ObservedOffsets(np.concatenate(offsets), *np.concatenate(rows).T)

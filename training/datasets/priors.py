@@ -38,9 +38,6 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
 
     Rows of other sources are skipped. All scenes have the source name `SOURCE`. Rows about the same
     pair of objects are in one group.
-
-    Raises:
-        DatasetError: the file is missing, invalid or too large.
     """
     scenes = []
     for where, (source, subject, relation, anchor, _, _) in _rows(path):
@@ -51,7 +48,7 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
             continue
         if not all(map(label_key, names)) or label_key(names[0]) == label_key(names[1]):
             continue
-        things = tuple(AnnotatedObject(str(place), name) for place, name in enumerate(names))
+        things = tuple(AnnotatedObject(str(index), name) for index, name in enumerate(names))
         group = " ".join(names)
         listed = ((0, relation, 1),)
         scenes.append(AnnotatedScene(where, SOURCE, group, None, things, listed))

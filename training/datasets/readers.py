@@ -1,16 +1,158 @@
-"""The readers of scene files, by the name of the file format."""
+"""The readers of scene files by the name of the format, and the readers of 3DSSG and COCO.
+
+3DSSG scene graphs (Wald et al., CVPR 2020): the whole data set consists of ``relationships.json``
+and of ``objects.json``, which contains the labels. The subset consists of
+``relationships_train.json`` and ``relationships_validation.json``. The files of the subset include
+the labels and divide scans into splits of at most nine objects. ``3RScan.json`` in the same folder
+lists the scans of each room.
+
+COCO instance annotations (Lin et al., ECCV 2014): ``instances*.json``.
+
+A reader raises a DatasetError if a file is missing or does not have the official format.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from training.datasets.coco import read_coco
+from training.datasets.files import load_json, located, take
 from training.datasets.jsonl import read_jsonl
-from training.datasets.records import AnnotatedScene, DatasetError
+from training.datasets.records import AnnotatedObject, AnnotatedScene, Box2d, DatasetError
+from training.datasets.sources import relation_of
 from training.datasets.sunrgbd_mat import read_sunrgbd_mat
-from training.datasets.threedssg import read_3dssg
+
+
+def read_3dssg(path: Path) -> list[AnnotatedScene]:
+    """Read the scans, or splits of scans, in a relationships file of 3DSSG as scenes.
+
+    All scans of a room are in one group. The official files contain no room types and no poses.
+    """
+    scans = _entries(path, "", load_json(path), "scans")
+    rooms = _rooms(path.with_name("3RScan.json"))
+    labels: dict[str, dict[str, str]] | None = None
+    scenes: dict[str, AnnotatedScene] = {}
+    for where, scan in scans:
+        name = take(path, where, scan, "scan", str)
+        if "objects" in scan:
+            objects = take(path, where, scan, "objects", dict)
+        else:
+            if labels is None:
+                labels = _labels(path.with_name("objects.json"))
+            if name not in labels:
+                raise DatasetError(path, where, f"scan {name} is not in objects.json")
+            objects = labels[name]
+        if name not in rooms:
+            raise DatasetError(path, where, f"scan {name} is not in 3RScan.json")
+        scene_id = f"3dssg-{name}-{scan['split']}" if "split" in scan else f"3dssg-{name}"
+        if scene_id in scenes:
+            raise DatasetError(path, where, f"scene {scene_id} is listed twice")
+        relations = _relations(path, where, scan, list(objects))
+        with located(path, where):
+            things = tuple(AnnotatedObject(key, label) for key, label in objects.items())
+            group = f"3rscan-{rooms[name]}"
+            scenes[scene_id] = AnnotatedScene(scene_id, "3dssg", group, None, things, relations)
+    return list(scenes.values())
+
+
+def _entries(path: Path, where: str, values: Any, name: str) -> list[tuple[str, Any]]:
+    """Return position and value of each entry of the list ``name``."""
+    entries = take(path, where, values, name, list)
+    start = f"{where}.{name}" if where else name
+    return [(f"{start}[{number}]", entry) for number, entry in enumerate(entries)]
+
+
+def _relations(
+    path: Path, where: str, scan: dict[str, Any], ids: list[str]
+) -> tuple[tuple[int, str, int], ...]:
+    index_of = {key: index for index, key in enumerate(ids)}
+    relations: dict[tuple[int, str, int], None] = {}
+    for here, entry in _entries(path, where, scan, "relationships"):
+        if not isinstance(entry, list) or len(entry) != 4 or not isinstance(entry[3], str):
+            raise DatasetError(
+                path, here, f"must be [subject, object, predicate id, predicate], not {entry!r}"
+            )
+        subject, anchor = index_of.get(str(entry[0])), index_of.get(str(entry[1]))
+        if subject is None or anchor is None:
+            raise DatasetError(path, here, f"{entry!r} names an object that is not in the scan")
+        relation = relation_of("3dssg", entry[3])
+        if relation is not None and subject != anchor:
+            relations[subject, relation, anchor] = None
+    return tuple(relations)
+
+
+def _labels(path: Path) -> dict[str, dict[str, str]]:
+    """Read ``objects.json``. Return a mapping from scan id to object id to label."""
+    labels: dict[str, dict[str, str]] = {}
+    for where, scan in _entries(path, "", load_json(path), "scans"):
+        of_scan = labels.setdefault(take(path, where, scan, "scan", str), {})
+        for here, thing in _entries(path, where, scan, "objects"):
+            key = str(take(path, here, thing, "id", (str, int)))
+            of_scan[key] = take(path, here, thing, "label", str)
+    return labels
+
+
+def _rooms(path: Path) -> dict[str, str]:
+    """Read ``3RScan.json``. Map each scan id to the id of the reference scan of the same room."""
+    rooms: dict[str, str] = {}
+    entries = load_json(path)
+    if not isinstance(entries, list):
+        raise DatasetError(path, "", "the file must contain a list of reference scans")
+    for number, entry in enumerate(entries):
+        where = f"[{number}]"
+        reference = take(path, where, entry, "reference", str)
+        rooms[reference] = reference
+        for here, rescan in _entries(path, where, entry, "scans"):
+            rooms[take(path, here, rescan, "reference", str)] = reference
+    return rooms
+
+
+def read_coco(path: Path) -> list[AnnotatedScene]:
+    """Read the images of a COCO file as scenes. Images without objects are skipped.
+
+    Boxes around crowds are also skipped, because they contain several objects. Boxes are in the
+    image plane. Encoding later derives the relations left and above from boxes.
+    """
+    content = load_json(path)
+    categories: dict[int, str] = {}
+    for where, entry in _entries(path, "", content, "categories"):
+        categories[take(path, where, entry, "id", int)] = take(path, where, entry, "name", str)
+    images: dict[int, dict[int, AnnotatedObject]] = {}
+    for where, entry in _entries(path, "", content, "images"):
+        images[take(path, where, entry, "id", int)] = {}
+    for where, entry in _entries(path, "", content, "annotations"):
+        image = take(path, where, entry, "image_id", int)
+        category = take(path, where, entry, "category_id", int)
+        if image not in images:
+            raise DatasetError(path, where, f"image_id {image} is not among the images of the file")
+        if category not in categories:
+            raise DatasetError(path, where, f"category_id {category} is not among the categories")
+        if entry.get("iscrowd"):
+            continue
+        key = take(path, where, entry, "id", int)
+        if key in images[image]:
+            raise DatasetError(path, f"image {image}", "two annotations have the same id")
+        with located(path, where):
+            box = _box(path, where, entry)
+            images[image][key] = AnnotatedObject(str(key), categories[category], box2d=box)
+    names = {f"coco-{image}": tuple(objects.values()) for image, objects in images.items()}
+    return [
+        AnnotatedScene(name, "coco", name, None, objects)
+        for name, objects in names.items()
+        if objects
+    ]
+
+
+def _box(path: Path, where: str, entry: dict[str, Any]) -> Box2d:
+    bbox = take(path, where, entry, "bbox", list)
+    numbers = all(isinstance(v, (int, float)) and math.isfinite(v) for v in bbox)
+    if len(bbox) != 4 or not numbers or min(bbox[2:]) < 0:
+        raise DatasetError(path, where, f"bbox must be [x, y, width, height], not {bbox!r}")
+    x, y, width, height = map(float, bbox)
+    return (x, y, x + width, y + height)
+
 
 READERS: Final[dict[str, Callable[[Path], list[AnnotatedScene]]]] = {
     "jsonl": read_jsonl,
@@ -44,9 +186,5 @@ def guess_format(path: Path) -> str:
 
 
 def read_scenes(path: Path) -> list[AnnotatedScene]:
-    """Read the scenes of a file. The file name determines the format.
-
-    Raises:
-        DatasetError: the name matches no known format, or the file is invalid.
-    """
+    """Read the scenes of a file in the format that `guess_format` returns, or raise its error."""
     return READERS[guess_format(path)](path)

@@ -19,11 +19,7 @@ MAX_PROBLEM: Final = 500
 
 
 class DatasetError(ValueError):
-    """A data file cannot be read or has invalid content.
-
-    Args:
-        where: position in the file, such as ``line 3`` or ``scans[0].objects[2]``.
-    """
+    """A data file cannot be read or has invalid content at a position, such as ``line 3``."""
 
     def __init__(self, path: Path, where: str, problem: str) -> None:
         if len(problem) > MAX_PROBLEM:  # the text can contain a value of several megabytes
@@ -40,8 +36,7 @@ class AnnotatedObject:
 
     Attributes:
         id: id of the object, distinct within the scene.
-        position: centre (x, y, z) of the object in metres.
-        size: extents (x, y, z) of the object in metres, before rotation by the yaw.
+        position, size: centre, and extents before rotation by the yaw, (x, y, z) in metres.
         yaw: rotation of the object about the z axis in radians.
         supported_by: id of the object that supports this object.
         box2d: box (xmin, ymin, xmax, ymax) in the image, with y downwards.
@@ -68,12 +63,9 @@ class AnnotatedObject:
         _check_numbers("box2d", self.id, self.box2d, 4)
         if self.size is not None and min(self.size) < 0:
             raise ValueError(f"size of {self.id!r} must not be negative, but is {self.size}")
-        if self.box2d is not None and (
-            self.box2d[0] > self.box2d[2] or self.box2d[1] > self.box2d[3]
-        ):
-            raise ValueError(
-                f"box2d of {self.id!r} must be (xmin, ymin, xmax, ymax), not {self.box2d}"
-            )
+        if self.box2d and (self.box2d[0] > self.box2d[2] or self.box2d[1] > self.box2d[3]):
+            corners = "(xmin, ymin, xmax, ymax)"
+            raise ValueError(f"box2d of {self.id!r} must be {corners}, not {self.box2d}")
         if not math.isfinite(self.yaw):
             raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
         if not 1 <= self.count <= MAX_COUNT:
@@ -82,21 +74,18 @@ class AnnotatedObject:
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedScene:
-    """One annotated scene.
+    """One annotated scene, whose id is distinct within its data source.
 
     Attributes:
-        scene_id: id of the scene, distinct within its data source.
         group: name of a group of near-duplicate scenes, such as frames of one place.
         room_type: room type in the data set. None means unknown.
-        relations: triples (subject index, relation, object index). The indices refer to
-            ``objects``. None means that relations were not annotated.
+        relations, false_relations: triples (subject index, relation, object index) that hold, and
+            that an annotator marked as false. Without annotated relations, `relations` is None.
         viewer_frame: True if positions are in viewer axes. Otherwise left and front are undefined
             until a viewpoint is chosen.
-        false_relations: triples that an annotator marked as false, in the form of ``relations``.
 
     Raises:
-        ValueError: two objects have the same id, or a support link or relation refers to an
-            unknown object.
+        ValueError: two objects have the same id, or a link or relation names an unknown object.
     """
 
     scene_id: str
@@ -118,14 +107,14 @@ class AnnotatedScene:
                     f"supported_by of {thing.id!r} is {thing.supported_by!r}, which is no object "
                     "of the scene"
                 )
+        size = len(self.objects)
         for subject, relation, anchor in (*(self.relations or ()), *self.false_relations):
             if relation not in RELATIONS:
                 raise ValueError(f"unknown relation {relation!r}")
             for end in (subject, anchor):
-                if not 0 <= end < len(self.objects):
+                if not 0 <= end < size:
                     raise ValueError(
-                        f"a relation has object index {end}, "
-                        f"but the scene has {len(self.objects)} objects"
+                        f"a relation has object index {end}, but the scene has {size} objects"
                     )
 
 

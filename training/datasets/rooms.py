@@ -8,6 +8,7 @@ A view omits 10 % of the small objects at random. All views of a room are in one
 
 from __future__ import annotations
 
+import itertools
 import math
 import tomllib
 from collections.abc import Mapping
@@ -17,9 +18,10 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from app.scene import Viewpoint, Vocabulary, to_viewer_frame
+from app.scene import Vocabulary, to_viewer_frame
 from app.scene.footprints import overlap_and_gap
 from training.datasets.array_types import Rng
+from training.datasets.encoding import side_viewpoints
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 from training.datasets.vocabulary import source_vocabulary
 
@@ -39,13 +41,7 @@ Candidate = Literal["left", "right", "front", "around"]
 
 @dataclass(frozen=True, slots=True)
 class Small:
-    """A small object on a piece of furniture.
-
-    Attributes:
-        size: mean extents of the object.
-        chance: probability that an object is added in each of ``most`` attempts.
-        most: maximum number of objects of this kind on the piece.
-    """
+    """A small object on furniture, added with a probability in each of ``most`` attempts."""
 
     label: str
     size: Size
@@ -57,10 +53,8 @@ class Small:
 class Beside:
     """A piece of furniture beside a main piece, such as a nightstand left of a bed.
 
-    Attributes:
-        piece: adjacent piece with the objects on it. Its ``chance`` applies to each side.
-        side: side of the main piece, as seen from the wall behind it. ``around`` means all four
-            sides.
+    The side of the main piece is seen from the wall behind it; ``around`` means all four sides. The
+    ``chance`` of the adjacent piece applies to each side.
     """
 
     piece: Piece
@@ -69,15 +63,12 @@ class Beside:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A piece of furniture.
+    """A piece of furniture, added to the room with a probability in each of ``most`` attempts.
 
     Attributes:
         size: mean extents of the piece.
-        chance: probability that a piece is added to the room in each of ``most`` attempts.
         where: place of the piece: at a wall, in the centre, hung on a wall, or under the ceiling.
-        most: maximum number of pieces of this kind in the room.
-        carries: small objects that can stand on the piece.
-        beside: pieces that can stand beside the piece.
+        carries, beside: small objects that can stand on the piece, and pieces beside it.
     """
 
     label: str
@@ -93,43 +84,36 @@ Rooms = Mapping[str, tuple[Piece, ...]]
 """Maps each room type to the pieces of furniture that it can contain."""
 
 
-class _Tables:
-    """The tables of `vocabularies/rooms.toml`.
+def _read_tables(path: Path) -> dict[str, Rooms]:
+    """Return the rooms of each domain. An entry is a table, or the name of an earlier table."""
+    values = tomllib.loads(path.read_text(encoding="utf-8"))
+    smalls: dict[str, Small] = {}
+    pieces: dict[str, Piece] = {}
 
-    An entry is a table, or the name of an earlier table.
-    """
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self.smalls: dict[str, Small] = {}
-        self.pieces: dict[str, Piece] = {}
-        for name, entry in values["small"].items():
-            self.smalls[name] = self._small(entry)
-        for name, entry in values["piece"].items():
-            self.pieces[name] = self._piece(entry)
-        self.rooms: dict[str, Rooms] = {
-            domain: {room: tuple(map(self._piece, entries)) for room, entries in rooms.items()}
-            for domain, rooms in values["rooms"].items()
-        }
-
-    def _small(self, entry: Any) -> Small:
+    def small(entry: Any) -> Small:
         if isinstance(entry, str):
-            return self.smalls[entry]
+            return smalls[entry]
         return Small(**entry | {"size": tuple(entry["size"])})
 
-    def _piece(self, entry: Any) -> Piece:
+    def piece(entry: Any) -> Piece:
         if isinstance(entry, str):
-            return self.pieces[entry]
-        beside = (Beside(self._piece(e["piece"]), e["side"]) for e in entry.get("beside", ()))
-        parts = {
-            "size": tuple(entry["size"]),
-            "carries": tuple(map(self._small, entry.get("carries", ()))),
-            "beside": tuple(beside),
-        }
-        return Piece(**entry | parts)
+            return pieces[entry]
+        beside = (Beside(piece(e["piece"]), e["side"]) for e in entry.get("beside", ()))
+        carries = map(small, entry.get("carries", ()))
+        parts = {"size": entry["size"], "carries": carries, "beside": beside}
+        return Piece(**entry | {name: tuple(values) for name, values in parts.items()})
+
+    for name, entry in values["small"].items():
+        smalls[name] = small(entry)
+    for name, entry in values["piece"].items():
+        pieces[name] = piece(entry)
+    return {
+        domain: {room: tuple(map(piece, entries)) for room, entries in rooms.items()}
+        for domain, rooms in values["rooms"].items()
+    }
 
 
-_FILE = Path(__file__).resolve().parent / "vocabularies" / "rooms.toml"
-DOMAINS: Final = _Tables(tomllib.loads(_FILE.read_text(encoding="utf-8"))).rooms
+DOMAINS: Final = _read_tables(Path(__file__).resolve().parent / "vocabularies" / "rooms.toml")
 """Rooms of each domain: ``homes``, or ``workplaces`` (laboratories, workshops, storerooms)."""
 
 ROOMS: Final = DOMAINS["homes"]
@@ -151,15 +135,10 @@ class _Box:
 
 
 def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[AnnotatedScene]:
-    """Generate scenes. The same seed gives the same scenes.
+    """Generate scenes. The same seed gives the same scenes. `DOMAINS` has other rooms.
 
-    Positions are in viewer axes. Objects have sizes and yaws. The field ``supported_by`` of an
-    object on furniture is the id of the furniture. ``relations`` is None, because encoding derives
-    the relations.
-
-    Args:
-        rooms: maps each room type to the pieces of furniture that it can contain. `DOMAINS`
-            contains the rooms of other domains.
+    Positions are in viewer axes. Objects have sizes, yaws, and the id of the furniture below them
+    (``supported_by``). ``relations`` is None, because encoding derives the relations.
 
     Raises:
         ValueError: ``count`` is negative.
@@ -168,13 +147,13 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
         raise ValueError(f"count must not be negative, not {count}")
     rng = np.random.default_rng(seed)
     scenes: list[AnnotatedScene] = []
-    room = 0
-    while len(scenes) < count:
+    for room in itertools.count():
+        if len(scenes) >= count:
+            break
         room_type = str(rng.choice(list(rooms)))
         layout = _Layout(rng, room_type, rooms[room_type])
         views = range(int(rng.integers(1, 4)))
-        scenes += [layout.seen(f"rooms-{seed}-{room}", view) for view in views]
-        room += 1
+        scenes += [layout.view(f"rooms-{seed}-{room}", view) for view in views]
     return scenes[:count]
 
 
@@ -187,11 +166,11 @@ def rooms_vocabulary() -> Vocabulary:
 
 
 def _labels(pieces: tuple[Piece, ...]) -> list[str]:
-    found = []
+    labels = []
     for piece in pieces:
-        found += [piece.label, *(small.label for small in piece.carries)]
-        found += _labels(tuple(beside.piece for beside in piece.beside))
-    return found
+        labels += [piece.label, *(small.label for small in piece.carries)]
+        labels += _labels(tuple(beside.piece for beside in piece.beside))
+    return labels
 
 
 class _Layout:
@@ -207,50 +186,32 @@ class _Layout:
                 if rng.random() < piece.chance:
                     self._furnish(piece)
 
-    def seen(self, group: str, view: int) -> AnnotatedScene:
+    def view(self, group: str, number: int) -> AnnotatedScene:
         """Return a view of the room from the middle of a random wall."""
-        viewpoint = (
-            Viewpoint(0.0, self.depth / 2, 0.0),
-            Viewpoint(self.width / 2, 0.0, math.pi / 2),
-            Viewpoint(self.width, self.depth / 2, math.pi),
-            Viewpoint(self.width / 2, self.depth, -math.pi / 2),
-        )[int(self.rng.integers(4))]
+        viewpoints = side_viewpoints(0.0, 0.0, self.width, self.depth)
+        viewpoint = viewpoints[int(self.rng.integers(4))]
         kept = [
-            index
+            (str(index), box)
             for index, box in enumerate(self.boxes)
             if box.support is None or self.rng.random() >= _GONE
         ]
-        boxes = [self.boxes[index] for index in kept]
         positions, yaws = to_viewer_frame(
-            [(box.x, box.y, box.z) for box in boxes], viewpoint, [box.yaw for box in boxes]
+            [(box.x, box.y, box.z) for _, box in kept], viewpoint, [box.yaw for _, box in kept]
         )
-        return AnnotatedScene(
-            scene_id=f"{group}-{view}",
-            source=SOURCE,
-            group=group,
-            room_type=self.room_type,
-            objects=tuple(
-                AnnotatedObject(
-                    id=str(index),
-                    label=box.label,
-                    position=(x, y, z),
-                    size=box.size,
-                    yaw=yaw,
-                    supported_by=None if box.support is None else str(box.support),
-                )
-                for index, box, (x, y, z), yaw in zip(
-                    kept, boxes, positions.tolist(), yaws.tolist(), strict=True
-                )
-            ),
-            viewer_frame=True,
+        poses = zip(kept, positions.tolist(), yaws.tolist(), strict=True)
+        objects = tuple(
+            AnnotatedObject(
+                *(index, box.label, (x, y, z), box.size, yaw),
+                supported_by=None if box.support is None else str(box.support),
+            )
+            for (index, box), (x, y, z), yaw in poses
         )
+        scene_id = f"{group}-{number}"
+        return AnnotatedScene(scene_id, SOURCE, group, self.room_type, objects, viewer_frame=True)
 
     def _size(self, mean: Size) -> Size:
-        x, y, z = (
-            side * factor
-            for side, factor in zip(mean, self.rng.uniform(0.88, 1.12, 3), strict=True)
-        )
-        return (float(x), float(y), float(z))
+        x, y, z = (np.array(mean) * self.rng.uniform(0.88, 1.12, 3)).tolist()
+        return x, y, z
 
     def _furnish(self, piece: Piece) -> None:
         size = self._size(piece.size)
@@ -332,7 +293,10 @@ class _Layout:
                 self._place(piece, box)
 
     def _inside(self, box: _Box) -> bool:
-        x, y = _half_extent(box)
+        cos, sin = abs(math.cos(box.yaw)), abs(math.sin(box.yaw))
+        half_x, half_y = box.size[0] / 2, box.size[1] / 2
+        # Half the side lengths of the axis-aligned rectangle around the rotated box.
+        x, y = cos * half_x + sin * half_y, sin * half_x + cos * half_y
         return x <= box.x <= self.width - x and y <= box.y <= self.depth - y
 
     def _free(self, box: _Box) -> bool:
@@ -359,10 +323,3 @@ def _offset(box: _Box, u: float, v: float) -> tuple[float, float]:
     """Return the point u metres along the front of a box and v metres away from its back."""
     cos, sin = math.cos(box.yaw), math.sin(box.yaw)
     return box.x + cos * u - sin * v, box.y + sin * u + cos * v
-
-
-def _half_extent(box: _Box) -> tuple[float, float]:
-    """Return half the side lengths of the axis-aligned rectangle around a rotated box."""
-    cos, sin = abs(math.cos(box.yaw)), abs(math.sin(box.yaw))
-    x, y = box.size[0] / 2, box.size[1] / 2
-    return cos * x + sin * y, sin * x + cos * y

@@ -12,6 +12,7 @@ randomization" (ACM TKDD, 2007).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
@@ -33,9 +34,7 @@ def shuffle_objects(
     """Permute classes between scenes of all data sources, and room types between scenes.
 
     Structure classes are exchanged only with structure classes, because their relations are
-    unobserved. Counts, confidences and relations stay with their slots. Room types are permuted
-    among the scenes with a room type. Scene ids, sources, groups and unknown labels
-    stay unchanged.
+    unobserved. Room types are permuted among the scenes with a room type.
 
     Raises:
         ValueError: a class index of a scene exceeds the length of `structure`.
@@ -67,21 +66,19 @@ def _exchange(owner: Ints, classes: Ints, rng: Rng) -> Ints:
     if not len(classes):
         return classes
     label, scene = classes.tolist(), owner.tolist()
-    there: dict[int, set[int]] = {}
+    classes_of: defaultdict[int, set[int]] = defaultdict(set)
     for s, c in zip(scene, label, strict=True):
-        there.setdefault(s, set()).add(c)
+        classes_of[s].add(c)
     drawn = rng.integers(len(label), size=(2, _STEPS_PER_MENTION * len(label)))
     # Each exchange depends on the earlier exchanges, so lists and sets are faster than arrays.
     for i, j in zip(*drawn.tolist(), strict=True):
         c, d = label[i], label[j]
-        first, second = there[scene[i]], there[scene[j]]
+        first, second = classes_of[scene[i]], classes_of[scene[j]]
         if first is not second:
             if d in first or c in second:
                 continue
-            first.remove(c)
-            first.add(d)
-            second.remove(d)
-            second.add(c)
+            first ^= {c, d}
+            second ^= {c, d}
         label[i], label[j] = d, c
     return np.array(label, dtype=np.int64)
 

@@ -24,7 +24,7 @@ objects on the same support, so left and front of distant pairs are unobserved.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from app.scene import CANONICAL, RELATIONS
@@ -65,9 +65,8 @@ BOXES: Final = Meaning(lateral="off for neighbours")
 """Meaning for relations derived from boxes. Without sizes, on-top and above are unobserved."""
 
 _CENTRES: Final = Meaning(on_top="unobserved", above="unobserved")
-_MENTIONS: Final = Meaning(
-    on_top="unobserved", above="unobserved", lateral="unobserved", complete_objects=False
-)
+_SELECTED: Final = Meaning(on_top="unobserved", above="unobserved", lateral="unobserved")
+_MENTIONS: Final = replace(_SELECTED, complete_objects=False)
 
 _THE_EIGHT: Final = {name: name for name in RELATIONS}
 # Relation of each predicate of 3DSSG. All kinds of support become on-top.
@@ -110,11 +109,9 @@ class Source:
             other predicates, such as "inside" and "wear". None means that another predicate is an
             error. Names of relations are predicates of every source.
         left_out: labels that are ignored because their annotation is too incomplete.
-        open_vocabulary: True if annotators used free words. An unlisted class is then absent.
-            Otherwise annotators chose labels from a list, and a class outside the list is
-            unobserved.
-        counts_movables: True if the source counts only movable objects. Other classes occur once
-            in each scene that lists them.
+        open_vocabulary: True if annotators used free words, so that an unlisted class is absent.
+            Otherwise a class outside their list of labels is unobserved.
+        counts_movables: True if only movable objects are counted. Others occur once in a scene.
         of_one_view: True if a scene is one camera frame. A frame does not show how many objects are
             in the room, so statistics of counts do not learn from it.
     """
@@ -189,9 +186,7 @@ SOURCES: Final[dict[str, Source]] = {
         "ALFRED (Shridhar et al., CVPR 2020): AI2-THOR rooms and triples from instructions; MIT",
         # Thousands of episodes show only about a hundred rooms, so all episodes of a room together
         # have the weight of three scenes.
-        meaning=Meaning(
-            on_top="unobserved", above="unobserved", lateral="unobserved", scenes_per_group=3.0
-        ),
+        meaning=replace(_SELECTED, scenes_per_group=3.0),
         predicates=_THE_EIGHT,
         counts_movables=True,
     ),
@@ -227,9 +222,9 @@ def meaning_of(source: str, *, listed: bool = True) -> Meaning:
         listed: True if the scene lists relations. Only unknown sources, and sources without a fixed
             meaning, depend on this argument.
     """
-    known = SOURCES.get(source)
-    if known is not None and known.meaning is not None:
-        return known.meaning
+    entry = SOURCES.get(source)
+    if entry is not None and entry.meaning is not None:
+        return entry.meaning
     return LISTS if listed else BOXES
 
 
@@ -239,9 +234,9 @@ def relation_of(source: str, predicate: str) -> str | None:
     Raises:
         ValueError: the predicate is unknown, and the data source has no table of predicates.
     """
-    known = SOURCES.get(source)
-    if known is not None and known.predicates is not None and predicate not in RELATIONS:
-        return known.predicates.get(predicate)
+    entry = SOURCES.get(source)
+    if entry is not None and entry.predicates is not None and predicate not in RELATIONS:
+        return entry.predicates.get(predicate)
     if predicate not in RELATIONS:
         raise ValueError(f"unknown relation {predicate!r}: must be one of {', '.join(RELATIONS)}")
     return predicate

@@ -72,11 +72,11 @@ def split(
 
 def stable_part(group: str, seed: int) -> Part:
     """Return the part of a group in the ``stable`` protocol. It depends on no other scenes."""
-    place = int.from_bytes(_rank(seed, group)[:8], "big") / 2**64
+    fraction = int.from_bytes(_rank(seed, group)[:8], "big") / 2**64
     for part, share in FRACTIONS["stable"].items():
-        if place < share:
+        if fraction < share:
             return part
-        place -= share
+        fraction -= share
     return "train"
 
 
@@ -85,9 +85,8 @@ def _families(
 ) -> list[dict[str, Counter[str]]]:
     """Count the room types of each unit (group or scene), for each set of connected data sources.
 
-    Data sources are connected if they have common units. A unit is counted only in the largest
-    source that contains the unit. A small source therefore cannot change the parts of a large
-    source.
+    Data sources are connected if they have common units. A unit is counted only in its largest
+    source, so that a small source cannot change the parts of a large source.
     """
     sources_of: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter()
@@ -152,9 +151,9 @@ def _assign(
     return part_of
 
 
-def _lack(share: float, given: int, total: int) -> float:
+def _lack(share: float, assigned: int, total: int) -> float:
     """Return the number of additional scenes with which a part reaches its target share."""
-    return share * total - given
+    return share * total - assigned
 
 
 def _rank(seed: int, unit: str) -> bytes:

@@ -42,15 +42,12 @@ _BLOCK = 20
 def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
     """Read all camera frames with boxes as scenes.
 
-    The file ``<sequenceName>/scene.txt`` gives the room type, if the image folders are in the same
-    folder as the MATLAB file. Frames of one SUN3D place are in one group. Other frames form groups
-    of 20 consecutive frames from one sensor and collection.
-
-    Raises:
-        DatasetError: the file does not have the official format, or has more than `MAX_BYTES`.
+    ``<sequenceName>/scene.txt`` in the folder of the MATLAB file gives the room type. Frames of one
+    SUN3D place are in one group. Other frames form groups of 20 consecutive frames from one sensor
+    and collection. The file may have at most `MAX_BYTES`.
     """
     scenes: list[AnnotatedScene] = []
-    taken: Counter[str] = Counter()
+    frames: Counter[str] = Counter()
     for number, frame in enumerate(_structs(_load(path))):
         where = f"SUNRGBDMeta({number + 1})"
         name = _text(path, where, frame, "sequenceName").strip("/")
@@ -58,24 +55,16 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
         if "sun3ddata" in name:
             group = "sunrgbd-" + "/".join(name.split("/")[:4])
         else:
-            group = f"sunrgbd-{collection}-{taken[collection] // _BLOCK}"
-        taken[collection] += 1
+            group = f"sunrgbd-{collection}-{frames[collection] // _BLOCK}"
+        frames[collection] += 1
         boxes = _structs(take(path, where, frame, "groundtruth3DBB", object))
         objects = tuple(
-            _box(path, f"{where}.groundtruth3DBB({position + 1})", position, box)
-            for position, box in enumerate(boxes)
+            _box(path, f"{where}.groundtruth3DBB({index + 1})", index, box)
+            for index, box in enumerate(boxes)
         )
         if objects:
-            scenes.append(
-                AnnotatedScene(
-                    scene_id=name,
-                    source=SOURCE,
-                    group=group,
-                    room_type=_room_type(path.parent / name / "scene.txt"),
-                    objects=objects,
-                    viewer_frame=True,
-                )
-            )
+            room = _room_type(path.parent / name / "scene.txt")
+            scenes.append(AnnotatedScene(name, SOURCE, group, room, objects, viewer_frame=True))
     return scenes
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -36,11 +36,9 @@ def build_vocabulary(
     """Collect the frequent classes of scenes with their aliases, most frequent class first.
 
     A label counts for its curated name. The base and household classes of ``names`` are always
-    included. Labels in ``names.not_objects`` are always excluded.
-
-    Args:
-        minimum_rooms: minimum number of scenes of a room type. The default is ``minimum``.
-        outdoor: True includes the labels in ``names.outdoor`` and ``names.surroundings``.
+    included. Labels in ``names.not_objects`` are always excluded, and those in ``names.outdoor``
+    and ``names.surroundings`` unless ``outdoor`` is True. ``minimum_rooms`` is the minimum number
+    of scenes of a room type, by default ``minimum``.
 
     Raises:
         ValueError: every class has fewer objects than the minimum.
@@ -56,29 +54,25 @@ def build_vocabulary(
     # Spellings with the same key count as one label, under the most common spelling.
     mentions = Counter(
         {
-            min(found, key=lambda label: (-found[label], label)): found.total()
-            for found in spellings.values()
+            min(labels, key=lambda x: (-labels[x], x)): labels.total()
+            for labels in spellings.values()
         }
     )
     refused = {label_key(name) for name in names.not_objects}
     if not outdoor:
         refused |= {label_key(name) for name in (*names.outdoor, *names.surroundings)}
-    rooms_from = minimum if minimum_rooms is None else minimum_rooms
+    if minimum_rooms is None:
+        minimum_rooms = minimum
     kept = {*names.base, *names.household}
     kept |= {label for label, count in mentions.items() if count >= minimum}
     structure = {label_key(name) for name in (*names.structure, *names.surroundings)}
-    return Vocabulary(
-        [
-            ObjectClass(
-                label,
-                aliases=names.aliases.get(label, ()),
-                structure=label_key(label) in structure,
-            )
-            for label in sorted(kept, key=lambda label: (-mentions[label], label))
-            if label_key(label) not in refused
-        ],
-        sorted(room for room, count in rooms.items() if count >= rooms_from),
-    )
+    key = {label: label_key(label) for label in kept}
+    classes = [
+        ObjectClass(label, names.aliases.get(label, ()), structure=key[label] in structure)
+        for label in sorted(kept, key=lambda label: (-mentions[label], label))
+        if key[label] not in refused
+    ]
+    return Vocabulary(classes, sorted(r for r, count in rooms.items() if count >= minimum_rooms))
 
 
 def build_indoor_vocabulary(scenes: Iterable[AnnotatedScene]) -> Vocabulary:
@@ -87,8 +81,8 @@ def build_indoor_vocabulary(scenes: Iterable[AnnotatedScene]) -> Vocabulary:
     Photographs contain relations between indoor objects and outdoor surroundings. Surroundings are
     therefore ordinary classes.
     """
-    names, minimum = replace(curated_names(), surroundings=()), INDOOR_MINIMUM_MENTIONS
-    rooms = MINIMUM_MENTIONS
+    names = replace(curated_names(), surroundings=())
+    minimum, rooms = INDOOR_MINIMUM_MENTIONS, MINIMUM_MENTIONS
     vocabulary = build_vocabulary(scenes, names, minimum=minimum, minimum_rooms=rooms, outdoor=True)
     return with_aliases(vocabulary, names)
 
@@ -109,8 +103,7 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
 def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
     """Return the vocabulary with the curated synonyms of its classes, and of kinds that it lacks.
 
-    The classes, their order and their sizes stay the same. The default of `names` is
-    `vocabularies/names.toml`.
+    The classes, their order and their sizes stay the same.
     """
     names = names or curated_names()
     objects = []
@@ -118,8 +111,8 @@ def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabula
         names_of = names.aliases.get(entry.label, ())
         new = [name for name in names_of if vocabulary.index(name) is None]
         objects.append(replace(entry, aliases=(*entry.aliases, *new)))
-    found = Vocabulary(objects, vocabulary.room_types)
-    objects = [_with_kinds(entry, found, names) for entry in found.objects]
+    named = Vocabulary(objects, vocabulary.room_types)
+    objects = [_with_kinds(entry, named, names) for entry in named.objects]
     return with_room_aliases(Vocabulary(objects, vocabulary.room_types), names)
 
 
@@ -131,12 +124,12 @@ def with_room_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Voc
         room: [name for name in names.rooms.get(room, ()) if label_key(name) not in own]
         for room in vocabulary.room_types
     }
-    found = {room: others for room, others in aliases.items() if others}
-    return Vocabulary(vocabulary.objects, vocabulary.room_types, found)
+    aliases = {room: others for room, others in aliases.items() if others}
+    return Vocabulary(vocabulary.objects, vocabulary.room_types, aliases)
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
-    """Read a vocabulary from a JSON file. `vocabulary_json` returns the format.
+    """Read a vocabulary from a JSON file in the format of `vocabulary_json`.
 
     Raises:
         OSError: the file cannot be read.
@@ -153,25 +146,19 @@ def indoor_vocabulary() -> Vocabulary:
 def source_vocabulary(
     scenes: Iterable[AnnotatedScene], *, minimum: int = MINIMUM_MENTIONS
 ) -> Vocabulary:
-    """Build a vocabulary that contains only classes of the scenes, without the base classes.
+    """Build a vocabulary of the classes of one data source, without the base classes.
 
-    The vocabulary is for models trained on one data source, such as ProcTHOR or VRD. Because it has
-    few classes, more specific names become aliases. For example, "dining table" becomes an alias of
-    "table".
+    Because it has few classes, more specific names become aliases. For example, "dining table"
+    becomes an alias of "table".
     """
     names = curated_names()
     # An empty entry preserves the curated spelling of a class without aliases.
     spellings = dict.fromkeys((*names.base, *names.household, *names.structure), ())
-    mentioned_only = Names(
-        structure=names.structure,
-        not_objects=names.not_objects,
-        surroundings=names.surroundings,
-        aliases=spellings | names.aliases,
-        rooms=names.rooms,
-    )
-    found = build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True)
-    objects = [_with_kinds(entry, found, names) for entry in found.objects]
-    return Vocabulary(objects, found.room_types)
+    aliases = spellings | names.aliases
+    mentioned_only = replace(names, base=(), household=(), outdoor=(), kinds={}, aliases=aliases)
+    vocabulary = build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True)
+    objects = [_with_kinds(entry, vocabulary, names) for entry in vocabulary.objects]
+    return Vocabulary(objects, vocabulary.room_types)
 
 
 def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> ObjectClass:
@@ -182,15 +169,12 @@ def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> Obj
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
-    """Add the typical size of each class, the median size of its boxes.
+    """Add the typical size of each class, the median size of its boxes in the scenes.
 
     The service uses the typical size for objects without a size, whose yaw is also unknown. The
     typical footprint is therefore a square. The side of the square is the median of sqrt(dx * dy),
-    which preserves the area.
-
-    Args:
-        vocabulary: the classes. A class with fewer than `MINIMUM_BOXES` boxes stays unchanged.
-        scenes: the scenes. Objects without a size and flat objects are skipped.
+    which preserves the area. A class with fewer than `MINIMUM_BOXES` boxes stays unchanged. Objects
+    without a size and flat objects are skipped.
     """
     boxes: dict[int, list[tuple[float, float]]] = {}
     index_of = cache(vocabulary.index)
@@ -198,17 +182,12 @@ def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene])
         if thing.size and min(thing.size) and (index := index_of(thing.label)) is not None:
             x, y, z = thing.size
             boxes.setdefault(index, []).append(((x * y) ** 0.5, z))
-    return Vocabulary(
-        [_sized(entry, boxes.get(index, ())) for index, entry in enumerate(vocabulary.objects)],
-        vocabulary.room_types,
-    )
-
-
-def _sized(entry: ObjectClass, boxes: Sequence[tuple[float, float]]) -> ObjectClass:
-    if len(boxes) < MINIMUM_BOXES:
-        return entry
-    side, height = (round(float(value), 3) for value in np.median(boxes, axis=0))
-    return ObjectClass(entry.label, entry.aliases, entry.structure, (side, side, height))
+    classes = list(vocabulary.objects)
+    for index, of_class in boxes.items():
+        if len(of_class) >= MINIMUM_BOXES:
+            side, height = (round(x, 3) for x in np.median(of_class, axis=0).tolist())
+            classes[index] = replace(classes[index], size=(side, side, height))
+    return Vocabulary(classes, vocabulary.room_types)
 
 
 def coverage(
@@ -216,20 +195,19 @@ def coverage(
 ) -> float:
     """Return the share of the objects in scenes whose label is in a vocabulary.
 
-    Args:
-        structure: True also counts objects of structure classes such as walls.
+    Objects of structure classes such as walls count only if `structure` is True.
 
     Raises:
         ValueError: the scenes contain no objects.
     """
-    known = total = 0
+    covered = total = 0
     mentions = Counter(thing.label for scene in scenes for thing in scene.objects)
     for label, count in mentions.items():
         index = vocabulary.index(label)
         if index is not None and not structure and vocabulary.structure[index]:
             continue
         total += count
-        known += count * (index is not None)
+        covered += count * (index is not None)
     if not total:
         raise ValueError("the scenes mention no object")
-    return known / total
+    return covered / total

@@ -6,6 +6,7 @@ int8 and the scalar ``scale``. The vector of a word is its row of ``vectors`` ti
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
 import zlib
@@ -78,22 +79,18 @@ class WordVectors:
 
 
 def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, Flags]:
-    """Return the word vectors of the classes of a vocabulary.
+    """Return the unit vectors of the classes, (classes, dimensions), and a mask of known ones.
 
     The vector of a class is the vector of its label. If the label has no vector, the vector of the
-    first alias with a vector is used.
-
-    Returns:
-        Vectors of length 1, (classes, dimensions) float32, and a mask (classes,) bool. The mask is
-        True for classes with a vector. The vector of any other class is zero.
+    first alias with a vector is used. The vector of any other class is zero.
     """
     vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
-    found = np.zeros(len(vocabulary), dtype=np.bool_)
+    has_vector = np.zeros(len(vocabulary), dtype=np.bool_)
     for index, entry in enumerate(vocabulary.objects):
         named = map(words.of, (entry.label, *entry.aliases))
         if (vector := next((one for one in named if one is not None), None)) is not None:
-            vectors[index], found[index] = vector, True
-    return vectors, found
+            vectors[index], has_vector[index] = vector, True
+    return vectors, has_vector
 
 
 def read_word_vectors(path: Path) -> WordVectors:
@@ -125,10 +122,7 @@ def read_word_vectors(path: Path) -> WordVectors:
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """Read one array of the archive, after a check of its declared size.
-
-    Pickled arrays are refused, because unpickling can run code of the file.
-    """
+    """Read one array of at most `MAX_BYTES`. Unpickling can run code, so pickles are refused."""
     if f"{name}.npy" not in archive.namelist():
         raise DatasetError(path, name, "is missing")
     with archive.open(f"{name}.npy") as file:
@@ -137,9 +131,7 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
             raise DatasetError(path, name, f"has the unsupported .npy version {version}")
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, _, dtype = read(file)
-        size = dtype.itemsize
-        for length in shape:
-            size *= length
+        size = dtype.itemsize * math.prod(shape)
         if dtype.hasobject or size > MAX_BYTES:
             raise DatasetError(
                 path, name, f"must be a plain array of at most {MAX_BYTES // 2**20} MiB"

@@ -4,7 +4,7 @@ An answer has a probability and a truth value. The answer to each question is tr
 
     relations    the relation holds between the two objects. In one variant, the relations of half
                  of the pairs are evidence. In another variant, one object was removed. Relations
-                 with unknown truth are left out (see `training.datasets.cases.known_relations`)
+                 with unknown truth are left out (see `training.datasets.cases.annotated_relations`)
     missing      the class is in the scene and was hidden. A request lists 25, 50 or 75 % of the
                  classes of the scene, or all classes but one. The share is drawn at random
     at a place   the class is in the scene at the place of the request. A place is a relation to an
@@ -34,12 +34,12 @@ from training.datasets.array_types import Flags, Ints, Rng
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import (
     altered_case,
-    known_relations,
+    annotated_relations,
+    observed_pairs,
     occupied_place,
+    removed_class,
     scene_of,
     scene_rng,
-    taken_away,
-    told_pairs,
 )
 from training.evaluation.asking import (
     canonical_triple,
@@ -97,7 +97,7 @@ def ask_relations(
     rng: Rng,  # noqa: ARG001
 ) -> Answered | None:
     """Ask for all relations of a scene. The request contains only the labels of the objects."""
-    known = known_relations(encoded)
+    known = annotated_relations(encoded)
     if not known.any():
         return None
     return _judged(artifact, encoded, labels_alone(encoded), known) or None
@@ -105,11 +105,11 @@ def ask_relations(
 
 def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for the relations of half of the pairs. The relations of the other half are evidence."""
-    asked, given = told_pairs(encoded, artifact.vocabulary.structure, rng)
+    asked, given = observed_pairs(encoded, artifact.vocabulary.structure, rng)
     if not given:
         return None
     scene = replace(scene_of(encoded, range(len(asked)), given), room_type=None)
-    return _judged(artifact, encoded, scene, known_relations(encoded) & asked) or None
+    return _judged(artifact, encoded, scene, annotated_relations(encoded) & asked) or None
 
 
 def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Flags) -> Answered:
@@ -128,19 +128,19 @@ def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Fla
 def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask where a removed object belongs. Up to `_REMOVALS` objects are removed one at a time."""
     found: Answered = []
-    if known_relations(encoded).any():
+    if annotated_relations(encoded).any():
         for _ in range(_REMOVALS):
             found += _places_of_one(artifact, encoded, rng)
     return found or None
 
 
 def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered:
-    taken = taken_away(encoded, artifact.vocabulary.structure, rng)
+    taken = removed_class(encoded, artifact.vocabulary.structure, rng)
     if taken is None:
         return []
     target, kept = taken
     gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
-    known = known_relations(encoded)
+    known = annotated_relations(encoded)
     found: Answered = []
     scene = labels_alone(encoded, kept)
     index = index_of_ids(scene)
@@ -179,7 +179,7 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered 
     kept = np.flatnonzero(~is_hidden).tolist()
     labels = np.array(artifact.vocabulary.labels, dtype=object)[encoded.instance_classes]
     there = set(labels[encoded.instance_holds[relation, :, anchor] & is_hidden])
-    unknown = set(labels[~known_relations(encoded)[relation, :, anchor] & is_hidden]) - there
+    unknown = set(labels[~annotated_relations(encoded)[relation, :, anchor] & is_hidden]) - there
     at = CANONICAL[relation], kept.index(anchor)
     entries = missing(artifact, labels_alone(encoded, kept), at=at, details=False)["missing"]
     judged = [entry for entry in entries if entry["label"] not in unknown]

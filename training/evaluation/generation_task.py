@@ -39,7 +39,8 @@ from training.evaluation.setting import Outcome, Setting
 from training.machines import BoltzmannMachine
 from training.machines.chain_samples import ChainSamples
 from training.machines.edges import present_classes
-from training.machines.gibbs import Clamp, State, gibbs_step, run
+from training.machines.gibbs import Clamp, gibbs_step, run
+from training.machines.machine import State
 
 _RESAMPLES = 200
 # Maximum number of held-out scenes for the bandwidth, and of classes for the covariances.

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from app.scene import CANONICAL
-from training.datasets.offsets import seen_offsets
+from training.datasets.offsets import observed_offsets
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
@@ -42,11 +42,11 @@ def offsets_task(model: Model, setting: Setting) -> Outcome | None:
     if model.artifact is None or (offsets := model.artifact.offsets) is None:
         return None
     scenes = setting.scenes.scenes
-    every = seen_offsets(scenes)
+    every = observed_offsets(scenes)
     known = offsets.relation_scenes[every.relation] > 0
     if not known.any():
         return None
-    seen = every.some(known)
+    seen = every.rows(known)
     values, _ = offsets.find(seen.relation, seen.subject, seen.other)
     away = seen.offset - values[:, :3]
     squares = np.square(away / values[:, 3:])

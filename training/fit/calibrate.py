@@ -5,7 +5,7 @@ None and the model gives no judgement. An unfitted entry of another question kee
 probability. The calibration has these entries:
 
     missing, outlier           See `training.fit.calibrate_objects`.
-    relation, relation_given   See `fit_relations` and `fit_given`.
+    relation, relation_given   See `fit_relations` and `fit_with_observed`.
     placement, asked_place     See `fit_placements`.
     misplaced                  See `fit_misplaced`.
 
@@ -42,12 +42,12 @@ from training.datasets.cases import (
     RIDGE,
     Triple,
     altered_scene,
-    known_relations,
+    annotated_relations,
     logistic,
+    observed_pairs,
+    removed_class,
     scene_of,
     stated_relations,
-    taken_away,
-    told_pairs,
 )
 from training.datasets.sources import meaning_of
 from training.evaluation.outlier_tasks import kept_in_each_source
@@ -89,11 +89,7 @@ def calibrate(
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> Calibration:
-    """Fit every entry of the calibration.
-
-    Args:
-        chosen: a calibration from which some values are copied; see `calibrate_objects`.
-    """
+    """Fit every entry of the calibration. `calibrate_objects` copies some values of `chosen`."""
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     objects = calibrate_objects(artifact, scenes, train, structure, seed, chosen)
     artifact = replace(artifact, calibration=objects)
@@ -109,7 +105,7 @@ def calibrate(
         artifact,
         relation=alone,
         **fit_placements(artifact, related, seed),
-        relation_given=fit_given(artifact, related, alone, seed),
+        relation_given=fit_with_observed(artifact, related, alone, seed),
         **fit_misplaced(artifact, related, seed),
     ).calibration
 
@@ -120,10 +116,10 @@ def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[P
     The input is the log-odds of the relation between the two classes. The fit uses scenes without
     observed relations.
     """
-    return _fit_listed(_examples(_asked_pairs(artifact, scenes)), artifact.spec.A, _LISTED)
+    return _fit_listed(_examples(_pair_examples(artifact, scenes)), artifact.spec.A, _LISTED)
 
 
-def fit_given(
+def fit_with_observed(
     artifact: Artifact, scenes: Sequence[EncodedScene], alone: tuple[PairSlope, ...], seed: int = 0
 ) -> tuple[PairSlope, ...]:
     """Fit the probability of relations when half of the pairs of a scene are observed.
@@ -133,28 +129,28 @@ def fit_given(
     would depend on the few data sources that list many relations, and made answers for other
     sources worse.
     """
-    blocks = _asked_pairs(artifact, scenes, np.random.default_rng(seed))
-    return _as_often_as_it_holds(_examples(blocks), alone, _LISTED)
+    blocks = _pair_examples(artifact, scenes, np.random.default_rng(seed))
+    return _fit_curve(_examples(blocks), alone, _LISTED)
 
 
-def _asked_pairs(
+def _pair_examples(
     artifact: Artifact, scenes: Sequence[EncodedScene], rng: Rng | None = None
 ) -> list[Floats]:
     """Return the examples of each scene; with `rng`, of half its pairs, given the other half."""
     blocks: list[Floats] = []
+    structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
     for number, encoded in enumerate(scenes):
-        asked = np.ones((len(encoded.instance_classes),) * 2, dtype=np.bool_)
-        told: list[Triple] = []
+        pairs = np.ones((len(encoded.instance_classes),) * 2, dtype=np.bool_)
+        observed: list[Triple] = []
         if rng is not None:
-            asked, told = told_pairs(encoded, artifact.vocabulary.structure, rng)
-            if not told:
+            pairs, observed = observed_pairs(encoded, structure, rng)
+            if not observed:
                 continue
-        scene = replace(scene_of(encoded, range(len(asked)), told), room_type=None)
+        scene = replace(scene_of(encoded, range(len(pairs)), observed), room_type=None)
         values = posterior_of(artifact, scene).relation_log_odds()
-        structure = artifact.vocabulary.structure
         source = sources.index(encoded.source)
-        blocks.append(_instance_pairs(number, source, encoded, values, structure, asked))
+        blocks.append(_instance_pairs(number, source, encoded, values, structure, pairs))
     return blocks
 
 
@@ -163,41 +159,38 @@ def fit_placements(
 ) -> dict[str, tuple[PairSlope, ...]]:
     """Fit the probability of relations between a removed object and the objects of its scene.
 
-    Returns:
-        The entries `placement` and `asked_place`. `placement` is fitted to the likeliest places,
-        because an answer lists the likeliest places. `asked_place` is fitted to all places with
-        equal weight, because a request can name any place. `asked_place` leaves out data sources
-        that never annotate false relations, such as people's sentences.
+    The entry `placement` is fitted to the likeliest places, because an answer lists these places.
+    `asked_place` is fitted to all places with equal weight, because a request can name any place.
+    It leaves out data sources that never annotate false relations, such as people's sentences.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
     blocks: list[Floats] = []
     for number, encoded in enumerate([*scenes] * _PLACEMENT_CASES):
-        taken = taken_away(encoded, structure, rng)
-        if taken is None:
+        removed = removed_class(encoded, structure, rng)
+        if removed is None:
             continue
-        target, kept = taken
-        gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
-        given = posterior_of(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
-        present = given.present
+        target, kept = removed
+        instance = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
+        posterior = posterior_of(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
+        present = posterior.present
         anchors = np.flatnonzero(~structure[present.classes])
-        both = given.placement_log_odds(np.array([target]), anchors)
+        both = posterior.placement_log_odds(np.array([target]), anchors)
         other = np.array(kept)[present.first[anchors]]
-        own = np.full_like(other, gone)
-        holds, known = encoded.instance_holds, known_relations(encoded)
+        own = np.full_like(other, instance)
+        holds, annotated = encoded.instance_holds, annotated_relations(encoded)
         for values, ends in zip(both, ((own, other), (other, own)), strict=True):
-            truth = np.where(known[:, *ends], holds[:, *ends], _UNKNOWN)
-            a, place = map(np.ravel, np.indices(truth.shape))
-            size = np.full(len(a), np.log(len(present.classes) + 1))
-            count = np.log(present.counts[anchors])[place]
-            which = np.full(len(a), number), a, values[0].ravel(), count, size, truth.ravel()
-            source = np.full(len(a), sources.index(encoded.source))
-            blocks.append(np.stack([*which, source], 1).astype(np.float64))
+            truth = np.where(annotated[:, *ends], holds[:, *ends], _UNKNOWN)
+            a, anchor = map(np.ravel, np.indices(truth.shape))
+            count, size = np.log(present.counts[anchors])[anchor], np.log(len(present.classes) + 1)
+            columns = number, a, values[0].ravel(), count, size, truth.ravel()
+            rows = np.broadcast_arrays(*columns, sources.index(encoded.source))
+            blocks.append(np.stack(rows, 1).astype(np.float64))
     examples, relations = _examples(blocks), artifact.spec.A
     return {
         "placement": _fit_listed(examples, relations, PLACES),
-        "asked_place": _fit_listed(_told(examples, sources), relations, len(examples)),
+        "asked_place": _fit_listed(_with_negatives(examples, sources), relations, len(examples)),
     }
 
 
@@ -207,16 +200,15 @@ def _examples(blocks: list[Floats]) -> Floats:
     return every[every[:, _LOGIT] > NO_UNIT]
 
 
-def _told(examples: Floats, sources: Sequence[str]) -> Floats:
+def _with_negatives(examples: Floats, sources: Sequence[str]) -> Floats:
     """Return the examples from data sources that also annotate false relations.
 
     If no source annotates a relation as false, return all examples of that relation.
     """
-    telling = np.array([[how != "unobserved" for how in meaning_of(s).unlisted] for s in sources])
-    relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
-    told = telling[source, relation]
-    without = np.setdiff1d(relation, relation[told])
-    return examples[told | np.isin(relation, without)]
+    complete = np.array([[how != "unobserved" for how in meaning_of(s).unlisted] for s in sources])
+    relation, source = examples[:, [_RELATION, _SOURCE]].astype(int).T
+    chosen = complete[source, relation]
+    return examples[chosen | ~np.isin(relation, relation[chosen])]
 
 
 def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[PairSlope, ...]:
@@ -226,23 +218,22 @@ def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[PairSlop
     relations hold less often than unselected relations with equal log-odds. Examples outside the
     list have a small weight. Examples without annotation take part only in the ranking.
     """
-    known = examples[:, _TRUTH] != _UNKNOWN
-    slopes = _fit_each(examples[known], relations, np.ones(known.sum()))
+    annotated = examples[:, _TRUTH] != _UNKNOWN
+    slopes = _fit_each(examples[annotated], relations, np.ones(annotated.sum()))
     for _ in range(_ROUNDS):
-        best = _among_best(examples, slopes, listed)[known]
-        weight = _source_weights(examples[known], best) * np.where(best, 1.0, _OF_THE_REST)
-        slopes = _fit_each(examples[known], relations, weight)
-    return _as_often_as_it_holds(examples, slopes, listed)
+        best = _among_best(examples, slopes, listed)[annotated]
+        weight = _source_weights(examples[annotated], best) * np.where(best, 1.0, _OF_THE_REST)
+        slopes = _fit_each(examples[annotated], relations, weight)
+    return _fit_curve(examples, slopes, listed)
 
 
-def _as_often_as_it_holds(
+def _fit_curve(
     examples: Floats, slopes: tuple[PairSlope, ...], listed: int
 ) -> tuple[PairSlope, ...]:
     """Fit one rising curve from logits to log-odds, for all relations, to the listed examples.
 
     The curve makes the mean probability equal to the share of true relations over all data sources.
-    A rising curve keeps the ranking of relations. The ranking comes from `slopes`, a fit in which
-    sources have similar weights.
+    It keeps the ranking by `slopes`, a fit in which sources have similar weights.
     """
     best = _among_best(examples, slopes, listed) & (examples[:, _TRUTH] != _UNKNOWN)
     examples = examples[best]
@@ -250,15 +241,11 @@ def _as_often_as_it_holds(
     if len(np.unique(truth)) < 2:
         return slopes
     intercept, slope, bends = rising_curve(_logits(examples, slopes), truth)
-    return tuple(
-        PairSlope(
-            intercept=intercept + slope * one.intercept,
-            slope=slope * one.slope,
-            log_count=slope * one.log_count,
-            bends=bends,
-        )
+    scaled = (
+        (intercept + slope * one.intercept, slope * one.slope, slope * one.log_count)
         for one in slopes
     )
+    return tuple(PairSlope(intercept=a, slope=b, log_count=c, bends=bends) for a, b, c in scaled)
 
 
 def rising_curve(
@@ -269,8 +256,8 @@ def rising_curve(
     A penalty on changes of slope stabilises the curve where examples are few.
 
     Returns:
-        Intercept and slope of the line at the lowest logits, and the bends of the curve. A bend is
-        a pair (logit, change of slope); see `PairSlope`.
+        Intercept and slope of the line at the lowest logits, and the bends (logit, change of slope)
+        of the curve; see `PairSlope`.
     """
     at = np.quantile(logits, np.linspace(0, 1, _BENDS + 2)[1:-1])
     edges = np.concatenate([[-np.inf], at, [np.inf]])
@@ -291,29 +278,23 @@ def rising_curve(
     start = np.concatenate([[0.0], np.ones(_BENDS + 1)])
     intercept, slope, *others = minimize(loss, start, jac=True, bounds=bounds).x.tolist()
     changes = np.diff([slope, *others]) / slope
-    return (
-        intercept,
-        slope,
-        tuple(zip((intercept + slope * at).tolist(), changes.tolist(), strict=True)),
-    )
+    bend_logits = (intercept + slope * at).tolist()
+    return intercept, slope, tuple(zip(bend_logits, changes.tolist(), strict=True))
 
 
 def _logits(examples: Floats, slopes: tuple[PairSlope, ...]) -> Floats:
     """Return the logits of the examples before the curve is applied."""
     table = np.array([(s.slope, s.log_count, s.log_classes, s.intercept) for s in slopes])
     weights = table[examples[:, _RELATION].astype(np.int64)]
-    found: Floats = (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1)
-    return found + weights[:, 3]
+    return (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1) + weights[:, 3]
 
 
 def _source_weights(examples: Floats, best: Flags) -> Floats:
     """Return the weight of each example, (examples,), see `_POWER`."""
-    relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
+    relation, source = examples[:, [_RELATION, _SOURCE]].astype(int).T
     key = relation * (source.max(initial=0) + 1) + source
     counts = np.bincount(key[best], minlength=int(key.max(initial=-1)) + 1)
-    weights = np.maximum(counts, 1.0) ** -_POWER
-    found: Floats = weights[key]
-    return found
+    return (np.maximum(counts, 1.0) ** -_POWER)[key]
 
 
 def _among_best(examples: Floats, slopes: tuple[PairSlope, ...], listed: int) -> Flags:
@@ -322,9 +303,9 @@ def _among_best(examples: Floats, slopes: tuple[PairSlope, ...], listed: int) ->
     order = np.lexsort((-logits, examples[:, 0]))
     scene = examples[order, 0]
     rank = np.arange(len(order)) - np.searchsorted(scene, scene)
-    found = np.zeros(len(order), dtype=np.bool_)
-    found[order] = rank < listed
-    return found
+    best = np.zeros(len(order), dtype=np.bool_)
+    best[order] = rank < listed
+    return best
 
 
 def _fit_each(examples: Floats, relations: int, weight: Floats) -> tuple[PairSlope, ...]:
@@ -347,7 +328,7 @@ def _instance_pairs(
     scene: EncodedScene,
     values: NDArray[np.floating[Any]],
     structure: Flags,
-    asked: Flags,
+    pairs: Flags,
 ) -> Floats:
     """Return the examples of a scene, (examples, 7).
 
@@ -356,22 +337,20 @@ def _instance_pairs(
     annotation are examples only if their log-odds are high enough for the list of an answer.
     """
     evidence = scene.evidence
-    place = np.searchsorted(evidence.classes, scene.instance_classes)
-    logs = np.log(evidence.counts[place])
+    index = np.searchsorted(evidence.classes, scene.instance_classes)
+    logs = np.log(evidence.counts[index])
     usable = ~structure[scene.instance_classes]
-    pair = asked & usable[:, None] & usable[None, :] & ~np.eye(len(place), dtype=np.bool_)
-    known, every = known_relations(scene)[: len(values)], values[:, place[:, None], place]
-    least = np.array([_so_many_best(own[pair], _LISTED) for own in every])
-    of = pair & (known | (every >= least[:, None, None]))
-    relation, i, j = np.nonzero(of)
-    truth = np.where(known, scene.instance_holds[: len(values)], _UNKNOWN)[of]
-    columns = number, relation, every[of], logs[i] + logs[j], np.log(len(evidence.classes)), truth
-    return np.stack(np.broadcast_arrays(*columns, source), 1)
-
-
-def _so_many_best(values: NDArray[np.floating[Any]], count: int) -> float:
-    """Return the smallest of the `count` largest values."""
-    return float(np.partition(values, -count)[-count]) if len(values) > count else -np.inf
+    pairs = pairs & usable[:, None] & usable[None, :] & ~np.eye(len(index), dtype=np.bool_)
+    annotated, every = annotated_relations(scene)[: len(values)], values[:, index[:, None], index]
+    # The smallest of the `_LISTED` largest values of each relation.
+    few = pairs.sum() <= _LISTED
+    least = [-np.inf if few else np.partition(own[pairs], -_LISTED)[-_LISTED] for own in every]
+    examples = pairs & (annotated | (every >= np.array(least)[:, None, None]))
+    relation, i, j = np.nonzero(examples)
+    truth = np.where(annotated, scene.instance_holds[: len(values)], _UNKNOWN)[examples]
+    size = np.log(len(evidence.classes))
+    columns = number, relation, every[examples], logs[i] + logs[j], size, truth, source
+    return np.stack(np.broadcast_arrays(*columns), 1)
 
 
 def fit_misplaced(

@@ -53,14 +53,13 @@ WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
 # Tested exponents alpha. With 0.5, the detected share of uniformly drawn intruders in sunrgbd falls
 # from .47 to .35.
 ALPHAS = (0.0, 0.125, 0.25, 0.375)
-PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
+EVIDENCE_WEIGHTS = (0.0, 0.1, 0.2, 0.5, 1.0)
 # Minimum thresholds. If the scores of intruders and other objects do not overlap, as in scenes that
 # hardly vary, the target shares would need alarms for objects that probably belong to the scene.
 LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
 # Lists of up to `_SHORT_LISTS` classes have separate thresholds, until the threshold of whole
 # scenes raises alarms in at most `_ENOUGH` times the target share of the shortened lists. Each
-# threshold is fitted to at least `_SHORTENED` shortened lists; few scenes are shortened several
-# times.
+# threshold is fitted to at least `_SHORTENED` lists; few scenes are shortened several times.
 _SHORT_LISTS = 8
 _ENOUGH = 1.5
 _SHORTENED = 200
@@ -113,10 +112,8 @@ def calibrate_objects(
 ) -> Calibration:
     """Return the model's calibration with newly fitted entries about objects.
 
-    Args:
-        train: training scenes. They give the frequency of each class, and limits for room types.
-        chosen: a calibration that was fitted on other validation scenes. Its coverage, coverage
-            weight, weights of evidence and alpha are copied. None chooses new values.
+    The training scenes give the frequency of each class, and limits for room types. The coverage,
+    coverage weight, weights of evidence and alpha of a `chosen` calibration are copied.
     """
     scenes = complete_scenes(validation, seed)
     if not len(scenes):
@@ -148,8 +145,7 @@ def popularity(train: SceneTensors) -> Floats:
     weight = train.weight * (train.complete if bool(train.complete.any()) else 1.0)
     count = (train.v * weight.unsqueeze(1)).sum(0).double().numpy()
     total = float(weight.sum())
-    found: Floats = np.log((count + 0.5) / (total - count + 0.5))
-    return found
+    return np.log((count + 0.5) / (total - count + 0.5))
 
 
 def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
@@ -161,8 +157,8 @@ def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple
     sizes = ((train.v > 0) & ~structure).sum(1).numpy()
     every = int(np.quantile(sizes, _SMALL))
     of = [sizes[train.room.numpy() == t] for t in range(rooms)]
-    found = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else every for n in of]
-    return (*found, every)
+    quantiles = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else every for n in of]
+    return (*quantiles, every)
 
 
 def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
@@ -170,27 +166,27 @@ def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
 
     The value is -1e9 for a room type with fewer than 20 scenes.
     """
-    found = []
+    limits = []
     for t in range(artifact.spec.C):
         own = train.v[train.room == t].numpy()
         limit = -1e9
         if len(own) >= _ROOM_SCENES:
             limit = float(np.quantile(room_fit(artifact.weights, own, t), _UNSUITED))
-        found.append(round(limit, 4))
-    return tuple(found)
+        limits.append(round(limit, 4))
+    return tuple(limits)
 
 
 # ------------------------------------------------------------------------------ unlisted classes
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
+class _PartialList:
     """A scene that lists only some of its classes. The remaining classes are hidden.
 
     Attributes:
         closed: log-odds of the unlisted classes if the list were complete, (unlisted classes,).
-        partial: maps an assumed coverage to the log-odds of the unlisted classes, (unlisted
-            classes,). The log-odds allow for an incomplete list.
+        partial: log-odds that allow for an incomplete list, (unlisted classes,), by assumed
+            coverage.
         hidden: True for unlisted classes that are in the scene, (unlisted classes,) bool.
         share: share of listed classes as text, such as "75 %".
         weight: number of scenes of the data source that this sampled scene represents.
@@ -213,15 +209,15 @@ def fit_coverage(
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
     """Fit the entries `coverage`, `coverage_weight` and `missing` of the calibration."""
-    cases = list(_shown(artifact, scenes, structure, seed))
+    cases = list(_partial_lists(artifact, scenes, structure, seed))
     if not cases:
         return {}
     if artifact.completions is None:
         coverage, weight = artifact.calibration.coverage, 0.0
-    elif chosen:
-        coverage, weight = chosen.coverage, chosen.coverage_weight
     else:
-        coverage, weight = _choose_coverage(cases)
+        coverage, weight = (
+            (chosen.coverage, chosen.coverage_weight) if chosen else _choose_coverage(cases)
+        )
     rows = [_rows(case, coverage, weight) for case in cases]
     examples = np.concatenate(rows)
     weights = np.repeat([case.weight for case in cases], [len(own) for own in rows])
@@ -232,7 +228,7 @@ def fit_coverage(
     return {"coverage": coverage, "coverage_weight": weight, "missing": entry}
 
 
-def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
+def _choose_coverage(cases: Sequence[_PartialList]) -> tuple[float, float]:
     """Return the coverage and the coverage weight with the best MRR of hidden classes.
 
     On nearly complete lists, their MRR must be at most `_COMPLETE_LOSS` below the MRR of weight 0.
@@ -247,19 +243,19 @@ def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
     return max(allowed, key=lambda pair: _mrr(cases, *pair))
 
 
-def _shown(
+def _partial_lists(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, seed: int
-) -> Iterable[_Shown]:
+) -> Iterable[_PartialList]:
     order = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(seed))
     source = scenes.source[order]
-    place = torch.zeros(len(order), dtype=torch.int64)
+    rank = torch.zeros(len(order), dtype=torch.int64)
     stands_for = torch.zeros(len(order))
     for one in source.unique():
         own = source == one
         count = int(own.sum())
-        place[own] = torch.arange(count)
+        rank[own] = torch.arange(count)
         stands_for[own] = scenes.weight[order][own].sum() / min(count, _PARTIAL_SCENES)
-    chosen = place < _PARTIAL_SCENES
+    chosen = rank < _PARTIAL_SCENES
     some, weight = subset(scenes, order[chosen]), stands_for[chosen].tolist()
     source_of = source[chosen].tolist()
     whole = recalibrated(artifact, coverage_weight=1.0)
@@ -274,39 +270,37 @@ def _shown(
         for k, v, hidden in zip(cases.scene, cases.v.numpy(), cases.hidden.numpy(), strict=True):
             classes = np.flatnonzero(v)
             absent = np.flatnonzero((v == 0) & ~structure.numpy())
-            given = posterior_of(whole, of_classes(classes.tolist()))
+            posterior = posterior_of(whole, of_classes(classes.tolist()))
             partial = {}
             if whole.completions is not None:
                 partial = {
-                    coverage: given.absent_posterior(absent, coverage).astype(np.float64)
+                    coverage: posterior.absent_posterior(absent, coverage).astype(np.float64)
                     for coverage in COVERAGES
                 }
-            closed = given.absent_log_odds(absent).astype(np.float64)
+            closed = posterior.absent_log_odds(absent).astype(np.float64)
             listed = max(1, int((~structure.numpy()[classes]).sum()))
             own = weight[int(k)] / (1 if share else _DRAWS_OF_ONE)
-            yield _Shown(closed, partial, hidden[absent], listed, name, source_of[int(k)], own)
+            own = (name, source_of[int(k)], own)
+            yield _PartialList(closed, partial, hidden[absent], listed, *own)
 
 
-def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
+def _mixed(case: _PartialList, coverage: float, weight: float) -> Floats:
     closed = case.closed + np.log1p(-coverage)
-    if not weight:
-        return closed
-    mixed: Floats = (1 - weight) * closed + weight * case.partial[coverage]
-    return mixed
+    return (1 - weight) * closed + weight * case.partial[coverage] if weight else closed
 
 
-def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
+def _mrr(cases: Sequence[_PartialList], coverage: float, weight: float) -> float:
     """Return the mean reciprocal rank of hidden classes. All data sources have the same weight."""
-    found: dict[int, list[Floats]] = {}
+    reciprocal: dict[int, list[Floats]] = {}
     for case in cases:
         z = _mixed(case, coverage, weight)
         others = np.sort(z[~case.hidden])
         above = len(others) - np.searchsorted(others, z[case.hidden], side="right")
-        found.setdefault(case.source, []).append(1.0 / (1.0 + above.astype(np.float64)))
-    return float(np.mean([np.concatenate(own).mean() for own in found.values()]))
+        reciprocal.setdefault(case.source, []).append(1.0 / (1.0 + above.astype(np.float64)))
+    return float(np.mean([np.concatenate(own).mean() for own in reciprocal.values()]))
 
 
-def _rows(case: _Shown, coverage: float, weight: float) -> Floats:
+def _rows(case: _PartialList, coverage: float, weight: float) -> Floats:
     """Return the data for the fit, one row for each of the best classes, (classes, 3).
 
     The columns are the log-odds, the log of the number of listed classes, and 1 for a hidden class.
@@ -346,30 +340,25 @@ def fit_outliers(
         name: intruder_scores(scenes, structure, score, weights=weights, seed=seed)
         for name, weights in laws.items()
     }
-    kinds = {name: found for name, found in kinds.items() if found.intruder.any()}
+    kinds = {name: scores for name, scores in kinds.items() if scores.intruder.any()}
     if not kinds:
         return {}
     alpha = chosen.popularity_weight if chosen else choose_alpha(kinds, prior)
-    judged = {name: found.with_prior(alpha * prior) for name, found in kinds.items()}
+    judged = [scores.with_prior(alpha * prior) for scores in kinds.values()]
     rng = np.random.default_rng(seed)
     parts = []
-    for found in judged.values():
-        clean_scene = rng.random(found.scenes) < 0.5
-        used = found.clean == clean_scene[found.scene]
-        features = np.stack([found.log_odds, np.log(found.size)], 1)[used]
-        parts.append(np.column_stack([features, found.intruder[used]]))
+    for scores in judged:
+        clean_scene = rng.random(scores.scenes) < 0.5
+        used = scores.clean == clean_scene[scores.scene]
+        columns = scores.log_odds, np.log(scores.size), scores.intruder
+        parts.append(np.column_stack(columns)[used])
     examples = np.concatenate(parts)
     slope, size, intercept = logistic(examples[:, :2], examples[:, 2] > 0, C=RIDGE)
     if slope >= 0:
         return {}
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
-    whole = [(next(iter(judged.values())), scenes)]
+    whole = [(judged[0], scenes)]
     limits = thresholds(partial(limit_of, whole, entry, rng))
-    fitted: dict[str, Any] = {
-        "popularity_weight": alpha,
-        "outlier": entry,
-        "outlier_thresholds": limits,
-    }
     short: list[Thresholds] = []
     for listed in range(1, _SHORT_LISTS + 1):
         lists = [listing(scenes, structure, listed, rng)]
@@ -377,16 +366,21 @@ def fit_outliers(
             break
         while len(lists) * len(lists[0][0]) < _SHORTENED:
             lists.append(listing(scenes, structure, listed, rng))
-        parts_scored = [
+        shortened = [
             (clean_scores(parts_of, structure, score).with_prior(alpha * prior), some)
             for some, parts_of in lists
         ]
         share = _ENOUGH * ALARMS["medium"]
-        if limit_of(parts_scored, entry, np.random.default_rng(seed), share) <= limits.medium:
+        if limit_of(shortened, entry, np.random.default_rng(seed), share) <= limits.medium:
             break
-        own = thresholds(partial(limit_of, parts_scored, entry, rng))
+        own = thresholds(partial(limit_of, shortened, entry, rng))
         short.append(_between(limits, own, short[-1] if short else NEVER))
-    return fitted | {"short_list_thresholds": tuple(short)}
+    return {
+        "popularity_weight": alpha,
+        "outlier": entry,
+        "outlier_thresholds": limits,
+        "short_list_thresholds": tuple(short),
+    }
 
 
 def listing(
@@ -430,13 +424,9 @@ def limit_of(untouched: Scored, entry: CountSlope, rng: Rng, share: float) -> fl
     return float(1 / (1 + np.exp(-np.mean(logits))))
 
 
-def _between(low: Thresholds, found: Thresholds, high: Thresholds) -> Thresholds:
-    return Thresholds(
-        **{
-            name: min(max(getattr(found, name), getattr(low, name)), getattr(high, name))
-            for name in ALARMS
-        }
-    )
+def _between(low: Thresholds, middle: Thresholds, high: Thresholds) -> Thresholds:
+    values = {n: min(max(getattr(middle, n), getattr(low, n)), getattr(high, n)) for n in ALARMS}
+    return Thresholds(**values)
 
 
 def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
@@ -445,22 +435,22 @@ def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
     For uniformly drawn intruders, hit@1 may be at most .04 lower than with alpha 0, and the
     detected share at most .06 lower.
     """
-    found = {
-        alpha: {name: _found(scores.with_prior(alpha * prior)) for name, scores in kinds.items()}
+    rates = {
+        alpha: {name: _detection(one.with_prior(alpha * prior)) for name, one in kinds.items()}
         for alpha in ALPHAS
     }
-    floor = found[0.0].get("uniform", np.zeros(2)) - _UNIFORM_LOSS
-    allowed = [alpha for alpha in ALPHAS if (found[alpha].get("uniform", floor) >= floor).all()]
-    return max(allowed, key=lambda alpha: (sum(map(np.sum, found[alpha].values())), -alpha))
+    floor = rates[0.0].get("uniform", np.zeros(2)) - _UNIFORM_LOSS
+    allowed = [alpha for alpha in ALPHAS if (rates[alpha].get("uniform", floor) >= floor).all()]
+    return max(allowed, key=lambda alpha: (sum(map(np.sum, rates[alpha].values())), -alpha))
 
 
-def _found(scores: IntruderScores) -> Floats:
+def _detection(scores: IntruderScores) -> Floats:
     """Return hit@1 and the share of intruders that an alarm in 10 % of unaltered scenes detects."""
     worst = np.full(scores.scenes, np.inf)
     np.minimum.at(worst, scores.scene[scores.clean], scores.log_odds[scores.clean])
     limit = np.quantile(worst[np.isfinite(worst)], ALARMS["medium"])
-    caught = (scores.log_odds[scores.intruder] <= limit).mean()
-    return np.array([scores.hit_at_1().figure().value, caught])
+    detected = (scores.log_odds[scores.intruder] <= limit).mean()
+    return np.array([scores.hit_at_1().figure().value, detected])
 
 
 # -------------------------------------------------------------------------------------- evidence
@@ -475,36 +465,34 @@ def fit_evidence(
     scenes has no effect on answers about objects.
     """
     plain = structure.numpy()
-    found = EvidenceWeights(relations_on_objects=0.0, poses_on_objects=0.0)
+    chosen = EvidenceWeights(relations_on_objects=0.0, poses_on_objects=0.0)
     scenes = complete_scenes(validation, seed)
     related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
     rng = np.random.default_rng(seed)
     count = _EVIDENCE_SCENES if artifact.oracle is None else _EVIDENCE_SCENES_OF_DRAWS
-    chosen = rng.permutation(related)[:count].astype(np.int64)
-    some = subset(scenes, torch.from_numpy(chosen))
-    if not len(some):
-        return found
+    picked = rng.permutation(related)[:count].astype(np.int64)
+    some = subset(scenes, torch.from_numpy(picked))
     for kind, name in (("relations", "relations_on_objects"), ("poses", "poses_on_objects")):
-        cases = list(removals(some, plain, kind, seed))
+        cases = list(removals(some, plain, kind, seed)) if len(some) else []
         if not cases:
             continue
         scores = {}
-        for pull in PULLS:
-            asked = recalibrated(artifact, evidence=found.model_copy(update={name: pull}))
-            ranks = [_rank(asked, case.scenes[1], case.target, plain) for case in cases]
-            scores[pull] = float(np.mean([1 / rank for rank in ranks]))
-        found = found.model_copy(update={name: least_of_the_best(scores)})
-    return found
+        for weight in EVIDENCE_WEIGHTS:
+            candidate = recalibrated(artifact, evidence=chosen.model_copy(update={name: weight}))
+            ranks = [_rank(candidate, case.scenes[1], case.target, plain) for case in cases]
+            scores[weight] = float(np.mean([1 / rank for rank in ranks]))
+        chosen = chosen.model_copy(update={name: smallest_good_weight(scores)})
+    return chosen
 
 
-def least_of_the_best(scores: dict[float, float]) -> float:
+def smallest_good_weight(scores: dict[float, float]) -> float:
     """Return the smallest weight whose score is at most `_AS_GOOD` below the best score."""
-    enough = max(scores.values()) - _AS_GOOD
-    return min(pull for pull, score in scores.items() if score >= enough)
+    least = max(scores.values()) - _AS_GOOD
+    return min(weight for weight, score in scores.items() if score >= least)
 
 
 def _rank(artifact: Artifact, scene: Scene, target: int, structure: Flags) -> int:
-    given = posterior_of(artifact, scene)
-    absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
-    z = given.absent_posterior(absent, artifact.calibration.coverage)
+    posterior = posterior_of(artifact, scene)
+    absent = np.setdiff1d(np.flatnonzero(~structure), posterior.present.classes)
+    z = posterior.absent_posterior(absent, artifact.calibration.coverage)
     return 1 + int((z > z[absent == target]).sum())

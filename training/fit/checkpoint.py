@@ -72,7 +72,7 @@ def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
 
 
 def write_csv(path: Path, epochs: list[Epoch]) -> None:
-    """Write the figures of each epoch to a CSV file, one row for each epoch."""
+    """Write a CSV file with one row for each epoch."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(Epoch)])
         writer.writeheader()

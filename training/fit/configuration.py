@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from operator import not_
 from pathlib import Path
 from typing import Literal
 
@@ -49,11 +50,9 @@ class DataConfig(_Section):
     words: str = Field(
         default="", description="file of word vectors in the data folder; empty: no vectors"
     )
-    # An empty value is left out of the dump, so that digests of earlier runs stay valid.
-    terms: str = Field(
-        default="", exclude_if=lambda words: not words, description="terms of use of own files"
-    )
-    research_only: bool = Field(default=False, exclude_if=lambda only: not only)
+    # A value that `exclude_if` leaves out of the dump preserves the digests of earlier runs.
+    terms: str = Field(default="", exclude_if=not_, description="terms of use of own files")
+    research_only: bool = Field(default=False, exclude_if=not_)
 
     @model_validator(mode="after")
     def _distinct(self) -> DataConfig:
@@ -84,9 +83,8 @@ class MachineConfig(_Section):
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
     initial_c1: float = 0.0
-    # An empty value is left out of the dump, so that digests of earlier runs stay valid.
     without: tuple[str, ...] = Field(
-        default=(), exclude_if=lambda names: not names, description="names of weights held at zero"
+        default=(), exclude_if=not_, description="names of weights held at zero"
     )
 
 
@@ -134,7 +132,7 @@ class ObjectsConfig(_Section):
     batch_size: int = Field(default=32, ge=1)
 
 
-class PolishConfig(_Section):
+class FineTuneConfig(_Section):
     """The last training phase, which fine-tunes the weights of objects by persistent chains.
 
     The phase needs a machine of the local form (`training.machines.machine`).
@@ -162,7 +160,6 @@ class TrainingConfig(_Section):
     patience: int | None = Field(default=None, ge=1)
     seed: int = 0
     threads: int = Field(default=1, ge=1)
-    # Left out of the dump when auto, so that digests of earlier runs stay valid.
     device: Literal["auto", "cpu", "cuda"] = Field(
         default="auto",
         exclude_if=lambda device: device == "auto",
@@ -175,10 +172,9 @@ class Config(_Section):
 
     name: str = Field(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")
     description: str = ""
-    # An empty value is left out of the dump, so that digests of earlier runs stay valid.
     examples: str = Field(
         default="",
-        exclude_if=lambda name: not name,
+        exclude_if=not_,
         description="example scenes for the visual page: indoor, or a file in the data folder that "
         "ends in .json; empty: none",
     )
@@ -187,7 +183,7 @@ class Config(_Section):
     objective: ObjectiveConfig
     training: TrainingConfig = TrainingConfig()
     objects: ObjectsConfig = ObjectsConfig()
-    polish: PolishConfig = PolishConfig()
+    polish: FineTuneConfig = FineTuneConfig()
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
@@ -199,32 +195,32 @@ class Config(_Section):
                     f"machine.without: a {self.machine.variant} has no weights "
                     f"{', '.join(unknown)}, only {', '.join(names)}"
                 )
-        kind = VARIANTS[self.machine.variant]
-        if self.machine.H2 and not kind.two_layers:
-            raise ValueError(
-                "machine.H2 must be 0, because this machine.variant has one hidden layer"
-            )
-        local = self.machine.form == "local"
-        if self.machine.G and not (local and kind.implications):
-            raise ValueError(
-                "machine.G is defined for the local form of the Triway only: it must be 0"
-            )
-        if self.machine.N and not local:
-            raise ValueError("machine.N is defined for the local form only: it must be 0")
-        if "rooms" in self.data.sources and not self.data.rooms:
-            raise ValueError("data.rooms must be at least 1, because `rooms` is a source")
-        if self.objective.generative_weight and not local:
-            raise ValueError(
-                "objective.generative_weight is defined for the local form only: it must be 0"
-            )
-        if self.objects.epochs and not local:
-            raise ValueError("objects.epochs is defined for the local form only: it must be 0")
-        if self.objective.name == "relations" and not self.objects.epochs:
-            raise ValueError(
-                "objects.epochs must be at least 1: the objective `relations` trains no objects"
-            )
-        if self.polish.updates and not local:
-            raise ValueError("polish.updates is defined for the local form only: it must be 0")
+        kind, local = VARIANTS[self.machine.variant], self.machine.form == "local"
+        local_only = {
+            "machine.N": self.machine.N,
+            "objective.generative_weight": self.objective.generative_weight,
+            "objects.epochs": self.objects.epochs,
+            "polish.updates": self.polish.updates,
+        }
+        rules = {
+            "machine.H2 must be 0, because this machine.variant has one hidden layer": (
+                self.machine.H2 and not kind.two_layers
+            ),
+            "machine.G is defined for the local form of the Triway only: it must be 0": (
+                self.machine.G and not (local and kind.implications)
+            ),
+            "data.rooms must be at least 1, because `rooms` is a source": (
+                "rooms" in self.data.sources and not self.data.rooms
+            ),
+            "objects.epochs must be at least 1: the objective `relations` trains no objects": (
+                self.objective.name == "relations" and not self.objects.epochs
+            ),
+        } | {
+            f"{name} is defined for the local form only: it must be 0": value and not local
+            for name, value in local_only.items()
+        }
+        if broken := next((message for message, breaks in rules.items() if breaks), None):
+            raise ValueError(broken)
         return self
 
     @property
@@ -234,7 +230,7 @@ class Config(_Section):
 
 
 def first_error(error: ValidationError) -> str:
-    """Return the place and the message of the first invalid entry."""
+    """Return the path and the message of the first invalid entry."""
     first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"]) or "the file"
-    return f"{place}: {first['msg']}"
+    path = ".".join(str(part) for part in first["loc"]) or "the file"
+    return f"{path}: {first['msg']}"

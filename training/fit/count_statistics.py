@@ -55,12 +55,12 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     views = {name for name, source in SOURCES.items() if source.of_one_view}
     counting = counted_classes(scenes, vocabulary)
     counting = {source: counted for source, counted in counting.items() if source not in views}
-    known = [scene for scene in scenes if scene.source in counting]
-    most = _most(known, counting, vocabulary)
+    counted = [scene for scene in scenes if scene.source in counting]
+    most = _most(counted, counting, vocabulary)
     if (most > 1).any():
-        known = _few_of_group(known)
-        most *= _better(known, most, counting, vocabulary)
-    return _fit(known, most, counting, vocabulary) if (most > 1).any() else None
+        counted = _limit_groups(counted)
+        most *= _better_than_mean(counted, most, counting, vocabulary)
+    return _fit(counted, most, counting, vocabulary) if (most > 1).any() else None
 
 
 def folds(
@@ -69,23 +69,18 @@ def folds(
     """Yield the training and the test scenes of five folds. A group is in the test of one fold."""
     groups = sorted({scene.group for scene in scenes})
     order = np.random.default_rng(0).permutation(len(groups)).tolist()
-    place = dict(zip(groups, order, strict=True))
+    fold = dict(zip(groups, order, strict=True))
     for number in range(_FOLDS):
-        train: list[EncodedScene] = []
-        test: list[EncodedScene] = []
-        for scene in scenes:
-            (test if place[scene.group] % _FOLDS == number else train).append(scene)
+        test = [scene for scene in scenes if fold[scene.group] % _FOLDS == number]
+        train = [scene for scene in scenes if fold[scene.group] % _FOLDS != number]
         yield train, test
 
 
 def _fit(
-    scenes: Sequence[EncodedScene],
-    most: Ints,
-    counting: dict[str, Flags],
-    vocabulary: Vocabulary,
+    scenes: Sequence[EncodedScene], most: Ints, counting: dict[str, Flags], vocabulary: Vocabulary
 ) -> Counts:
     """Fit the statistics to all cases of the scenes. Return those of the classes with a `most`."""
-    cases = _Cases.of(scenes, counting, vocabulary, _DRAWS)
+    cases = _Cases.of(scenes, counting, vocabulary)
     share = _shares(cases, len(vocabulary))
     weights = _weights(cases, share, len(vocabulary))
     # The exponent -1 stands for the listed number, which is uniform from 1 to n.
@@ -98,14 +93,14 @@ def _fit(
     )
 
 
-def _few_of_group(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
+def _limit_groups(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
     """Return at most `_OF_GROUP` scenes of each group."""
-    found, seen = [], Counter[tuple[str, str]]()
+    kept, number = [], Counter[tuple[str, str]]()
     for scene in scenes:
-        seen[scene.source, scene.group] += 1
-        if seen[scene.source, scene.group] <= _OF_GROUP:
-            found.append(scene)
-    return found
+        number[scene.source, scene.group] += 1
+        if number[scene.source, scene.group] <= _OF_GROUP:
+            kept.append(scene)
+    return kept
 
 
 def _most(
@@ -141,8 +136,7 @@ class _Cases:
 
     Attributes:
         index: (N,) the class.
-        listed: (N,) number of listed instances, from 1 to `number`.
-        number: (N,) number of instances in the scene.
+        listed, number: (N,) numbers of instances, listed (from 1 to `number`) and in the scene.
         features: (N, 3 + C + V) features of the listed part, in the columns of `Counts.weights`.
         weight: (N,) weight that balances the data sources.
     """
@@ -155,29 +149,25 @@ class _Cases:
 
     @classmethod
     def of(
-        cls,
-        scenes: Sequence[EncodedScene],
-        counting: dict[str, Flags],
-        vocabulary: Vocabulary,
-        draws: int,
+        cls, scenes: Sequence[EncodedScene], counting: dict[str, Flags], vocabulary: Vocabulary
     ) -> _Cases:
-        """List each scene in part, `draws` times."""
+        """List each scene in part, `_DRAWS` times."""
         names, start = sorted(counting), ROOM + len(vocabulary.room_types)
         rows: list[tuple[Ints, Floats]] = []
         cases: list[tuple[int, ...]] = []
-        for place, scene in enumerate(scenes):
+        for row, scene in enumerate(scenes):
             counted, source = counting[scene.source], names.index(scene.source)
-            for seed in range(draws):
-                part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
-                rows += [_features(part, k, start) for k in asked.tolist()]
-                numbers = np.stack([part.classes, part.listed, part.number])[:, asked]
-                cases += [(*case, place, source) for case in numbers.T.tolist()]
-        index, listed, number, places, sources = np.array(cases, dtype=np.int64).T
+            for seed in range(_DRAWS):
+                part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
+                rows += [_features(part, k, start) for k in indices.tolist()]
+                numbers = np.stack([part.classes, part.listed, part.number])[:, indices]
+                cases += [(*case, row, source) for case in numbers.T.tolist()]
+        index, listed, number, scene_rows, sources = np.array(cases, dtype=np.int64).T
         columns, values = (np.concatenate(some) for some in zip(*rows, strict=True))
         bounds = np.cumsum([0, *(len(row) for row, _ in rows)])
         shape = (len(cases), start + len(vocabulary))
         features = sparse.csr_matrix((values, columns, bounds), shape=shape)
-        return cls(index, listed, number, features, source_weights(sources, places) / draws)
+        return cls(index, listed, number, features, source_weights(sources, scene_rows) / _DRAWS)
 
 
 def _features(part: Part, k: int, start: int) -> tuple[Ints, Floats]:
@@ -199,8 +189,7 @@ def _shares(cases: _Cases, V: int) -> Floats:
     # Each number needs a positive share, because the fitted scene may favour it.
     overall = 0.999 * table.sum(axis=0) / table.sum() + 0.001 / MOST
     table += _PRIOR * overall
-    share: Floats = np.log(table / table.sum(axis=1, keepdims=True))
-    return share
+    return np.log(table / table.sum(axis=1, keepdims=True))
 
 
 def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
@@ -216,7 +205,7 @@ def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
     both = sparse.hstack([own[:, used], features]).tocsr()
     penalty = np.repeat([_OWN, _SHARED], [len(used), width])[:, None]
     numbers, of_number = np.arange(1, MOST + 1), functions(MOST)
-    place, case = cases.number - 1, np.arange(N)
+    observed, case = cases.number - 1, np.arange(N)
     base = share.T[:, cases.index] - np.log(numbers)[:, None]
     base[numbers[:, None] < cases.listed] = -np.inf
 
@@ -227,25 +216,22 @@ def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
         logits -= logits.max(axis=0)
         p = np.exp(logits)
         total = p.sum(axis=0)
-        fit = cases.weight @ (logits[place, case] - np.log(total))
-        error = cases.weight * (of_number @ p / total - of_number[:, place])
+        fit = cases.weight @ (logits[observed, case] - np.log(total))
+        error = cases.weight * (of_number @ p / total - of_number[:, observed])
         slope = both.T @ error.T + penalty * terms
         return 0.5 * (penalty * terms**2).sum() - fit, slope.ravel()
 
     start, options = np.zeros(both.shape[1] * EXPONENTS), {"ftol": _PRECISION}
-    found = minimize(loss, start, jac=True, method="L-BFGS-B", options=options)
-    terms = found.x.reshape(-1, EXPONENTS)
+    optimum = minimize(loss, start, jac=True, method="L-BFGS-B", options=options)
+    terms = optimum.x.reshape(-1, EXPONENTS)
     weights = np.zeros((V * width, EXPONENTS))
     weights[used] = terms[: len(used)]
-    of_class: Floats = weights.reshape(V, width, EXPONENTS) + terms[len(used) :]
+    of_class = weights.reshape(V, width, EXPONENTS) + terms[len(used) :]
     return of_class.swapaxes(1, 2)
 
 
-def _better(
-    scenes: Sequence[EncodedScene],
-    most: Ints,
-    counting: dict[str, Flags],
-    vocabulary: Vocabulary,
+def _better_than_mean(
+    scenes: Sequence[EncodedScene], most: Ints, counting: dict[str, Flags], vocabulary: Vocabulary
 ) -> Flags:
     """Return the classes, (V,), whose expected number is closer than the class mean."""
     gain = np.zeros(len(vocabulary))
@@ -254,19 +240,18 @@ def _better(
         for scene in test:
             for seed in range(_DRAWS):
                 counted = counting[scene.source]
-                part, asked = listed_cases(scene, counted, vocabulary.structure, seed)
-                classes, change = _changes(counts, part, asked, len(vocabulary))
+                part, indices = listed_cases(scene, counted, vocabulary.structure, seed)
+                classes, change = _changes(counts, part, indices, len(vocabulary))
                 gain[classes] -= change
     return gain > 0
 
 
-def _changes(counts: Counts, part: Part, asked: NDArray[np.intp], V: int) -> tuple[Ints, Floats]:
+def _changes(counts: Counts, part: Part, indices: NDArray[np.intp], V: int) -> tuple[Ints, Floats]:
     """Return classes (k,), and error of the expected number minus error of the mean."""
     room = part.room if part.room >= 0 else None
     which, p = distribution(counts, V, part.classes, part.listed, room)
-    usable = np.isin(which, asked)
+    usable = np.isin(which, indices)
     which, expected = which[usable], p[usable] @ np.arange(1, MOST + 1)
     classes, number = part.classes[which], part.number[which]
     mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[which])
-    change: Floats = np.abs(expected - number) - np.abs(mean - number)
-    return classes, change
+    return classes, np.abs(expected - number) - np.abs(mean - number)

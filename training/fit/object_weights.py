@@ -32,11 +32,12 @@ import torch
 from torch import Tensor
 
 from training.datasets.batches import SceneTensors
-from training.fit.configuration import ObjectsConfig, PolishConfig
+from training.fit.configuration import FineTuneConfig, ObjectsConfig
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
 from training.machines.chain_samples import pack_scenes
-from training.machines.gibbs import Clamp, State, initial_state, run
+from training.machines.gibbs import Clamp, initial_state, run
+from training.machines.machine import State
 from training.machines.mean_field import Evidence, mean_field
 
 OBJECT_WEIGHTS = ("b", "c1", "c2", "W", "J", "Q")
@@ -63,11 +64,7 @@ _FINE_TUNED_SWEEPS = 50
 
 @dataclass
 class _Chains:
-    """Persistent Gibbs chains.
-
-    The fields are the presence of objects (chains, classes), the two layers of hidden units and the
-    index of the room type of each chain.
-    """
+    """Objects, (chains, classes), hidden units of both layers and room types of Gibbs chains."""
 
     v: Tensor
     h1: Tensor
@@ -82,12 +79,9 @@ def fit_objects(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> None:
-    """Train the object weights b, c1, c2, W, J and Q of a machine of the local form, in place.
+    """Train b, c1, c2, W, J and Q of a machine of the local form, in place; not with 0 epochs.
 
-    Args:
-        train: training scenes. Scenes with incomplete object lists are left out.
-        config: epochs, learning rate, number of chains and batch size. With 0 epochs, the machine
-            stays unchanged.
+    Scenes with incomplete object lists are left out.
 
     Raises:
         FloatingPointError: a weight became infinite or NaN.
@@ -99,12 +93,13 @@ def fit_objects(
     weights = {name: machine.get_parameter(name) for name in OBJECT_WEIGHTS if name != "Q"}
     updates = config.epochs * max(1, round(scenes.size / config.batch_size))
     with torch.no_grad():
-        chains = _begin(machine, *_withheld(*scenes.draw(config.chains)))
+        v, room = scenes.draw(config.chains)
+        chains = _begin(machine, v, torch.full_like(room, -1))
         average = {name: weight.clone() for name, weight in weights.items()}
         for update in range(updates):
-            v, room = _withheld(*scenes.draw(config.batch_size))
+            v, room = scenes.draw(config.batch_size)
             rate = config.learning_rate * (1 - update / updates)
-            _update(machine, weights, v, room, chains, rate, generator)
+            _update(machine, weights, v, torch.full_like(room, -1), chains, rate, generator)
             late = update - (1 - _AVERAGED) * updates
             share = 1.0 if late <= 0 else max(_FORGETTING, 1 / (late + 1))
             for name, weight in weights.items():
@@ -120,14 +115,11 @@ def fit_objects(
         _fit_rooms(machine, scenes, generator)
 
 
-def _withheld(v: Tensor, room: Tensor) -> tuple[Tensor, Tensor]:
-    return v, torch.full_like(room, -1)
-
-
 def _fit_rooms(machine: BoltzmannMachine, scenes: _Scenes, generator: torch.Generator) -> None:
     """Train Q by maximum likelihood of p(v | t), separately for each room type t."""
-    known = scenes.room >= 0
-    counts = torch.zeros(len(machine.Q)).index_add_(0, scenes.room[known], scenes.weight[known])
+    has_room = scenes.room >= 0
+    counts = torch.zeros(len(machine.Q))
+    counts.index_add_(0, scenes.room[has_room], scenes.weight[has_room])
     rooms = counts.nonzero().squeeze(1)
     if not len(rooms):
         return
@@ -157,10 +149,8 @@ def store_samples(
 ) -> None:
     """Store samples in the machine: the final states of N long Gibbs chains.
 
-    Each chain starts at a training scene, and its sample has the room type of that scene.
-
-    Args:
-        room_dropout: share of the chains that run without a room type.
+    Each chain starts at a training scene, and its sample has the room type of that scene. A share
+    of the chains, `room_dropout`, runs without a room type.
     """
     if not machine.spec.N:
         return
@@ -188,29 +178,23 @@ class _Scenes:
         self.v, self.room, self.weight = train.v[kept], train.room[kept], train.weight[kept]
         self.size = float(self.weight.sum())
         self._generator = generator
-        self._order, self._place = torch.zeros(0, dtype=torch.int64), 0
+        self._order = torch.zeros(0, dtype=torch.int64)
 
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
         """Return the objects, (scenes, classes), and room types, (scenes,), of the next scenes."""
-        parts = []
-        while count:
-            if self._place == len(self._order):
-                self._shuffle()
-            part = self._order[self._place : self._place + count]
-            self._place, count = self._place + len(part), count - len(part)
-            parts.append(part)
-        index = torch.cat(parts)
+        while len(self._order) < count:
+            self._order = torch.cat([self._order, self._shuffled()])
+        index, self._order = self._order[:count], self._order[count:]
         return self.v[index], self.room[index]
 
-    def _shuffle(self) -> None:
+    def _shuffled(self) -> Tensor:
         """Start a random pass; the expected number of draws of a scene is its weight."""
         times = self.weight.floor()
         extra = torch.rand(len(times), generator=self._generator) < self.weight - times
         index = torch.arange(len(times)).repeat_interleave(times.long() + extra)
         if not len(index):
             index = self.weight.argmax().view(1)
-        self._order = index[torch.randperm(len(index), generator=self._generator)]
-        self._place = 0
+        return index[torch.randperm(len(index), generator=self._generator)]
 
 
 def _begin(machine: BoltzmannMachine, v: Tensor, room: Tensor) -> _Chains:
@@ -260,7 +244,7 @@ def _add(weights: Mapping[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, rate:
 def fine_tune(
     machine: BoltzmannMachine,
     train: SceneTensors,
-    config: PolishConfig,
+    config: FineTuneConfig,
     room_dropout: float,
     seed: int,
 ) -> None:
@@ -271,10 +255,7 @@ def fine_tune(
     removes the bias. It changes only b, c1, c2, W and Q. The penalty anchor · sum (θ - θ_before)²
     keeps the conditionals accurate. The function then stores N samples. They come from chains with
     the averaged weights, and each sample has the room type of the scene where its chain started.
-
-    Args:
-        config: number of updates and chains. With 0 updates and N = 0, the machine stays unchanged.
-        room_dropout: share of chains and scenes without a room type.
+    A share of the chains and scenes, `room_dropout`, has no room type.
     """
     if not config.updates and not machine.spec.N:
         return

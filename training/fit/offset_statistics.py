@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from app.registry import Offsets
 from app.scene import CANONICAL
 from training.datasets import EncodedScene
 from training.datasets.array_types import Floats, Ints
-from training.datasets.offsets import Seen, seen_offsets
+from training.datasets.offsets import ObservedOffsets, observed_offsets
 
 # Shrinkage of the class effects u and v. It acts like `LAMBDA` additional pairs with effect 0.
 LAMBDA: Final = 4.0
@@ -48,19 +48,18 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     """Fit the distribution of offsets. Return None if no scene has poses.
 
     All offsets of a pair of classes in one scene have a total weight of 1, because they depend on
-    each other. All data sources have the same total weight, because boxes of one source are
-    similar.
+    each other. All data sources have the same total weight.
     """
-    seen = seen_offsets(scenes)
-    if not len(seen.offset):
+    observed = observed_offsets(scenes)
+    if not len(observed.offset):
         return None
     A = len(CANONICAL)
     relation, scenes_of = np.zeros((A, 6)), np.zeros(A, dtype=np.int32)
     subject, other = np.zeros((A, V, 6)), np.zeros((A, V, 6))
     pair = [np.zeros(0, dtype=np.int64)]
-    known, counts = [np.zeros((0, 6))], [np.zeros(0, dtype=np.int32)]
+    moments, counts = [np.zeros((0, 6))], [np.zeros(0, dtype=np.int32)]
     for a in range(A):
-        some = seen.some(seen.relation == a)
+        some = observed.rows(observed.relation == a)
         if not len(some.offset):
             continue
         pairs = _pairs(some)
@@ -69,11 +68,13 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
         mean, variance = fit.predict(pairs)
         scenes_of[a] = len(np.unique(some.scene))
         pair.append((a * V + pairs.subject) * V + pairs.other)
-        known.append(np.concatenate([mean, np.sqrt(variance)], axis=1))
+        moments.append(np.concatenate([mean, np.sqrt(variance)], axis=1))
         counts.append(pairs.scenes.astype(np.int32))
+    tables = map(half_precision, (relation, subject, other, np.concatenate(moments)))
+    relation_table, subject_table, other_table, moment_table = tables
     return Offsets(
-        *(half_precision(relation), scenes_of, half_precision(subject), half_precision(other)),
-        *(np.concatenate(pair), half_precision(np.concatenate(known)), np.concatenate(counts)),
+        *(relation_table, scenes_of, subject_table, other_table),
+        *(np.concatenate(pair), moment_table, np.concatenate(counts)),
     )
 
 
@@ -97,46 +98,40 @@ class Pairs(NamedTuple):
     scatter: Floats
 
 
-def _pairs(seen: Seen) -> Pairs:
-    classes = np.stack([seen.subject, seen.other], axis=1)
-    found, pair = np.unique(classes, axis=0, return_inverse=True)
+def _pairs(observed: ObservedOffsets) -> Pairs:
+    classes = np.stack([observed.subject, observed.other], axis=1)
+    distinct, pair = np.unique(classes, axis=0, return_inverse=True)
     pair = pair.reshape(-1)
     # Group the offsets by scene and pair of classes.
+    key = np.stack([pair, observed.scene])
     _, first, group, size = np.unique(
-        np.stack([pair, seen.scene]),
-        axis=1,
-        return_index=True,
-        return_inverse=True,
-        return_counts=True,
+        key, axis=1, return_index=True, return_inverse=True, return_counts=True
     )
-    weight = source_weights(seen.source, seen.scene) / size[group.reshape(-1)]
-    P, weights = len(found), weight[:, None]
+    weight = source_weights(observed.source, observed.scene) / size[group.reshape(-1)]
+    P, weights = len(distinct), weight[:, None]
     n = _sums(pair, weights, P)
-    mean = _sums(pair, weights * seen.offset, P) / n
-    squares = np.square(seen.offset - mean[pair]) + _RESOLUTION**2
-    subject, other = found.T
+    mean = _sums(pair, weights * observed.offset, P) / n
+    squares = np.square(observed.offset - mean[pair]) + _RESOLUTION**2
     scenes = np.bincount(pair[first], minlength=P)
+    subject, other = distinct.T
     return Pairs(subject, other, scenes, n, mean, _sums(pair, weights * squares, P))
 
 
 def _sums(group: Ints, values: Floats, groups: int) -> Floats:
     """Return the sum of the values, (rows, k), over each group of rows, (groups, k)."""
-    found = np.zeros((groups, values.shape[1]))
-    np.add.at(found, group, values)
-    return found
+    sums = np.zeros((groups, values.shape[1]))
+    np.add.at(sums, group, values)
+    return sums
 
 
 def source_weights(source: Ints, scene: Ints) -> Floats:
-    """Return weights of N items, (N,), that balance large and small data sources.
+    """Return weights, (N,), that balance large and small data sources.
 
-    Args:
-        source: (N,) index of the data source of each item.
-        scene: (N,) index of the scene of each item.
+    The arguments are the indices of the data source and the scene of each item, (N,).
     """
     count = np.array([len(np.unique(scene[source == s])) for s in range(source.max() + 1)])
     least = count[count >= _FEW].min(initial=count.max())
-    weight: Floats = np.minimum(1.0, least / np.maximum(count, 1))[source]
-    return weight
+    return np.minimum(1.0, least / np.maximum(count, 1))[source]
 
 
 @dataclass(eq=False)
@@ -165,17 +160,14 @@ class _Fit:
     def predict(self, pairs: Pairs) -> tuple[Floats, Floats]:
         """Return mean and variance of a new offset of each pair, both (pairs, 3)."""
         kappa = self.kappa / (1 + self.doubt_u[pairs.subject] + self.doubt_v[pairs.other])
-        return posterior(
-            *(self.expected(pairs), kappa, self.alpha, self.beta),
-            *(pairs.n, pairs.mean, pairs.scatter),
-        )
+        prior = self.expected(pairs), kappa, self.alpha, self.beta
+        return posterior(prior, pairs.n, pairs.mean, pairs.scatter)
 
     def tables(self) -> tuple[Floats, Floats, Floats]:
-        """Return three tables whose sum gives mean and variance of a pair without data.
+        """Return tables whose sum gives mean and variance of a pair without data, as `predict`.
 
         The first table, (6,), contains three means and three variances for unknown classes. The
-        other tables, (classes, 6), contain the contributions of the subject class and of the object
-        class. The sum equals `predict`.
+        others, (classes, 6), contain the contributions of the subject and of the object class.
         """
         spread = self.beta / (self.alpha - 1)
         unknown = 1 / LAMBDA
@@ -187,60 +179,50 @@ class _Fit:
         return relation, subject, other
 
 
-def posterior(
-    expected: Floats,
-    kappa: Floats,
-    alpha: Floats,
-    beta: Floats,
-    n: Floats,
-    mean: Floats,
-    scatter: Floats,
-) -> tuple[Floats, Floats]:
-    """Return mean and variance of a new value given n values, under a normal–inverse-gamma prior.
+Prior = tuple[Any, Any, Any, Any]
+"""Mean expected, kappa, alpha and beta of a normal–inverse-gamma prior."""
+
+
+def posterior(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> tuple[Floats, Floats]:
+    """Return mean and variance of a new value given n values with this mean.
 
     Args:
-        expected, kappa, alpha, beta: parameters of the prior. alpha + n / 2 must be above 1.
+        prior: alpha + n / 2 must be above 1.
         scatter: sum of the squared deviations from the mean.
     """
-    after = kappa + n
-    rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
-    variance = rate / (alpha + n / 2 - 1) * (1 + 1 / after)
-    return (kappa * expected + n * mean) / after, variance
+    after, shape, rate = _updated(prior, n, mean, scatter)
+    expected, kappa, _, _ = prior
+    return (kappa * expected + n * mean) / after, rate / (shape - 1) * (1 + 1 / after)
 
 
-def log_likelihood(
-    expected: Floats,
-    kappa: float,
-    alpha: float,
-    beta: float,
-    n: Floats,
-    mean: Floats,
-    scatter: Floats,
-) -> Floats:
-    """Return the log-likelihood of n values, with their mean and variance integrated out.
-
-    `posterior` describes the arguments.
-    """
-    after, shape = kappa + n, alpha + n / 2
-    rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
-    found: Floats = (
+def log_likelihood(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> Floats:
+    """Return the log-likelihood of n values, with their mean and variance integrated out."""
+    after, shape, rate = _updated(prior, n, mean, scatter)
+    _, kappa, alpha, beta = prior
+    return (
         gammaln(shape) - gammaln(alpha) + alpha * np.log(beta) - shape * np.log(rate)
         + (np.log(kappa) - np.log(after) - n * np.log(2 * np.pi)) / 2
     )  # fmt: skip
-    return found
+
+
+def _updated(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> tuple[Any, Any, Any]:
+    """Return kappa, alpha and beta of the posterior."""
+    expected, kappa, alpha, beta = prior
+    after = kappa + n
+    rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
+    return after, alpha + n / 2, rate
 
 
 def _fit(pairs: Pairs, V: int) -> _Fit:
     """Fit the parameters of one relation, by alternation between the prior and class effects."""
     nothing = np.zeros((V, 3))
     start = (pairs.n * pairs.mean).sum(axis=0) / pairs.n.sum()
-    fit = _Fit(
-        np.ones(3), np.full(3, 2.0), np.full(3, 0.1), start, nothing, nothing, nothing, nothing
-    )
+    prior = np.ones(3), np.full(3, 2.0), np.full(3, 0.1)
+    fit = _Fit(*prior, start, *[nothing] * 4)
     for _ in range(_ROUNDS):
         expected = fit.expected(pairs)
-        found = [_hyperparameters(pairs, axis, expected[:, axis]) for axis in range(3)]
-        fit.kappa, fit.alpha, fit.beta = np.array(found).T
+        priors = [_hyperparameters(pairs, axis, expected[:, axis]) for axis in range(3)]
+        fit.kappa, fit.alpha, fit.beta = np.array(priors).T
         _effects(fit, pairs, V)
     return fit
 
@@ -249,13 +231,11 @@ def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
     """Return kappa, alpha and beta of one axis, fitted by maximum likelihood."""
 
     def loss(logs: Floats) -> float:
-        kappa, alpha, beta = np.exp(logs)
         n, mean, scatter = pairs.n[:, 0], pairs.mean[:, axis], pairs.scatter[:, axis]
-        return -float(log_likelihood(expected, kappa, alpha, beta, n, mean, scatter).sum())
+        return -float(log_likelihood((expected, *np.exp(logs)), n, mean, scatter).sum())
 
     bounds = [(-7.0, 7.0), (np.log(_LEAST_ALPHA), 7.0), (-12.0, 7.0)]
-    found: Floats = np.exp(minimize(loss, np.log([1.0, 2.0, 0.1]), bounds=bounds).x)
-    return found
+    return np.exp(minimize(loss, np.log([1.0, 2.0, 0.1]), bounds=bounds).x)
 
 
 def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:

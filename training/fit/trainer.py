@@ -44,16 +44,15 @@ _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
 # Attributes of the trainer that a checkpoint stores as they are.
 _COUNTERS = ("objects_trained", "best_epoch", "best_score", "updates", "seconds")
-# Function that is called in the first training phase (objects only) with the finished share of it.
+# Function that is called in the first training phase (objects only) with its finished share.
 ObjectProgress = Callable[[float], None]
 # Names of the weights with the full learning rate. The setting `relation_rate` can lower the rate
 # of all other weights. Relation weights can overfit within one epoch.
 _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
-# Function that is called after every update. The arguments are the epoch, the finished share of the
-# epoch and the mean loss in the epoch so far.
+# Function that is called after every update with the epoch, its finished share and its mean loss.
 Progress = Callable[[int, float, float], None]
-# Function that is called with the figures of every finished epoch.
+# Function that is called after every epoch.
 Ended = Callable[[Epoch], None]
 
 
@@ -63,18 +62,10 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
     spec = MachineSpec(
-        variant=shape.variant,
-        V=V,
-        A=data.relations,
-        H1=shape.H1,
-        H2=shape.H2,
-        C=data.room_types,
-        K=shape.K if VARIANTS[shape.variant].factorised else 0,
-        T=len(triples),
-        G=shape.G,
-        N=shape.N,
-        form=shape.form,
-    )
+        shape.variant, V=V, A=data.relations, H1=shape.H1, H2=shape.H2, C=data.room_types,
+        K=shape.K if VARIANTS[shape.variant].factorised else 0, T=len(triples), G=shape.G,
+        N=shape.N, form=shape.form,
+    )  # fmt: skip
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
     with torch.no_grad():
         annotated = data.train.annotated_classes[data.train.source].sum(0)
@@ -105,8 +96,8 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
         classes = torch.from_numpy(e.classes)
         relation, subject, object_ = torch.from_numpy(e.holds).nonzero(as_tuple=True)
         keys = triple_keys(relation, classes[subject], classes[object_], V)
-        place, found = find_triples(machine.triple_keys, keys)
-        per_unit[place[found]] += 1
+        index, exists = find_triples(machine.triple_keys, keys)
+        per_unit[index[exists]] += 1
         logs[classes] += torch.from_numpy(e.counts).log()
         times[classes] += 1
     machine.start_relations(
@@ -132,9 +123,7 @@ class _Loss(nn.Module):
 class Trainer:
     """Train one configuration on one set of scenes.
 
-    Args:
-        folder: folder of `checkpoint.pt`, `curve.csv` and `curve.png`; None writes no files. Only
-            the first process writes.
+    The first process writes `checkpoint.pt`, `curve.csv` and `curve.png` into the folder, if any.
     """
 
     def __init__(self, config: Config, data: TrainingData, folder: Path | None = None) -> None:
@@ -156,7 +145,7 @@ class Trainer:
         self.optimiser = self._optimiser()
         self.steps_per_epoch = math.ceil(len(self.train) / config.training.batch_size)
         self.scheduler = self._scheduler()
-        self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
+        self.average = self._copies()
         self.updates = 0
         self.epochs: list[Epoch] = []
         self.best: dict[str, Tensor] = {}
@@ -164,6 +153,9 @@ class Trainer:
         self.seconds = 0.0
         self.objects_trained = not config.objects.epochs
         self._drawn = -math.inf
+
+    def _copies(self) -> dict[str, Tensor]:
+        return {name: p.detach().clone() for name, p in self.machine.named_parameters()}
 
     def _placed(self) -> torch.device | nullcontext[None]:
         """Return a context in which new tensors are on the device."""
@@ -179,30 +171,28 @@ class Trainer:
 
     def _optimiser(self) -> torch.optim.Optimizer:
         t = self.config.training
-        matrices: list[Tensor] = []
-        biases: list[Tensor] = []
-        relations: list[Tensor] = []
+        groups: tuple[list[Tensor], list[Tensor], list[Tensor]] = ([], [], [])
+        matrices, biases, relations = groups
         for name, parameter in self.machine.named_parameters():
             if not parameter.requires_grad:
                 continue
             group = matrices if parameter.dim() > 1 else biases
             (group if name in _FULL_RATE else relations).append(parameter)
-        rate = t.learning_rate * t.relation_rate
         biases += self.objective.parameters()
-        groups = [
-            {"params": matrices, "weight_decay": t.weight_decay, "lr": t.learning_rate},
-            {"params": biases, "weight_decay": 0.0, "lr": t.learning_rate},
-            {"params": relations, "weight_decay": t.relation_decay, "lr": rate},
+        decays = t.weight_decay, 0.0, t.relation_decay
+        rates = t.learning_rate, t.learning_rate, t.learning_rate * t.relation_rate
+        settings = [
+            {"params": group, "weight_decay": decay, "lr": rate}
+            for group, decay, rate in zip(groups, decays, rates, strict=True)
         ]
-        if t.optimiser == "sgd":
-            return torch.optim.SGD(groups, lr=t.learning_rate, fused=True)
-        return torch.optim.AdamW(groups, lr=t.learning_rate, fused=True)
+        kind = torch.optim.SGD if t.optimiser == "sgd" else torch.optim.AdamW
+        return kind(settings, lr=t.learning_rate, fused=True)
 
     def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
         """Return the schedule of the learning rate.
 
-        In the one-cycle schedule, the rate rises linearly over the first tenth of the updates. It
-        then falls to 0 along a cosine.
+        In the one-cycle schedule, it rises over the first tenth of the updates, and then falls to 0
+        along a cosine.
         """
         t = self.config.training
         if t.schedule == "constant":
@@ -251,16 +241,15 @@ class Trainer:
     ) -> TrainingResult:
         """Run the first training phase (objects only) if there is one, then all epochs.
 
-        Training ends after the last epoch. It ends earlier if the validation score does not improve
-        for `training.patience` epochs. After a KeyboardInterrupt, the checkpoint of the last
-        finished epoch is on disk.
+        Training ends earlier if the validation score does not improve for `training.patience`
+        epochs. After a KeyboardInterrupt, the checkpoint of the last finished epoch is on disk.
         """
         if not self.objects_trained:
             began = time.perf_counter()
             state = distributed.on_first(partial(self._fit_objects, objects))
             self.machine.load_state_dict(state)
             self.objects_trained = True
-            self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
+            self.average = self._copies()
             self.seconds += time.perf_counter() - began
             self._save()
         while len(self.epochs) < self.config.training.epochs and not self._out_of_patience():
@@ -269,20 +258,15 @@ class Trainer:
             if ended is not None:
                 ended(self.epochs[-1])
         self._draw()
-        parameters = dict(self.machine.named_parameters())
         with torch.no_grad():
             for name, value in self.best.items():
-                parameters[name].copy_(value)
+                self.machine.get_parameter(name).copy_(value)
         self.machine.cpu().index_triples()
         machine = self.objective.finish(self.machine, self.train)
         if not self.config.objects.epochs:
-            fine_tune(
-                self.machine,
-                self.data.train,
-                self.config.polish,
-                self.config.objective.room_dropout,
-                self.config.training.seed,
-            )
+            training, dropout = self.config.training, self.config.objective.room_dropout
+            data = self.data.train
+            fine_tune(self.machine, data, self.config.polish, dropout, training.seed)
         return TrainingResult(machine, self.epochs, self.best_epoch, self.seconds)
 
     def _fit_objects(self, progress: ObjectProgress) -> dict[str, Tensor]:
@@ -341,8 +325,7 @@ class Trainer:
     @torch.no_grad()
     def _close_epoch(self, number: int, loss: float, began: float) -> None:
         """Evaluate the weights, or their average, on validation scenes. Keep the best weights."""
-        parameters = dict(self.machine.named_parameters())
-        current = {name: p.detach().clone() for name, p in parameters.items()}
+        parameters, current = dict(self.machine.named_parameters()), self._copies()
         if self.config.training.averaging:
             for name, p in parameters.items():
                 p.copy_(self.average[name])
@@ -357,7 +340,7 @@ class Trainer:
         score = mrr + (0.0 if math.isnan(precision) else precision)
         if score > self.best_score or self.objective.keeps_last:
             self.best_score, self.best_epoch = score, number
-            self.best = {name: p.detach().clone() for name, p in parameters.items()}
+            self.best = self._copies()
         for name, p in parameters.items():
             p.copy_(current[name])
         seconds = time.perf_counter() - began

@@ -8,9 +8,8 @@ Sizes: B scenes, V object classes, A relations, E relation units, H1 and H2 hidd
 from __future__ import annotations
 
 from app.inference.variants import MachineSpec
-from training.machines.gbm import GBM
 from training.machines.machine import BoltzmannMachine
-from training.machines.rbm import RBM
+from training.machines.rbm import GBM, RBM
 from training.machines.triway import Triway
 
 VARIANTS: dict[str, type[BoltzmannMachine]] = {

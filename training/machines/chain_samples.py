@@ -32,8 +32,8 @@ from torch.nn.functional import logsigmoid
 from app.inference import weights
 from app.inference.chains import OTHER_ROOM
 from training.machines.bernoulli import bernoulli
-from training.machines.gibbs import FREE, Clamp, State, bare_state, initial_state
-from training.machines.machine import BoltzmannMachine
+from training.machines.gibbs import FREE, Clamp, bare_state, initial_state
+from training.machines.machine import BoltzmannMachine, State
 from training.machines.mean_field import Evidence, mean_field
 
 
@@ -77,34 +77,34 @@ class ChainSamples:
             self._unit = logsigmoid(field.y)
 
     @torch.no_grad()
-    def start(self, given: Tensor, generator: torch.Generator, clamp: Clamp = FREE) -> State:
+    def start(self, observed: Tensor, generator: torch.Generator, clamp: Clamp = FREE) -> State:
         """Return the start state of each chain: a stored sample, drawn by its weight.
 
-        If the machine stores no samples, each chain starts at the objects in `given`.
+        If the machine stores no samples, each chain starts at the observed objects.
 
         Args:
-            given: observed objects, (chains, classes). 1 means that the class must be present.
+            observed: observed objects, (chains, classes). 1 means that the class must be present.
             clamp: room types and clamped hidden units. They also enter the weights.
         """
         machine = self.machine
         if not machine.spec.N:
-            return _held(initial_state(machine, given, generator, clamp), clamp)
-        weight = self.log_weight(given, clamp)
+            return _held(initial_state(machine, observed, generator, clamp), clamp)
+        weight = self.log_weight(observed, clamp)
         chosen = torch.multinomial(weight.softmax(1), 1, generator=generator).squeeze(1)
         h1, h2 = bernoulli(self.h1[chosen], generator), bernoulli(self.h2[chosen], generator)
-        return _held(bare_state(machine, self.v[chosen].maximum(given), h1, h2), clamp)
+        return _held(bare_state(machine, self.v[chosen].maximum(observed), h1, h2), clamp)
 
-    def log_weight(self, given: Tensor, clamp: Clamp = FREE) -> Tensor:
+    def log_weight(self, observed: Tensor, clamp: Clamp = FREE) -> Tensor:
         """Return the log weight log w of each stored sample for each chain, (chains, samples)."""
-        weight = given @ self._present.T
+        weight = observed @ self._present.T
         if clamp.room is not None and self.machine.spec.C:
-            known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
+            has_room = (clamp.room >= 0).to(observed.dtype).unsqueeze(1)
             own = self.machine.fantasy_rooms == clamp.room.unsqueeze(1)
             hint = self._room.T[clamp.room.clamp(min=0)]
             hint = torch.where(own.any(1, keepdim=True), -float(OTHER_ROOM) * ~own, hint)
-            weight = weight + known * hint
+            weight = weight + has_room * hint
         if clamp.h1 is not None:
-            weight = weight + clamp.h1.to(given.dtype) @ self._unit.T
+            weight = weight + clamp.h1.to(observed.dtype) @ self._unit.T
         return weight
 
 

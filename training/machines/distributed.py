@@ -89,9 +89,7 @@ def new_generator(seed: int) -> torch.Generator:
 def own_rows(rows: int, generator: torch.Generator | None) -> tuple[int, int]:
     """Return the index of the first of this process' rows among all rows, and their number.
 
-    Args:
-        rows: number of rows of this process.
-        generator: only a `SharedGenerator` has rows of other processes.
+    Only a `SharedGenerator` has rows of other processes.
     """
     if not isinstance(generator, SharedGenerator):
         return 0, rows

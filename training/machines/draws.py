@@ -46,17 +46,11 @@ class HiddenDraws:
     field: MeanField
 
     def implied(
-        self, machine: BoltzmannMachine, edges: Edges, given: Tensor, *, apart: bool = False
+        self, machine: BoltzmannMachine, edges: Edges, observed: Tensor, *, apart: bool = False
     ) -> Tensor:
-        """Return the change of each relation logit due to the given relations, (scenes, units).
+        """Return `machine.implied` for the mean of the hidden units given the objects."""
 
-        The change also depends on the hidden units h1, which are at their mean given the objects.
-
-        Args:
-            given: given relations, (scenes, units). 1 means that the relation holds.
-            apart: True leaves out the effects between relations of the same two classes.
-        """
-        return machine.implied(edges, given, self.field.x.sigmoid(), apart=apart)
+        return machine.implied(edges, observed, self.field.x.sigmoid(), apart=apart)
 
     def mean(self, values: Tensor) -> Tensor:
         """Return the weighted mean over the draws of values (draws, scenes, ...)."""
@@ -69,10 +63,9 @@ class HiddenDraws:
         return (values + weight).logsumexp(0)
 
     def standard_error(self, values: Tensor) -> Tensor:
-        """Return the standard error of `mean(values)` by the delta method, (scenes, ...).
+        """Return an upper bound of the standard error of `mean(values)`, (scenes, ...).
 
-        The formula assumes independent draws. The draws of a Sobol sequence have smaller errors, so
-        the result is an upper bound in practice.
+        The delta method assumes independent draws; those of a Sobol sequence have smaller errors.
         """
         deviation = (values - self.mean(values)) ** 2
         return torch.einsum("mb,mb...->b...", (2 * self.log_weight).exp(), deviation).sqrt()
@@ -86,11 +79,7 @@ def fixed_uniforms(count: int, units: int) -> Tensor:
 
 
 def draw_hidden(
-    machine: BoltzmannMachine,
-    evidence: Evidence,
-    *,
-    draws: int = 64,
-    pull: float = 1.0,
+    machine: BoltzmannMachine, evidence: Evidence, *, draws: int = 64, pull: float = 1.0
 ) -> HiddenDraws:
     """Return weighted draws of the hidden units h1 given the evidence.
 

@@ -61,20 +61,17 @@ class TripleEdges(Edges):
 
     @property
     def shape(self) -> torch.Size:
-        """Shape of tensors with one value for each unit, (1, units)."""
         return self.valid.shape
 
     @property
     def classes(self) -> Tensor:
-        """Empty tensor (1, 0), because the table does not depend on the classes of a scene."""
+        # The table does not depend on the classes of a scene.
         return self.subject.new_zeros(1, 0)
 
     def expand(self, rows: int) -> TripleEdges:
-        """Return this object, because its single row of units applies to all scenes."""
         return self
 
     def ends_present(self, v: Tensor) -> Tensor:
-        """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
         present: Tensor = v[..., self.subject[0]] * v[..., self.object[0]] * self.valid
         return present
 
@@ -84,16 +81,13 @@ class PairEdges(Edges):
     """All A·n·m units between n subject classes and m object classes of each scene.
 
     The units of a scene have the flattened layout (relations, subjects, objects). With this layout,
-    shared weights need only small matrix products. The index tensors of the units are computed on
-    first use.
+    shared weights need only small matrix products.
 
     Attributes:
         relations: number of canonical relations A.
-        subjects: class indices of the subjects, (scenes, n) int64. Padding is 0.
-        objects: class indices of the objects, (scenes, m) int64. Padding is 0.
+        subjects, objects: class indices, (scenes, n) and (scenes, m) int64. Padding is 0.
         valid_subjects, valid_objects: bool, shaped like the classes. False marks padding.
-        log_subjects, log_objects: log of the number of instances of each class, shaped like the
-            classes.
+        log_subjects, log_objects: log of the number of instances, shaped like the classes.
     """
 
     relations: int
@@ -106,44 +100,36 @@ class PairEdges(Edges):
 
     @property
     def shape(self) -> torch.Size:
-        """Shape of tensors with one value for each unit, (scenes, A·n·m)."""
         (B, n), m = self.subjects.shape, self.objects.shape[1]
         return torch.Size((B, self.relations * n * m))
 
     @property
     def classes(self) -> Tensor:
-        """Class indices of the subjects, (scenes, n). Padding is -1."""
         return torch.where(self.valid_subjects, self.subjects, -1)
 
     def expand(self, rows: int) -> PairEdges:
-        """Return the units of one scene, repeated for `rows` scenes."""
         ends = [getattr(self, field.name) for field in fields(self) if field.name != "relations"]
         return PairEdges(self.relations, *(end.expand(rows, -1) for end in ends))
 
     @cached_property
     def relation(self) -> Tensor:  # type: ignore[override]
-        """Relation index a of each unit, (scenes, units) int64."""
         axis = torch.arange(self.relations, device=self.subjects.device)
         return self._flat(axis[:, None, None])
 
     @cached_property
     def subject(self) -> Tensor:  # type: ignore[override]
-        """Class index i of the subject of each unit, (scenes, units) int64."""
         return self._flat(self.subjects[:, None, :, None])
 
     @cached_property
     def object(self) -> Tensor:  # type: ignore[override]
-        """Class index j of the object of each unit, (scenes, units) int64."""
         return self._flat(self.objects[:, None, None, :])
 
     @cached_property
     def valid(self) -> Tensor:  # type: ignore[override]
-        """False where a unit is padding, else True, (scenes, units) bool."""
         pairs = self.valid_subjects.unsqueeze(-1) & self.valid_objects.unsqueeze(-2)
         return self._flat(pairs.unsqueeze(1))
 
     def ends_present(self, v: Tensor) -> Tensor:
-        """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
         lead = v.shape[:-1]
         subject = v.gather(-1, self.subjects.expand(*lead, -1)) * self.valid_subjects
         object_ = v.gather(-1, self.objects.expand(*lead, -1)) * self.valid_objects
@@ -171,10 +157,9 @@ def pair_edges(
     """Return the relation units between the given classes.
 
     Args:
-        subjects: class indices of the subjects, (scenes, n) int64. Padding is -1.
+        subjects, objects: class indices, (scenes, n) and (scenes, m) int64. Padding is -1. The
+            default of the objects is `subjects`.
         relations: number of canonical relations A.
-        objects: class indices of the objects, (scenes, m) int64. Padding is -1. The default is
-            `subjects`.
         log_subjects, log_objects: log of the number of instances of each class, shaped like the
             classes. The default is one instance of each class.
     """
@@ -186,23 +171,12 @@ def pair_edges(
         log_subjects = torch.zeros(subjects.shape, device=subjects.device)
     if log_objects is None:
         log_objects = torch.zeros(objects.shape, device=objects.device)
-    return PairEdges(
-        relations=relations,
-        subjects=subjects,
-        objects=objects,
-        valid_subjects=valid_subjects,
-        valid_objects=valid_objects,
-        log_subjects=log_subjects,
-        log_objects=log_objects,
-    )
+    ends = subjects, objects, valid_subjects, valid_objects, log_subjects, log_objects
+    return PairEdges(relations, *ends)
 
 
 def triple_edges(triples: Tensor) -> TripleEdges:
-    """Return the relation units of a table of triples, which apply to all scenes.
-
-    Args:
-        triples: triples (relation a, subject class i, object class j), (triples, 3).
-    """
+    """Return the units of a table of triples (a, i, j), (triples, 3), which apply to all scenes."""
     relation, subject, object_ = triples.long().T.unsqueeze(1).unbind(0)
     return TripleEdges(relation, subject, object_, torch.ones_like(subject, dtype=torch.bool))
 
@@ -235,10 +209,9 @@ def present_classes(v: Tensor, leading: Tensor | None = None, least: int = 0) ->
         present[rows, lead] = False
     row, column = present.nonzero()
     counts = present.sum(1)
-    width = lead.shape[1] + int(counts.max(initial=0))
-    width = max(width, least)
+    width = max(lead.shape[1] + int(counts.max(initial=0)), least)
     classes = np.full((len(v), width), -1, dtype=np.int64)
     classes[:, : lead.shape[1]] = lead
-    place = np.arange(len(row)) - np.repeat(counts.cumsum() - counts, counts)
-    classes[row, lead.shape[1] + place] = column
+    rank = np.arange(len(row)) - np.repeat(counts.cumsum() - counts, counts)
+    classes[row, lead.shape[1] + rank] = column
     return torch.from_numpy(classes).to(v.device)

@@ -31,7 +31,7 @@ from torch.nn.functional import embedding_bag
 from training.machines.bernoulli import bernoulli, integers, uniform
 from training.machines.distributed import widest
 from training.machines.edges import Edges
-from training.machines.machine import BoltzmannMachine
+from training.machines.machine import BoltzmannMachine, State
 from training.machines.mean_field import Evidence, mean_field
 
 _PROPOSAL_BLOCKS = 8
@@ -44,30 +44,11 @@ _PRESENT = 0.12
 
 
 @dataclass(frozen=True)
-class State:
-    """The state of several Gibbs chains.
-
-    Attributes:
-        v: presence of objects, (chains, classes).
-        h1, h2: hidden units of each layer, (chains, hidden units).
-        r: values of the relation units, (chains, units).
-        edges: layout of the relation units in r.
-    """
-
-    v: Tensor
-    h1: Tensor
-    h2: Tensor
-    r: Tensor
-    edges: Edges
-
-
-@dataclass(frozen=True)
 class Clamp:
     """Units that a Gibbs chain keeps at their value, and observed relations.
 
     Attributes:
-        v, h1, h2: bool masks of the clamped units, broadcastable to v, h1 and h2 of `State`. None
-            clamps no unit.
+        v, h1, h2: bool masks of the clamped units, broadcastable to `State`; None clamps no unit.
         edges, r, observed: observed relations, as in `Evidence`. In a Triway machine, both objects
             of an observed relation must be clamped as present.
         room: index of the room type of each chain, (chains,) int64.
@@ -101,10 +82,7 @@ FREE = Clamp()
 def initial_state(
     machine: BoltzmannMachine, v: Tensor, generator: torch.Generator, clamp: Clamp = FREE
 ) -> State:
-    """Return a start state with the objects v.
-
-    The hidden units h1 and h2 are sampled from their biases, and the relations r given v and h1.
-    """
+    """Return the objects v, h1 and h2 sampled from their biases, and relations given v and h1."""
     rows = len(v)
     h1 = bernoulli(machine.context_bias(clamp.room).sigmoid().expand(rows, -1), generator)
     h2 = bernoulli(machine.c2.sigmoid().expand(rows, -1), generator)
@@ -153,18 +131,15 @@ def reconstruct(
     collapsed: bool = True,
     relations: bool = True,
 ) -> State:
-    """Run the second half of a Gibbs step: given h1, sample h2, the objects v and the relations r.
-
-    `gibbs_step` describes the arguments.
-    """
+    """Run the second half of a `gibbs_step`: given h1, sample h2, v and r."""
     h1, h2 = state.h1, state.h2
     if machine.spec.H2:
         drawn = bernoulli(machine.second_layer_logits(h1).sigmoid(), generator)
         h2 = _keep(clamp.h2, h2, drawn)
-    state = replace(state, h2=h2)
-    v = sample_v(machine, state, generator, clamp, collapsed=collapsed)
+    v = machine.sample_objects(state, generator, held=clamp.v, collapsed=collapsed)
+    v = _keep(clamp.v, state.v, v)
     if not relations:
-        return replace(state, v=v)
+        return replace(state, v=v, h2=h2)
     edges, r = sample_relations(machine, v, h1, generator, clamp)
     return State(v, h1, h2, r, edges)
 
@@ -178,7 +153,7 @@ def run(
     *,
     relations: bool = True,
 ) -> State:
-    """Run `sweeps` Gibbs steps, and return the last state. `gibbs_step` describes the arguments."""
+    """Run `sweeps` Gibbs steps, and return the last state."""
     for _ in range(sweeps):
         state = gibbs_step(machine, state, generator, clamp, relations=relations)
     return state
@@ -188,24 +163,21 @@ def sample_h1(
     machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp = FREE
 ) -> Tensor:
     """Sample the hidden units h1 given v, r and h2, (chains, hidden units)."""
-    v, h2 = state.v, state.h2
-    second = h2 if machine.spec.H2 else None
-    x = presence_product(v, machine.W).add_(machine.context_bias(clamp.room))
-    if second is not None:
-        x = torch.addmm(x, second, machine.J.T)
+    x = presence_product(state.v, machine.W).add_(machine.context_bias(clamp.room))
+    if machine.spec.H2:
+        x = torch.addmm(x, state.h2, machine.J.T)
     if machine.relations_act and state.r.shape[-1]:
         x = x + machine.hidden_input(state.edges, state.r)
     prior = x.sigmoid_()
-    given = clamp.relations
-    if machine.relations_act or given is None:
+    if machine.relations_act or clamp.relations is None:
         return _keep(clamp.h1, state.h1, bernoulli(prior, generator))
     h1 = state.h1
-    weight = _observed_weight(machine, v, h1, given)
+    weight = _observed_weight(machine, state.v, h1, clamp.relations)
     block = integers(_PROPOSAL_BLOCKS, h1.shape, generator)
     for k in range(_PROPOSAL_BLOCKS):
         proposal = torch.where(block == k, bernoulli(prior, generator), h1)
         proposal = _keep(clamp.h1, h1, proposal)
-        new = _observed_weight(machine, v, proposal, given)
+        new = _observed_weight(machine, state.v, proposal, clamp.relations)
         accept = uniform(new.shape, generator, new.dtype).log() < new - weight
         h1 = torch.where(accept.unsqueeze(-1), proposal, h1)
         weight = torch.where(accept, new, weight)
@@ -226,31 +198,8 @@ def presence_product(v: Tensor, W: Tensor) -> Tensor:
         return v @ W
     chains, classes = v.shape
     starts = on.searchsorted(np.arange(chains + 1) * classes)
-    return embedding_bag(
-        torch.from_numpy(on % classes),
-        W,
-        torch.from_numpy(starts),
-        mode="sum",
-        include_last_offset=True,
-    )
-
-
-def sample_v(
-    machine: BoltzmannMachine,
-    state: State,
-    generator: torch.Generator,
-    clamp: Clamp = FREE,
-    *,
-    collapsed: bool = True,
-) -> Tensor:
-    """Sample the objects v given the hidden units h1, (chains, classes).
-
-    If `collapsed` is True, unobserved relations are summed out. Otherwise v also depends on r.
-    """
-    drawn = machine.sample_objects(
-        *(state.v, state.h1, state.r, state.edges, generator), held=clamp.v, collapsed=collapsed
-    )
-    return _keep(clamp.v, state.v, drawn)
+    index, offsets = torch.from_numpy(on % classes), torch.from_numpy(starts)
+    return embedding_bag(index, W, offsets, mode="sum", include_last_offset=True)
 
 
 def sample_relations(
@@ -263,18 +212,18 @@ def sample_relations(
     """Sample the relations r given v and h1. Observed relations keep their value.
 
     Returns:
-        The layout of the relation units that can be 1 given v, and their values r, (chains, units).
-        In a Triway machine, the units between the classes of `clamp.edges` come first.
+        The units that can be 1 given v, and their values r, (chains, units). In a Triway machine,
+        the units between the classes of `clamp.edges` come first.
     """
-    edges, r, known = machine.open_units(v, clamp.relations, widest(v, generator))
+    edges, r, observed = machine.open_units(v, clamp.relations, widest(v, generator))
     logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
     if not machine.spec.G:
-        return edges, torch.where(known, r, bernoulli(logits.sigmoid() * gate, generator))
+        return edges, torch.where(observed, r, bernoulli(logits.sigmoid() * gate, generator))
     context = mean_field(machine, Evidence(v, room=clamp.room)).y.sigmoid()
     group = _drawing_order(machine.between(edges, logits, edges.classes), generator).flatten(-3)
     for k in range(2 * _RELATION_GROUPS):
         p = (logits + machine.implied(edges, r, context)).sigmoid() * gate
-        r = torch.where((group == k) & ~known, bernoulli(p, generator), r)
+        r = torch.where((group == k) & ~observed, bernoulli(p, generator), r)
     return edges, r
 
 

@@ -59,11 +59,8 @@ class _ContextGain(torch.autograd.Function):
 def context_gain(x: Tensor, W: Tensor) -> Tensor:
     """Return the log-odds of each object i from the hidden units, (scenes, classes).
 
-    The value is sum_k [softplus(x_k + W_ik) - softplus(x_k)] over hidden units k.
-
-    Args:
-        x: logits of the hidden units, (scenes, hidden units).
-        W: weights between objects and hidden units, (classes, hidden units).
+    The value is sum_k [softplus(x_k + W_ik) - softplus(x_k)] for the logits x, (scenes, H1), of the
+    hidden units and their weights W, (classes, H1).
     """
     gain: Tensor = _ContextGain.apply(x, W)  # type: ignore[no-untyped-call]
     return gain
@@ -84,7 +81,6 @@ def object_log_odds(
     is differentiable.
 
     Args:
-        evidence: observed units of the scenes. The candidates must be absent in `evidence.v`.
         candidates: class indices, (scenes or 1, candidates) int64. The default is all classes.
         pull: weight of the observed relations, from 0 to 1; see `mean_field`.
     """
@@ -114,14 +110,10 @@ def presence_log_odds(
 
         log-odds_i = b_i + G_i + log E_w[exp(W_i·h1 + attraction_i)] - log mean exp(W_i·h1)
 
-    E_w is the weighted mean over draws of h1. G_i = log E_q[exp(W_i·h1)] has a closed form, because
-    the draws come from the factorial distribution q. The last term estimates G_i from the
-    unweighted draws. G_i and its estimate are a control variate: their difference cancels a part of
-    the sampling error of E_w.
-
-    Args:
-        candidates: class indices, (scenes or 1, candidates) int64.
-        draws: draws of h1 given the evidence. The default is 64 new draws.
+    E_w is the weighted mean over `draws` of h1, by default 64. G_i = log E_q[exp(W_i·h1)] has a
+    closed form, because the draws come from the factorial distribution q. The last term estimates
+    G_i from the unweighted draws. G_i and its estimate are a control variate: their difference
+    cancels a part of the sampling error of E_w.
     """
     if not machine.relations_act and evidence.edges is None:
         return object_log_odds(machine, evidence, candidates=candidates)
@@ -138,17 +130,13 @@ def presence_log_odds(
 def weights_with(
     machine: BoltzmannMachine, evidence: Evidence, draws: HiddenDraws, candidates: Tensor
 ) -> Tensor:
-    """Return weights that turn draws of h1 into draws given one more present object i.
+    """Return weights, (draws, candidates), that turn draws of h1 into draws given a new object i.
 
     p(h1 | rest, v_i = 1) ∝ p(h1 | rest) exp(W_i·h1 + attraction_i(h1))
 
-    Args:
-        evidence: the observed units of one scene.
-        draws: draws of h1 given the evidence.
-        candidates: class indices of the added objects, (candidates,) int64.
+    The weights of a candidate sum to 1.
 
-    Returns:
-        Weights (draws, candidates). The weights of a candidate sum to 1.
+    The evidence has one scene, and the candidates are class indices, (candidates,) int64.
     """
     row = candidates.unsqueeze(0)
     gain = _object_input(machine, draws.h1, row) + _attraction(machine, evidence, draws, row)
@@ -179,17 +167,11 @@ def relation_log_odds(
     *,
     count: int = 64,
 ) -> tuple[Tensor, Tensor]:
-    """Return the log-odds of the unobserved relation units in `edges`, with standard errors.
+    """Return log-odds and standard errors of the unobserved units in `edges`, (scenes, units).
 
-    p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms of the energy. x_e is
-    the change of the logit of unit e due to the observed relations. In a Triway machine, the
-    log-odds are -inf if an object of the relation is absent.
-
-    Args:
-        count: number of draws of h1.
-
-    Returns:
-        Log-odds and their standard errors, both (scenes, units).
+    p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms of the energy, from
+    `count` draws of h1. x_e is the change of the logit of unit e due to the observed relations. In
+    a Triway machine, the log-odds are -inf if an object of the relation is absent.
 
     Raises:
         ValueError: the machine has implication weights (G > 0), and the observed relations have a

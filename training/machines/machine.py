@@ -22,6 +22,7 @@ Tensor dimensions: "..." stands for samples. They come first, then scenes, then 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Self
 
 import torch
@@ -31,6 +32,24 @@ from torch.nn.functional import softplus
 from app.inference.variants import MachineSpec
 from training.machines.bernoulli import bernoulli
 from training.machines.edges import Edges, PairEdges, triple_keys
+
+
+@dataclass(frozen=True)
+class State:
+    """The state of several Gibbs chains.
+
+    Attributes:
+        v: presence of objects, (chains, classes).
+        h1, h2: hidden units of each layer, (chains, hidden units).
+        r: values of the relation units, (chains, units).
+        edges: layout of the relation units in r.
+    """
+
+    v: Tensor
+    h1: Tensor
+    h2: Tensor
+    r: Tensor
+    edges: Edges
 
 
 class BoltzmannMachine(nn.Module, ABC):
@@ -109,8 +128,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
         Args:
             by_relation: log-odds that an observed relation holds, (relations,).
-            by_unit: log-odds that a triple of the table holds in a scene with annotated relations,
-                (triples,).
+            by_unit: log-odds that a triple holds in a scene with annotated relations, (triples,).
             usual: mean log number of instances of each class, (classes,).
         """
 
@@ -125,56 +143,47 @@ class BoltzmannMachine(nn.Module, ABC):
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
         """Return the relation units between the given classes of each scene.
 
-        Args:
-            classes: class indices, (scenes, n) int64. Padding is -1.
-            counts: number of instances of each class, (scenes, n). 0 means that the number is
-                unknown. The default is one instance of each class.
+        The class indices are (scenes, n) int64, with padding -1. The counts are the numbers of
+        instances, 0 where unknown. The default is one instance of each class.
         """
 
     @abstractmethod
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """Find the machine's unit for each relation in `pairs`.
+        """Return the units, the index of the unit of each relation in `pairs`, and its existence.
 
-        Returns:
-            Three values: the units of the machine, the index of the unit of each relation, and True
-            where the machine has a unit for the relation. The last two have the shape (scenes,
-            relations of `pairs`). Where the last value is False, the index is arbitrary.
+        The last two have the shape (scenes, relations of `pairs`). Without a unit, the index is
+        arbitrary.
         """
 
     @abstractmethod
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relations between classes in the layout of this machine.
+        """Return the relations between classes in the layout of this machine: edges, r, observed.
 
-        The result is (edges, r, observed): layout, values and observed flags of the relation units.
         In an RBM or GBM, the units of absent classes are 0. They count as observed if the scene has
         any annotated relation.
 
         Args:
             classes, counts: class indices and numbers of instances, (scenes, n), as in `edges`.
-            holds: values of the relations between the classes, (scenes, relations, n, n).
-            observed: True where the relation is observed, (scenes, relations, n, n).
+            holds, observed: value of each relation between the classes, and True where it is
+                observed, (scenes, relations, n, n).
         """
 
     @abstractmethod
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
+        self, v: Tensor, observed: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relation units that can be 1 given the objects v.
-
-        r contains the values of the given units.
+        """Return edges, r and observed of the relation units that can be 1 given the objects v.
 
         Args:
+            observed: observed relations, whose values r contains.
             least: least number of classes between which there are units, with padding.
         """
 
     @abstractmethod
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the gate of each unit, (..., scenes, units).
-
-        The gate is 1 if the unit can be 1 given the objects v, else 0.
-        """
+        """Return 1 for each unit that can be 1 given v, else 0, (..., scenes, units)."""
 
     @abstractmethod
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
@@ -186,67 +195,48 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """Return sum_e weight_e U_e, the input of relations to h1, (..., scenes, hidden units).
-
-        Args:
-            weight: factor of each relation unit, (..., scenes, units).
-        """
+        """Return sum_e weight_e U_e for weights (..., scenes, units), (..., scenes, H1)."""
 
     def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sum_e r_e ℓ_e(v, 0) and sum_e r_e U_e over relation units e.
-
-        The shapes are (..., scenes) and (..., scenes, hidden units).
-        """
+        """Return sum_e r_e ℓ_e(v, 0), (..., scenes), and sum_e r_e U_e, (..., scenes, H1)."""
         bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
         return (r * bare).sum(-1), self.hidden_input(edges, r)
 
-    def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """Return the change of each relation logit due to the given relations, (scenes, units).
+    def implied(self, edges: Edges, observed: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
+        """Return the change of each relation logit due to observed relations, (scenes, units).
 
         The change is zero in a machine without implication weights (`training.machines.triway`).
 
         Args:
-            given: given relations, (scenes, units). 1 means that the relation holds.
+            observed: observed relations, (scenes, units). 1 means that the relation holds.
             h1: means of the hidden units given the objects, (scenes, hidden units).
             apart: True leaves out the effects between relations of the same two classes.
         """
         del edges, h1, apart
-        return torch.zeros_like(given)
+        return torch.zeros_like(observed)
 
     @abstractmethod
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return the weights U_e between each relation unit e and the hidden units h1.
-
-        The result has the shape (scenes or 1, units, hidden units). It is large, so pass few units.
-        """
+        """Return the weights U_e to h1 of few units, (scenes or 1, units, hidden units)."""
 
     @abstractmethod
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
         """Return the part of each candidate's log-odds that comes from its unobserved relations.
 
+        For candidate i, the part is log sum_{R_i} exp(-E) at v_i = 1 minus the same at v_i = 0,
+        given h1. R_i are the relations of i. The terms b_i + W_i·h1 are left out.
+
         Args:
             v: presence of objects, (..., scenes, classes). Each candidate counts as absent.
-            h1: hidden units, (..., scenes, hidden units).
             edges: relation units of the scene. The units of a candidate are unobserved.
             candidates: class indices, (scenes or 1, candidates) int64.
-
-        Returns:
-            Part of the log-odds of each candidate i, (..., scenes, candidates). The part is
-            log sum_{R_i} exp(-E) at v_i = 1 minus log sum_{R_i} exp(-E) at v_i = 0, given h1. R_i
-            are the relations of i. The terms b_i + W_i·h1 are left out.
         """
 
     @abstractmethod
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return values of relation units as a table over pairs of n classes.
+        """Return values of the units as a table, (scenes, relations, n, n); -inf without unit.
 
-        The table has the shape (scenes, relations, n, n). The value of a relation without a unit is
-        -inf.
-
-        Args:
-            edges: the relation units between `classes`.
-            values: values of the relation units, (scenes, units).
-            classes: class indices, (scenes, n) int64. Padding is -1.
+        The units are those between the classes, (scenes, n) int64. Padding is -1.
         """
 
     @property
@@ -264,26 +254,16 @@ class BoltzmannMachine(nn.Module, ABC):
         return None
 
     def sample_objects(
-        self,
-        v: Tensor,
-        h1: Tensor,
-        r: Tensor,
-        edges: Edges,
-        generator: torch.Generator,
-        *,
-        held: Tensor | None = None,
-        collapsed: bool = True,
+        self, state: State, generator: torch.Generator, *, held: Tensor | None, collapsed: bool
     ) -> Tensor:
-        """Sample the objects v given the hidden units h1, (scenes, classes); see `gibbs`.
-
-        In some forms of the energy, v also depends on the relations r.
+        """Sample the objects v given the other units, (scenes, classes); see `gibbs`.
 
         Args:
             held: bool, broadcastable to v. True marks objects that keep their value.
             collapsed: True sums out the unobserved relations that affect objects.
         """
-        del v, r, edges, held, collapsed
-        return bernoulli(self._object_input(h1).sigmoid_(), generator)
+        del held, collapsed
+        return bernoulli(self._object_input(state.h1).sigmoid_(), generator)
 
     def _object_input(self, h1: Tensor) -> Tensor:
         # addmm adds the bias within the product, because memory access limits the speed of a sweep.
@@ -307,14 +287,11 @@ class BoltzmannMachine(nn.Module, ABC):
     # -- the relation part ----------------------------------------------------------------------
 
     def relation_term(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Return the term of each relation unit in log sum_{unobserved r} exp(-E), given h1.
-
-        The result has the shape (..., scenes, units).
+        """Return the term of each unit in log sum_{unobserved r} exp(-E), (..., scenes, units).
 
         Args:
             logits, gate: logit ℓ_e and gate of each relation unit, (..., scenes, units).
-            r: values of the observed relations. Values of unobserved relations are ignored.
-            observed: bool, broadcastable to `logits`.
+            r, observed: values and bool mask of the observed relations, broadcastable to `logits`.
         """
         summed = softplus(logits)
         if not self.relations_act:
@@ -333,8 +310,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def context_bias(self, room: Tensor | None) -> Tensor:
         """Return the bias c1 + Q[t] of the hidden units, (scenes or 1, hidden units).
 
-        Args:
-            room: index t of the room type of each scene, (scenes,) int64. -1 means unknown.
+        The room type t of a scene is its entry of `room`, (scenes,) int64. -1 means unknown.
         """
         if room is None or not self.spec.C:
             return self.c1.unsqueeze(0)
@@ -349,10 +325,7 @@ class BoltzmannMachine(nn.Module, ABC):
         edges: Edges,
         room: Tensor | None = None,
     ) -> Tensor:
-        """Return the energy E(v, r, h1, h2), (..., scenes).
-
-        The energy is +inf if a relation unit with gate 0 is 1.
-        """
+        """Return the energy E(v, r, h1, h2), (..., scenes); +inf if a unit with gate 0 is 1."""
         gate = self.gate(edges, v)
         logits = self.relation_logits(edges, v, h1)
         observed = torch.ones_like(gate, dtype=torch.bool)
@@ -366,27 +339,8 @@ class BoltzmannMachine(nn.Module, ABC):
         return -(v @ self.b + h2 @ self.c2 + context + ((h1 @ self.J) * h2).sum(-1))
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the sum of κ_a over relation units with an open gate, (..., scenes).
-
-        The sum is 0 in a machine without κ.
-        """
+        """Return the sum of κ_a over units with an open gate, (..., scenes); 0 without κ."""
         return v.new_zeros(v.shape[:-1])
-
-    def hidden_logits(
-        self,
-        v: Tensor,
-        r: Tensor,
-        edges: Edges,
-        h2: Tensor | None = None,
-        room: Tensor | None = None,
-    ) -> Tensor:
-        """Return the logits x = c1 + v'W + sum_e r_e U_e + J h2 of the hidden units h1.
-
-        In the seed form p(h1 = 1 | v, r, h2) = sigmoid(x). In the local form, pass zeros for r:
-        `draw_hidden` accounts for relations by weights of the draws.
-        """
-        x = self.context_bias(room) + v @ self.W + self.hidden_input(edges, r)
-        return x if h2 is None else x + h2 @ self.J.T
 
     def free_energy(
         self,
@@ -429,12 +383,9 @@ class BoltzmannMachine(nn.Module, ABC):
     def free_energy_given(
         self, v: Tensor, context: Tensor, h2: Tensor | None = None, room: Tensor | None = None
     ) -> Tensor:
-        """Return the free energy of the object part, (..., scenes).
+        """Return -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k, (..., scenes).
 
-        The value is -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k.
-
-        Args:
-            context: addition to the logits of the hidden units h1, (..., scenes, hidden units).
+        The context is an addition to the logits of h1, (..., scenes, hidden units).
         """
         free = -(v @ self.b)
         x = self.context_bias(room) + v @ self.W + context
@@ -449,8 +400,5 @@ class BoltzmannMachine(nn.Module, ABC):
         return self.c2 + h1 @ self.J
 
     def object_logits(self, h1: Tensor) -> Tensor:
-        """Return the log-odds b + W h1 of each object given h1, (..., scenes, classes).
-
-        The contributions of relations are left out.
-        """
+        """Return the log-odds b + W h1 of each object without relations, (..., scenes, classes)."""
         return self.b + h1 @ self.W.T

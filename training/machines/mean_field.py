@@ -31,10 +31,9 @@ class Evidence:
     Attributes:
         v: presence of objects, (scenes, classes).
         edges: layout of the relation units that can be 1.
-        r: values of the observed relations, (scenes, units). Unobserved relations are 0.
-        observed: True where a relation is observed, (scenes, units) bool.
-        room: index of each scene's room type, (scenes,) int64. -1 means unknown. None means that
-            all room types are unknown.
+        r, observed: values, and bool mask, of the observed relations, (scenes, units). Unobserved
+            relations are 0.
+        room: index of each scene's room type, (scenes,) int64. None or -1 means unknown.
     """
 
     v: Tensor
@@ -64,10 +63,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class MeanField:
-    """The mean-field fixed point of the hidden units.
-
-    y contains the logits of h1, x the logits of h1 without relations, and h2 the means of h2.
-    """
+    """The mean-field fixed point: logits y of h1, logits x without relations, and means h2."""
 
     y: Tensor
     x: Tensor
@@ -87,15 +83,16 @@ def mean_field(
     Args:
         iterations: number of sweeps over both hidden layers.
         damping: share of the previous slope_e that remains after a sweep; see the module.
-        pull: weight of the observed relations. The result interpolates between the fixed point
-            without relations (0) and the fixed point with all relations (1).
+        pull: weight of the observed relations. Below 1, the result is an interpolation to the fixed
+            point without relations.
     """
-    if pull < 1 and evidence.relations(machine) is not None:
-        without = mean_field(machine, unobserved(evidence), iterations=iterations, damping=damping)
-        with_all = mean_field(machine, evidence, iterations=iterations, damping=damping)
-        pairs = (
-            (getattr(field, name) for field in (without, with_all)) for name in ("y", "x", "h2")
+    if pull < 1 and evidence.observed is not None and evidence.relations(machine) is not None:
+        nothing = torch.zeros_like(evidence.observed)
+        without, with_all = (
+            mean_field(machine, one, iterations=iterations, damping=damping)
+            for one in (replace(evidence, observed=nothing), evidence)
         )
+        pairs = zip(vars(without).values(), vars(with_all).values(), strict=True)
         return MeanField(*(torch.lerp(one, other, pull) for one, other in pairs))
     base = x = machine.context_bias(evidence.room) + evidence.v @ machine.W
     relations = evidence.relations(machine)
@@ -126,10 +123,3 @@ def mean_field(
             h2 = machine.second_layer_logits((x + added).sigmoid()).sigmoid()
             x = torch.addmm(base, h2, machine.J.T)
     return MeanField(x + added, x, h2)
-
-
-def unobserved(evidence: Evidence) -> Evidence:
-    """Return a copy of the evidence in which every relation is unobserved."""
-    if evidence.observed is None:
-        return evidence
-    return replace(evidence, observed=torch.zeros_like(evidence.observed))

@@ -23,8 +23,8 @@ from torch.nn.functional import softplus
 
 from training.machines import build
 from training.machines.bernoulli import bernoulli
-from training.machines.gibbs import State, gibbs_step, initial_state
-from training.machines.machine import BoltzmannMachine
+from training.machines.gibbs import gibbs_step, initial_state
+from training.machines.machine import BoltzmannMachine, State
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class LogPartition:
     """An estimate of log Z.
 
     Attributes:
-        log_z: estimate of log Z. Forward runs use the log of the mean weight w over chains. Reverse
-            runs use minus the log of the mean inverse weight.
+        log_z: log of the mean weight w over chains in forward runs, and minus the log of the mean
+            inverse weight in reverse runs.
         standard_error: standard error of log_z, by the delta method over chains.
-        bound: mean of log w over chains. In expectation, it is a lower bound of log Z for forward
-            runs, and an upper bound for reverse runs.
+        bound: mean of log w. In expectation, it is a lower bound of log Z for forward runs, and an
+            upper bound for reverse runs.
     """
 
     log_z: float
@@ -60,13 +60,10 @@ class LogPartition:
 
 
 def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> BoltzmannMachine:
-    """Return the base machine at beta = 0, which has independent objects.
+    """Return the base machine at beta = 0, with independent objects of log-odds b, (classes,).
 
     The relation units of an RBM or GBM keep their bias d. The relation units of a Triway contribute
     a factor of one to Z.
-
-    Args:
-        b: log-odds of the objects, (classes,). The default is the bias b of the machine.
     """
     base = build(machine.spec).to(machine.b.dtype).requires_grad_(False)
     with torch.no_grad():
@@ -113,10 +110,7 @@ def reverse_ais(
     generator: torch.Generator,
     base: BoltzmannMachine | None = None,
 ) -> LogPartition:
-    """Run reverse AIS. The chains start at `state`, which contains samples of the machine.
-
-    Pass `betas` in increasing order, as for `ais`.
-    """
+    """Run reverse AIS from samples of the machine, with `betas` in increasing order as in `ais`."""
     _check(betas)
     base = independent_base(machine) if base is None else base
     log_weight = torch.zeros(len(state.v), dtype=torch.float64)

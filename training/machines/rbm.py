@@ -1,10 +1,18 @@
-"""The restricted Boltzmann machine (RBM) of the paper: one hidden layer for objects and relations.
+"""The machines of the paper with a relation unit for each triple seen in training: RBM and GBM.
+
+The restricted Boltzmann machine (RBM) has one hidden layer for objects and relations:
 
     E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
 
-Only triples t = (a,i,j) seen in training have a relation unit. All other relations are always 0.
-The units have no gate, so r_t depends on its two objects only through the hidden units h1. This is
-the seed form of the energy. `training.machines.machine` also defines the local form.
+The sum runs over the triples t = (relation a, subject class i, object class j) seen in training.
+All other relations are always 0. The units have no gate, so r_t depends on its two objects only
+through the hidden units h1. The general Boltzmann machine (GBM) has two layers and two-way
+object–relation edges:
+
+    E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2
+                   - sum_t r_t (d_t + g_t v_i + g'_t v_j + U_t·h1)
+
+These are the seed forms of the energy. `training.machines.machine` also defines the local form.
 """
 
 from __future__ import annotations
@@ -17,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from app.inference.variants import MachineSpec
+from training.machines.bernoulli import bernoulli
 from training.machines.edges import (
     Edges,
     PairEdges,
@@ -25,7 +34,7 @@ from training.machines.edges import (
     triple_edges,
     triple_keys,
 )
-from training.machines.machine import BoltzmannMachine
+from training.machines.machine import BoltzmannMachine, State
 
 
 class RBM(BoltzmannMachine):
@@ -38,7 +47,6 @@ class RBM(BoltzmannMachine):
 
     @torch.no_grad()
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
-        """Set the bias d_t to the training log-odds of each relation unit t."""
         self.d.copy_(by_unit)
 
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
@@ -53,75 +61,114 @@ class RBM(BoltzmannMachine):
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relations in this machine's layout. Relations without a unit are left out."""
+        # Relations without a unit are left out.
         pairs = pair_edges(classes, holds.shape[1])
-        edges, position, found = self.places(pairs)
-        row, slot = (found & pairs.valid).nonzero(as_tuple=True)
+        edges, position, exists = self.places(pairs)
+        row, slot = (exists & pairs.valid).nonzero(as_tuple=True)
         unit = position[row, slot]
         r = torch.zeros(len(classes), self.spec.T)
         r[row, unit] = holds.flatten(1)[row, slot]
         annotated = observed.flatten(1).any(1)
-        known = annotated.unsqueeze(1).expand(-1, self.spec.T).clone()
-        known[row, unit] = observed.flatten(1)[row, slot]
-        return edges, r, known
+        unit_observed = annotated.unsqueeze(1).expand(-1, self.spec.T).clone()
+        unit_observed[row, unit] = observed.flatten(1)[row, slot]
+        return edges, r, unit_observed
 
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
+        self, v: Tensor, observed: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return all relation units, with the values of the given relations."""
-        if given is not None:
-            return given
+        if observed is not None:
+            return observed
         r = v.new_zeros(len(v), self.spec.T)
         return triple_edges(self.triples), r, torch.zeros_like(r, dtype=torch.bool)
 
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return 1 for every unit of the table, because units have no gate."""
+        # The units have no gate.
         return edges.valid.to(v.dtype).expand(*v.shape[:-1], -1)
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """Return the logit d_t + U_t·h1 of each relation unit t."""
         return self.d + h1 @ self.U.T
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """Return weight @ U, the input of the relations to the hidden units."""
         return weight @ self.U
 
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return the weights U with a leading scene dimension, (1, triples, hidden units)."""
         return self.U.unsqueeze(0)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Return zero, because given h1 the relations have no effect on objects."""
+        # Given h1, the relations have no effect on objects.
         return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
 
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return values of relation units as a table over classes; -inf where no unit exists."""
         pairs = pair_edges(classes, self.spec.A)
-        _, position, found = self.places(pairs)
+        _, position, exists = self.places(pairs)
         if not self.spec.T:
-            return pairs.unflatten(torch.full(found.shape, -torch.inf))
+            return pairs.unflatten(torch.full(exists.shape, -torch.inf))
         spread = values.gather(1, position)
-        return pairs.unflatten(torch.where(found & pairs.valid, spread, -torch.inf))
+        return pairs.unflatten(torch.where(exists & pairs.valid, spread, -torch.inf))
 
     def acting_units(self, v: Tensor) -> Edges | None:
-        """Return all relation units in the seed form, and None in the local form."""
         return triple_edges(self.triples) if self.relations_act else None
 
     @torch.no_grad()
     def begin_independent(self, machine: BoltzmannMachine) -> None:
-        """Copy the relation biases d from `machine`."""
         self.d.copy_(machine.get_parameter("d"))
 
     def relation_log_partition(self) -> float:
-        """Return sum_t softplus(d_t) over relation units t in the seed form, else 0."""
         return float(softplus(self.d).sum()) if self.relations_act else 0.0
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """Multiply every weight by beta.
+        # With a base, the biases d and b are interpolated between `base` and this machine.
+        return scale(self, beta, base, keep=("b", "d"))
 
-        If there is a `base`, the biases d and b are interpolated between `base` and this machine.
+
+class GBM(RBM):
+    """The GBM: an RBM with relation logits ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1."""
+
+    def __init__(self, spec: MachineSpec) -> None:
+        super().__init__(spec)
+        self.g = nn.Parameter(torch.zeros(spec.T, 2))
+
+    def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
+        subject, object_ = v[..., edges.subject[0]], v[..., edges.object[0]]
+        two_way = subject * self.g[:, 0] + object_ * self.g[:, 1]
+        return super().relation_logits(edges, v, h1) + two_way
+
+    def sample_objects(
+        self, state: State, generator: torch.Generator, *, held: Tensor | None, collapsed: bool
+    ) -> Tensor:
+        logits, r, edges = self._object_input(state.h1), state.r, state.edges
+        if self.relations_act:
+            # Class i receives sum_t r_t (g_t [i = subject of t] + g'_t [i = object of t]).
+            active = r.new_zeros(*r.shape[:-1], self.spec.V)
+            active = active.index_add(-1, edges.subject[0], r * self.g[:, 0])
+            logits = logits + active.index_add(-1, edges.object[0], r * self.g[:, 1])
+        return bernoulli(logits.sigmoid_(), generator)
+
+    def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
+        """Return the sum of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0) over relations of i.
+
+        In the local form, the part of each candidate i is 0.
         """
+        if not self.relations_act:
+            return super().attraction(v, h1, edges, candidates)
+        subject, object_ = edges.subject[0], edges.object[0]
+        bare = RBM.relation_logits(self, edges, v, h1)
+        g, g2 = self.g.unbind(1)
+        loop = (subject == object_).to(v.dtype)
+        off = bare + v[..., object_] * g2 * (1 - loop)
+        as_subject = softplus(off + g + g2 * loop) - softplus(off)
+        off = bare + v[..., subject] * g
+        as_object = (softplus(off + g2) - softplus(off)) * (1 - loop)
+        shape = torch.broadcast_shapes(as_subject.shape, as_object.shape)
+        total = bare.new_zeros(*shape[:-1], self.spec.V)
+        total = total.index_add(-1, subject, as_subject.expand(shape))
+        total = total.index_add(-1, object_, as_object.expand(shape))
+        return total.gather(-1, candidates.expand(*total.shape[:-1], candidates.shape[-1]))
+
+    @torch.no_grad()
+    def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
+        """Scale the weights as in the RBM, and multiply the two-way weights g by beta."""
         return scale(self, beta, base, keep=("b", "d"))
 
 

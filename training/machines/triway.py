@@ -56,7 +56,7 @@ from training.machines.edges import (
     present_classes,
     triple_keys,
 )
-from training.machines.machine import BoltzmannMachine
+from training.machines.machine import BoltzmannMachine, State
 from training.machines.rbm import scale
 
 # Maximum of a degree feature. Degrees are capped, because more neighbours add little information.
@@ -89,18 +89,11 @@ class Triway(BoltzmannMachine):
 
     @torch.no_grad()
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
-        """Set the bias d_a to the training log-odds of each relation a."""
         self.d.copy_(by_relation)
         self.usual.copy_(usual)
 
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> PairEdges:
-        """Return the A·n² relation units between n classes. All other units are 0.
-
-        Args:
-            classes: class indices, (scenes, n) int64. Padding is -1.
-            counts: number of instances of each class, (scenes, n). 0 means unknown; the mean of the
-                class is then used.
-        """
+        """Return the A·n² relation units between n classes. All other units are 0."""
         if counts is None:
             return pair_edges(classes, self.spec.A)
         usual = self.usual[classes.clamp(min=0)]
@@ -108,22 +101,19 @@ class Triway(BoltzmannMachine):
         return pair_edges(classes, self.spec.A, log_subjects=logs)
 
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """Return `pairs` itself, because this machine has a unit for every relation."""
-        place = torch.arange(pairs.shape[-1]).expand(pairs.shape)
-        return pairs, place, torch.ones_like(place, dtype=torch.bool)
+        index = torch.arange(pairs.shape[-1]).expand(pairs.shape)
+        return pairs, index, torch.ones_like(index, dtype=torch.bool)
 
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relations flattened. This machine needs no other change of layout."""
+        # A flattened table has the layout of this machine.
         return self.edges(classes, counts), holds.flatten(1), observed.flatten(1)
 
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the gate v_i v_j of each unit: 1 if both objects are present."""
         return edges.ends_present(v)
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """Return the logit d_a + w_e + U_e·h1 of each relation unit e."""
         pairs = _pairs(edges)
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
         left = embedding(pairs.subjects, self.S).unsqueeze(-3) * shared.unsqueeze(-2)
@@ -133,12 +123,10 @@ class Triway(BoltzmannMachine):
         subject, object_ = self._end_weights(pairs)
         ends = (subject + bias.unsqueeze(-1)).unsqueeze(-1) + object_.unsqueeze(-2)
         logits: Tensor = product + ends
-        if self.spec.T:
-            logits = logits + self._residuals(pairs)
-        return logits.flatten(-3)
+        return (logits + self._residuals(pairs) if self.spec.T else logits).flatten(-3)
 
     def _end_weights(self, pairs: PairEdges) -> tuple[Tensor, Tensor]:
-        """Return the terms of the relation logits that depend only on the subject or object class.
+        """Return the terms of the relation logits of only the subject or only the object class.
 
         The terms are s[a,i] + n[a,0] log n_i, (scenes, relations, n), for subjects i, and
         o[a,j] + n[a,1] log n_j, (scenes, relations, m), for objects j.
@@ -149,29 +137,23 @@ class Triway(BoltzmannMachine):
         return subject, self.o[:, pairs.objects].transpose(0, 1) + counts
 
     def _residuals(self, pairs: PairEdges) -> Tensor:
-        """Return the residual weight w_e' of each relation unit, (scenes, relations, n, m).
-
-        The weight of a triple that did not occur in training is 0.
-        """
+        """Return the weight w_e' of each unit, (scenes, relations, n, m); 0 without a triple."""
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
-        position, found = find_triples(self.triple_keys, keys)
-        return pairs.unflatten(self.residual[position] * found)
+        position, exists = find_triples(self.triple_keys, keys)
+        return pairs.unflatten(self.residual[position] * exists)
 
-    def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """Return the logit changes x_e. They are 0 in a machine without the weights gamma and B."""
+    def implied(self, edges: Edges, observed: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
         if not self.spec.G:
-            return super().implied(edges, given, h1)
-        grid = _pairs(edges).unflatten(given)
+            return super().implied(edges, observed, h1)
+        grid = _pairs(edges).unflatten(observed)
         return implied(self.gamma, self.B, grid, h1, apart=apart).flatten(-3)
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """Return sum_e weight_e U_e. The full matrix U is never stored."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(weight)
         return self._context_input(self._factors(pairs, grid), grid.sum((-1, -2)))
 
     def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sum_e r_e ℓ_e(0) and sum_e r_e U_e. The full ℓ and U are never stored."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(r)
         factors, outgoing, incoming = self._factors(pairs, grid), grid.sum(-1), grid.sum(-2)
@@ -192,10 +174,7 @@ class Triway(BoltzmannMachine):
         return (product * subjects).sum(-2)
 
     def _context_input(self, factors: Tensor, count: Tensor) -> Tensor:
-        """Return the sum over a and k of factors[a,k] M[a,k], plus the sum over a of count_a P[a].
-
-        The result has the shape (..., scenes, hidden units).
-        """
+        """Return sum_{a,k} factors[a,k] M[a,k] + sum_a count_a P[a], (..., scenes, H1)."""
         return factors.flatten(-2) @ self.M.flatten(0, 1) + count @ self.P
 
     def held_objects(self, edges: Edges, r: Tensor) -> Tensor:
@@ -208,7 +187,6 @@ class Triway(BoltzmannMachine):
         return held
 
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return the weights U_e between relation units and h1, (scenes, units, hidden units)."""
         pairs = _pairs(edges)
         subject, object_ = self.S[pairs.subjects], self.O[pairs.objects]
         product = subject.unsqueeze(-2) * object_.unsqueeze(-3)
@@ -216,14 +194,10 @@ class Triway(BoltzmannMachine):
         return (rows + self.P[:, None, None]).flatten(1, 3)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Return the sum of softplus(ℓ_e) + κ_a over the relations of each candidate.
-
-        The sum has the shape (..., scenes, candidates). In the local form, the sum is 0.
-        """
+        # The sum of softplus(ℓ_e) + κ_a over the relations of each candidate; 0 in the local form.
         pairs = _pairs(edges)
-        return self._attraction(
-            v, h1, pairs.subjects, pairs.valid_subjects, pairs.log_subjects, candidates
-        )
+        ends = pairs.subjects, pairs.valid_subjects, pairs.log_subjects
+        return self._attraction(v, h1, *ends, candidates)
 
     def attraction_to_all(self, v: Tensor, h1: Tensor, candidates: Tensor) -> Tensor:
         """Return `attraction` by relations to all present classes, with one instance of each."""
@@ -259,10 +233,7 @@ class Triway(BoltzmannMachine):
         return total + (softplus(loop) + self.kappa).sum(-1)
 
     def _loop_logits(self, candidates: Tensor, h1: Tensor) -> Tensor:
-        """Return the logits of the relations of each candidate to its own class.
-
-        The logits have the shape (..., scenes, candidates, relations).
-        """
+        """Return the logits of the relations of each candidate to its own class, (..., A)."""
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
         product = (self.S * self.O)[candidates] @ shared.mT
         bias = (self.d + h1 @ self.P.T).unsqueeze(-2)
@@ -271,63 +242,54 @@ class Triway(BoltzmannMachine):
             return logits
         axis = torch.arange(self.spec.A, device=candidates.device)
         ends = candidates.unsqueeze(-1)
-        position, found = find_triples(self.triple_keys, triple_keys(axis, ends, ends, self.spec.V))
-        return logits + self.residual[position] * found
+        position, exists = find_triples(
+            self.triple_keys, triple_keys(axis, ends, ends, self.spec.V)
+        )
+        return logits + self.residual[position] * exists
 
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
+        self, v: Tensor, observed: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relation units between present classes.
-
-        The classes of the given units come first.
+        """Return the units between present classes; the classes of observed units come first.
 
         Raises:
-            ValueError: the numbers of scenes in `given` and in v differ.
+            ValueError: the numbers of scenes in `observed` and in v differ.
         """
-        frame = None if given is None else _pairs(given[0])
+        frame = None if observed is None else _pairs(observed[0])
         if frame is not None and len(frame.subjects) != len(v):
             raise ValueError(f"observed relations must have one row per chain, {len(v)} rows")
-        leading = None if frame is None else frame.subjects
-        edges = self.edges(present_classes(v, leading, least))
+        edges = self.edges(present_classes(v, None if frame is None else frame.subjects, least))
         r = self.b.new_zeros(edges.shape)
-        known = torch.zeros_like(r, dtype=torch.bool)
-        if frame is not None and given is not None:
-            # unflatten() returns views, so both assignments change r and known.
+        is_observed = torch.zeros_like(r, dtype=torch.bool)
+        if frame is not None and observed is not None:
+            # unflatten() returns views, so both assignments change r and is_observed.
             n = frame.subjects.shape[1]
-            edges.unflatten(known)[..., :n, :n] = frame.unflatten(given[2])
-            edges.unflatten(r)[..., :n, :n] = frame.unflatten(given[1] * given[2])
-        return edges, r, known
+            edges.unflatten(is_observed)[..., :n, :n] = frame.unflatten(observed[2])
+            edges.unflatten(r)[..., :n, :n] = frame.unflatten(observed[1] * observed[2])
+        return edges, r, is_observed
 
     def sample_objects(
-        self,
-        v: Tensor,
-        h1: Tensor,
-        r: Tensor,
-        edges: Edges,
-        generator: torch.Generator,
-        *,
-        held: Tensor | None = None,
-        collapsed: bool = True,
+        self, state: State, generator: torch.Generator, *, held: Tensor | None, collapsed: bool
     ) -> Tensor:
         """Sample the objects v given the hidden units h1, (scenes, classes).
 
-        In the seed form with `collapsed`, the objects are sampled one after another. In the seed
-        form without `collapsed`, objects of relations with r = 1 stay present.
+        In the seed form, `collapsed` samples the objects one after another. Without it, objects of
+        relations with r = 1 stay present.
 
         Raises:
             ValueError: `collapsed` is False in a seed-form machine with κ.
         """
         if not self.relations_act:
-            return super().sample_objects(v, h1, r, edges, generator)
+            return super().sample_objects(state, generator, held=held, collapsed=collapsed)
         if collapsed:
-            return self._collapsed_sweep(v.clone(), h1, held, generator)
+            return self._collapsed_sweep(state.v.clone(), state.h1, held, generator)
         if bool(self.kappa.any()):
             raise ValueError(
                 "collapsed=False needs a machine with κ = 0; with κ, the objects depend on each "
                 "other even given h1 and r"
             )
-        drawn = super().sample_objects(v, h1, r, edges, generator)
-        return drawn.maximum(self.held_objects(edges, r))
+        drawn = super().sample_objects(state, generator, held=held, collapsed=collapsed)
+        return drawn.maximum(self.held_objects(state.edges, state.r))
 
     def _collapsed_sweep(
         self, v: Tensor, h1: Tensor, held: Tensor | None, generator: torch.Generator
@@ -342,30 +304,25 @@ class Triway(BoltzmannMachine):
         return v
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the sum of κ_a over relation units between present classes, (..., scenes)."""
         if not bool(self.kappa.any()):
             return super().pair_offset(edges, v)
         gate = self.gate(edges, v)
         return _pairs(edges).unflatten(gate).sum((-1, -2)) @ self.kappa
 
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return the values of the units as a table over relations and pairs of classes."""
         return _pairs(edges).unflatten(values)
 
     def acting_units(self, v: Tensor) -> Edges | None:
-        """Return the relation units between present classes. The local form returns None."""
         if not self.relations_act:
             return None
         value, index = v.topk(int(v.sum(1).max()), dim=1)
         return self.edges(torch.where(value > 0, index, -1))
 
     def context_units(self, edges: Edges) -> Edges | None:
-        """Return all relation units in the seed form, and None in the local form."""
         return edges if self.relations_act else None
 
     @torch.no_grad()
     def begin_independent(self, machine: BoltzmannMachine) -> None:
-        """Set κ to -log 2 in the seed form."""
         if self.relations_act:
             self.kappa.fill_(-math.log(2))
 
@@ -389,40 +346,45 @@ def _pairs(edges: Edges) -> PairEdges:
     return edges
 
 
-def implication_features(given: Tensor) -> Tensor:
-    """Return the features phi of given relations, (scenes, features, n, n) over pairs of classes.
+def implication_features(observed: Tensor) -> Tensor:
+    """Return the features phi of observed relations, (scenes, features, n, n) over class pairs.
 
     The pair feature of relation a equals r_e itself, so `implied` does not use that feature for a.
 
     Args:
-        given: given relations, (scenes, relations, n, n). 1 means that the relation holds.
+        observed: observed relations, (scenes, relations, n, n). 1 means that the relation holds.
     """
-    n = given.shape[-1]
-    between = given * ~torch.eye(n, dtype=torch.bool, device=given.device)
+    n = observed.shape[-1]
+    between = observed * ~torch.eye(n, dtype=torch.bool, device=observed.device)
     both = torch.cat([between, between.mT], 1)
     steps = both.shape[1]
     # One batched product counts the paths of all relation pairs: (B, 2A·n, n) by (B, n, 2A·n).
     paths = both.flatten(1, 2) @ both.transpose(1, 2).flatten(2)
-    paths = paths.view(len(given), steps, n, steps, n).transpose(2, 3).flatten(1, 2).clamp(max=1.0)
+    paths = (
+        paths.view(len(observed), steps, n, steps, n).transpose(2, 3).flatten(1, 2).clamp(max=1.0)
+    )
     outgoing = both.sum(-1, keepdim=True) - both
     incoming = both.sum(-2, keepdim=True) - both
     degrees = torch.cat([outgoing, incoming], 1).clamp(max=_MOST)
     return torch.cat([both, paths, degrees], 1)
 
 
-def implied(gamma: Tensor, B: Tensor, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-    """Return the changes x of the relation logits due to given relations.
+def implied(
+    gamma: Tensor, B: Tensor, observed: Tensor, h1: Tensor, *, apart: bool = False
+) -> Tensor:
+    """Return the changes x of the relation logits due to observed relations.
 
     The result has the shape (scenes, relations, n, n) over pairs of n classes.
+
 
     Args:
         gamma: weights of the features, (1 + G, relations, features).
         B: weights from hidden units to z, (G, hidden units).
-        given: given relations, (scenes, relations, n, n). 1 means that the relation holds.
+        observed: observed relations, (scenes, relations, n, n). 1 means that the relation holds.
         h1: means of the hidden units given the objects, (scenes, hidden units).
         apart: True leaves out the effects between relations of the same pair of classes.
     """
-    A = given.shape[1]
+    A = observed.shape[1]
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool, device=gamma.device)
     itself[:, :A].fill_diagonal_(True)
     if apart:
@@ -430,6 +392,5 @@ def implied(gamma: Tensor, B: Tensor, given: Tensor, h1: Tensor, *, apart: bool 
         itself[:, : 2 * A] = True
     gamma = gamma.masked_fill(itself, 0.0)
     weight = gamma[0] + torch.einsum("bq,qaf->baf", h1 @ B.T, gamma[1:])
-    features = implication_features(given)
-    shifts: Tensor = (weight @ features.flatten(2)).view(given.shape)
-    return shifts
+    features = implication_features(observed)
+    return (weight @ features.flatten(2)).view(observed.shape)

@@ -33,12 +33,9 @@ def things(*labels: str, **fields: Any) -> tuple[AnnotatedObject, ...]:
 
 
 def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
-    scene = AnnotatedScene(
-        **{"scene_id": "s", "source": "t", "group": "g", "room_type": None, "objects": objects}
-        | fields
-    )
-    (found,) = encode([scene], VOCABULARY)
-    return found
+    values: dict[str, Any] = {"scene_id": "s", "source": "t", "group": "g", "room_type": None}
+    (scene,) = encode([AnnotatedScene(**values | {"objects": objects} | fields)], VOCABULARY)
+    return scene
 
 
 def triples(found: Any) -> set[tuple[int, int, int]]:

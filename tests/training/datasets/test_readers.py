@@ -6,6 +6,7 @@ A reader is tested by being listed: `LAYOUTS` must name every format of `READERS
 from __future__ import annotations
 
 import gzip
+import itertools
 import json
 import math
 from collections.abc import Callable
@@ -33,6 +34,13 @@ from training.fit.configuration import ConfigError, DataConfig
 from training.runs.pipeline import read_sources
 
 Write = Callable[[Path], Path]
+
+
+def check_malformed(path: Path, message: str, where: str | None = None) -> None:
+    with pytest.raises(DatasetError, match=message) as caught:
+        read_scenes(path)
+    assert caught.value.path == path
+    assert where is None or caught.value.where == where
 
 
 def write_json(path: Path, content: Any) -> Path:
@@ -84,11 +92,8 @@ def test_jsonl(tmp_path: Path) -> None:
 def test_jsonl_takes_a_scene_as_a_request_writes_it(tmp_path: Path) -> None:
     """Both forms of each field give one scene; fields left out have stable values."""
     stated = {"subject": "cup_2", "relation": "on-top", "object": "desk"}
-    desk = {
-        "label": "desk",
-        "position": {"x": 2, "y": 0, "z": 0.4},
-        "size": {"x": 1, "y": 2, "z": 1},
-    }
+    desk = {"label": "desk", "position": {"x": 2, "y": 0, "z": 0.4}}
+    desk["size"] = {"x": 1, "y": 2, "z": 1}
     request = {"objects": ["cup", desk, {"label": "cup"}], "relations": [stated]}
     desk = {"id": "desk", "label": "desk", "position": [2, 0, 0.4], "size": [1, 2, 1]}
     cups = [{"id": name, "label": "cup"} for name in ("cup_1", "cup_2")]
@@ -122,13 +127,11 @@ def test_jsonl_is_read_as_it_was_written(tmp_path: Path, name: str) -> None:
 def test_jsonl_tells_of_every_bad_line(tmp_path: Path) -> None:
     path = write_jsonl(tmp_path)
     path.write_text(path.read_text() + "[]\n" + "[" * 100_000 + "\n" + path.read_text())
-    found = list(jsonl.scan_jsonl(path))
-    assert [type(entry).__name__ for entry in found] == (
-        ["AnnotatedScene"] * 2 + ["DatasetError"] * 4
-    )
-    assert [entry.where for entry in found if isinstance(entry, DatasetError)] == [
-        "line 4", "line 5", "line 6", "line 8",
-    ]  # fmt: skip
+    *valid, first, second, third, fourth = jsonl.scan_jsonl(path)
+    assert [type(scene).__name__ for scene in valid] == ["AnnotatedScene"] * 2
+    errors = (first, second, third, fourth)
+    wheres = [getattr(error, "where", None) for error in errors]
+    assert wheres == ["line 4", "line 5", "line 6", "line 8"]
     with pytest.raises(DatasetError, match="line 4: a scene must be a JSON object"):
         read_scenes(path)
 
@@ -253,11 +256,7 @@ def test_sources_by_name_are_found_in_the_folder_extra(
 def test_malformed_jsonl(tmp_path: Path, line: str, message: str) -> None:
     path = tmp_path / "scenes.jsonl"
     path.write_text(f"{json.dumps(BARE_SCENE | {'scene_id': 'good'})}\n{line}\n")
-    with pytest.raises(DatasetError, match=message) as caught:
-        read_scenes(path)
-    assert caught.value.path == path
-    assert caught.value.where == "line 2"
-    assert str(path) in str(caught.value)
+    check_malformed(path, message, "line 2")
 
 
 # ------------------------------------------------------------------------------- 3DSSG
@@ -266,58 +265,36 @@ RESCANS = [
     {"reference": "room-1", "type": "train", "scans": [{"reference": "room-1b", "removed": []}]},
     {"reference": "room-2", "type": "validation", "scans": []},
 ]
-SPLITS = {
-    "scans": [
-        {
-            "scan": "room-1b",
-            "split": 2,
-            "objects": {"1": "floor", "4": "bed", "7": "pillow"},
-            "relationships": [
-                [7, 4, 15, "lying on"],
-                [4, 1, 14, "standing on"],
-                [7, 4, 1, "left"],
-                [4, 7, 2, "right"],
-                [7, 4, 5, "close by"],
-                [7, 7, 9, "bigger than"],
-            ],
-        }
-    ]
-}
-WHOLE = {
-    "scans": [{"scan": "room-2", "relationships": [["3", "2", 11, "higher than"]]}],
-}
-OBJECTS = {
-    "scans": [
-        {
-            "scan": "room-2",
-            "objects": [
-                {"global_id": "6", "label": "shelf", "id": "2", "ply_color": "#aec7e8"},
-                {"global_id": "7", "label": "picture", "id": "3", "attributes": {}},
-            ],
-        }
-    ]
-}
+SCAN = {
+    "scan": "room-1b",
+    "split": 2,
+    "objects": {"1": "floor", "4": "bed", "7": "pillow"},
+    "relationships": [
+        [7, 4, 15, "lying on"], [4, 1, 14, "standing on"], [7, 4, 1, "left"],
+        [4, 7, 2, "right"], [7, 4, 5, "close by"], [7, 7, 9, "bigger than"],
+    ],
+}  # fmt: skip
+WHOLE = {"scans": [{"scan": "room-2", "relationships": [["3", "2", 11, "higher than"]]}]}
+THINGS = [
+    {"global_id": "6", "label": "shelf", "id": "2", "ply_color": "#aec7e8"},
+    {"global_id": "7", "label": "picture", "id": "3", "attributes": {}},
+]
+OBJECTS = {"scans": [{"scan": "room-2", "objects": THINGS}]}
 
 
 def write_3dssg(folder: Path) -> Path:
     write_json(folder / "3RScan.json", RESCANS)
-    return write_json(folder / "relationships_train.json", SPLITS)
+    return write_json(folder / "relationships_train.json", {"scans": [SCAN]})
 
 
 def test_3dssg_splits(tmp_path: Path) -> None:
     (scene,) = READERS["3dssg"](write_3dssg(tmp_path))
     assert (scene.scene_id, scene.group) == ("3dssg-room-1b-2", "3rscan-room-1")
-    assert [(thing.id, thing.label) for thing in scene.objects] == [
-        ("1", "floor"),
-        ("4", "bed"),
-        ("7", "pillow"),
-    ]
+    things = [(thing.id, thing.label) for thing in scene.objects]
+    assert things == [("1", "floor"), ("4", "bed"), ("7", "pillow")]
     assert scene.relations == (
-        (2, "on-top", 1),
-        (1, "on-top", 0),
-        (2, "left", 1),
-        (1, "right", 2),
-    )
+        (2, "on-top", 1), (1, "on-top", 0), (2, "left", 1), (1, "right", 2),
+    )  # fmt: skip
     # Both spellings of one statement become one triple.
     (encoded,) = encode([scene], indoor_vocabulary())
     assert encoded.instance_holds.sum() == 2  # pillow on bed and left of it; the floor drops out
@@ -348,9 +325,6 @@ def test_3dssg_needs_its_companions(tmp_path: Path) -> None:
         read_scenes(path)
 
 
-SCAN = SPLITS["scans"][0]
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -368,40 +342,31 @@ SCAN = SPLITS["scans"][0]
     ],
 )
 def test_malformed_3dssg(tmp_path: Path, content: Any, message: str) -> None:
-    path = write_3dssg(tmp_path)
-    write_json(path, content)
-    with pytest.raises(DatasetError, match=message) as caught:
-        read_scenes(path)
-    assert caught.value.path == path
+    check_malformed(write_json(write_3dssg(tmp_path), content), message)
 
 
 # ------------------------------------------------------------------------------- SUN RGB-D
 
-HALF_TURN = math.radians(30)
+TURN = math.radians(30)
+COS, SIN = math.cos(TURN), math.sin(TURN)
+
+
+def box(classname: str, basis: Any, coeffs: list[float], centroid: list[float]) -> dict[str, Any]:
+    half, centre = np.array([coeffs]), np.array([centroid])
+    extra = {"orientation": np.array([[0.0, -1.0, 0.0]]), "label": np.array([[1]])}
+    values = {"basis": np.array(basis), "coeffs": half, "centroid": centre}
+    return values | {"classname": classname} | extra
+
+
 BOXES = [
-    {
-        "basis": np.eye(3),
-        "coeffs": np.array([[1.0, 0.5, 0.4]]),
-        "centroid": np.array([[0.5, 3.0, -0.6]]),
-        "classname": "bed",
-        "orientation": np.array([[0.0, -1.0, 0.0]]),
-        "label": np.array([[1]]),
-    },
-    {
-        # Turned by 30 degrees against the clock, seen from above; a negative half extent occurs.
-        "basis": np.array(
-            [
-                [math.cos(HALF_TURN), math.sin(HALF_TURN), 0.0],
-                [-math.sin(HALF_TURN), math.cos(HALF_TURN), 0.0],
-                [0.0, 0.0, 1.0],
-            ]
-        ),
-        "coeffs": np.array([[-0.2, 0.3, 0.25]]),
-        "centroid": np.array([[1.2, 2.5, -0.7]]),
-        "classname": "night_stand",
-        "orientation": np.array([[0.0, -1.0, 0.0]]),
-        "label": np.array([[2]]),
-    },
+    box("bed", np.eye(3), [1.0, 0.5, 0.4], [0.5, 3.0, -0.6]),
+    # Turned by 30 degrees against the clock, seen from above; a negative half extent occurs.
+    box(
+        "night_stand",
+        [[COS, SIN, 0.0], [-SIN, COS, 0.0], [0.0, 0.0, 1.0]],
+        [-0.2, 0.3, 0.25],
+        [1.2, 2.5, -0.7],
+    ),
 ]
 
 
@@ -416,16 +381,8 @@ def struct_array(entries: list[dict[str, Any]]) -> np.ndarray:
 
 
 def frame(name: str, boxes: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        "sequenceName": name,
-        "groundtruth3DBB": struct_array(boxes),
-        "Rtilt": np.eye(3),
-        "K": np.eye(3),
-        "depthpath": f"{name}/depth/1.png",
-        "rgbpath": f"{name}/image/1.jpg",
-        "sensorType": "kv2",
-        "valid": np.array([[1]]),
-    }
+    extra = {"Rtilt": np.eye(3), "K": np.eye(3), "sensorType": "kv2", "valid": np.array([[1]])}
+    return {"sequenceName": name, "groundtruth3DBB": struct_array(boxes)} | extra
 
 
 def write_mat(folder: Path) -> Path:
@@ -472,12 +429,11 @@ def corners(thing: Any) -> list[tuple[float, float]]:
 
 def expected_corners(box: dict[str, Any]) -> list[tuple[float, float]]:
     """Corners straight from the definition: centroid plus signed half extents along the basis."""
-    found = []
-    for u in (-1, 1):
-        for v in (-1, 1):
-            x, y, _ = box["centroid"][0] + np.array([u, v, 0]) * box["coeffs"][0] @ box["basis"]
-            found.append((round(float(y), 6), round(float(-x), 6)))
-    return sorted(found)
+    corners = []
+    for u, v in itertools.product((-1, 1), repeat=2):
+        x, y, _ = box["centroid"][0] + np.array([u, v, 0]) * box["coeffs"][0] @ box["basis"]
+        corners.append((round(float(y), 6), round(float(-x), 6)))
+    return sorted(corners)
 
 
 @pytest.mark.parametrize(
@@ -494,9 +450,7 @@ def test_malformed_sunrgbd_mat(tmp_path: Path, box: Any, message: str) -> None:
     broken = BOXES[0] | box if box else {k: v for k, v in BOXES[0].items() if k != "classname"}
     path = tmp_path / "SUNRGBDMeta3DBB_v2.mat"
     savemat(path, {"SUNRGBDMeta": struct_array([frame("SUNRGBD/kv2/a/1", [broken])])})
-    with pytest.raises(DatasetError, match=message) as caught:
-        read_scenes(path)
-    assert caught.value.where == "SUNRGBDMeta(1).groundtruth3DBB(1)"
+    check_malformed(path, message, "SUNRGBDMeta(1).groundtruth3DBB(1)")
 
 
 def test_mat_files_of_other_content(tmp_path: Path) -> None:
@@ -512,10 +466,7 @@ def test_mat_files_of_other_content(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------- COCO
 
 COCO: dict[str, Any] = {
-    "images": [
-        {"id": 9, "file_name": "9.jpg", "width": 640, "height": 480},
-        {"id": 4, "file_name": "4.jpg", "width": 640, "height": 480},
-    ],
+    "images": [{"id": 9, "file_name": "9.jpg"}, {"id": 4, "file_name": "4.jpg"}],
     "categories": [{"id": 62, "name": "chair"}, {"id": 67, "name": "dining table"}],
     "annotations": [
         {"id": 1, "image_id": 9, "category_id": 62, "bbox": [10, 100, 50, 80], "iscrowd": 0},
@@ -561,10 +512,7 @@ def test_coco(tmp_path: Path) -> None:
     ],
 )
 def test_malformed_coco(tmp_path: Path, content: Any, message: str) -> None:
-    path = write_json(tmp_path / "instances.json", content)
-    with pytest.raises(DatasetError, match=message) as caught:
-        read_scenes(path)
-    assert caught.value.path == path
+    check_malformed(write_json(tmp_path / "instances.json", content), message)
 
 
 # ------------------------------------------------------------------------------- all of them

@@ -84,13 +84,11 @@ def test_lists_of_the_users_own_are_complete() -> None:
 
 @pytest.mark.parametrize("source", ["procthor", "rooms", "robot"])
 def test_boxes_far_apart_are_not_stacked(source: str) -> None:
-    objects = (
-        AnnotatedObject("a", "desk", position=(0.0, 0.0, 0.5), size=CUBE),
-        AnnotatedObject("b", "monitor", position=(0.5, 0.0, 0.5), size=CUBE),
-        AnnotatedObject("c", "pencil", position=(9.0, 0.0, 0.5), size=CUBE),
-        AnnotatedObject("d", "pencil"),
+    objects = tuple(
+        AnnotatedObject(str(x), label, position=(x, 0.0, 0.5), size=CUBE)
+        for label, x in (("desk", 0.0), ("monitor", 0.5), ("pencil", 9.0))
     )
-    observed = encoded(source, *objects).instance_observed
+    observed = encoded(source, *objects, AnnotatedObject("d", "pencil")).instance_observed
     located = np.array([1, 1, 1, 0], dtype=bool)
     assert (observed[VERTICAL] == (located[:, None] & located & ~np.eye(4, dtype=bool))).all()
     assert np.argwhere(observed[LEFT]).tolist() == [[0, 1], [1, 0]]
@@ -98,10 +96,9 @@ def test_boxes_far_apart_are_not_stacked(source: str) -> None:
 
 @pytest.mark.parametrize("source", ["sunrgbd_bedrooms_3d", "sunrgbd-bedroom-3d"])
 def test_centres_tell_left_and_front_alone(source: str) -> None:
-    objects = (
-        AnnotatedObject("a", "desk", position=(0.0, 0.0, 0.5)),
-        AnnotatedObject("b", "monitor", position=(0.5, 0.0, 0.5)),
-        AnnotatedObject("c", "pencil", position=(9.0, 0.0, 0.5)),
+    objects = tuple(
+        AnnotatedObject(str(x), label, position=(x, 0.0, 0.5))
+        for label, x in (("desk", 0.0), ("monitor", 0.5), ("pencil", 9.0))
     )
     found = encoded(source, *objects)
     assert (found.instance_observed[LATERAL] == ~np.eye(3, dtype=bool)).all()

@@ -55,37 +55,34 @@ def test_labels_are_pooled_under_their_curated_names() -> None:
 
 
 def test_some_labels_become_no_class() -> None:
-    given = scenes("space", "sky", "truck", "wall", "walls", "partition wall")
-    found = build_vocabulary(given, NAMES, minimum=1)
+    several = scenes("space", "sky", "truck", "wall", "walls", "partition wall")
+    found = build_vocabulary(several, NAMES, minimum=1)
     assert found.labels == ("wall", "chair", "throne")
     assert found.structure.tolist() == [True, False, False]
-    outdoors = build_vocabulary(given, NAMES, minimum=1, outdoor=True)
+    outdoors = build_vocabulary(several, NAMES, minimum=1, outdoor=True)
     assert outdoors.labels == ("wall", "sky", "truck", "chair", "throne")
     assert outdoors.structure.tolist() == [True, True, False, False, False]
 
 
 def test_rooms_have_one_spelling() -> None:
-    given = [
-        *scenes("chair", room="bed_room"),
-        *scenes("chair", room="Bed Room"),
-        *scenes("chair", room="toilet"),
-        *scenes("chair", room="bathroom"),
-        *scenes("chair", room="attic"),
-        *scenes("chair", room="room", times=3),
-        *scenes("chair", times=3),
-    ]
-    assert build_vocabulary(given, NAMES, minimum=2).room_types == ("bathroom", "bed room")
+    rooms = "bed_room", "Bed Room", "toilet", "bathroom", "attic", *["room"] * 3, *[None] * 3
+    several = [scene for room in rooms for scene in scenes("chair", room=room)]
+    assert build_vocabulary(several, NAMES, minimum=2).room_types == ("bathroom", "bed room")
 
 
 def test_names_that_mean_two_things_are_refused() -> None:
-    with pytest.raises(ValueError, match="aliases: 'Couches' names both 'sofa' and 'bench'"):
-        Names(aliases={"sofa": ("couch",), "bench": ("Couches",)})
-    with pytest.raises(ValueError, match="base class 'couch' is an alias of 'sofa'"):
-        Names(base=("couch",), aliases={"sofa": ("couch",)})
-    with pytest.raises(ValueError, match="kinds: 'stool' names both 'chair' and 'seat'"):
-        Names(kinds={"chair": ("stool",), "seat": ("stool",)})
-    with pytest.raises(ValueError, match="kinds: 'couch' is an alias of 'sofa'"):
-        Names(aliases={"sofa": ("couch",)}, kinds={"seat": ("couch",)})
+    for names, message in (
+        ({"aliases": {"sofa": ("couch",), "bench": ("Couches",)}},
+         "aliases: 'Couches' names both 'sofa' and 'bench'"),
+        ({"base": ("couch",), "aliases": {"sofa": ("couch",)}},
+         "base class 'couch' is an alias of 'sofa'"),
+        ({"kinds": {"chair": ("stool",), "seat": ("stool",)}},
+         "kinds: 'stool' names both 'chair' and 'seat'"),
+        ({"aliases": {"sofa": ("couch",)}, "kinds": {"seat": ("couch",)}},
+         "kinds: 'couch' is an alias of 'sofa'"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            Names(**names)
 
 
 def test_sources_have_a_vocabulary_of_their_own() -> None:
@@ -109,17 +106,12 @@ def test_a_class_answers_to_its_kinds_that_have_none_of_their_own() -> None:
 
 def test_typical_sizes_are_medians_of_square_footprints() -> None:
     vocabulary = build_vocabulary(scenes("chair", "lamp"), Names(), minimum=1)
-    boxes = [
-        AnnotatedScene(
-            f"s{k}", "t", "g", None,
-            (
-                AnnotatedObject("0", "Chairs", size=(0.2 * k, 0.8 * k, 1.0 * k)),
-                AnnotatedObject("1", "throne", size=(9.0, 9.0, 9.0)),
-                AnnotatedObject("2", "lamp"),
-            ),
-        )
-        for k in range(1, 6)
-    ]  # fmt: skip
+    boxes = []
+    for k in range(1, 6):
+        chair = AnnotatedObject("0", "Chairs", size=(0.2 * k, 0.8 * k, 1.0 * k))
+        throne = AnnotatedObject("1", "throne", size=(9.0, 9.0, 9.0))
+        things = (chair, throne, AnnotatedObject("2", "lamp"))
+        boxes.append(AnnotatedScene(f"s{k}", "t", "g", None, things))
     found = with_typical_sizes(vocabulary, boxes)
     assert found.objects[0].size == pytest.approx((1.2, 1.2, 3.0))
     assert found.objects[1].size is None
@@ -130,9 +122,9 @@ def test_typical_sizes_are_medians_of_square_footprints() -> None:
 
 def test_coverage_counts_mentions() -> None:
     vocabulary = build_vocabulary(scenes("chair", "wall"), NAMES, minimum=1)
-    given = scenes("chairs", "chair", "wall", "sky")
-    assert coverage(vocabulary, given) == 0.75
-    assert coverage(vocabulary, given, structure=False) == pytest.approx(2 / 3)
+    several = scenes("chairs", "chair", "wall", "sky")
+    assert coverage(vocabulary, several) == 0.75
+    assert coverage(vocabulary, several, structure=False) == pytest.approx(2 / 3)
     with pytest.raises(ValueError, match="mention no object"):
         coverage(vocabulary, scenes())
 

@@ -41,13 +41,8 @@ def test_vectors_of_words(tmp_path: Path) -> None:
 
 
 def test_classes_have_the_vector_of_their_label_or_alias(tmp_path: Path) -> None:
-    vocabulary = Vocabulary(
-        [
-            ObjectClass("coffee table"),
-            ObjectClass("settee", ("davenport", "sofa", "table")),
-            ObjectClass("lamp"),
-        ]
-    )
+    classes = ObjectClass("settee", ("davenport", "sofa", "table")), ObjectClass("lamp")
+    vocabulary = Vocabulary([ObjectClass("coffee table"), *classes])
     vectors, found = class_vectors(read_word_vectors(save(tmp_path)), vocabulary)
     assert found.tolist() == [True, True, False]
     assert vectors.dtype == np.float32

@@ -26,19 +26,19 @@ from training.fit.calibrate import calibrate, fit_misplaced, fit_relations, risi
 from training.fit.calibrate_objects import (
     ALPHAS,
     COVERAGES,
+    EVIDENCE_WEIGHTS,
     LEAST,
-    PULLS,
     WEIGHTS,
     calibrate_objects,
     choose_alpha,
     complete_scenes,
     fit_coverage,
     fit_evidence,
-    least_of_the_best,
     limit_of,
     listing,
     popularity,
     recalibrated,
+    smallest_good_weight,
     smallest_scenes,
     thresholds,
 )
@@ -156,7 +156,7 @@ def judged(hits):
 PRIOR = np.array([0.0, 1.0])
 
 
-def test_alpha_is_the_least_of_the_best():
+def test_alpha_is_the_smallest_good_weight():
     kinds = {"uniform": judged(10), "popularity": judged(5), "signature": judged(5)}
     assert choose_alpha(kinds, PRIOR) == 0.375
     assert choose_alpha({"uniform": judged(10)}, PRIOR) == 0.0
@@ -204,8 +204,8 @@ def test_every_entry_of_objects_is_fitted(fitted):
     assert fitted.popularity_weight in ALPHAS
     assert fitted.coverage in COVERAGES
     assert fitted.coverage_weight in WEIGHTS
-    assert fitted.evidence.relations_on_objects in PULLS
-    assert fitted.evidence.poses_on_objects in PULLS
+    assert fitted.evidence.relations_on_objects in EVIDENCE_WEIGHTS
+    assert fitted.evidence.poses_on_objects in EVIDENCE_WEIGHTS
     # The likelier a class, the likelier it is missing; the likelier, the less an intruder.
     assert fitted.missing.slope > 0
     assert fitted.outlier.slope < 0
@@ -308,9 +308,9 @@ def test_machines_without_samples_use_the_closed_form_alone():
 
 def test_the_least_pull_that_is_as_good_is_taken():
     """More evidence that brings nothing may do harm elsewhere."""
-    assert least_of_the_best({0.0: 0.400, 0.2: 0.402, 1.0: 0.4025}) == 0.0
-    assert least_of_the_best({0.0: 0.400, 0.2: 0.410, 1.0: 0.411}) == 0.2
-    assert least_of_the_best({0.0: 0.400, 0.2: 0.410, 1.0: 0.420}) == 1.0
+    assert smallest_good_weight({0.0: 0.400, 0.2: 0.402, 1.0: 0.4025}) == 0.0
+    assert smallest_good_weight({0.0: 0.400, 0.2: 0.410, 1.0: 0.411}) == 0.2
+    assert smallest_good_weight({0.0: 0.400, 0.2: 0.410, 1.0: 0.420}) == 1.0
 
 
 def test_evidence_of_no_scene_has_no_weight():

@@ -21,15 +21,9 @@ from training.evaluation.setting import Setting
 from training.fit.count_statistics import fit_counts, folds
 
 CHAIR, DESK, TABLE, WALL = range(4)
-WORDS = Vocabulary(
-    [
-        ObjectClass("chair"),
-        ObjectClass("desk"),
-        ObjectClass("table"),
-        ObjectClass("wall", (), True),
-    ],
-    ("office", "kitchen"),
-)
+NAMES = ("chair", "desk", "table", "wall")
+CLASSES = [ObjectClass(name, structure=name == "wall") for name in NAMES]
+WORDS = Vocabulary(CLASSES, ("office", "kitchen"))
 FEW, MANY = (0.62, 0.24, 0.10, 0.04), (0.2, 0.3, 0.3, 0.2)
 
 

@@ -10,9 +10,9 @@ import torch
 
 from tests.enumeration.small_machines import binary
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
-from tests.training.fit.test_trainer import small_config
+from tests.training.fit.test_trainer import same, small_config, weights
 from training.fit import object_weights as objects
-from training.fit.configuration import ObjectsConfig, PolishConfig
+from training.fit.configuration import FineTuneConfig, ObjectsConfig
 from training.fit.object_weights import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
 from training.fit.trainer import Trainer
 from training.machines import MachineSpec, build
@@ -77,14 +77,6 @@ def independent(p):
     share = (p @ EVERY.double()).clamp(1e-6, 1 - 1e-6)
     log_q = (EVERY.double() * share.log() + (1 - EVERY.double()) * (1 - share).log()).sum(1)
     return float((p * (p.log() - log_q)).sum())
-
-
-def weights(machine):
-    return {name: p.detach().clone() for name, p in machine.named_parameters()}
-
-
-def same(first, second):
-    return all(torch.equal(first[name], second[name]) for name in first)
 
 
 def test_an_update_is_the_likelihood_s_gradient():
@@ -205,7 +197,7 @@ def wide_machine(N, variant="triway", form="local", scale=0.5):
 
 
 def store(machine, scenes, seed):
-    fine_tune(machine, scenes, PolishConfig(updates=0, chains=1), 0.5, seed)
+    fine_tune(machine, scenes, FineTuneConfig(updates=0, chains=1), 0.5, seed)
 
 
 def stored(machine):
@@ -256,14 +248,12 @@ def test_chains_come_to_the_data(variant):
         machine.b.fill_(1.0)
         machine.requires_grad_()
         start = machine.W.detach().clone()
-        fine_tune(machine, data, PolishConfig(learning_rate=0.05, **changes), 0.5, 1)
+        fine_tune(machine, data, FineTuneConfig(learning_rate=0.05, **changes), 0.5, 1)
         return machine, float((machine.W.detach() - start).abs().mean())
 
-    (before, none), (after, much), (held, little) = (
-        fine_tuned(updates=0),
-        fine_tuned(updates=400, anchor=0.0),
-        fine_tuned(updates=400, anchor=10.0),
-    )
+    before, none = fine_tuned(updates=0)
+    after, much = fine_tuned(updates=400, anchor=0.0)
+    held, little = fine_tuned(updates=400, anchor=10.0)
     assert none == 0
     assert distance(after) < 0.5 * distance(before)
     assert 0 < little < 0.2 * much

@@ -28,8 +28,8 @@ from training.fit.objectives import OBJECTIVES
 from training.fit.objectives.composite import mask_one_class, unlisted_off
 from training.fit.objectives.contrastive import centre_gradients, energy_difference
 from training.machines import build
-from training.machines.gibbs import State
 from training.machines.log_odds import object_log_odds
+from training.machines.machine import State
 from training.machines.mean_field import Evidence
 
 SAMPLES = 200_000
@@ -150,15 +150,8 @@ def toy_batch(size=24, seed=0):
     observed = torch.ones(size, 2, 3, 3, dtype=torch.bool)
     observed[: size // 3] = False
     holds[: size // 3] = 0
-    return Batch(
-        v=v,
-        classes=classes,
-        counts=torch.ones_like(classes),
-        holds=holds,
-        observed=observed,
-        room=torch.full((size,), -1),
-        source=torch.zeros(size, dtype=torch.int64),
-    )
+    room, source = torch.full((size,), -1), torch.zeros(size, dtype=torch.int64)
+    return Batch(v, classes, torch.ones_like(classes), holds, observed, room, source)
 
 
 TOY_TRIPLES = torch.tensor([[0, 1, 2], [1, 3, 4]])
@@ -237,15 +230,8 @@ def test_masking_takes_one_class_out_and_never_structure():
 
 def test_composite_likelihood_ranks_the_removed_class_and_separates_present_from_absent():
     """The loss without relations and chains, scene by scene."""
-    config = ObjectiveConfig(
-        name="composite",
-        presence_weight=0.7,
-        relation_weight=0.0,
-        generative_weight=0.0,
-        object_dropout=0.0,
-        structure_dropout=0.0,
-        room_dropout=0.0,
-    )
+    dropouts = dict.fromkeys(("object_dropout", "structure_dropout", "room_dropout"), 0.0)
+    config = ObjectiveConfig(name="composite", presence_weight=0.7, relation_weight=0.0, **dropouts)
     machine, batch = toy_machine("triway-local"), toy_batch()
     generators = [torch.Generator().manual_seed(4) for _ in range(2)]
     found = OBJECTIVES["composite"](config, machine).loss(machine, batch, generators[0])

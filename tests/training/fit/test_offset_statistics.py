@@ -12,7 +12,7 @@ from app.registry import Offsets
 from app.scene.relations import LEFT, ON_TOP
 from tests.training.evaluation.scenes import scene
 from training.datasets import encode, generate_rooms, rooms_vocabulary
-from training.datasets.offsets import seen_offsets
+from training.datasets.offsets import observed_offsets
 from training.fit.offset_statistics import fit_offsets, log_likelihood, posterior
 
 V = 6
@@ -64,8 +64,8 @@ def test_the_posterior_and_the_likelihood_are_the_integrals():
     evidence = integral(np.ones_like(MEANS))
     mean = integral(MEANS) / evidence
     second = integral(VARIANCES + np.square(MEANS)) / evidence
-    found, variance = posterior(*PRIOR, *moments(VALUES))
-    assert log_likelihood(*PRIOR, *moments(VALUES)) == pytest.approx(np.log(evidence), abs=1e-4)
+    found, variance = posterior(PRIOR, *moments(VALUES))
+    assert log_likelihood(PRIOR, *moments(VALUES)) == pytest.approx(np.log(evidence), abs=1e-4)
     assert found == pytest.approx(mean, abs=1e-4)
     assert variance == pytest.approx(second - mean**2, rel=2e-3)
 
@@ -168,7 +168,7 @@ def test_relations_without_poses_mean_nothing():
 def test_things_without_a_position_are_passed_over():
     known, unknown = draws(MEAN, STD, 2, 9)
     unknown.instance_positions[0] = np.nan
-    assert len(seen_offsets([known, unknown]).offset) == 1
+    assert len(observed_offsets([known, unknown]).offset) == 1
     assert fit_offsets([unknown], V) is None
 
 

@@ -15,7 +15,7 @@ from training.fit.configuration import ObjectiveConfig
 from training.fit.objectives.relation_likelihood import (
     RelationLikelihood,
     bake_word_prior,
-    partly_shown,
+    hide_objects,
     with_counted_residuals,
 )
 from training.machines import MachineSpec, build
@@ -39,19 +39,27 @@ def machine_of(name, seed=0):
     return machine.initialise(torch.Generator().manual_seed(seed), 0.1)
 
 
+def annotated(triple, *, holds, source):
+    """A scene of all classes, which observes one relation."""
+    one = toy([0, 1, 2, 3, 4], [triple] if holds else [], source=source)
+    observed = np.zeros_like(one.evidence.observed)
+    observed[triple] = True
+    return replace(one, evidence=replace(one.evidence, observed=observed))
+
+
 def scenes_of(shares, count=40):
-    """Scenes of all classes, by source. Of each, left(1, 2) or left(3, 4) is known, and listed in
-    a share of them."""
-    every = []
-    for source, share in shares.items():
-        for k in range(count):
-            i, j = (1, 2) if k % 2 else (3, 4)
-            listed = [(0, i, j)] if k // 2 < share * count / 2 else []
-            one = toy([0, 1, 2, 3, 4], listed, source=source)
-            observed = np.zeros_like(one.evidence.observed)
-            observed[0, i, j] = True
-            every.append(replace(one, evidence=replace(one.evidence, observed=observed)))
-    return tensors(every)
+    """Scenes by source. Each observes left(1, 2) or left(3, 4), and a share of them lists it."""
+    return tensors(
+        [
+            annotated(
+                (0, 1, 2) if k % 2 else (0, 3, 4),
+                holds=k // 2 < share * count / 2,
+                source=source,
+            )
+            for source, share in shares.items()
+            for k in range(count)
+        ]
+    )
 
 
 def whole(scenes):
@@ -146,7 +154,7 @@ def test_unknown_units_do_not_change_the_loss(machine):
 def test_the_context_sees_a_share_of_the_objects_uniform_over_scenes():
     """Of 2,000 scenes of 40 objects; five standard errors of the mean and of the spread."""
     v = (torch.rand(2000, 50, generator=torch.Generator().manual_seed(1)) < 0.8).float()
-    shown = partly_shown(v, torch.Generator().manual_seed(0))
+    shown = hide_objects(v, torch.Generator().manual_seed(0))
     assert bool((shown <= v).all())
     share = shown.sum(1) / v.sum(1)
     assert float(share.mean()) == pytest.approx(0.5, abs=5 * 0.3 / 2000**0.5)
@@ -156,7 +164,7 @@ def test_the_context_sees_a_share_of_the_objects_uniform_over_scenes():
 
 def test_the_loss_is_the_mean_over_scenes_and_the_prior_of_one(monkeypatch):
     """With a context that sees all objects."""
-    monkeypatch.setattr("training.fit.objectives.relation_likelihood.partly_shown", lambda v, _: v)
+    monkeypatch.setattr("training.fit.objectives.relation_likelihood.hide_objects", lambda v, _: v)
     scenes, machine = scenes_of({"captions": 0.5}), machine_of("triway")
     batch = whole(scenes)
     nothing = replace(batch, observed=torch.zeros_like(batch.observed))
@@ -237,22 +245,20 @@ LISTED = {(0, 1, 2): (18, 2), (0, 3, 4): (4, 8), (1, 0, 3): (0, 12)}
 
 def listed_scenes():
     """Scenes of two sources; each observes one triple of `LISTED`."""
-    every = []
-    for (a, i, j), counts in LISTED.items():
-        for holds, count in zip((True, False), counts, strict=True):
-            for k in range(count):
-                source = "captions" if k % 2 else "rooms"
-                one = toy([0, 1, 2, 3, 4], [(a, i, j)] if holds else [], source=source)
-                observed = np.zeros_like(one.evidence.observed)
-                observed[a, i, j] = True
-                every.append(replace(one, evidence=replace(one.evidence, observed=observed)))
-    return tensors(every)
+    return tensors(
+        [
+            annotated(triple, holds=holds, source="captions" if k % 2 else "rooms")
+            for triple, counts in LISTED.items()
+            for holds, count in zip((True, False), counts, strict=True)
+            for k in range(count)
+        ]
+    )
 
 
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (0.5, 2.0)])
 def test_residuals_maximise_the_likelihood_of_triples_under_a_normal_prior(monkeypatch, weights):
     """At the mode the slope of the log-likelihood is τ δ, with one precision τ for all triples."""
-    monkeypatch.setattr("training.fit.objectives.relation_likelihood.partly_shown", lambda v, _: v)
+    monkeypatch.setattr("training.fit.objectives.relation_likelihood.hide_objects", lambda v, _: v)
     scenes, machine = listed_scenes(), machine_of("triway")
     with torch.no_grad():
         machine.residual.copy_(torch.linspace(-0.3, 0.3, 6))

@@ -34,6 +34,10 @@ def data(tmp_path_factory):
     return prepare(small_config(), tmp_path_factory.mktemp("none")).training_data()
 
 
+def state(machine):
+    return {name: value.clone() for name, value in machine.state_dict().items()}
+
+
 def weights(machine):
     return {name: p.clone() for name, p in machine.named_parameters()}
 
@@ -90,10 +94,6 @@ def worded(data):
     generator = torch.Generator().manual_seed(9)
     vectors = torch.randn(data.train.v.shape[1], 5, generator=generator)
     return replace(data, words=torch.nn.functional.normalize(vectors, dim=1))
-
-
-def state(machine):
-    return {name: value.clone() for name, value in machine.state_dict().items()}
 
 
 @pytest.mark.slow

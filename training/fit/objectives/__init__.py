@@ -19,11 +19,4 @@ OBJECTIVES: dict[str, type[Objective]] = {
     "relations": RelationLikelihood,
 }
 
-__all__ = [
-    "OBJECTIVES",
-    "CompositeLikelihood",
-    "ContrastiveDivergence",
-    "Objective",
-    "PersistentCD",
-    "RelationLikelihood",
-]
+__all__ = ["OBJECTIVES", "Objective"]

@@ -41,8 +41,7 @@ class Objective(ABC):
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return a scalar whose gradient is the update direction.
 
-        In several processes, the batch is a share of the global batch. The sum of their losses is
-        the loss of the global batch.
+        In several processes, the losses of the shares of a batch add up to the loss of the batch.
         """
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:  # noqa: B027
@@ -67,8 +66,7 @@ class Objective(ABC):
 
 def withhold_rooms(batch: Batch, share: float, generator: torch.Generator) -> Tensor:
     """Return the room types of the batch, (B,), with a share of them hidden (-1)."""
-    hidden = uniform((len(batch),), generator) < share
-    return torch.where(hidden, -1, batch.room)
+    return torch.where(uniform((len(batch),), generator) < share, -1, batch.room)
 
 
 def withhold_counts(batch: Batch, share: float, generator: torch.Generator) -> Batch:
@@ -95,17 +93,16 @@ def relation_nll(
     on a random share of the observed relations of each scene and sums over the other relations.
 
     Args:
-        logits, r, observed, weight: logit, value, observed flag and weight of each relation unit,
-            all (scenes, units).
+        logits, r, observed, weight: tensors over the relation units, (scenes, units).
         h1: means of the hidden units given the objects, (scenes, hidden units).
     """
     nll = bernoulli_nll(logits, r, weight).sum()
     if not machine.spec.G:
         return nll
     share = uniform((len(r), 1), generator)
-    given = r * observed * (uniform(r.shape, generator) < share)
-    shifted = logits + machine.implied(edges, given, h1)
-    return nll + bernoulli_nll(shifted, r, weight * (1 - given)).sum()
+    condition = r * observed * (uniform(r.shape, generator) < share)
+    shifted = logits + machine.implied(edges, condition, h1)
+    return nll + bernoulli_nll(shifted, r, weight * (1 - condition)).sum()
 
 
 def bernoulli_nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:

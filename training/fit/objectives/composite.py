@@ -52,7 +52,7 @@ class Masked:
         batch: the complete scenes.
         v: presence of objects without the removed class, (scenes, classes).
         target: index of the removed class, (scenes,).
-        absent: True for absent classes, which include the removed class, (scenes, classes).
+        absent: True for absent classes and the removed class, (scenes, classes).
         removable: number of classes that can be removed, (scenes,).
     """
 
@@ -66,11 +66,8 @@ class Masked:
 def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) -> Masked | None:
     """Remove one random class from each scene that has at least two removable classes.
 
-    The result is None if the scenes of all processes have fewer.
-
-    Args:
-        structure: True for structure classes such as walls, (classes,) bool. Structure classes are
-            never removed or ranked.
+    The result is None if the scenes of all processes have fewer. Structure classes such as walls,
+    (classes,) bool, are never removed or ranked.
     """
     removable = batch.v * ~structure
     enough = removable.sum(1) >= 2
@@ -95,9 +92,6 @@ class ObjectChains:
     the data therefore have the same distribution of room types.
 
     Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
-
-    Args:
-        steps: number of Gibbs steps before each update of the weights.
     """
 
     def __init__(self, count: int, steps: int) -> None:
@@ -145,20 +139,17 @@ class CompositeLikelihood(Objective):
         self.chains = ObjectChains(config.chains, config.k)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the persistent chains."""
         return {name: gather(block) for name, block in self.chains.blocks.items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the persistent chains."""
         self.chains.blocks = {name: share(block) for name, block in state.items()}
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the weighted sum of the terms, averaged over the scenes of the batch."""
         total = machine.b.sum() * 0.0
         if self.config.relation_weight:
-            total = total + self.config.relation_weight * self.relation_part(
-                machine, batch, generator
-            )
+            relations = self.relation_part(machine, batch, generator)
+            total = total + self.config.relation_weight * relations
         if self.config.generative_weight:
             room = withhold_rooms(batch, self.config.room_dropout, generator)
             chains = self.chains.loss(machine, batch.v, room, generator)
@@ -175,10 +166,7 @@ class CompositeLikelihood(Objective):
         return total + mean_part(ranking + self.config.presence_weight * presence)
 
     def _log_odds(
-        self,
-        machine: BoltzmannMachine,
-        masked: Masked,
-        generator: torch.Generator,
+        self, machine: BoltzmannMachine, masked: Masked, generator: torch.Generator
     ) -> Tensor:
         """Return the log-odds of each class given the other classes, (scenes, classes)."""
         v, batch = masked.v, masked.batch

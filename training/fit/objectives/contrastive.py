@@ -30,7 +30,8 @@ from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
 from training.machines.distributed import anywhere, gather, mean_part, share, total
 from training.machines.edges import Edges
-from training.machines.gibbs import Clamp, State, gibbs_step, initial_state, reconstruct, sample_h1
+from training.machines.gibbs import Clamp, gibbs_step, initial_state, reconstruct, sample_h1
+from training.machines.machine import State
 from training.machines.mean_field import Evidence, mean_field
 
 _OFFSETS = ("offset_v", "offset_h1", "offset_h2")
@@ -97,7 +98,6 @@ class ContrastiveDivergence(Objective):
     """CD-k: the model samples come from k Gibbs steps that start at the data."""
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the loss between the data and the states after k Gibbs steps."""
         room = withhold_rooms(batch, self.config.room_dropout, generator)
         data, observed = data_state(machine, batch, room, generator)
         relations = machine.relations_act
@@ -129,7 +129,6 @@ class PersistentCD(Objective):
         self.offsets = [torch.full((n,), 0.5) for n in (spec.V, spec.H1, spec.H2)]
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the loss between the data and the states of the chains."""
         free = torch.full((len(batch),), -1)
         data, observed = data_state(machine, batch, free, generator)
         chains = self._resume(machine, generator)
@@ -143,7 +142,6 @@ class PersistentCD(Objective):
         return energy_difference(machine, data, observed, chains, free, no_room)
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:
-        """Replace the gradients by centred gradients, as `centre_gradients` describes."""
         centre_gradients(machine, *self.offsets)
 
     def _resume(self, machine: BoltzmannMachine, generator: torch.Generator) -> State:
@@ -166,7 +164,7 @@ class PersistentCD(Objective):
         return state | blocks | {"classes": gather(self.chains.edges.classes)}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the running means, and keep the chains for the next update."""
+        # The chains continue at the next update.
         self.offsets = [state[name] for name in _OFFSETS]
         self.saved = {name: value for name, value in state.items() if name not in _OFFSETS}
 
@@ -177,12 +175,9 @@ def centre_gradients(
 ) -> None:
     """Replace the gradients of (b, c1, c2, W, J) by centred gradients, in place.
 
-    d<v>, d<h1> and d<vh1> are differences between data means and model means. The centred gradient
-    of W is d<vh1> - μ d<h1>' - d<v> λ1'. The product of the centred weight gradients and the means
-    is subtracted from each bias gradient.
-
-    Args:
-        mu, lambda1, lambda2: running data means μ of v, λ1 of h1 and λ2 of h2.
+    μ, λ1 and λ2 are running data means of v, h1 and h2. d<v>, d<h1> and d<vh1> are differences
+    between data means and model means. The centred gradient of W is d<vh1> - μ d<h1>' - d<v> λ1'.
+    The product of the centred weight gradients and the means is subtracted from each bias gradient.
     """
     b, c1, c2 = (getattr(machine, name).grad for name in ("b", "c1", "c2"))
     W, J = machine.W.grad, machine.J.grad

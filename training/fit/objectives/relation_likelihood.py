@@ -68,11 +68,9 @@ _BATCH = 64
 
 
 class WordPrior(nn.Module):
-    """Add a trained linear map of word vectors to the weights of classes.
+    """Add a trained linear map of scaled word vectors, (classes, dimensions), to class weights.
 
-    Args:
-        words: scaled word vectors, (classes, dimensions).
-        columns: True if the weights have the shape (width, classes), False for (classes, width).
+    The weights have the shape (width, classes) with `columns`, and (classes, width) without.
     """
 
     def __init__(self, words: Tensor, width: int, *, columns: bool) -> None:
@@ -83,7 +81,6 @@ class WordPrior(nn.Module):
         self.map = nn.Parameter(torch.zeros(words.shape[1], width))
 
     def forward(self, deviation: Tensor) -> Tensor:
-        """Return the weights of all classes: the map of the word vectors plus the deviations."""
         shared = self.words @ self.map
         return deviation + (shared.T if self.columns else shared)
 
@@ -91,11 +88,8 @@ class WordPrior(nn.Module):
 class RelationLikelihood(Objective):
     """The negative conditional log-likelihood of annotated relations, plus priors.
 
-    Args:
-        machine: the machine to train. The constructor adds the word prior to its weights.
-        train: the training scenes. They give the names of the sources and the number of scenes.
-        words: word vectors of the classes with length 1, (classes, dimensions). None means no word
-            prior.
+    The constructor adds a word prior to the machine if there are word vectors of the classes with
+    length 1, (classes, dimensions).
     """
 
     keeps_last = True
@@ -117,7 +111,6 @@ class RelationLikelihood(Objective):
 
     @classmethod
     def of(cls, config: ObjectiveConfig, machine: BoltzmannMachine, data: TrainingData) -> Self:
-        """Return the objective for the training scenes of a run."""
         return cls(config, machine, data.train, data.words)
 
     def finish(self, machine: BoltzmannMachine, train: SceneTensors) -> BoltzmannMachine:
@@ -130,15 +123,12 @@ class RelationLikelihood(Objective):
         return machine
 
     def parameters(self) -> list[nn.Parameter]:
-        """Return the trained logit offsets of the data sources."""
         return [self.offsets]
 
     def state(self) -> dict[str, Tensor]:
-        """Return the logit offsets of the data sources for a checkpoint."""
         return {"offsets": self.offsets.detach()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the logit offsets of the data sources from a checkpoint."""
         with torch.no_grad():
             self.offsets.copy_(state["offsets"])
 
@@ -155,14 +145,14 @@ class RelationLikelihood(Objective):
         batch = withhold_counts(batch, self.config.count_dropout, generator)
         edges, r, observed = relation_units(machine, batch)
         with torch.no_grad():
-            shown = partly_shown(batch.v, generator)
+            shown = hide_objects(batch.v, generator)
             h1 = mean_field(machine, Evidence(shown, room=room)).y.sigmoid()
         offsets = self.offsets[batch.source]
         weight = self.source_weights[batch.source].unsqueeze(1)
         logits = machine.relation_logits(edges, batch.v, h1)
         logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
-        known = observed * machine.gate(edges, batch.v) * weight
-        nll = relation_nll(machine, edges, logits, r, observed, known, h1, generator)
+        weight = observed * machine.gate(edges, batch.v) * weight
+        nll = relation_nll(machine, edges, logits, r, observed, weight, h1, generator)
         scenes = int(total(torch.tensor(len(batch))))
         return nll / scenes + self._prior(machine) / max(self.scenes, 1) / size()
 
@@ -178,7 +168,7 @@ class RelationLikelihood(Objective):
         return total
 
 
-def partly_shown(v: Tensor, generator: torch.Generator) -> Tensor:
+def hide_objects(v: Tensor, generator: torch.Generator) -> Tensor:
     """Hide objects of scenes (B, V) at random, each scene with its own uniform probability."""
     chance = uniform((len(v), 1), generator)
     return v * (uniform(v.shape, generator) < chance)
@@ -220,7 +210,7 @@ def with_counted_residuals(
         offsets: corrections of the logits for each data source, (sources, relations).
         source_weights: weight of a relation from each data source, (sources,).
     """
-    keys, logits, holds, weights = _known_units(machine, train, offsets, source_weights)
+    keys, logits, holds, weights = _annotated_units(machine, train, offsets, source_weights)
     triples, which, counts = np.unique(keys, return_inverse=True, return_counts=True)
     delta = np.zeros(len(triples))
     for _ in range(_NEWTON_STEPS):
@@ -229,15 +219,15 @@ def with_counted_residuals(
         curvature = np.bincount(which, weights * p * (1 - p), len(triples)) + _PRECISION
         delta += (slope / curvature).clip(-2, 2)
     before = machine.get_parameter("residual").tolist()
-    old = dict(zip(machine.triple_keys.tolist(), before, strict=True))
+    residuals = dict(zip(machine.triple_keys.tolist(), before, strict=True))
     kept = (counts >= _SPEAKING_SCENES) & (np.abs(delta) >= _LEAST_RESIDUAL)
     for key, value in zip(triples[kept].tolist(), delta[kept].tolist(), strict=True):
-        old[key] = old.get(key, 0.0) + value
-    return _with_residuals(machine, old)
+        residuals[key] = residuals.get(key, 0.0) + value
+    return _with_residuals(machine, residuals)
 
 
 @torch.no_grad()
-def _known_units(
+def _annotated_units(
     machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
 ) -> tuple[Ints, Floats, Floats, Floats]:
     """Return keys, logits, values and weights of all annotated relations, each (relations,)."""
@@ -247,14 +237,14 @@ def _known_units(
     for index in torch.arange(len(train)).split(_BATCH):
         batch = train.batch(index)
         edges, r, observed = relation_units(machine, batch)
-        h1 = mean_field(machine, Evidence(partly_shown(batch.v, generator))).y.sigmoid()
+        h1 = mean_field(machine, Evidence(hide_objects(batch.v, generator))).y.sigmoid()
         logits = machine.relation_logits(edges, batch.v, h1)
         logits = logits + offsets[batch.source].gather(1, edges.relation)
-        known = (observed * machine.gate(edges, batch.v)) > 0
+        annotated = (observed * machine.gate(edges, batch.v)) > 0
         key = (edges.relation * V + edges.subject) * V + edges.object
         weight = source_weights[batch.source].unsqueeze(1).expand_as(logits)
         for column, values in zip(columns, (key, logits, r, weight), strict=True):
-            column.append(values[known])
+            column.append(values[annotated])
     key, logits, r, weight = (torch.cat(column) for column in columns)
     return key.numpy(), logits.double().numpy(), r.double().numpy(), weight.double().numpy()
 
