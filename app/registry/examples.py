@@ -16,6 +16,7 @@ MAX_EXAMPLES: Final = 8
 MAX_WORD: Final = 100
 MAX_EXAMPLES_BYTES: Final = 32_768
 """Maximum size of all examples of a model as JSON, in bytes."""
+_FIELDS: Final = frozenset({"objects", "relations", "room_type", "frame_id", "viewpoint"})
 
 
 def _compact(value: Any) -> Any:
@@ -42,6 +43,8 @@ class Example(Frozen):
     @field_validator("scene")
     @classmethod
     def _makes_a_scene(cls, scene: SceneRequest) -> SceneRequest:
+        if further := sorted(scene.model_fields_set - _FIELDS):
+            raise ValueError(f"an example must not have the field {further[0]!r}")
         names = [
             thing if isinstance(thing, str) else thing.id or thing.label for thing in scene.objects
         ]
