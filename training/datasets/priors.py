@@ -20,8 +20,6 @@ COLUMNS: Final = ("source", "subject", "relation", "object", "count", "room")
 MAX_LINE: Final = 4096
 MAX_ROWS: Final = 2_000_000
 
-# Prefixes of names in one of the sources, for example "food bread" and "clothes skirt".
-_KINDS: Final = ("food ", "clothes ")
 
 SOURCE: Final = "placing_priors"
 """Source name of all scenes that the reader makes from rows of the table."""
@@ -43,7 +41,9 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
     for where, (source, subject, relation, anchor, _, _) in _rows(path):
         if source not in _SOURCES:
             raise DatasetError(path, where, f"unknown source {source!r}")
-        names = [_plain(subject), _plain(anchor)]
+        # One of the sources has prefixes, for example in "food bread" and "clothes skirt".
+        ends = subject, anchor
+        names = [end.removeprefix("food ").removeprefix("clothes ").strip() for end in ends]
         if source not in _PLACES or relation not in RELATIONS:
             continue
         if not all(map(label_key, names)) or label_key(names[0]) == label_key(names[1]):
@@ -53,12 +53,6 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
         listed = ((0, relation, 1),)
         scenes.append(AnnotatedScene(where, SOURCE, group, None, things, listed))
     return scenes
-
-
-def _plain(label: str) -> str:
-    for kind in _KINDS:
-        label = label.removeprefix(kind)
-    return label.strip()
 
 
 def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:

@@ -35,8 +35,7 @@ _CELL, _STRUCT, _OBJECT = 1, 2, 3
 # Bytes that an entry of a cell or struct array counts at least. It costs so much memory.
 _ENTRY = 64
 
-# Number of consecutive frames in a group. Consecutive frames often show the same place.
-_BLOCK = 20
+_BLOCK = 20  # consecutive frames in a group; they often show the same place
 
 
 def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
@@ -63,7 +62,9 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
             for index, box in enumerate(boxes)
         )
         if objects:
-            room = _room_type(path.parent / name / "scene.txt")
+            note = path.parent / name / "scene.txt"
+            room = note.read_text(encoding="utf-8").strip() if note.is_file() else None
+            room = room or None
             scenes.append(AnnotatedScene(name, SOURCE, group, room, objects, viewer_frame=True))
     return scenes
 
@@ -181,7 +182,3 @@ def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
             size=(2 * float(half[ahead]), 2 * float(half[aside]), 2 * float(half[upright])),
             yaw=math.atan2(-float(basis[ahead, 0]), float(basis[ahead, 1])),
         )
-
-
-def _room_type(path: Path) -> str | None:
-    return path.read_text(encoding="utf-8").strip() or None if path.is_file() else None

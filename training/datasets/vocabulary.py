@@ -21,8 +21,7 @@ INDOOR_FILE = Path(__file__).resolve().parent / "vocabularies" / "indoor.json"
 # vectors, so a smaller minimum is enough for these vocabularies.
 MINIMUM_MENTIONS = 8
 INDOOR_MINIMUM_MENTIONS = 5
-# Minimum number of boxes of a class from which a typical size is computed.
-MINIMUM_BOXES = 5
+MINIMUM_BOXES = 5  # from which a typical size is computed
 
 
 def build_vocabulary(

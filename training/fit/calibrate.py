@@ -2,12 +2,7 @@
 
 All fits use validation scenes. Without enough scenes for `outlier` or `misplaced`, the entry is
 None and the model gives no judgement. An unfitted entry of another question keeps the model's own
-probability. The calibration has these entries:
-
-    missing, outlier           See `training.fit.calibrate_objects`.
-    relation, relation_given   See `fit_relations` and `fit_with_observed`.
-    placement, asked_place     See `fit_placements`.
-    misplaced                  See `fit_misplaced`.
+probability. `training.fit.calibrate_objects` fits the entries about objects.
 
 All fits are logistic regressions (Platt scaling) on relations that a data source annotates as true
 or false. Other relations are left out. One source of generated rooms has more examples than all
@@ -58,8 +53,7 @@ _SCENES = 2500
 # Number of scenes for a machine whose log-odds have no closed form. Sampling the log-odds takes a
 # hundred times longer than a closed form.
 _SCENES_OF_DRAWS = 300
-# Number of relations that an answer of the service lists by default.
-_LISTED = 20
+_LISTED = 20  # relations that an answer of the service lists by default
 _OF_THE_REST = 0.02
 _ROUNDS = 3
 # Column indices of the table of examples. Column 0 is the scene.
@@ -73,13 +67,11 @@ _POWER = 0.5
 _BENDS = 7
 _LEAST_SLOPE = 0.05
 _STIFFNESS = 2.0
-# Value in the truth column of an example whose data source does not annotate the relation.
-_UNKNOWN = -1.0
+_UNKNOWN = -1.0  # truth of an example whose data source does not annotate the relation
 # Number of objects that are removed from each scene in turn to fit placements. With one removed
 # object, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
-# Minimum number of scenes with relations for a judgement of relations.
-_JUDGED_SCENES = 20
+_JUDGED_SCENES = 20  # minimum number of scenes with relations for a judgement of relations
 
 
 def calibrate(

@@ -63,8 +63,7 @@ LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
 _SHORT_LISTS = 8
 _ENOUGH = 1.5
 _SHORTENED = 200
-# Number of scenes used from each source.
-_PARTIAL_SCENES = 120
+_PARTIAL_SCENES = 120  # scenes used from each source
 # Number of times that the hidden class is drawn, for scenes that show all but one class.
 _DRAWS_OF_ONE = 4
 # Quantiles over real rooms of a room type. A generated scene is too small if its number of classes
@@ -85,8 +84,7 @@ _NEARLY_COMPLETE = ("75 %", "all but one")
 # Weights whose MRR differs from the best MRR by at most this value count as equal. The smallest of
 # these weights is used.
 _AS_GOOD = 0.006
-# Number of classes in the fit of each scene. An answer of the service lists ten by default.
-_LISTED = 10
+_LISTED = 10  # classes in the fit of each scene; an answer of the service lists ten by default
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:

@@ -53,12 +53,14 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     temporary.replace(path)
 
 
-def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
-    """Read a checkpoint.
+def load_checkpoint(path: Path, digest: str) -> dict[str, Any] | None:
+    """Read a checkpoint. Return None if the file does not exist.
 
     Raises:
         RunError: the file cannot be read, or belongs to another configuration or other scenes.
     """
+    if not path.exists():
+        return None
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:

@@ -29,15 +29,12 @@ from training.datasets.sources import SOURCES
 from training.evaluation.count_task import class_mean
 from training.fit.offset_statistics import half_precision, source_weights
 
-# Maximum number of scenes of a group. Scenes of a group are near-duplicates.
-_OF_GROUP: Final = 8
+_OF_GROUP: Final = 8  # maximum number of scenes of a group; they are near-duplicates
 _DRAWS: Final = 2  # listings of each training and validation scene
-# Weight of the shares over all classes in s(n), in scenes.
-_PRIOR: Final = 8.0
+_PRIOR: Final = 8.0  # weight of the shares over all classes in s(n), in scenes
 # Penalties on the squares of the terms of a class and of the shared terms.
 _OWN, _SHARED = 0.3, 0.15
-# A smaller relative change of the loss ends the fit.
-_PRECISION: Final = 1e-6
+_PRECISION: Final = 1e-6  # a smaller relative change of the loss ends the fit
 # A class needs this many scenes, and this many groups that have several instances.
 _SCENES, _GROUPS = 20, 10
 # Three or more listed instances are covered if this many groups have as many.

@@ -51,10 +51,8 @@ _PER_ROOM = 12
 _ROOM_UPDATES = 1500
 _ROOM_RATE = 0.2
 _ROOM_PRIOR = 0.5
-# Number of Gibbs sweeps between the last update and the storage of samples.
-_SWEEPS = 200
-# Number of updates between two calls of `progress`.
-_REPORTED = 100
+_SWEEPS = 200  # Gibbs sweeps between the last update and the storage of samples
+_REPORTED = 100  # updates between two calls of `progress`
 # Settings of `fine_tune`: names of the trained weights, decay of the moving average of the weights,
 # and number of Gibbs sweeps before the storage of samples.
 _FINE_TUNED = ("b", "c1", "c2", "W", "Q")

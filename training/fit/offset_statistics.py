@@ -82,8 +82,7 @@ class Pairs(NamedTuple):
     """Pairs of classes in one relation, with the moments of their offsets.
 
     Attributes:
-        subject, other: class indices of the relation's subject and object, (pairs,). The pairs are
-            sorted by subject, then by object.
+        subject, other: class indices, (pairs,), sorted by subject, then by object.
         scenes: number of scenes with the pair, (pairs,).
         n: total weight of the offsets of the pair, (pairs, 1).
         mean: weighted mean of the offsets, (pairs, 3).
@@ -140,8 +139,8 @@ class _Fit:
 
     Attributes:
         kappa, alpha, beta, mu: parameters of the prior (see the module), one for each axis, (3,).
-        u, v: effects of the class of the relation's subject (u) and object (v), (classes, 3).
-        doubt_u, doubt_v: variances of u and v in units of s / kappa, (classes, 3).
+        u, v, doubt_u, doubt_v: effects of the class of the relation's subject (u) and object (v),
+            and their variances in units of s / kappa, (classes, 3).
     """
 
     kappa: Floats

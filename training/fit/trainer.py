@@ -14,7 +14,6 @@ from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -52,7 +51,6 @@ _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
 # Function that is called after every update with the epoch, its finished share and its mean loss.
 Progress = Callable[[int, float, float], None]
-# Function that is called after every epoch.
 Ended = Callable[[Epoch], None]
 
 
@@ -217,7 +215,8 @@ class Trainer:
         """
         if self.folder is None:
             return False
-        state = distributed.on_first(partial(_checkpoint, self.folder, self._digest))
+        path = self.folder / "checkpoint.pt"
+        state = distributed.on_first(partial(load_checkpoint, path, self._digest))
         if state is None:
             return False
         for name in ("objective", "average", "best"):
@@ -400,11 +399,6 @@ class Trainer:
         if self.folder is not None and distributed.is_first():
             write_plot(self.folder / "curve.png", self.epochs, self.config.name)
             self._drawn = time.perf_counter()
-
-
-def _checkpoint(folder: Path, digest: str) -> dict[str, Any] | None:
-    path = folder / "checkpoint.pt"
-    return load_checkpoint(path, digest) if path.exists() else None
 
 
 def _with_relations(scenes: SceneTensors) -> SceneTensors:

@@ -12,11 +12,7 @@ from training.machines.machine import BoltzmannMachine
 from training.machines.rbm import GBM, RBM
 from training.machines.triway import Triway
 
-VARIANTS: dict[str, type[BoltzmannMachine]] = {
-    "rbm": RBM,
-    "gbm": GBM,
-    "triway": Triway,
-}
+VARIANTS: dict[str, type[BoltzmannMachine]] = {"rbm": RBM, "gbm": GBM, "triway": Triway}
 
 
 def build(spec: MachineSpec) -> BoltzmannMachine:
@@ -24,12 +20,4 @@ def build(spec: MachineSpec) -> BoltzmannMachine:
     return VARIANTS[spec.variant](spec)
 
 
-__all__ = [
-    "GBM",
-    "RBM",
-    "VARIANTS",
-    "BoltzmannMachine",
-    "MachineSpec",
-    "Triway",
-    "build",
-]
+__all__ = ["GBM", "RBM", "VARIANTS", "BoltzmannMachine", "MachineSpec", "Triway", "build"]

@@ -161,11 +161,7 @@ def _attraction(
 
 
 def relation_log_odds(
-    machine: BoltzmannMachine,
-    edges: Edges,
-    evidence: Evidence,
-    *,
-    count: int = 64,
+    machine: BoltzmannMachine, edges: Edges, evidence: Evidence, *, count: int = 64
 ) -> tuple[Tensor, Tensor]:
     """Return log-odds and standard errors of the unobserved units in `edges`, (scenes, units).
 

@@ -317,13 +317,7 @@ class BoltzmannMachine(nn.Module, ABC):
         return self.c1 + self.Q[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
 
     def energy(
-        self,
-        v: Tensor,
-        r: Tensor,
-        h1: Tensor,
-        h2: Tensor,
-        edges: Edges,
-        room: Tensor | None = None,
+        self, v: Tensor, r: Tensor, h1: Tensor, h2: Tensor, edges: Edges, room: Tensor | None = None
     ) -> Tensor:
         """Return the energy E(v, r, h1, h2), (..., scenes); +inf if a unit with gate 0 is 1."""
         gate = self.gate(edges, v)

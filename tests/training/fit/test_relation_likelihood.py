@@ -52,9 +52,7 @@ def scenes_of(shares, count=40):
     return tensors(
         [
             annotated(
-                (0, 1, 2) if k % 2 else (0, 3, 4),
-                holds=k // 2 < share * count / 2,
-                source=source,
+                (0, 1, 2) if k % 2 else (0, 3, 4), holds=k // 2 < share * count / 2, source=source
             )
             for source, share in shares.items()
             for k in range(count)

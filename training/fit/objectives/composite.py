@@ -104,25 +104,23 @@ class ObjectChains:
         """Run the chains, then return mean F(data) - mean F(chains). F is the free energy."""
         with torch.no_grad():
             h2 = bernoulli(mean_field(machine, Evidence(v, room=room)).h2, generator)
-            self._advance(machine, v, room, generator)
+            if not self.blocks:
+                self.blocks = self._start(machine, gather(v), gather(room), generator)
+            clamp = Clamp(room=self.blocks["room"])
+            state = bare_state(machine, *(self.blocks[name] for name in ("v", "h1", "h2")))
+            state = run(machine, state, generator, self.steps, clamp, relations=False)
+            self.blocks |= {"v": state.v, "h1": state.h1, "h2": state.h2}
         chains = self.blocks
         data = mean_part(machine.free_energy(v, h2=h2, room=room))
         model = machine.free_energy(chains["v"], h2=chains["h2"], room=chains["room"])
         return data - mean_part(model)
 
-    def _advance(
+    def _start(
         self, machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
-    ) -> None:
-        if not self.blocks:
-            v, room = gather(v), gather(room)
-            pick = share(torch.randint(len(v), (self.count,), generator=generator, device="cpu"))
-            v, room = v[pick], room[pick]
-            state = initial_state(machine, v, generator, Clamp(room=room))
-            self.blocks = {"v": state.v, "h1": state.h1, "h2": state.h2, "room": room}
-        clamp = Clamp(room=self.blocks["room"])
-        state = bare_state(machine, self.blocks["v"], self.blocks["h1"], self.blocks["h2"])
-        state = run(machine, state, generator, self.steps, clamp, relations=False)
-        self.blocks |= {"v": state.v, "h1": state.h1, "h2": state.h2}
+    ) -> dict[str, Tensor]:
+        pick = share(torch.randint(len(v), (self.count,), generator=generator, device="cpu"))
+        state = initial_state(machine, v[pick], generator, Clamp(room=room[pick]))
+        return {"v": state.v, "h1": state.h1, "h2": state.h2, "room": room[pick]}
 
 
 class CompositeLikelihood(Objective):

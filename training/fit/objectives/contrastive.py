@@ -29,7 +29,6 @@ from training.fit.objectives.base import Objective, bernoulli_nll, withhold_room
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
 from training.machines.distributed import anywhere, gather, mean_part, share, total
-from training.machines.edges import Edges
 from training.machines.gibbs import Clamp, gibbs_step, initial_state, reconstruct, sample_h1
 from training.machines.machine import State
 from training.machines.mean_field import Evidence, mean_field
@@ -56,14 +55,6 @@ def data_state(
     return State(batch.v, h1, h2, r, edges), observed
 
 
-def relation_nll(
-    machine: BoltzmannMachine, edges: Edges, v: Tensor, h1: Tensor, r: Tensor, observed: Tensor
-) -> Tensor:
-    """Return -log p(observed r | v, h1) for each scene, (scenes,)."""
-    logits = machine.relation_logits(edges, v, h1)
-    return bernoulli_nll(logits, r, observed * machine.gate(edges, v)).sum(-1)
-
-
 def energy_difference(
     machine: BoltzmannMachine,
     data: State,
@@ -78,8 +69,9 @@ def energy_difference(
     form, the energy E replaces F, and -log p(r | v, h1) of the data is added.
     """
     if not machine.relations_act:
-        positive = machine.object_energy(data.v, data.h1, data.h2, data_room)
-        positive = positive + relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
+        logits = machine.relation_logits(data.edges, data.v, data.h1)
+        nll = bernoulli_nll(logits, data.r, observed * machine.gate(data.edges, data.v)).sum(-1)
+        positive = machine.object_energy(data.v, data.h1, data.h2, data_room) + nll
         negative = machine.object_energy(model.v, model.h1, model.h2, model_room)
         return mean_part(positive) - mean_part(negative)
     # Both terms in one pass. The states are reachable, so the gate need not be checked.

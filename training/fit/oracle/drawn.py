@@ -284,10 +284,7 @@ class DrawnPosterior:
         log_odds = torch.cat(
             [
                 object_log_odds(
-                    machine,
-                    observation.without(part),
-                    candidates=where,
-                    pull=self._pull.objects,
+                    machine, observation.without(part), candidates=where, pull=self._pull.objects
                 )
                 for part in removed.split(_rows(size))
             ]

@@ -33,11 +33,7 @@ _RELATION_DRAWS = 1 << 25
 
 
 def draw_context(
-    machine: BoltzmannMachine,
-    evidence: Evidence,
-    *,
-    rows: int | None = None,
-    pull: float = 1.0,
+    machine: BoltzmannMachine, evidence: Evidence, *, rows: int | None = None, pull: float = 1.0
 ) -> HiddenDraws:
     """Return weighted draws of h1 given the evidence. Equal evidence gives equal draws.
 
