@@ -27,7 +27,7 @@ from training.domain.init_command import fail
 from training.domain.translation import BEYOND, Translation, same_classes
 from training.evaluation.missing_tasks import leave_one_out
 from training.evaluation.model import Model, ObjectScore
-from training.evaluation.report import Progress, SourceReport, digest, run, silent
+from training.evaluation.report import Progress, measure, silent
 from training.evaluation.results import Difference, Results, only, summarise
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS, in_words
@@ -296,9 +296,7 @@ def side_by_side(
         raise ValueError("the scenes belong to one group, but intervals need at least two groups")
     reports = {}
     for title, model in zip(titles, models, strict=True):
-        report = SourceReport("held out", digest(setting))
-        for _ in run(model, setting, report, tasks=tasks, progress=progress):
-            pass
+        report = measure(model, setting, "held out", tasks=tasks, progress=progress)
         reports[title, 0] = {"held out": only(report, COMPARED)}
     progress("resampling groups")
     return summarise(reports, titles[0], groups=groups)

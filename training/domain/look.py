@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,26 +21,21 @@ SHOWN = 5
 LONGEST = 100
 
 
-@dataclass
+@dataclass(frozen=True)
 class Finding:
     """A property of the scenes that the user should check.
 
     Attributes:
         what: description of the property, in one sentence.
-        examples: the first `SHOWN` cases.
         advice: recommended action of the user.
+        count: number of cases.
+        examples: the first `SHOWN` cases.
     """
 
     what: str
     advice: str
-    count: int = 0
-    examples: list[str] = field(default_factory=list)
-
-    def add(self, example: str) -> None:
-        """Add one case, and keep it as an example if there is space."""
-        self.count += 1
-        if len(self.examples) < SHOWN:
-            self.examples.append(example)
+    count: int
+    examples: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -117,78 +112,98 @@ def _shares(scenes: Sequence[AnnotatedScene], names: Names) -> dict[str, float]:
 def _findings(
     scenes: Sequence[AnnotatedScene], rooms: Counter[str], names: Names
 ) -> Iterator[Finding]:
-    small = Finding(
+    def finding(what: str, advice: str, cases: Iterable[str]) -> Finding:
+        every = list(cases)
+        return Finding(what, advice, len(every), tuple(every[:SHOWN]))
+
+    held = [{canonicalise(*triple) for triple in scene.relations or ()} for scene in scenes]
+    yield finding(
         "Scenes have fewer than two different objects, so they do not show co-occurrence.",
         "Training reads them. Questions that need more objects skip them.",
+        (s.scene_id for s in scenes if len({label_key(thing.label) for thing in s.objects}) < 2),
     )
-    both_ways = Finding(
+    yield finding(
         "A relation is annotated in both directions, such as left and right of each other.",
         "Such a relation counts as unobserved. Correct it, or check the point of view.",
+        (
+            f"{_pair(scene, i, j)}, {CANONICAL[a]}"
+            for scene, triples in zip(scenes, held, strict=True)
+            for a, i, j in sorted(triples)
+            if i < j and (a, j, i) in triples
+        ),
     )
-    crossed = Finding(
+    yield finding(
         "An object is on-top of another object that is annotated as above it.",
         "Correct one of the two relations.",
+        (
+            _pair(scene, i, j)
+            for scene, triples in zip(scenes, held, strict=True)
+            for a, i, j in sorted(triples)
+            if a == _ON_TOP and (_ABOVE, j, i) in triples
+        ),
     )
-    cycles = Finding(
+    yield finding(
         "Objects support each other in a cycle (on-top or supported_by).",
         "Correct the cycle: an object cannot stand on an object that it supports.",
+        (
+            f"{scene.scene_id}: {', '.join(circle)}"
+            for scene, triples in zip(scenes, held, strict=True)
+            if (circle := _circle(scene, triples)) is not None
+        ),
     )
-    for scene in scenes:
-        if len({label_key(thing.label) for thing in scene.objects}) < 2:
-            small.add(scene.scene_id)
-        held = {canonicalise(s, r, o) for s, r, o in scene.relations or ()}
-        for a, i, j in sorted(held):
-            if i < j and (a, j, i) in held:
-                both_ways.add(f"{_pair(scene, i, j)}, {CANONICAL[a]}")
-            if a == _ON_TOP and (_ABOVE, j, i) in held:
-                crossed.add(_pair(scene, i, j))
-        if (circle := _circle(scene, held)) is not None:
-            cycles.add(f"{scene.scene_id}: {', '.join(circle)}")
-    yield from (small, both_ways, crossed, cycles, _unaskable(scenes, names))
-    yield _duplicates(scenes)
-    yield _alone(scenes)
-    nowhere = Finding(
+    yield finding(
+        f"Labels are blank, longer than {LONGEST} characters or not printable.",
+        "A request cannot contain such a label. Use other labels.",
+        _unaskable(scenes, names),
+    )
+    yield finding(
+        "Scenes of different groups have the same objects in the same places or relations.",
+        "Remove copies or put them into one group. Otherwise test scenes occur in training.",
+        _duplicates(scenes),
+    )
+    alone = len({scene.group for scene in scenes}) == len(scenes)
+    yield Finding(
+        "Every scene has its own group.",
+        "If several scenes are frames or scans of one place, put these scenes into one group. "
+        "Near-duplicates in training and test scenes make the test results too good.",
+        len(scenes) if alone else 0,
+    )
+    yield finding(
         "Scenes have no room type.",
         "Room types are optional; known room types make the answers more accurate.",
+        (scene.scene_id for scene in scenes if rooms and scene.room_type is None),
     )
-    for scene in scenes:
-        if scene.room_type is None:
-            nowhere.add(scene.scene_id)
-    if rooms:
-        yield nowhere
-    axes = Finding(
+    yield finding(
         "Scenes with positions do not state that the positions are in viewer axes.",
         "Left and front are derived from a viewpoint on one side of the room, which depends on the "
         'scene id. If x is away from the viewer, y left and z up, set "viewer_frame": true.',
+        (
+            scene.scene_id
+            for scene in scenes
+            if scene.relations is None
+            and not scene.viewer_frame
+            and any(thing.position for thing in scene.objects)
+        ),
     )
-    for scene in scenes:
-        placed = any(thing.position for thing in scene.objects)
-        if placed and scene.relations is None and not scene.viewer_frame:
-            axes.add(scene.scene_id)
-    yield axes
-    units = Finding(
+    yield finding(
         f"Positions are beyond {MOST_DISTANT:g} m, or sides of objects beyond {LARGEST:g} m.",
         "Positions and sizes must be in metres.",
+        (scene.scene_id for scene in scenes if _beyond_metres(scene)),
     )
-    for scene in scenes:
-        points = [thing.position for thing in scene.objects if thing.position] or [(0.0, 0.0, 0.0)]
-        middle = np.zeros(3) if scene.viewer_frame else np.median(points, 0)
-        far = bool((np.linalg.norm(points - middle, axis=1) > MOST_DISTANT).any())
-        if far or max((max(thing.size or (0,)) for thing in scene.objects), default=0) > LARGEST:
-            units.add(scene.scene_id)
-    yield units
 
 
-def _unaskable(scenes: Sequence[AnnotatedScene], names: Names) -> Finding:
-    found = Finding(
-        f"Labels are blank, longer than {LONGEST} characters or not printable.",
-        "A request cannot contain such a label. Use other labels.",
-    )
+def _beyond_metres(scene: AnnotatedScene) -> bool:
+    points = [thing.position for thing in scene.objects if thing.position] or [(0.0, 0.0, 0.0)]
+    middle = np.zeros(3) if scene.viewer_frame else np.median(points, 0)
+    far = bool((np.linalg.norm(points - middle, axis=1) > MOST_DISTANT).any())
+    return far or max((max(thing.size or (0,)) for thing in scene.objects), default=0) > LARGEST
+
+
+def _unaskable(scenes: Sequence[AnnotatedScene], names: Names) -> Iterator[str]:
     for label in sorted({thing.label for scene in scenes for thing in scene.objects}):
         name = names.canonical(label)
         if not name.strip() or len(name) > LONGEST or not name.isprintable():
-            found.add(repr(label) if len(label) <= LONGEST else f"{label[:40]!r} …")
-    return found
+            yield repr(label) if len(label) <= LONGEST else f"{label[:40]!r} …"
 
 
 def _pair(scene: AnnotatedScene, i: int, j: int) -> str:
@@ -198,7 +213,7 @@ def _pair(scene: AnnotatedScene, i: int, j: int) -> str:
 
 def _circle(scene: AnnotatedScene, held: set[tuple[int, int, int]]) -> list[str] | None:
     """Return the labels of objects that support each other in a cycle, or None without a cycle."""
-    place = {thing.id: index for index, thing in enumerate(scene.objects)}
+    index_of = {thing.id: index for index, thing in enumerate(scene.objects)}
     below: dict[int, set[int]] = {}
     for a, i, j in held:
         # Skip pairs of objects that are on top of each other. Another finding reports such pairs.
@@ -206,7 +221,7 @@ def _circle(scene: AnnotatedScene, held: set[tuple[int, int, int]]) -> list[str]
             below.setdefault(i, set()).add(j)
     for index, thing in enumerate(scene.objects):
         if thing.supported_by is not None:
-            below.setdefault(index, set()).add(place[thing.supported_by])
+            below.setdefault(index, set()).add(index_of[thing.supported_by])
     # Repeatedly remove objects whose supports were all removed. Then only cycles remain.
     while free := [i for i, under in below.items() if not under & set(below)]:
         for i in free:
@@ -219,18 +234,14 @@ def _circle(scene: AnnotatedScene, held: set[tuple[int, int, int]]) -> list[str]
     return [scene.objects[i].label for i in walk[walk.index(following) :]]
 
 
-def _duplicates(scenes: Sequence[AnnotatedScene]) -> Finding:
-    found = Finding(
-        "Scenes of different groups have the same objects in the same places or relations.",
-        "Remove copies or put them into one group. Otherwise test scenes occur in training.",
-    )
+def _duplicates(scenes: Sequence[AnnotatedScene]) -> Iterator[str]:
     first: dict[object, AnnotatedScene] = {}
     for scene in scenes:
         labels = {thing.id: label_key(thing.label) for thing in scene.objects}
         things = [
             (
                 labels[thing.id],
-                _rounded(thing.position),
+                None if thing.position is None else tuple(round(x, 3) for x in thing.position),
                 thing.box2d,
                 None if thing.supported_by is None else labels[thing.supported_by],
             )
@@ -241,20 +252,4 @@ def _duplicates(scenes: Sequence[AnnotatedScene]) -> Finding:
         content = (tuple(sorted(things, key=repr)), tuple(sorted(scene.relations or ())))
         other = first.setdefault(content, scene)
         if other.group != scene.group:
-            found.add(f"{other.scene_id} and {scene.scene_id}")
-    return found
-
-
-def _rounded(position: tuple[float, float, float] | None) -> tuple[float, ...] | None:
-    return None if position is None else tuple(round(value, 3) for value in position)
-
-
-def _alone(scenes: Sequence[AnnotatedScene]) -> Finding:
-    found = Finding(
-        "Every scene has its own group.",
-        "If several scenes are frames or scans of one place, put these scenes into one group. "
-        "Near-duplicates in training and test scenes make the test results too good.",
-    )
-    if len({scene.group for scene in scenes}) == len(scenes):
-        found.count = len(scenes)
-    return found
+            yield f"{other.scene_id} and {scene.scene_id}"

@@ -70,9 +70,18 @@ class SourceReport:
         }
 
     @classmethod
-    def read(cls, path: Path) -> SourceReport:
-        """Read a report that `measure` wrote."""
+    def read(cls, path: Path, setting: Setting | None = None) -> SourceReport:
+        """Read a report that `measure` wrote.
+
+        Raises:
+            ValueError: the report does not belong to `setting`.
+        """
         values = json.loads(path.read_text(encoding="utf-8"))
+        if setting is not None and values["scenes"] != digest(setting):
+            raise ValueError(
+                f"the report {path} belongs to other scenes or tasks: use --fresh, use another "
+                "folder, or delete it"
+            )
         tasks = values["tasks"].items()
         return cls(
             values["source"],
@@ -119,56 +128,39 @@ def digest(setting: Setting) -> str:
     return sha256(asked.encode()).hexdigest()
 
 
-def run(
-    model: Model,
-    setting: Setting,
-    report: SourceReport,
-    *,
-    tasks: Iterable[str] = tuple(TASKS),
-    known: Mapping[str, Task] = EVERY_TASK,
-    progress: Progress = silent,
-) -> Iterator[str]:
-    """Measure the tasks that the report lacks. Yield the name of each task after measuring it.
-
-    Args:
-        tasks: names of the tasks, which are keys of `known`.
-
-    Raises:
-        ValueError: a task is unknown, or the report belongs to other scenes or questions.
-    """
-    if report.scenes != digest(setting):
-        raise ValueError(
-            f"the file of the report on {report.source} is from other scenes or tasks: delete it"
-        )
-    wanted = list(tasks)
-    if unknown := sorted(set(wanted) - set(known)):
-        raise ValueError(f"unknown tasks {unknown}: choose from {list(known)}")
-    for task in wanted:
-        if task in report.outcomes:
-            continue
-        progress(f"{report.source}: {task}")
-        began = time.perf_counter()
-        report.outcomes[task] = known[task](model, setting)
-        report.seconds[task] = time.perf_counter() - began
-        yield task
-
-
 def measure(
-    path: Path,
     model: Model,
     setting: Setting,
     source: str,
     *,
     tasks: Iterable[str] = tuple(TASKS),
     known: Mapping[str, Task] = EVERY_TASK,
+    path: Path | None = None,
     progress: Progress = silent,
 ) -> SourceReport:
-    """Measure the tasks that the file at `path` lacks, and write it after every task."""
+    """Measure tasks. With `path`, skip the tasks in this file, and write it after every task.
+
+    Args:
+        tasks: names of the tasks, which are keys of `known`.
+
+    Raises:
+        ValueError: a task is unknown, or the file belongs to other scenes or questions.
+    """
+    wanted = list(tasks)
+    if unknown := sorted(set(wanted) - set(known)):
+        raise ValueError(f"unknown tasks {unknown}: choose from {list(known)}")
     report = SourceReport(source, digest(setting))
-    if path.exists():
-        report = SourceReport.read(path)
-    for _ in run(model, setting, report, tasks=tasks, known=known, progress=progress):
-        write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
+    if path is not None and path.exists():
+        report = SourceReport.read(path, setting)
+    for task in wanted:
+        if task in report.outcomes:
+            continue
+        progress(f"{source}: {task}")
+        began = time.perf_counter()
+        report.outcomes[task] = known[task](model, setting)
+        report.seconds[task] = time.perf_counter() - began
+        if path is not None:
+            write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
     return report
 
 
@@ -224,38 +216,28 @@ def evaluate(
     wanted = [
         task for task, one in EVERY_TASK.items() if one.card and (tasks is None or task in tasks)
     ]
-    single = [task for task in wanted if task not in WHOLE_SET]
-    settings = dict(settings_by_source(scenes, structure, train, None, limit=limit))
     rows: list[CardMetric] = []
+
+    def add(setting: Setting, source: str, tasks: list[str]) -> None:
+        report = measure(model, setting, source, tasks=tasks, progress=progress)
+        rows.extend(
+            CardMetric(task=task, source=source, metric=name, **asdict(metric.figure()))
+            for task, outcome in report.outcomes.items()
+            if outcome is not None
+            for name in EVERY_TASK[task].card
+            # A metric is missing if the data source lacks data for it, such as listed relations.
+            if (metric := outcome.metrics.get(name)) is not None
+        )
+
+    settings = dict(settings_by_source(scenes, structure, train, None, limit=limit))
     for source, setting in settings.items():
-        rows += _published(model, setting, source, single, progress)
+        add(setting, source, [task for task in wanted if task not in WHOLE_SET])
     together = next(iter(settings)) if len(settings) == 1 else "pooled"
-    setting = Setting(scenes, structure, train, limit=limit)
     whole = [task for task in wanted if task in WHOLE_SET and task not in ONCE]
-    rows += _published(model, setting, together, whole, progress)
+    add(Setting(scenes, structure, train, limit=limit), together, whole)
     setting = Setting(scenes, structure, limit=limit, everyday=everyday)
-    once = [task for task in wanted if task in ONCE]
-    return rows + _published(model, setting, SOURCE, once, progress)
-
-
-def _published(
-    model: Model,
-    setting: Setting,
-    source: str,
-    tasks: Iterable[str],
-    progress: Progress,
-) -> list[CardMetric]:
-    report = SourceReport(source, digest(setting))
-    for _ in run(model, setting, report, tasks=tasks, progress=progress):
-        pass
-    return [
-        CardMetric(task=task, source=source, metric=name, **asdict(outcome.metrics[name].figure()))
-        for task, outcome in report.outcomes.items()
-        if outcome is not None
-        for name in EVERY_TASK[task].card
-        # A metric is missing if the data source lacks data for it, such as listed relations.
-        if name in outcome.metrics
-    ]
+    add(setting, SOURCE, [task for task in wanted if task in ONCE])
+    return rows
 
 
 def _to_dict(outcome: Outcome | None) -> dict[str, Any] | None:

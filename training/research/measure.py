@@ -130,7 +130,10 @@ class Plan:
             if not self.asked(source):
                 found[source] = SourceReport(source, digest(setting))
             elif path.exists():
-                report = read_report(path, setting)
+                try:
+                    report = SourceReport.read(path, setting)
+                except ValueError as error:
+                    raise BenchmarkError(str(error)) from error
                 if set(self.asked(source)) <= set(report.outcomes):
                     found[source] = report
         return found
@@ -153,9 +156,10 @@ class Plan:
                 model = entry.make(self.data, folder, say)
                 _note_parameters(folder, model.parameters)
             measure(
-                *(folder / f"{source}.json", model, setting, source),
+                *(model, setting, source),
                 tasks=self.asked(source),
                 known=self.known_tasks,
+                path=folder / f"{source}.json",
                 progress=say,
             )
             say(DONE)
@@ -353,20 +357,6 @@ def claim(place: Path, entry: Entry, material: str) -> None:
         return
     values = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
     write_whole(path, json.dumps(values | {"material": material}))
-
-
-def read_report(path: Path, setting: Setting) -> SourceReport:
-    """Read a report from a file, and check that it belongs to `setting`.
-
-    Raises:
-        BenchmarkError: the report belongs to other scenes or questions.
-    """
-    report = SourceReport.read(path)
-    if report.scenes != digest(setting):
-        raise BenchmarkError(
-            f"the report {path} belongs to other scenes or questions: use --fresh or another folder"
-        )
-    return report
 
 
 def _note_parameters(place: Path, count: int | None) -> None:

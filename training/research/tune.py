@@ -317,7 +317,7 @@ class Search:
         for source, setting in settings_by_source(
             self.data.validation, self.data.structure, self.data.train, seen=None
         ):
-            measure(place / f"{source}.json", model, setting, source, tasks=tasks)
+            measure(model, setting, source, tasks=tasks, path=place / f"{source}.json")
         return self.metrics(place)
 
     def metrics(self, place: Path) -> dict[str, Metric]:

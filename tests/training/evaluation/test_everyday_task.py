@@ -23,7 +23,7 @@ from training.evaluation.everyday_task import (
     facts_file,
 )
 from training.evaluation.model import Model
-from training.evaluation.report import SourceReport, digest, evaluate, run
+from training.evaluation.report import evaluate, measure
 from training.evaluation.setting import Setting
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -139,13 +139,14 @@ def test_an_absent_folder_leaves_the_task_out(tmp_path):
     assert facts_digest(tmp_path) == ""
 
 
-def test_other_facts_are_other_questions(folder):
+def test_other_facts_are_other_questions(folder, tmp_path):
     before = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
-    report = SourceReport("pooled", digest(before))
-    assert list(run(Model(), before, report, tasks=("Everyday",))) == ["Everyday"]
+    path = tmp_path / "report.json"
+    report = measure(Model(), before, "pooled", tasks=("Everyday",), path=path)
+    assert report.outcomes == {"Everyday": None}
     (folder / "facts.json").write_text(json.dumps(FACTS | {"seeds": [7]}))
     with pytest.raises(ValueError, match="other scenes or tasks"):
-        list(run(Model(), before, report, tasks=("T2 missing",)))
+        measure(Model(), before, "pooled", tasks=("T2 missing",), path=path)
 
 
 def test_a_card_has_the_lines_once(folder):

@@ -31,12 +31,9 @@ from training.evaluation.density_task import DensitySettings
 from training.evaluation.generation_task import held_out_halves
 from training.evaluation.model import Model
 from training.evaluation.report import (
-    SourceReport,
-    digest,
     evaluate,
     measure,
     pooled,
-    run,
     settings_by_source,
 )
 from training.evaluation.setting import Setting
@@ -55,8 +52,8 @@ OF_OBJECTS = {name for name, task in TASKS.items() if task.of_objects}
 
 
 def report_of(model, setting, tasks=tuple(TASKS)):
-    report = SourceReport("toy", digest(setting))
-    assert list(run(model, setting, report, tasks=tasks)) == list(tasks)
+    report = measure(model, setting, "toy", tasks=tasks)
+    assert list(report.outcomes) == list(tasks)
     return report
 
 
@@ -93,14 +90,14 @@ def test_the_tasks_about_objects():
 def test_reports_are_stored_and_resumed(tmp_path):
     path = tmp_path / "model" / "seed-0" / "toy.json"
     some = ("T2 missing", "T3b placement")
-    first = measure(path, MODEL, SETTING, "toy", tasks=some)
+    first = measure(MODEL, SETTING, "toy", tasks=some, path=path)
     assert tuple(first.outcomes) == some
     asked = []
     every = (*some, "T4 generate", "T3 outliers, uniform")
-    whole = measure(path, MODEL, SETTING, "toy", tasks=every, progress=asked.append)
+    whole = measure(MODEL, SETTING, "toy", tasks=every, path=path, progress=asked.append)
     assert asked == ["toy: T4 generate", "toy: T3 outliers, uniform"]
     # A finished file needs no model.
-    again = measure(path, Model(), SETTING, "toy", tasks=every)
+    again = measure(Model(), SETTING, "toy", tasks=every, path=path)
     assert values_of(again) == pytest.approx(values_of(whole))
     assert again.outcomes["T4 generate"].notes == whole.outcomes["T4 generate"].notes
     assert not list(path.parent.glob("*.part"))
@@ -108,9 +105,9 @@ def test_reports_are_stored_and_resumed(tmp_path):
     assert written["figure"] == asdict(whole.outcomes["T2 missing"].metrics["MRR"].figure())
     for other in (replace(SETTING, seed=1), replace(SETTING, limit=3)):
         with pytest.raises(ValueError, match="other scenes or tasks"):
-            measure(path, MODEL, other, "toy")
+            measure(MODEL, other, "toy", path=path)
     with pytest.raises(ValueError, match="unknown tasks"):
-        measure(path, MODEL, SETTING, "toy", tasks=("T9",))
+        measure(MODEL, SETTING, "toy", tasks=("T9",), path=path)
 
 
 @pytest.mark.parametrize("name", LARGER)
@@ -228,7 +225,7 @@ def test_completion_has_the_metrics_of_relations():
 def test_a_skill_that_is_undefined_is_left_out(tmp_path, monkeypatch):
     """No answer was true: the calibration error stands, and the report can be written."""
     monkeypatch.setitem(QUESTIONS, "missing", lambda *_: [(0.25, False), (0.5, False)])
-    report = measure(tmp_path / "toy.json", MODEL, SETTING, "toy", tasks=("Calibration",))
+    report = measure(MODEL, SETTING, "toy", tasks=("Calibration",), path=tmp_path / "toy.json")
     metrics = report.outcomes["Calibration"].metrics
     assert metrics["ECE, missing"].value == pytest.approx(0.375)
     assert "Brier skill, missing" not in metrics
