@@ -160,15 +160,9 @@ def torch_clamp(machine, rows, condition):
     observed, r = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape)
     for a, i, j, on in zip(given.a, given.i, given.j, given.r, strict=True):
         observed[a, i, j], r[a, i, j] = True, float(on)
+    observed, r = (table.view(1, -1).expand(rows, -1) for table in (observed, r))
     edges = machine.edges(classes)
-    return mask, Clamp(
-        v=mask,
-        h1=held,
-        edges=edges,
-        r=r.view(1, -1).expand(rows, -1),
-        observed=observed.view(1, -1).expand(rows, -1),
-        room=room,
-    )
+    return mask, Clamp(v=mask, h1=held, edges=edges, r=r, observed=observed, room=room)
 
 
 CONDITIONS = {
