@@ -158,15 +158,9 @@ def torch_clamp(machine, rows, condition):
     seen, r = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape)
     for a, i, j, on in zip(observed.a, observed.i, observed.j, observed.r, strict=True):
         seen[a, i, j], r[a, i, j] = True, float(on)
+    seen, r = (table.view(1, -1).expand(rows, -1) for table in (seen, r))
     edges = machine.edges(classes)
-    return mask, Clamp(
-        v=mask,
-        h1=held,
-        edges=edges,
-        r=r.view(1, -1).expand(rows, -1),
-        observed=seen.view(1, -1).expand(rows, -1),
-        room=room,
-    )
+    return mask, Clamp(v=mask, h1=held, edges=edges, r=r, observed=seen, room=room)
 
 
 CONDITIONS = {

@@ -52,23 +52,18 @@ def test_same_seed_gives_the_same_bits_and_another_seed_does_not(data):
     assert not same(first, weights(Trainer(small_config(seed=1), data).run().machine))
 
 
-class Interrupt:
-    """Raises KeyboardInterrupt in the middle of the second epoch, as ctrl-C does."""
-
-    def __call__(self, epoch, done, loss):
-        if epoch == 1 and done > 0.4:
-            raise KeyboardInterrupt
+def interrupt(epoch, done, loss):
+    """As ctrl-C in the middle of the second epoch."""
+    if epoch == 1 and done > 0.4:
+        raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("objective", ["composite", "persistent_cd"])
 def test_an_interrupted_run_resumes_to_the_same_bits(data, tmp_path, objective):
-    config = small_config()
-    config = config.model_copy(
-        update={"objective": config.objective.model_copy(update={"name": objective, "chains": 16})}
-    )
+    config = with_settings(small_config(), {"objective.name": objective, "objective.chains": 16})
     whole = Trainer(config, data).run()
     with pytest.raises(KeyboardInterrupt):
-        Trainer(config, data, tmp_path).run(Interrupt())
+        Trainer(config, data, tmp_path).run(interrupt)
     again = Trainer(config, data, tmp_path)
     assert again.resume()
     assert len(again.epochs) == 1
@@ -111,7 +106,7 @@ def test_phases_resume_to_the_same_bits_wherever_they_were_interrupted(worded, t
     again = Trainer(config, worded, tmp_path)
     assert not again.resume()
     with pytest.raises(KeyboardInterrupt):
-        again.run(Interrupt())
+        again.run(interrupt)
     last = Trainer(config, worded, tmp_path)
     assert last.resume()
     assert last.objects_trained
