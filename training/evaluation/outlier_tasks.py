@@ -256,7 +256,8 @@ def judge_intruders(
     """
     index = np.flatnonzero((intruders >= 0).numpy())
     cases = [
-        with_intruder(artifact, labels_alone(scenes.scenes[k]), int(intruders[k])) for k in index
+        with_intruder(artifact, labels_alone(scenes.scenes[k]), int(intruders[k]))
+        for k in index.tolist()
     ]
     answers = {
         name: ask_every(partial(judge, artifact, sensitivity=name), cases) for name in SENSITIVITIES
@@ -270,12 +271,14 @@ def judge_intruders(
         ]
         return Ratio.of_items(index, np.array(first), len(scenes))
 
-    return {f"hit@1{law}": hits(0, 1), f"hit@1{law}, log-odds alone": hits(1, -1)} | {
-        f"caught{law}, {name}": Ratio.of_items(
-            index, np.array([judged[-1, 2] for judged in each]), len(scenes)
-        )
-        for name, each in answers.items()
+    metrics: dict[str, Metric] = {
+        f"hit@1{law}": hits(0, 1),
+        f"hit@1{law}, log-odds alone": hits(1, -1),
     }
+    for name, each in answers.items():
+        caught = np.array([judged[-1, 2] for judged in each])
+        metrics[f"caught{law}, {name}"] = Ratio.of_items(index, caught, len(scenes))
+    return metrics
 
 
 def share_of_first(values: Floats, target: int) -> float:

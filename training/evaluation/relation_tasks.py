@@ -77,8 +77,9 @@ class Candidates:
 
     def where(self, mask: Flags) -> Candidates:
         """Select the triples with a True value in `mask` (k,)."""
-        columns = (self.relation, self.key, self.score, self.truth)
-        return Candidates(self.scene, *(column[mask] for column in columns))
+        return Candidates(
+            self.scene, self.relation[mask], self.key[mask], self.score[mask], self.truth[mask]
+        )
 
 
 def scorable(batch: Batch, structure: Tensor) -> Tensor:

@@ -18,8 +18,13 @@ from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, first_error
 from training.research.entries import Entry, machine_entry
 from training.research.measure import Plan, Reports, measure_entries, resumable, shown
-from training.research.shipped_files import own_or_shipped
-from training.runs.config_files import data_folder, load_config, read_toml, with_settings
+from training.runs.config_files import (
+    data_folder,
+    load_config,
+    own_or_shipped,
+    read_toml,
+    with_settings,
+)
 from training.runs.folder import load_run
 from training.runs.pipeline import prepare
 

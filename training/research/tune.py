@@ -42,11 +42,11 @@ from training.fit.configuration import Config, ConfigError, first_error
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.measure import resumable
-from training.research.shipped_files import own_or_shipped
 from training.runs.config_files import (
     config_toml,
     data_folder,
     load_config,
+    own_or_shipped,
     read_toml,
     with_settings,
 )
