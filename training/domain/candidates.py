@@ -157,8 +157,7 @@ def _baselines(data: TrainingData, say: Say) -> Model:
 
 # --------------------------------------------------------------------------------- held-out scenes
 
-# Function that takes a scene. It returns False if a model is known to have learnt from the scene.
-Kept = Callable[[AnnotatedScene], bool]
+Sources = Mapping[str, Sequence[AnnotatedScene]]
 
 
 @dataclass(frozen=True)
@@ -178,9 +177,7 @@ class HeldOut:
     certain: bool
 
 
-def held_out(
-    a: Candidate, b: Candidate, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
-) -> HeldOut:
+def held_out(a: Candidate, b: Candidate, sources: Sources, root: Path) -> HeldOut:
     """Return the first model's test scenes without scenes that the second model learnt from.
 
     Args:
@@ -208,11 +205,9 @@ def held_out(
     certain = True
     kept = candidates
     for candidate in (a, b):
-        judge, note, sure = _kept(candidate, sources, root)
-        if note:
-            notes.append(note)
+        kept, note, sure = _not_learnt(candidate, kept, sources, root)
+        notes += [note] if note else []
         certain &= sure
-        kept = [scene for scene in kept if judge(scene)]
     dropped = len(candidates) - len(kept)
     if not kept:
         raise ConfigError(
@@ -227,12 +222,16 @@ def held_out(
     return HeldOut(kept, dropped, tuple(notes), certain)
 
 
-def _kept(
-    candidate: Candidate, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
-) -> tuple[Kept, str, bool]:
-    """Return a filter of the held-out scenes, a note or "", and whether the filter is certain."""
+def _not_learnt(
+    candidate: Candidate, scenes: list[AnnotatedScene], sources: Sources, root: Path
+) -> tuple[list[AnnotatedScene], str, bool]:
+    """Leave out the scenes that a candidate learnt from.
+
+    Returns:
+        The other scenes, a note or "", and True if the candidate learnt from none of these scenes.
+    """
     if candidate.artifact is None:
-        return _all, "", True  # the baselines are fitted on the training scenes of the first model
+        return scenes, "", True  # baselines are fitted on the training scenes of the first model
     digests = {name: digest_of(some) for name, some in sources.items()}
     shared = {
         name
@@ -241,48 +240,41 @@ def _kept(
     }
     if not shared:
         names = ", ".join(candidate.learnt) or "unknown"
-        return _all, f"{candidate.title} learnt from other data sources ({names})", True
+        return scenes, f"{candidate.title} learnt from other data sources ({names})", True
     if candidate.config is None:
         note = f"{candidate.title} does not record its split and may have learnt from these scenes"
-        return _all, note, False
+        return scenes, note, False
     data = candidate.config.data
     if data.split == "stable":
         seed = data.split_seed
-        return (
-            lambda scene: scene.source not in shared or stable_part(scene.group, seed) == "test",
-            "",
-            True,
-        )
+        held = [s for s in scenes if s.source not in shared or stable_part(s.group, seed) == "test"]
+        return held, "", True
     if (own := _scenes_of(data, candidate.learnt, sources, digests, root)) is None:
         note = (
             f"{candidate.title} may have learnt from these scenes: it learnt from other versions "
             f"of {', '.join(sorted(shared))}, so its split cannot be reproduced. Use the "
             "stable split to avoid this"
         )
-        return _all, note, False
+        return scenes, note, False
     parts = split(own, seed=data.split_seed, protocol=data.split)
     # Filter by group for all protocols: scenes of one group are near-duplicates.
     learnt = {scene.group for part in ("train", "validation") for scene in parts[part]}
-    return lambda scene: scene.group not in learnt, "", True
-
-
-def _all(_: AnnotatedScene) -> bool:
-    return True
+    return [scene for scene in scenes if scene.group not in learnt], "", True
 
 
 def _scenes_of(
     data: DataConfig,
     learnt: Mapping[str, str],
-    sources: Mapping[str, Sequence[AnnotatedScene]],
+    sources: Sources,
     digests: Mapping[str, str],
     root: Path,
 ) -> list[AnnotatedScene] | None:
     """Return all scenes of a candidate before its split, or None if a data source has changed."""
-    found: list[AnnotatedScene] = []
+    scenes: list[AnnotatedScene] = []
     for source in data.sources:
         name = source_name(source)
         if name in digests and digests[name] == learnt.get(name):
-            found += sources[name]
+            scenes += sources[name]
             continue
         try:
             one = data.model_copy(update={"sources": (source,), "words": ""})
@@ -291,5 +283,5 @@ def _scenes_of(
             return None
         if digest_of(read) != learnt.get(name):
             return None
-        found += read
-    return found
+        scenes += read
+    return scenes

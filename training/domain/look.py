@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -35,7 +35,7 @@ class Finding:
     what: str
     advice: str
     count: int
-    examples: tuple[str, ...] = ()
+    examples: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _findings(
 ) -> Iterator[Finding]:
     def finding(what: str, advice: str, cases: Iterable[str]) -> Finding:
         every = list(cases)
-        return Finding(what, advice, len(every), tuple(every[:SHOWN]))
+        return Finding(what, advice, len(every), every[:SHOWN])
 
     held = [{canonicalise(*triple) for triple in scene.relations or ()} for scene in scenes]
     yield finding(

@@ -165,15 +165,13 @@ def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
 def missing_evidence_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T2 (missing objects) with labels only and with additional evidence."""
 
-    def value(artifact: Artifact, scene: Scene, case: Case) -> float:
-        return reciprocal_rank(artifact, scene, case.target)
-
+    structure = setting.structure.numpy()
     return _changes(
         "MRR",
         model,
         setting,
-        lambda _, scenes, kind: removals(scenes, setting.structure.numpy(), kind, setting.seed),
-        value,
+        lambda _, scenes, kind: removals(scenes, structure, kind, setting.seed),
+        lambda artifact, scene, case: reciprocal_rank(artifact, scene, case.target),
     )
 
 

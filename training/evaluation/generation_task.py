@@ -32,7 +32,7 @@ from app.questions.generate import STEPS
 from training.datasets.array_types import Floats
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
-from training.evaluation.contradictions import Contradictions
+from training.evaluation.contradictions import contradiction_metrics, count_contradictions
 from training.evaluation.metrics import Metric, Ratio, Resampled
 from training.evaluation.model import Drawn, Model, Sampler
 from training.evaluation.setting import Outcome, Setting
@@ -51,11 +51,9 @@ _CHAINS = 256
 
 def drawn_of(scenes: SceneTensors) -> Drawn:
     """Return held-out scenes in the format of generated scenes."""
-    parts = [
-        Contradictions.of(scenes.batch(index).holds)
-        for index in torch.arange(len(scenes)).split(64)
-    ]
-    return Drawn(scenes.v, Contradictions.joined(parts))
+    blocks = torch.arange(len(scenes)).split(64)
+    counts = [count_contradictions(scenes.batch(index).holds) for index in blocks]
+    return Drawn(scenes.v, torch.cat(counts))
 
 
 def independent_sampler(train: SceneTensors) -> Sampler:
@@ -79,7 +77,7 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
     Raises:
         ValueError: no scene has the given classes and room type (raised by the sampler).
     """
-    real = drawn_of(scenes)
+    counts = drawn_of(scenes).contradictions
 
     def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
         rng = np.random.default_rng(seed)
@@ -97,8 +95,7 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
             own = free and row in places
             chosen.append(row if own else int(rng.choice(places)))
         index = torch.tensor(chosen)
-        found = real.contradictions
-        return Drawn(real.v[index], None if found is None else found.at(index))
+        return Drawn(scenes.v[index], None if counts is None else counts[index])
 
     return sample
 
@@ -121,9 +118,9 @@ def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler
             clamp = Clamp(v=given[index], room=room[index] if machine.spec.C else None)
             state = samples.start(given[index].to(machine.b.dtype), generator, clamp)
             state = _sweep(machine, state, generator, clamp, steps)
-            parts.append((state.v, Contradictions.of(_grid(machine, state))))
-        objects, found = zip(*parts, strict=True)
-        return Drawn(torch.cat(objects), Contradictions.joined(found))
+            parts.append((state.v, count_contradictions(_grid(machine, state))))
+        objects, counts = zip(*parts, strict=True)
+        return Drawn(torch.cat(objects), torch.cat(counts))
 
     return sample
 
@@ -280,7 +277,7 @@ def generation_metrics(
     if np.isfinite(pairs.value):
         metrics["pair correlation"] = pairs
     if drawn.contradictions is not None:
-        metrics |= drawn.contradictions.metrics()
+        metrics |= contradiction_metrics(drawn.contradictions)
     return metrics
 
 

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -84,21 +83,13 @@ def draw_intruders(
     return intruders
 
 
-@dataclass(frozen=True, eq=False)
-class Signatures:
-    """Signatures of the room types, from training scenes.
+def signatures(train: SceneTensors) -> tuple[Flags, Floats]:
+    """Return the signature classes and the class frequencies of every room type.
 
-    Attributes:
+    Returns:
         typical: (room types, classes) bool, True for the signature classes of each room type.
         share: (room types, classes) p(class | room type). NaN for a room type with too few scenes.
     """
-
-    typical: Flags
-    share: Floats
-
-
-def signatures(train: SceneTensors) -> Signatures:
-    """Compute the signature of every room type."""
     known = (train.room >= 0).numpy()
     v, room = train.v.numpy()[known] > 0, train.room.numpy()[known]
     rooms = int(room.max(initial=-1)) + 1
@@ -114,18 +105,18 @@ def signatures(train: SceneTensors) -> Signatures:
         lift = np.divide(share[r], popularity, where=often, out=np.zeros(v.shape[1]))
         best = np.argsort(-lift, kind="stable")[:SIGNATURE]
         typical[r, best[lift[best] >= _LIFT]] = True
-    return Signatures(typical, share)
+    return typical, share
 
 
 def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
     """Return the sampling probability of each signature intruder, (scenes, classes), or 0."""
-    found = signatures(train)
+    typical, share = signatures(train)
     weights = np.zeros(scenes.v.shape)
     absent = scenes.v.numpy() == 0
     for k, room in enumerate(scenes.room.tolist()):
-        if not 0 <= room < len(found.typical) or np.isnan(found.share[room]).any():
+        if not 0 <= room < len(typical) or np.isnan(share[room]).any():
             continue
-        suitable = found.typical & absent[k] & (found.share[room] < _FOREIGN)
+        suitable = typical & absent[k] & (share[room] < _FOREIGN)
         suitable[room] = False
         sizes = suitable.sum(1)
         some = sizes > 0
@@ -210,11 +201,14 @@ class IntruderScores:
         return Ratio.of_scenes(alarm, there)
 
 
+Score = Callable[[Tensor], Tensor]
+
+
 @torch.no_grad()
 def intruder_scores(
     scenes: SceneTensors,
     structure: Tensor,
-    score: Callable[[Tensor], Tensor],
+    score: Score,
     *,
     weights: Tensor | None = None,
     seed: int = 0,
@@ -227,45 +221,39 @@ def intruder_scores(
         score: function that takes presence (rows, classes) and returns log-odds (rows, classes).
     """
     added = draw_intruders(scenes, structure, weights, seed)
-    kept = (added >= 0).nonzero().squeeze(1)
-    parts = []
-    for index in kept.split(32):
+    blocks = []
+    for index in (added >= 0).nonzero().squeeze(1).split(32):
         clean, intruder = scenes.v[index], added[index]
-        dirty = clean.scatter(1, intruder.unsqueeze(1), 1.0)
-        parts.append(_scored(clean, index, torch.full_like(intruder, -1), structure, score))
-        parts.append(_scored(dirty, index, intruder, structure, score))
-    return _joined(parts, len(scenes), len(kept))
+        blocks.append((clean, index, torch.full_like(intruder, -1)))
+        blocks.append((clean.scatter(1, intruder.unsqueeze(1), 1.0), index, intruder))
+    return _scores(blocks, structure, score, len(scenes), int((added < 0).sum()))
 
 
 @torch.no_grad()
-def clean_scores(v: Tensor, structure: Tensor, score: Callable[[Tensor], Tensor]) -> IntruderScores:
+def clean_scores(v: Tensor, structure: Tensor, score: Score) -> IntruderScores:
     """Score every object of the scenes `v` (scenes, classes), without intruders."""
-    parts = [
-        _scored(v[index], index, torch.full_like(index, -1), structure, score)
-        for index in torch.arange(len(v)).split(64)
+    blocks = [
+        (v[index], index, torch.full_like(index, -1)) for index in torch.arange(len(v)).split(64)
     ]
-    return _joined(parts, len(v), len(v))
+    return _scores(blocks, structure, score, len(v), 0)
 
 
-def _scored(
-    v: Tensor,
-    index: Tensor,
-    added: Tensor,
+def _scores(
+    blocks: list[tuple[Tensor, Tensor, Tensor]],
     structure: Tensor,
-    score: Callable[[Tensor], Tensor],
-) -> tuple[Tensor, ...]:
-    """Return the arrays of `IntruderScores` for a block of scenes."""
-    row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
-    odds = torch.zeros(0)
-    if len(row):
-        rest = v[row].scatter(1, thing.unsqueeze(1), 0.0)
-        odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
-    size, clean = (v > 0).sum(1)[row], added[row] < 0
-    return index[row], thing, odds.double(), thing == added[row], size, clean
-
-
-def _joined(parts: list[tuple[Tensor, ...]], scenes: int, kept: int) -> IntruderScores:
-    names = ("scene", "thing", "log_odds", "intruder", "size", "clean")
+    score: Score,
+    scenes: int,
+    skipped: int,
+) -> IntruderScores:
+    """Score the objects of blocks of (presence, scene indices, intruders or -1)."""
+    parts = []
+    for v, index, added in blocks:
+        row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
+        odds = torch.zeros(0)
+        if len(row):
+            rest = v[row].scatter(1, thing.unsqueeze(1), 0.0)
+            odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
+        size, clean = (v > 0).sum(1)[row], added[row] < 0
+        parts.append((index[row], thing, odds.double(), thing == added[row], size, clean))
     columns = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
-    values: dict[str, Any] = dict(zip(names, columns, strict=True))
-    return IntruderScores(**values, scenes=scenes, skipped=scenes - kept)
+    return IntruderScores(*columns, scenes=scenes, skipped=skipped)  # type: ignore[arg-type]

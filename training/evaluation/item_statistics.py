@@ -9,11 +9,10 @@ equal score, the statistic is the expectation under random order. An undefined s
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.array_types import Flags, Floats
 
 Prepared = Callable[[Floats], float]
 
@@ -21,38 +20,30 @@ BINS = 10
 _EDGES = np.linspace(0.0, 1.0, BINS + 1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Levels:
-    """Items grouped by score. A level is the set of items with the same score.
+def _by_score(
+    score: Floats, truth: Flags
+) -> tuple[Floats, Callable[[Floats], tuple[Floats, Floats]]]:
+    """Return the distinct scores, lowest first, and a function that counts the items of each.
 
-    Attributes:
-        level: (items,) index of the level of each item. Levels are sorted by score, lowest first.
-        scores: (levels,) score of each level.
+    The function takes item weights (items,). It returns the total weight of all items and of the
+    true items of each score, both (scores,).
     """
+    scores, level = np.unique(score, return_inverse=True)
 
-    level: Ints
-    scores: Floats
-    truth: Flags
-
-    def count(self, weight: Floats) -> tuple[Floats, Floats]:
-        """Return the total weight of all items and of the true items, each (levels,)."""
-        size = len(self.scores)
-        every = np.bincount(self.level, weights=weight, minlength=size).astype(np.float64)
-        true = np.bincount(self.level, weights=weight * self.truth, minlength=size)
+    def count(weight: Floats) -> tuple[Floats, Floats]:
+        every = np.bincount(level, weights=weight, minlength=len(scores)).astype(np.float64)
+        true = np.bincount(level, weights=weight * truth, minlength=len(scores))
         return every, true.astype(np.float64)
 
-
-def _levels(score: Floats, truth: Flags) -> _Levels:
-    scores, level = np.unique(score, return_inverse=True)
-    return _Levels(level.astype(np.int64), scores, truth)
+    return scores, count
 
 
 def auroc(score: Floats, truth: Flags) -> Prepared:
     """Return the probability that a true item scores above a false item; ties count half."""
-    levels = _levels(score, truth)
+    _, count = _by_score(score, truth)
 
     def at(weight: Floats) -> float:
-        every, true = levels.count(weight)
+        every, true = count(weight)
         false = every - true
         below = np.cumsum(false) - false
         pairs = true.sum() * false.sum()
@@ -68,10 +59,10 @@ def average_precision(score: Floats, truth: Flags) -> Prepared:
     have a higher score and that P of them are true. If a true item has rank N + k, the expected
     number of true items among the first N + k items is P + 1 + (k - 1)(p - 1)/(n - 1).
     """
-    levels = _levels(score, truth)
+    _, count = _by_score(score, truth)
 
     def at(weight: Floats) -> float:
-        every, true = (part[::-1] for part in levels.count(weight))
+        every, true = (part[::-1] for part in count(weight))
         some = every > 0
         n, p = every[some], true[some]
         if not p.sum():
@@ -91,14 +82,14 @@ def calibration_error(score: Floats, truth: Flags) -> Prepared:
     The items are sorted by probability and divided into `BINS` bins of equal weight. The ECE is the
     mean over bins of |mean probability - share of true items|.
     """
-    levels = _levels(score, truth)
+    scores, count = _by_score(score, truth)
 
     def at(weight: Floats) -> float:
-        every, true = levels.count(weight)
+        every, true = count(weight)
         if not every.sum():
             return float("nan")
-        mass, p, y = _bins(levels.scores, every, true)
-        return float(np.abs(p - y) @ mass)
+        p, y = _bins(scores, every, true)
+        return float(np.abs(p - y) @ np.full(BINS, 1 / BINS))
 
     return at
 
@@ -108,44 +99,27 @@ def brier_skill(score: Floats, truth: Flags) -> Prepared:
 
     The base rate is the share of true items. The skill is 0 if all probabilities are the base rate.
     """
-    levels = _levels(score, truth)
+    scores, count = _by_score(score, truth)
 
     def at(weight: Floats) -> float:
-        every, true = levels.count(weight)
+        every, true = count(weight)
         total = every.sum()
         rate = true.sum() / total if total else 0.0
         base = rate * (1 - rate)
-        p = levels.scores
-        brier = (true * (1 - p) ** 2 + (every - true) * p**2).sum()
+        brier = (true * (1 - scores) ** 2 + (every - true) * scores**2).sum()
         return float(1 - brier / total / base) if base > 0 else float("nan")
 
     return at
 
 
-@dataclass(frozen=True, eq=False)
-class Reliability:
-    """Bins of a reliability plot. All bins have the same weight of items.
-
-    Attributes:
-        probability: (bins,) mean probability of the items in each bin.
-        frequency: (bins,) share of true items in each bin.
-        mass: (bins,) share of all items in each bin.
-    """
-
-    probability: Floats
-    frequency: Floats
-    mass: Floats
+def reliability(score: Floats, truth: Flags) -> tuple[Floats, Floats]:
+    """Return the mean probability and the share of true items of each bin, both (bins,)."""
+    scores, count = _by_score(score, truth)
+    return _bins(scores, *count(np.ones(len(score))))
 
 
-def reliability(score: Floats, truth: Flags) -> Reliability:
-    """Return the bins that `calibration_error` uses."""
-    levels = _levels(score, truth)
-    mass, p, y = _bins(levels.scores, *levels.count(np.ones(len(score))))
-    return Reliability(p, y, mass)
-
-
-def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the share of items, the mean score and the share of true items of each bin.
+def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats]:
+    """Return the mean score and the share of true items of each bin of `calibration_error`.
 
     If a bin border divides items of equal score, each bin gets a proportional part of the true
     items among them.
@@ -161,7 +135,7 @@ def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats, 
         upto = np.interp(edges, last, sums)
         return (upto[1:] - upto[:-1]) * (BINS / total)
 
-    return np.full(BINS, 1 / BINS), means(every * scores), means(true)
+    return means(every * scores), means(true)
 
 
 STATISTICS: dict[str, Callable[[Floats, Flags], Prepared]] = {

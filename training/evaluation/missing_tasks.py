@@ -24,7 +24,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from app.registry import Artifact
@@ -147,12 +146,7 @@ def leave_one_out(
     *,
     told_room: bool = False,
 ) -> Ranking:
-    """Remove each class of each scene in turn, and rank the removed class.
-
-    Args:
-        score: a higher score of a class means that the class is more likely missing.
-        told_room: True passes the room type of each scene to the score.
-    """
+    """Rank each class of each scene when it is removed; `told_room` passes the room types."""
     removable = (scenes.v > 0) & ~structure
     enough = removable.sum(1) >= 2
     row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
@@ -184,7 +178,7 @@ class Partial:
 def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int = 0) -> Partial:
     """Hide classes of each scene with at least two: all but a share of them, or one (None)."""
     plain = ~structure.numpy()
-    places: list[int] = []
+    rows: list[int] = []
     hidden = torch.zeros_like(scenes.v, dtype=torch.bool)
     for k, scene in enumerate(scenes.scenes):
         classes = scene.evidence.classes[plain[scene.evidence.classes]]
@@ -192,8 +186,8 @@ def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int
             continue
         order = scene_rng(scene, seed).permutation(classes)
         hidden[k, torch.from_numpy(order[shown_classes(len(order), share) :])] = True
-        places.append(k)
-    index = torch.tensor(places, dtype=torch.int64)
+        rows.append(k)
+    index = torch.tensor(rows, dtype=torch.int64)
     v = scenes.v.masked_fill(hidden, 0.0)
     return Partial(index, v[index], hidden[index], len(scenes))
 
@@ -222,11 +216,10 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
     others = partial.hidden[row].scatter(1, target.unsqueeze(1), False)
     alone = values[row].masked_fill(others, -torch.inf)
     ranking = Ranking.of(partial.scene[row], target, alone, partial.scenes, 0)
-    hits = []
-    for own, right in zip(values, partial.hidden, strict=True):
-        candidate = own > -torch.inf
-        found = own[candidate].double().numpy()
-        hits.append(expected_hits(found, right[candidate].numpy(), _FIRST))
+    hits = [
+        expected_hits(own[own > -np.inf], right[own > -np.inf], _FIRST)
+        for own, right in zip(values.double().numpy(), partial.hidden.numpy(), strict=True)
+    ]
     precision = Ratio.of_items(partial.scene.numpy(), np.array(hits), partial.scenes)
     return ranking.mrr(), Ratio(precision.numerators, _FIRST * precision.denominators)
 
@@ -239,12 +232,12 @@ def partial_score(artifact: Artifact, coverage: float | None = None) -> ObjectSc
             With 1, unlisted objects are absent.
     """
 
-    def log_p(row: NDArray[np.float32]) -> Floats:
-        p = missing_probabilities(artifact, of_classes(np.flatnonzero(row).tolist()), coverage)
-        found: Floats = np.log(np.maximum(p, np.finfo(np.float64).tiny))
-        return found
+    def score(v: Tensor) -> Tensor:
+        scenes = [of_classes(row.nonzero().squeeze(1).tolist()) for row in v]
+        p = np.stack([missing_probabilities(artifact, scene, coverage) for scene in scenes])
+        return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
 
-    return lambda v: torch.from_numpy(np.stack([log_p(row) for row in v.numpy()]))
+    return score
 
 
 # ------------------------------------------------------------------------------------------ T2-at
@@ -254,7 +247,7 @@ def removed_places(
     scenes: SceneTensors, structure: Tensor, seed: int = 0
 ) -> tuple[Tensor, Tensor, Places]:
     """Return the indices of the scenes (N,), the removed classes (N,), and the places."""
-    found: list[tuple[int, int, int, int, bool]] = []
+    removals: list[tuple[int, int, int, int, bool]] = []
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
         evidence = scene.evidence
@@ -269,8 +262,8 @@ def removed_places(
             a, i, j = touching[rng.integers(len(touching))].tolist()
             anchor = j if i == x else i
             target, other = evidence.classes[[x, anchor]].tolist()
-            found.append((k, target, a, other, bool(i == x)))
-    table = torch.tensor(found, dtype=torch.int64).reshape(-1, 5)
+            removals.append((k, target, a, other, bool(i == x)))
+    table = torch.tensor(removals, dtype=torch.int64).reshape(-1, 5)
     row, target, relation, anchor, outgoing = table.unbind(1)
     v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
     counts = torch.zeros_like(v)
@@ -302,12 +295,12 @@ def missing_task(model: Model, setting: Setting) -> Outcome | None:
     if model.missing is None:
         return None
     scenes = setting.scenes
-    found = leave_one_out(scenes, setting.structure, model.missing)
-    if not len(found.target):
+    ranking = leave_one_out(scenes, setting.structure, model.missing)
+    if not len(ranking.target):
         return None
     unknown = np.array([len(scene.unknown) for scene in scenes.scenes], dtype=np.int64)
-    metrics = found.metrics() | {"MRR, unknown labels score 0": found.with_unknown(unknown)}
-    return Outcome(metrics, len(scenes), found.skipped)
+    metrics = ranking.metrics() | {"MRR, unknown labels score 0": ranking.with_unknown(unknown)}
+    return Outcome(metrics, len(scenes), ranking.skipped)
 
 
 def missing_in_room_task(model: Model, setting: Setting) -> Outcome | None:
@@ -316,13 +309,13 @@ def missing_in_room_task(model: Model, setting: Setting) -> Outcome | None:
     scenes, structure, score = setting.scenes, setting.structure, model.missing_in_room
     if score is None or not len(scenes):
         return None
-    found = leave_one_out(scenes, structure, score, told_room=True)
-    if not len(found.target):
+    ranking = leave_one_out(scenes, structure, score, told_room=True)
+    if not len(ranking.target):
         return None
-    metrics = found.metrics()
+    metrics = ranking.metrics()
     if model.missing is not None:
         metrics["MRR, room type withheld"] = leave_one_out(scenes, structure, model.missing).mrr()
-    return Outcome(metrics, len(scenes), found.skipped)
+    return Outcome(metrics, len(scenes), ranking.skipped)
 
 
 def partial_task(model: Model, setting: Setting) -> Outcome | None:
@@ -357,16 +350,16 @@ def placed_task(model: Model, setting: Setting) -> Outcome | None:
     if model.at_place is None:
         return None
     scenes, structure = setting.some(related=True, share=3), setting.structure
-    found, relation = leave_one_out_at(scenes, structure, model.at_place, seed=setting.seed)
+    ranking, relation = leave_one_out_at(scenes, structure, model.at_place, seed=setting.seed)
     if not len(relation):
         return None
-    metrics: dict[str, Metric] = {"MRR": found.mrr()}
+    metrics: dict[str, Metric] = {"MRR": ranking.mrr()}
     for a, name in enumerate(CANONICAL):
         if (relation == a).any():
-            metrics[f"MRR, {name}"] = found.mrr(relation == a)
+            metrics[f"MRR, {name}"] = ranking.mrr(relation == a)
     if (objects := model.missing) is not None:
         blind, _ = leave_one_out_at(
             scenes, structure, lambda places: objects(places.v), seed=setting.seed
         )
         metrics["MRR, place unknown"] = blind.mrr()
-    return Outcome(metrics, len(scenes), found.skipped)
+    return Outcome(metrics, len(scenes), ranking.skipped)

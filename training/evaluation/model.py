@@ -12,7 +12,6 @@ from torch import Tensor
 from app.registry import Artifact
 from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import Batch
-from training.evaluation.contradictions import Contradictions
 from training.evaluation.intruders import IntruderScores
 from training.evaluation.setting import Setting
 from training.machines import BoltzmannMachine
@@ -101,12 +100,12 @@ class Drawn:
     """Generated scenes.
 
     Attributes:
-        contradictions: contradictions of the generated relations. None if the sampler generates no
+        contradictions: (scenes, 4) from `count_contradictions`. None if the sampler generates no
             relations.
     """
 
     v: Tensor
-    contradictions: Contradictions | None = None
+    contradictions: Tensor | None = None
 
 
 class Sampler(Protocol):

@@ -152,12 +152,11 @@ def _bound(worst: Floats, group: NDArray[np.str_], rng: Rng, share: float) -> fl
     is a high quantile of the threshold over resampled groups.
     """
     members = [worst[group == name] for name in np.unique(group)]
-    found = []
+    thresholds = []
     for _ in range(_RESAMPLES):
         drawn = rng.integers(len(members), size=len(members))
-        scenes = np.concatenate([members[k] for k in drawn])
-        found.append(np.quantile(scenes, 1 - share))
-    return float(np.quantile(found, _CONFIDENCE))
+        thresholds.append(np.quantile(np.concatenate([members[k] for k in drawn]), 1 - share))
+    return float(np.quantile(thresholds, _CONFIDENCE))
 
 
 # ------------------------------------------------------------------------------------------ tasks
@@ -232,8 +231,7 @@ def sensitivity_task(model: Model, setting: Setting) -> Outcome | None:
         return None
     cases = [labels_alone(scene) for scene in scenes.scenes]
     for sensitivity in SENSITIVITIES:
-        share = alarms(artifact, cases, structure, sensitivity, judged)
-        metrics[f"alarms, {sensitivity}"] = share
+        metrics[f"alarms, {sensitivity}"] = alarms(artifact, cases, structure, sensitivity, judged)
     plain = ((scenes.v > 0) & ~structure).sum(1).numpy()
     for listed in _SHORT_LISTS:
         large = judged & (plain > listed)
@@ -256,27 +254,31 @@ def judge_intruders(
         intruders: (N,) class of the intruder of each scene, or -1 for a scene without intruder.
         law: suffix of the metric names, for the distribution of the intruders.
     """
-    asked = (intruders >= 0).numpy()
-    places = np.flatnonzero(asked).tolist()
+    index = np.flatnonzero((intruders >= 0).numpy())
     cases = [
-        with_intruder(artifact, labels_alone(scenes.scenes[k]), int(intruders[k])) for k in places
+        with_intruder(artifact, labels_alone(scenes.scenes[k]), int(intruders[k]))
+        for k in index.tolist()
     ]
-    hits, hits_by_odds = np.zeros(len(asked)), np.zeros(len(asked))
-    caught: dict[str, Metric] = {}
-    for name in SENSITIVITIES:
-        flagged = np.zeros(len(asked))
-        found = ask_every(partial(judge, artifact, sensitivity=name), cases)
-        for k, case, columns in zip(places, cases, found, strict=True):
-            flagged[k] = columns[-1, 2]
-            if name == "medium":
-                plain = things(case, structure.numpy())
-                hits[k] = share_of_first(np.where(plain, columns[:, 0], -np.inf), -1)
-                hits_by_odds[k] = share_of_first(np.where(plain, -columns[:, 1], -np.inf), -1)
-        caught[f"caught{law}, {name}"] = Ratio.of_scenes(flagged, asked)
-    return {
-        f"hit@1{law}": Ratio.of_scenes(hits, asked),
-        f"hit@1{law}, log-odds alone": Ratio.of_scenes(hits_by_odds, asked),
-    } | caught
+    answers = {
+        name: ask_every(partial(judge, artifact, sensitivity=name), cases) for name in SENSITIVITIES
+    }
+    plain = [things(case, structure.numpy()) for case in cases]
+
+    def hits(column: int, sign: int) -> Ratio:
+        first = [
+            share_of_first(np.where(own, sign * judged[:, column], -np.inf), -1)
+            for own, judged in zip(plain, answers["medium"], strict=True)
+        ]
+        return Ratio.of_items(index, np.array(first), len(scenes))
+
+    metrics: dict[str, Metric] = {
+        f"hit@1{law}": hits(0, 1),
+        f"hit@1{law}, log-odds alone": hits(1, -1),
+    }
+    for name, each in answers.items():
+        caught = np.array([judged[-1, 2] for judged in each])
+        metrics[f"caught{law}, {name}"] = Ratio.of_items(index, caught, len(scenes))
+    return metrics
 
 
 def share_of_first(values: Floats, target: int) -> float:
@@ -293,10 +295,10 @@ def alarms(
     judged: Flags,
 ) -> Ratio:
     """Return the share of judged clean scenes with an object flagged as an outlier."""
-    found = ask_every(partial(judge, artifact, sensitivity=sensitivity), cases)
+    answers = ask_every(partial(judge, artifact, sensitivity=sensitivity), cases)
     loud = [
         bool(((columns[:, 2] > 0) & things(case, structure.numpy())).any())
-        for case, columns in zip(cases, found, strict=True)
+        for case, columns in zip(cases, answers, strict=True)
     ]
     return Ratio.of_scenes(np.array(loud) & judged, judged)
 

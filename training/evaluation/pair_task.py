@@ -14,7 +14,7 @@ Pairs with structure classes are excluded. Scenes without such a pair are skippe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -112,59 +112,22 @@ def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
     return score
 
 
-@dataclass(frozen=True, eq=False)
-class PairAnswers:
-    """Answers about all N pairs of a set of scenes.
+def accuracy(p: Floats, listed: Flags) -> Floats:
+    """Return 1 for each pair whose most probable relation is listed, else 0; expected over ties.
 
-    Attributes:
-        scene: (N,) index of the scene of each pair.
-        classes: (N, 2) indices of the two classes of each pair.
-        p: (N, 8) probability of each of the eight relations.
-        listed: (N, 8) bool, True for relations that the scene lists.
+    Args:
+        p: (N, k) probabilities of k relations.
+        listed: (N, k) bool, True for relations that the scene lists.
     """
-
-    scene: Ints
-    classes: Ints
-    p: Floats
-    listed: Flags
-    scenes: int
-
-    def where(self, mask: Flags) -> PairAnswers:
-        """Select the pairs with a True value in `mask` (N,)."""
-        return PairAnswers(
-            self.scene[mask], self.classes[mask], self.p[mask], self.listed[mask], self.scenes
-        )
-
-    def accuracy(self) -> Ratio:
-        """Return the share of pairs whose most probable relation is listed in the scene."""
-        best = self.p == self.p.max(1, keepdims=True)
-        right = (best & self.listed).sum(1) / best.sum(1)
-        return Ratio.of_items(self.scene, right, self.scenes)
-
-    def upright(self) -> Ratio:
-        """Return the share of pairs whose most probable vertical relation is listed."""
-        columns = [a + back for back in (0, self.p.shape[1] // 2) for a in VERTICAL]
-        return replace(self, p=self.p[:, columns], listed=self.listed[:, columns]).accuracy()
-
-    def log_loss(self) -> Ratio:
-        """Return the mean -log of the listed relations' share of the probabilities."""
-        total = self.p.sum(1)
-        share = np.divide(
-            (self.p * self.listed).sum(1), total, where=total > 0, out=self.listed.mean(1)
-        )
-        return Ratio.of_items(self.scene, -np.log(np.maximum(share, _LEAST)), self.scenes)
+    best = p == p.max(1, keepdims=True)
+    return np.asarray((best & listed).sum(1) / best.sum(1))
 
 
-def answer_pairs(asked: list[ScenePairs], score: PairScore, scenes: int) -> PairAnswers:
-    """Compute the probabilities of the eight relations for all pairs of all scenes."""
-    found = ask_every(score, asked)
-    return PairAnswers(
-        scene=np.repeat([one.place for one in asked], [len(one.ends) for one in asked]),
-        classes=np.concatenate([one.classes for one in asked]),
-        p=np.concatenate(found),
-        listed=np.concatenate([one.listed for one in asked]),
-        scenes=scenes,
-    )
+def log_loss(p: Floats, listed: Flags) -> Floats:
+    """Return -log of the listed relations' share of the probabilities of each pair, (N,)."""
+    total = p.sum(1)
+    share = np.divide((p * listed).sum(1), total, where=total > 0, out=listed.mean(1))
+    return np.asarray(-np.log(np.maximum(share, _LEAST)))
 
 
 def pairs_task(model: Model, setting: Setting) -> Outcome | None:
@@ -181,17 +144,23 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
         score = baseline_score(scenes, model.relations)
     else:
         return None
-    answers = answer_pairs(asked, score, len(scenes))
+    p = np.concatenate(ask_every(score, asked))
+    listed = np.concatenate([one.listed for one in asked])
+    scene = np.repeat([one.place for one in asked], [len(one.ends) for one in asked])
+    upright = [a + back for back in (0, p.shape[1] // 2) for a in VERTICAL]
+    right, loss = accuracy(p, listed), log_loss(p, listed)
     metrics: dict[str, Metric] = {
-        "accuracy": answers.accuracy(),
-        "accuracy, vertical": answers.upright(),
-        "log-loss": answers.log_loss(),
+        "accuracy": Ratio.of_items(scene, right, len(scenes)),
+        "accuracy, vertical": Ratio.of_items(
+            scene, accuracy(p[:, upright], listed[:, upright]), len(scenes)
+        ),
+        "log-loss": Ratio.of_items(scene, loss, len(scenes)),
     }
-    for name, which in _little_known(answers.classes, setting).items():
-        if which.any():
-            some = answers.where(which)
-            metrics[f"accuracy, {name}"] = some.accuracy()
-            metrics[f"log-loss, {name}"] = some.log_loss()
+    classes = np.concatenate([one.classes for one in asked])
+    for name, some in _little_known(classes, setting).items():
+        if some.any():
+            metrics[f"accuracy, {name}"] = Ratio.of_items(scene[some], right[some], len(scenes))
+            metrics[f"log-loss, {name}"] = Ratio.of_items(scene[some], loss[some], len(scenes))
     return Outcome(metrics, len(scenes), 0)
 
 
@@ -211,12 +180,5 @@ def _little_known(classes: Ints, setting: Setting) -> dict[str, Flags]:
     known = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
     partners = np.bincount(known.ravel(), minlength=V)
     rare: Flags = np.any(partners[classes] <= RARE, axis=1)
-    return {
-        "unseen pairs": ~np.isin(_keys(classes, V), _keys(known, V)),
-        "rare classes": rare,
-    }
-
-
-def _keys(pairs: Ints, classes: int) -> Ints:
-    keys: Ints = pairs[:, 0] * classes + pairs[:, 1]
-    return keys
+    unseen = ~np.isin(classes @ np.array([V, 1]), known @ np.array([V, 1]))
+    return {"unseen pairs": unseen, "rare classes": rare}

@@ -109,7 +109,7 @@ def _batches(
 
 def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candidates]:
     """Return the candidates of every scene, numbered in order."""
-    found: list[Candidates] = []
+    candidates: list[Candidates] = []
     for batch, values, mask in batches:
         for row, own in enumerate(batch.classes):
             relation, x, y = mask[row].nonzero(as_tuple=True)
@@ -118,8 +118,8 @@ def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candida
                 raise FloatingPointError(f"the score of a triple in scene {row} of a batch is NaN")
             key = triple_keys(relation, own[x], own[y], batch.v.shape[1]).numpy()
             truth = (batch.holds[row, relation, x, y] > 0).numpy()
-            found.append(Candidates(len(found), relation.numpy(), key, score, truth))
-    return found
+            candidates.append(Candidates(len(candidates), relation.numpy(), key, score, truth))
+    return candidates
 
 
 @torch.no_grad()
@@ -130,10 +130,10 @@ def score_scenes(
 
     def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
         for _, batch in _batches(scenes, 1, block=32):
-            asked = telling(batch)
+            question = telling(batch)
             if not counts:
-                asked = replace(asked, counts=torch.zeros_like(asked.counts))
-            yield batch, score(asked), scorable(batch, structure)
+                question = replace(question, counts=torch.zeros_like(batch.counts))
+            yield batch, score(question), scorable(batch, structure)
 
     return _candidates(scored())
 
@@ -264,9 +264,7 @@ def placement_scores(
         The triples as items. The score of an item is the suspicion that its triple is false, and
         the truth of an item is True for the false triple.
     """
-    scene = [torch.zeros(0, dtype=torch.int64)]
-    values = [torch.zeros(0, dtype=torch.float64)]
-    false = [torch.zeros(0, dtype=torch.bool)]
+    parts: list[Tensor] = [torch.zeros(0, 3, dtype=torch.float64)]
     for index, batch in _batches(scenes, 2):
         usable = scorable(batch, structure)
         truth = (batch.holds > 0) & usable
@@ -279,13 +277,13 @@ def placement_scores(
                 stated[row] = truth[row]
                 stated[row][before] = False
                 stated[row][after] = wrong[row][after] = True
-        result = score(telling(batch, stated))
-        scene.append(torch.tensor(index)[stated.nonzero()[:, 0]])
-        values.append(result[stated].double())
-        false.append(wrong[stated])
-    place, likely, is_false = (torch.cat(column).numpy() for column in (scene, values, false))
-    skipped = len(scenes) - len(np.unique(place))
-    return Items(place, -likely, is_false, len(scenes), skipped)
+        likely = score(telling(batch, stated))[stated].double()
+        parts.append(
+            torch.stack([torch.tensor(index)[stated.nonzero()[:, 0]], -likely, wrong[stated]], 1)
+        )
+    scene, suspicion, false = torch.cat(parts).numpy().T
+    skipped = len(scenes) - len(np.unique(scene))
+    return Items(scene.astype(np.int64), suspicion, false > 0, len(scenes), skipped)
 
 
 # ------------------------------------------------------------------------------------------ tasks

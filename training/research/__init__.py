@@ -4,11 +4,10 @@ An entry of a result table is a model and its training seed. `benchmark` and `ab
 entries on the same scenes. They report bootstrap intervals, and the paired difference between each
 model and one reference model (`evaluation.results`).
 
-entries.py        the entries of a result table, and the training of their models
-measure.py        evaluation of entries in several processes, with reports on disk
-plots.py          plots of the results
-benchmark.py      comparison of machines and baselines, and two further experiments with them
-ablate.py         comparison of a configuration with variants of it
-tune.py           search for better settings on validation scenes
-shipped_files.py  the shipped rows of `ablate` and search spaces of `tune`
+entries.py    the entries of a result table, and the training of their models
+measure.py    evaluation of entries in several processes, with reports on disk
+plots.py      plots of the results
+benchmark.py  comparison of machines and baselines, and two further experiments with them
+ablate.py     comparison of a configuration with variants of it
+tune.py       search for better settings on validation scenes
 """

@@ -16,10 +16,15 @@ from training.evaluation.results import grid, only, summarise, write
 from training.evaluation.setting import Setting
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, first_error
-from training.research.entries import machine_entry
-from training.research.measure import Plan, Reports, measure_entries, place_of, resumable, shown
-from training.research.shipped_files import own_or_shipped
-from training.runs.config_files import data_folder, load_config, read_toml, with_settings
+from training.research.entries import Entry, machine_entry
+from training.research.measure import Plan, Reports, measure_entries, resumable, shown
+from training.runs.config_files import (
+    data_folder,
+    load_config,
+    own_or_shipped,
+    read_toml,
+    with_settings,
+)
 from training.runs.folder import load_run
 from training.runs.pipeline import prepare
 
@@ -87,7 +92,7 @@ def ablate(
         raise typer.Exit(1)
     with console.status("resampling scenes"):
         reports: Reports = {row: _with_pools(found) for row, found in measured.items()}
-        weights, seconds = _costs(place, configs, seeds)
+        weights, seconds = _costs(plan, entries)
         results = summarise(reports, configs[0].name, weights)
     parts = [
         grid(
@@ -152,25 +157,19 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
     return {name: only(report, PRIMARY) for name, report in (pools | reports).items()}
 
 
-def _costs(
-    folder: Path, configs: Sequence[Config], seeds: int
-) -> tuple[dict[str, int], dict[str, float]]:
+def _costs(plan: Plan, entries: Sequence[Entry]) -> tuple[dict[str, int], dict[str, float]]:
     """Return the number of weights not held at zero, and the mean seconds, by model name."""
     weights, seconds = {}, {}
-    for config in configs:
-        places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]
+    for name in dict.fromkeys(entry.name for entry in entries):
         try:
-            runs = [load_run(place) for place in places]
+            runs = [load_run(plan.place(one) / "run") for one in entries if one.name == name]
         except RunError:
             continue
-        held = {"kappa", *config.machine.without}
+        held = {"kappa", *runs[0].config.machine.without}
         parameters = runs[0].machine.named_parameters()
-        weights[config.name] = sum(p.numel() for name, p in parameters if name not in held)
-        seconds[config.name] = sum(run.seconds for run in runs) / seeds
+        weights[name] = sum(p.numel() for key, p in parameters if key not in held)
+        seconds[name] = sum(run.seconds for run in runs) / len(runs)
     return weights, seconds
-
-
-# ------------------------------------------------------------------------------- rows from a file
 
 
 class _Change(BaseModel):
@@ -218,7 +217,6 @@ def _config(row: _Change, full: Config, file: str) -> Config:
             raise ConfigError(f"the row has the same settings as {full.name}: change a setting")
         values = changed.model_dump() | {"name": row.name, "description": row.what}
         return Config.model_validate(values)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {row.name}: {error}") from error
-    except ValidationError as error:
-        raise ConfigError(f"{file}: {row.name}: {error.errors()[0]['msg']}") from error
+    except (ConfigError, ValidationError) as error:
+        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise ConfigError(f"{file}: {row.name}: {reason}") from error

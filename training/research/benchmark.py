@@ -33,7 +33,6 @@ from training.research.measure import (
     Plan,
     Reports,
     measure_entries,
-    parameters,
     resumable,
     shown,
     slug,
@@ -297,7 +296,7 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
         entries += baseline_entries(seed, options.baselines, related=plan.data.related)
     entries += reference_entries()
     reports = _measured(plan, entries, options, domain.name)
-    results = summarise(reports, domain.configs[0].name, parameters(folder, entries))
+    results = summarise(reports, domain.configs[0].name, plan.parameters(entries))
     _write(folder, scenes, results.to_dict(), f"# {domain.name}\n\n{results.markdown()}")
     console.print(*results.tables())
     names = {config.name for config in domain.configs}
@@ -314,7 +313,7 @@ def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> 
         for config in options.configs(domain, 0)
     ]
     reports = _measured(plan, entries, options, f"{domain.name}, seed protocol")
-    found = summarise(reports, domain.configs[0].name, parameters(folder, entries))
+    found = summarise(reports, domain.configs[0].name, plan.parameters(entries))
     # The seed protocol does not rank the machines, so the results contain no paired differences.
     results = replace(found, differences=())
     _write(folder, scenes, results.to_dict() | {"paper": PAPER}, _protocol_text(results))
@@ -354,7 +353,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
         names = [name for name in names if name in yardsticks | set(options.baselines)]
     entries += baseline_entries(0, names, related=plan.data.related, whole=False)
     reports = _measured(plan, entries, options, f"{domain.name}, shuffled")
-    weights = parameters(folder, entries)
+    weights = plan.parameters(entries)
     results = {}
     for task in asked:
         yardstick, metric = YARDSTICKS[task]

@@ -97,7 +97,7 @@ def machine_entry(config: Config, *, calibrated: bool = True) -> Entry:
         calibrated: True calibrates the machine as for publication.
     """
     identity = f"{config.digest}, calibrated" if calibrated else config.digest
-    make = partial(_calibrated if calibrated else _bare, config)
+    make = partial(_machine, config, calibrated)
     return Entry(config.name, config.training.seed, identity, make)
 
 
@@ -131,9 +131,14 @@ def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: S
     return model
 
 
-def _calibrated(config: Config, data: TrainingData, folder: Path, say: Say) -> Model:
-    machine = as_stored(_trained(config, data, folder / "run", say))
-    path, seed = folder / "run" / CALIBRATION, config.training.seed
+def _machine(config: Config, calibrated: bool, data: TrainingData, folder: Path, say: Say) -> Model:
+    run, seed = folder / "run", config.training.seed
+    machine = _trained(config, data, run, say)
+    if not calibrated:
+        draft = draft_artifact(machine.requires_grad_(False), data.classes)
+        return artifact_model(draft, data.train, seed=seed, calibrated=False)
+    machine = as_stored(machine)
+    path = run / CALIBRATION
     if path.exists():
         calibration = Calibration.model_validate_json(path.read_text(encoding="utf-8"))
     else:
@@ -143,12 +148,6 @@ def _calibrated(config: Config, data: TrainingData, folder: Path, say: Say) -> M
         write_whole(path, calibration.model_dump_json(indent=1))
     artifact = draft_artifact(machine, data.classes, calibration)
     return artifact_model(artifact, data.train, seed=seed)
-
-
-def _bare(config: Config, data: TrainingData, folder: Path, say: Say) -> Model:
-    machine = _trained(config, data, folder / "run", say).requires_grad_(False)
-    draft = draft_artifact(machine, data.classes)
-    return artifact_model(draft, data.train, seed=config.training.seed, calibrated=False)
 
 
 def _trained(config: Config, data: TrainingData, run: Path, say: Say) -> BoltzmannMachine:

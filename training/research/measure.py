@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 import typer
@@ -108,13 +108,42 @@ class Plan:
 
     def place(self, entry: Entry) -> Path:
         """Return the folder of an entry and its training seed."""
-        return place_of(self.folder, entry.name, entry.seed)
+        return self.folder / slug(entry.name) / f"seed-{entry.seed}"
 
     def asked(self, source: str) -> list[str]:
         """Return the names of the tasks to measure on a data source, or on `POOLED`."""
         if source == POOLED:
             return [task for task in self.tasks if task in WHOLE_SET]
         return [task for task in self.tasks if task not in ONCE]
+
+    def claim(self, entry: Entry) -> None:
+        """Reserve the folder of an entry, or check that it belongs to this entry and these scenes.
+
+        Raises:
+            BenchmarkError: the folder belongs to an entry with other settings or other scenes.
+        """
+        path = self.place(entry) / "row.json"
+        values = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
+        if not path.exists():
+            write_whole(path, json.dumps(values | {"material": self.data.digest}))
+            return
+        row = _read_row(path)
+        if row["identity"] != entry.identity:
+            raise BenchmarkError(
+                f"{path.parent} holds reports of another configuration of {entry.name}: use "
+                "--fresh or another folder"
+            )
+        if row.get("material") != self.data.digest:
+            raise BenchmarkError(
+                f"the reports in {path.parent} belong to other training scenes, or do not record "
+                "their scenes (files, sources, limit, split and vocabulary must be equal): use "
+                "--fresh or another folder"
+            )
+
+    def parameters(self, entries: Sequence[Entry]) -> dict[str, int]:
+        """Return the number of trained weights by name, for entries that record this number."""
+        rows = [_read_row(self.place(entry) / "row.json") for entry in entries]
+        return {row["name"]: row["parameters"] for row in rows if row.get("parameters") is not None}
 
     def known(self, entry: Entry) -> dict[str, SourceReport]:
         """Return the finished reports of an entry, by data source.
@@ -123,20 +152,20 @@ class Plan:
             BenchmarkError: the folder holds reports of other test scenes, other training scenes, or
                 another configuration of the entry.
         """
-        claim(self.place(entry), entry, self.data.digest)
-        found = {}
+        self.claim(entry)
+        reports = {}
         for source, setting in self.settings.items():
             path = self.place(entry) / f"{source}.json"
             if not self.asked(source):
-                found[source] = SourceReport(source, digest(setting))
+                reports[source] = SourceReport(source, digest(setting))
             elif path.exists():
                 try:
                     report = SourceReport.read(path, setting)
                 except ValueError as error:
                     raise BenchmarkError(str(error)) from error
                 if set(self.asked(source)) <= set(report.outcomes):
-                    found[source] = report
-        return found
+                    reports[source] = report
+        return reports
 
     def measure(self, entry: Entry, progress: Progress) -> None:
         """Measure an entry on every data source that lacks a finished report.
@@ -154,7 +183,8 @@ class Plan:
             if model is None:
                 say("training")
                 model = entry.make(self.data, folder, say)
-                _note_parameters(folder, model.parameters)
+                row = _read_row(folder / "row.json") | {"parameters": model.parameters}
+                write_whole(folder / "row.json", json.dumps(row))
             measure(
                 *(model, setting, source),
                 tasks=self.asked(source),
@@ -166,14 +196,12 @@ class Plan:
 
     def report(self, entry: Entry) -> dict[str, SourceReport]:
         """Return the reports of an entry, by data source. The pooled report has all tasks."""
-        found = self.known(entry)
-        sources = [found[source] for source in self.settings if source != POOLED]
+        reports = self.known(entry)
         if POOLED in self.settings:
-            whole = found[POOLED]
-            every = pooled(sources, POOLED)
-            every.outcomes |= whole.outcomes
-            found[POOLED] = every
-        return {source: found[source] for source in self.settings}
+            every = pooled([reports[name] for name in self.settings if name != POOLED], POOLED)
+            every.outcomes |= reports[POOLED].outcomes
+            reports[POOLED] = every
+        return {source: reports[source] for source in self.settings}
 
 
 def measure_entries(
@@ -313,54 +341,11 @@ def shown(console: Console, title: str, total: int) -> Iterator[Progress]:
         yield show
 
 
-def place_of(folder: Path, name: str, seed: int) -> Path:
-    """Return the folder of an entry and its training seed."""
-    return folder / slug(name) / f"seed-{seed}"
+def _read_row(path: Path) -> dict[str, Any]:
+    row: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return row
 
 
 def slug(name: str) -> str:
     """Convert a name to a folder name: lower-case words joined by hyphens."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
-
-
-def parameters(folder: Path, entries: Sequence[Entry]) -> dict[str, int]:
-    """Return the number of trained weights by name, for entries that record this number."""
-    found = {}
-    for entry in entries:
-        path = place_of(folder, entry.name, entry.seed) / "row.json"
-        count = json.loads(path.read_text(encoding="utf-8")).get("parameters")
-        if count is not None:
-            found[entry.name] = int(count)
-    return found
-
-
-def claim(place: Path, entry: Entry, material: str) -> None:
-    """Reserve a folder for an entry, or check that the folder already belongs to it.
-
-    Raises:
-        BenchmarkError: the folder belongs to an entry with other settings or other scenes.
-    """
-    path = place / "row.json"
-    if path.exists():
-        known = json.loads(path.read_text(encoding="utf-8"))
-        if known["identity"] != entry.identity:
-            raise BenchmarkError(
-                f"{place} holds reports of another configuration of {entry.name}: use --fresh or "
-                "another folder"
-            )
-        if known.get("material") != material:
-            raise BenchmarkError(
-                f"the reports in {place} belong to other training scenes, or do not record their "
-                "scenes (files, sources, limit, split and vocabulary must be equal): use --fresh "
-                "or another folder"
-            )
-        return
-    values = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
-    write_whole(path, json.dumps(values | {"material": material}))
-
-
-def _note_parameters(place: Path, count: int | None) -> None:
-    path = place / "row.json"
-    values = json.loads(path.read_text(encoding="utf-8"))
-    if values.get("parameters") != count:
-        write_whole(path, json.dumps(values | {"parameters": count}))

@@ -100,9 +100,9 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
             metric = outcome.metrics[f"ECE, {name}{suffix}"]
             if not isinstance(metric, Scored):
                 raise TypeError(f"the metric ECE of {name} does not store its answers")
-            bins = reliability(metric.score, metric.truth)
+            probability, frequency = reliability(metric.score, metric.truth)
             label = f"{suffix[2:] or 'as published'}, ECE {metric.value:.3f}"
-            axis.plot(bins.probability, bins.frequency, marker=marker, linewidth=1, label=label)
+            axis.plot(probability, frequency, marker=marker, linewidth=1, label=label)
         axis.set_xscale("symlog", linthresh=1e-3)
         axis.set_yscale("symlog", linthresh=1e-3)
         axis.set(xlim=(0, 1.1), ylim=(0, 1.1), xlabel="probability", title=name)

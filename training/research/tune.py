@@ -22,6 +22,7 @@ import os
 import shutil
 import socket
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
@@ -39,12 +40,13 @@ from training.evaluation.report import SourceReport, measure, pooled, settings_b
 from training.evaluation.tasks import in_words
 from training.fit.configuration import Config, ConfigError, first_error
 from training.fit.trainer import Trainer
+from training.machines import BoltzmannMachine
 from training.research.measure import resumable
-from training.research.shipped_files import own_or_shipped
 from training.runs.config_files import (
     config_toml,
     data_folder,
     load_config,
+    own_or_shipped,
     read_toml,
     with_settings,
 )
@@ -166,36 +168,28 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
 
 
 def _distribution(entry: Any) -> BaseDistribution:
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
+    from optuna import distributions
 
     if isinstance(entry, list):
-        return CategoricalDistribution(entry)
+        return distributions.CategoricalDistribution(entry)
     bounds = _Interval.model_validate(entry)
     if not bounds.low < bounds.high:
         raise ValueError(f"low must be below high, not {bounds.low} and {bounds.high}")
     if isinstance(bounds.low, int) and isinstance(bounds.high, int):
-        return IntDistribution(bounds.low, bounds.high, log=bounds.log)
-    return FloatDistribution(bounds.low, bounds.high, log=bounds.log)
+        return distributions.IntDistribution(bounds.low, bounds.high, log=bounds.log)
+    return distributions.FloatDistribution(bounds.low, bounds.high, log=bounds.log)
 
 
+@dataclass(eq=False)
 class Search:
     """A search for settings. Each trial trains a machine and measures it on validation scenes."""
 
-    def __init__(
-        self,
-        folder: Path,
-        config: Config,
-        data: TrainingData,
-        space: Mapping[str, BaseDistribution],
-        by: By,
-        journal: Path | None = None,
-    ) -> None:
-        self.folder, self.config, self.data, self.space, self.by = folder, config, data, space, by
-        self.journal = journal or folder / "study.log"
+    folder: Path
+    config: Config
+    data: TrainingData
+    space: Mapping[str, BaseDistribution]
+    by: By
+    journal: Path
 
     def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
         """Open the optuna study in the folder, or create it.
@@ -285,8 +279,8 @@ class Search:
         import optuna
 
         config = with_settings(self.config, settings)
-        place = self.folder / _folder(trial)
-        trainer = Trainer(config, self.data, place)
+        folder = self.folder / _folder(trial)
+        trainer = Trainer(config, self.data, folder)
         trainer.resume()
         reported = 0
 
@@ -303,27 +297,26 @@ class Search:
         try:
             trainer.run(ended=report)
         except (FloatingPointError, optuna.TrialPruned):
-            (place / "checkpoint.pt").unlink(missing_ok=True)
+            (folder / "checkpoint.pt").unlink(missing_ok=True)
             raise
-        metrics = self._judge(trainer, place)
-        (place / "checkpoint.pt").unlink(missing_ok=True)
+        metrics = self._measure(trainer.machine, folder)
+        (folder / "checkpoint.pt").unlink(missing_ok=True)
         trial.set_user_attr("figures", {name: str(m.figure()) for name, m in metrics.items()})
         return sum(metrics[name].value for name in _BY[self.by] if name in metrics)
 
-    def _judge(self, trainer: Trainer, place: Path) -> dict[str, Metric]:
-        machine = trainer.machine
+    def _measure(self, machine: BoltzmannMachine, folder: Path) -> dict[str, Metric]:
         model = Model(missing=MachineScore(machine), relations=machine_score(machine))
         tasks = [task for task, _ in FIGURES.values()]
         for source, setting in settings_by_source(
             self.data.validation, self.data.structure, self.data.train, seen=None
         ):
-            measure(model, setting, source, tasks=tasks, path=place / f"{source}.json")
-        return self.metrics(place)
+            measure(model, setting, source, tasks=tasks, path=folder / f"{source}.json")
+        return self.metrics(folder)
 
-    def metrics(self, place: Path) -> dict[str, Metric]:
+    def metrics(self, folder: Path) -> dict[str, Metric]:
         """Return `FIGURES` of a finished trial in its folder, over all validation scenes."""
         sources = sorted({scene.source for scene in self.data.validation.scenes})
-        report = pooled([SourceReport.read(place / f"{source}.json") for source in sources])
+        report = pooled([SourceReport.read(folder / f"{source}.json") for source in sources])
         return {
             name: outcome.metrics[metric]
             for name, (task, metric) in FIGURES.items()

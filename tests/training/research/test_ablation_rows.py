@@ -8,8 +8,7 @@ import pytest
 
 from training.fit.configuration import ConfigError
 from training.research.ablate import load_rows
-from training.research.shipped_files import shipped_files
-from training.runs.config_files import load_config
+from training.runs.config_files import load_config, shipped_files
 
 FULL = load_config("indoor-triway")
 

@@ -10,7 +10,7 @@ from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.evaluation.model import Model
 from training.evaluation.setting import Setting
 from training.research.entries import Entry
-from training.research.measure import Plan, measure_entries, place_of
+from training.research.measure import Plan, measure_entries
 
 
 def answers(*_):
@@ -39,9 +39,8 @@ def test_a_row_that_fails_stops_no_other(tmp_path):
     assert failed == {"first": "seed 3: loss is nan", "third": "seed 3: loss is nan"}
     assert set(reports) == {("second", 3), ("fourth", 3)}
     for name in makers:
-        assert (place_of(tmp_path, name, 3) / "none.json").exists() is (
-            name in ("second", "fourth")
-        )
+        report = tmp_path / name / "seed-3" / "none.json"
+        assert report.exists() is (name in ("second", "fourth"))
     assert {("second", "done"), ("fourth", "done")} <= set(said)
 
 

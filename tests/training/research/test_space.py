@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from training.fit.configuration import Config, ConfigError
-from training.research.shipped_files import shipped_files
 from training.research.tune import load_space
-from training.runs.config_files import load_config, with_settings
+from training.runs.config_files import load_config, shipped_files, with_settings
 
 CONFIG = Config.model_validate(
     {

@@ -146,7 +146,7 @@ def test_a_trial_below_the_median_is_given_up(tmp_path):
     config = load_config(str(tmp_path / "config.toml"))
     data = replace(prepare(config, tmp_path).training_data(), test=None)
     space = {"training.learning_rate": CategoricalDistribution([0.03])}
-    search = Search(tmp_path / "study", config, data, space, "both")
+    search = Search(tmp_path / "study", config, data, space, "both", tmp_path / "study.log")
     study = search.open("scenes", 0, prune=True)
     search.run(study, 5)
     search.space = {"training.learning_rate": CategoricalDistribution([1e-6])}
