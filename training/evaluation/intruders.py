@@ -256,4 +256,4 @@ def _scores(
         size, clean = (v > 0).sum(1)[row], added[row] < 0
         parts.append((index[row], thing, odds.double(), thing == added[row], size, clean))
     columns = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
-    return IntruderScores(*columns, scenes=scenes, skipped=skipped)  # type: ignore[arg-type]
+    return IntruderScores(*columns, scenes, skipped)  # type: ignore[arg-type]
