@@ -248,12 +248,15 @@ def _scores(
     """Score the objects of blocks of (presence, scene indices, intruders or -1)."""
     parts = []
     for v, index, added in blocks:
-        row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
-        odds = torch.zeros(0)
+        row, things = ((v > 0) & ~structure).nonzero(as_tuple=True)
+        log_odds = torch.zeros(0)
         if len(row):
-            rest = v[row].scatter(1, thing.unsqueeze(1), 0.0)
-            odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
-        size, clean = (v > 0).sum(1)[row], added[row] < 0
-        parts.append((index[row], thing, odds.double(), thing == added[row], size, clean))
-    columns = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
-    return IntruderScores(*columns, scenes, skipped)  # type: ignore[arg-type]
+            rest = v[row].scatter(1, things.unsqueeze(1), 0.0)
+            log_odds = score(rest).gather(1, things.unsqueeze(1)).squeeze(1)
+        sizes = (v > 0).sum(1)[row]
+        flags = things == added[row], added[row] < 0
+        parts.append((index[row], things, log_odds.double(), flags[0], sizes, flags[1]))
+    scene, thing, odds, intruder, size, clean = (
+        torch.cat(column).numpy() for column in zip(*parts, strict=True)
+    )
+    return IntruderScores(scene, thing, odds, intruder, size, clean, scenes, skipped)
