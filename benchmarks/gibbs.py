@@ -11,7 +11,8 @@ from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, rbms, scikit_learn
 from training.machines import MachineSpec
-from training.machines.gibbs import State, gibbs_step, initial_state
+from training.machines.gibbs import gibbs_step, initial_state
+from training.machines.machine import State
 
 OURS, SKLEARN, RBMS = "ours", "scikit-learn", "rbms"
 PRODUCTS = "two bare products"
