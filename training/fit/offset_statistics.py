@@ -70,11 +70,9 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
         pair.append((a * V + pairs.subject) * V + pairs.other)
         moments.append(np.concatenate([mean, np.sqrt(variance)], axis=1))
         counts.append(pairs.scenes.astype(np.int32))
-    tables = map(half_precision, (relation, subject, other, np.concatenate(moments)))
-    relation_table, subject_table, other_table, moment_table = tables
     return Offsets(
-        *(relation_table, scenes_of, subject_table, other_table),
-        *(np.concatenate(pair), moment_table, np.concatenate(counts)),
+        *(half_precision(relation), scenes_of, half_precision(subject), half_precision(other)),
+        *(np.concatenate(pair), half_precision(np.concatenate(moments)), np.concatenate(counts)),
     )
 
 

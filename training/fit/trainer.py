@@ -51,7 +51,7 @@ _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
 # Function that is called after every update with the epoch, its finished share and its mean loss.
 Progress = Callable[[int, float, float], None]
-Ended = Callable[[Epoch], None]
+Ended = Callable[[Epoch], None]  # is called after every epoch
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:

@@ -26,6 +26,8 @@ VOCABULARY = Vocabulary(
 DESK, MONITOR, PENCIL, WALL, FLOOR = range(5)
 DESK_BOX: dict[str, Any] = {"position": (2.0, 0.0, 0.4), "size": (0.8, 1.6, 0.8)}
 MONITOR_BOX: dict[str, Any] = {"position": (2.0, 0.3, 1.0), "size": (0.1, 0.5, 0.4)}
+DESK_THING = AnnotatedObject("d", "desk", **DESK_BOX)
+MONITOR_THING = AnnotatedObject("m", "monitor", **MONITOR_BOX)
 
 
 def things(*labels: str, **fields: Any) -> tuple[AnnotatedObject, ...]:
@@ -110,8 +112,8 @@ def test_labels_that_a_source_annotates_incompletely_are_left_out() -> None:
 
 def test_poses_in_viewer_axes() -> None:
     objects = (
-        AnnotatedObject("d", "desk", **DESK_BOX),
-        AnnotatedObject("m", "monitor", **MONITOR_BOX),
+        DESK_THING,
+        MONITOR_THING,
         AnnotatedObject("p", "pencil", position=(1.4, 0.1, 0.8), size=(0.1, 0.1, 0.1)),
         AnnotatedObject("w", "wall"),
     )
@@ -137,7 +139,7 @@ def test_without_sizes_nothing_vertical_is_observed() -> None:
 
 def test_an_object_in_a_drawer_is_on_top_of_the_desk() -> None:
     objects = (
-        AnnotatedObject("d", "desk", **DESK_BOX),
+        DESK_THING,
         # Inside the desk: by the boxes alone the pencil would be left of it.
         AnnotatedObject("p", "pencil", position=(2.0, 0.5, 0.3), size=(0.01, 0.1, 0.01)),
     )
@@ -227,10 +229,7 @@ def test_positions_are_kept_in_the_axes_that_relations_were_derived_in() -> None
 
 
 def test_positions_say_nothing_where_people_stated_the_relations() -> None:
-    objects = (
-        AnnotatedObject("1", "desk", **DESK_BOX),
-        AnnotatedObject("3", "monitor", **MONITOR_BOX),
-    )
+    objects = (DESK_THING, MONITOR_THING)
     assert encoded(objects, relations=((1, "left", 0),)).instance_positions is None
     assert encoded(things("desk", "monitor")).instance_positions is None
 

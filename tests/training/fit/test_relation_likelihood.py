@@ -39,7 +39,7 @@ def machine_of(name, seed=0):
     return machine.initialise(torch.Generator().manual_seed(seed), 0.1)
 
 
-def annotated(triple, *, holds, source):
+def annotated(triple, holds, source):
     """A scene of all classes, which observes one relation."""
     one = toy([0, 1, 2, 3, 4], [triple] if holds else [], source=source)
     observed = np.zeros_like(one.evidence.observed)
@@ -49,15 +49,12 @@ def annotated(triple, *, holds, source):
 
 def scenes_of(shares, count=40):
     """Scenes by source. Each observes left(1, 2) or left(3, 4), and a share of them lists it."""
-    return tensors(
-        [
-            annotated(
-                (0, 1, 2) if k % 2 else (0, 3, 4), holds=k // 2 < share * count / 2, source=source
-            )
-            for source, share in shares.items()
-            for k in range(count)
-        ]
-    )
+    every = [
+        annotated((0, 1, 2) if k % 2 else (0, 3, 4), k // 2 < share * count / 2, source)
+        for source, share in shares.items()
+        for k in range(count)
+    ]
+    return tensors(every)
 
 
 def whole(scenes):
@@ -243,14 +240,12 @@ LISTED = {(0, 1, 2): (18, 2), (0, 3, 4): (4, 8), (1, 0, 3): (0, 12)}
 
 def listed_scenes():
     """Scenes of two sources; each observes one triple of `LISTED`."""
-    return tensors(
-        [
-            annotated(triple, holds=holds, source="captions" if k % 2 else "rooms")
-            for triple, counts in LISTED.items()
-            for holds, count in zip((True, False), counts, strict=True)
-            for k in range(count)
-        ]
-    )
+    every = [
+        annotated(triple, k < true, "captions" if k % 2 else "rooms")
+        for triple, (true, false) in LISTED.items()
+        for k in range(true + false)
+    ]
+    return tensors(every)
 
 
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (0.5, 2.0)])
