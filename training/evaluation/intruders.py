@@ -255,5 +255,7 @@ def _scores(
             odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
         size, clean = (v > 0).sum(1)[row], added[row] < 0
         parts.append((index[row], thing, odds.double(), thing == added[row], size, clean))
-    columns = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
-    return IntruderScores(*columns, scenes=scenes, skipped=skipped)  # type: ignore[arg-type]
+    scene, thing, log_odds, intruder, size, clean = (
+        torch.cat(column).numpy() for column in zip(*parts, strict=True)
+    )
+    return IntruderScores(scene, thing, log_odds, intruder, size, clean, scenes, skipped)
