@@ -24,8 +24,9 @@ from app.registry.references import AliasTarget
 from training.datasets import DatasetError
 from training.datasets.batches import subset
 from training.datasets.files import DATA
-from training.domain.compare import compare_command, show
-from training.domain.gate import MARGIN, compare_with_served, losses, measure_usefulness, seat
+from training.domain.candidates import Candidate
+from training.domain.compare import compare, compare_command, show
+from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, seat
 from training.domain.init_command import example, fail, init
 from training.domain.labels import outside_vocabulary
 from training.evaluation.everyday_task import EVERYDAY
@@ -227,8 +228,8 @@ def evaluate_command(
     try:
         tables: dict[str, list[Metric]] = {}
         for reference in models:
-            found = Store(store)
-            artifact = found.load(*found.resolve(reference))
+            stored = Store(store)
+            artifact = stored.load(*stored.resolve(reference))
             config = Config.model_validate(artifact.manifest.training["config"])
             wanted = source or [source_name(name) for name in config.data.sources]
             with console.status("reading scenes"):
@@ -396,8 +397,9 @@ def _promote(
             reasons = useful.objections()
             if before.holder is not None and (gate.even_if_worse or not reasons):
                 try:
-                    comparison = compare_with_served(
-                        *(run, scenes, artifact, before.holder, root), limit=limit, say=say
+                    new = Candidate(NEW, run.config, scenes.digests, artifact, root)
+                    comparison = compare(
+                        *(new, before.holder, root), limit=limit, examples=3, say=say
                     )
                     show(comparison, console)
                     reasons += losses(comparison, gate.margin)

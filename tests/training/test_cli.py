@@ -120,7 +120,7 @@ def test_from_rooms_to_answers(tmp_path):
         tuple(SceneObject(name, name, artifact.vocabulary.index(name)) for name in things)
     )
     assert missing(artifact, scene)
-    assert relations(artifact, scene)[0]
+    assert relations(artifact, scene)
     assert len(outliers(artifact, scene).outliers) == 3
     assert len(generate(artifact, scene, seed=0, steps=5)) == 1
 

@@ -14,22 +14,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from app.registry import Artifact, ArtifactError, Store, StoreError
 from app.registry.references import AliasTarget
 from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.domain.candidates import Candidate, Say, stored_candidate
-from training.domain.compare import Comparison, compare
+from training.domain.compare import Comparison
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
 from training.evaluation.missing_tasks import MachineScore, leave_one_out
 from training.evaluation.model import ObjectScore
 from training.evaluation.tasks import in_words
 from training.machines.arrays import machine_of
-from training.runs.folder import FinishedRun
-from training.runs.pipeline import SplitScenes
 
 # Accepted loss of a primary metric when a new version replaces the served version.
 MARGIN = 0.02
@@ -141,12 +138,11 @@ class Seat:
     """An alias of the model store, and the model that it serves now.
 
     Attributes:
-        target: model version that the alias names now. None if the alias is new.
+        target: model version that the alias names. None if the alias is new.
         holder: the served model. None if the alias is new or the model cannot be read.
         note: reason why a comparison with the served model is impossible, or "".
     """
 
-    alias: str
     target: AliasTarget | None
     holder: Candidate | None
     note: str
@@ -160,27 +156,12 @@ def seat(store: Store, alias: str) -> Seat:
     """
     target = store.aliases().get(alias)
     if target is None:
-        return Seat(alias, None, None, f"{alias} is a new alias, so there is no older version")
+        return Seat(None, None, f"{alias} is a new alias, so there is no older version")
     try:
-        return Seat(alias, target, stored_candidate(alias, store), "")
+        return Seat(target, stored_candidate(alias, store), "")
     except (ArtifactError, StoreError) as error:
         note = f"no comparison: the model served as {alias} cannot be read ({error})"
-        return Seat(alias, target, None, note)
-
-
-def compare_with_served(
-    run: FinishedRun,
-    scenes: SplitScenes,
-    artifact: Artifact,
-    holder: Candidate,
-    root: Path,
-    *,
-    limit: int | None,
-    say: Say,
-) -> Comparison:
-    """Compare a new version with the served version before publication."""
-    new = Candidate(NEW, run.config, scenes.digests, artifact, root)
-    return compare(new, holder, root, limit=limit, examples=3, say=say)
+        return Seat(target, None, note)
 
 
 def losses(comparison: Comparison, margin: float) -> list[str]:

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 
@@ -84,11 +85,11 @@ def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -
     answers: list[tuple[int, float, bool]] = []
     skipped = 0
     for k, scene in enumerate(scenes.scenes):
-        found = ask(artifact, scene, scene_rng(scene, seed))
-        skipped += found is None
-        answers += [(k, probability, so) for probability, so in found or ()]
-    place, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
-    return Items(place.astype(np.int64), probability, truth > 0, len(scenes), skipped)
+        own = ask(artifact, scene, scene_rng(scene, seed))
+        skipped += own is None
+        answers += [(k, probability, truth) for probability, truth in own or ()]
+    index, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
+    return Items(index.astype(np.int64), probability, truth > 0, len(scenes), skipped)
 
 
 def ask_relations(
@@ -113,25 +114,20 @@ def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered |
 
 
 def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Flags) -> Answered:
-    """Return the answers about the relations that are True in ``judged``.
-
-    The shape of ``judged`` is (relations, objects, objects).
-    """
-    found: Answered = []
-    for entry in relations(artifact, scene)["relations"]:
-        triple = canonical_triple(scene, entry)
-        if judged[triple]:
-            found.append((entry["probability"], bool(encoded.instance_holds[triple])))
-    return found
+    """Return the answers about the relations in `judged`, (relations, objects, objects) bool."""
+    answers = [
+        (entry["probability"], canonical_triple(scene, entry))
+        for entry in relations(artifact, scene)["relations"]
+    ]
+    return [(p, bool(encoded.instance_holds[triple])) for p, triple in answers if judged[triple]]
 
 
 def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask where a removed object belongs. Up to `_REMOVALS` objects are removed one at a time."""
-    found: Answered = []
-    if annotated_relations(encoded).any():
-        for _ in range(_REMOVALS):
-            found += _places_of_one(artifact, encoded, rng)
-    return found or None
+    if not annotated_relations(encoded).any():
+        return None
+    each = (_places_of_one(artifact, encoded, rng) for _ in range(_REMOVALS))
+    return list(chain.from_iterable(each)) or None
 
 
 def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered:
@@ -266,7 +262,11 @@ def calibration_task(model: Model, setting: Setting) -> Outcome | None:
     metrics: dict[str, Metric] = {}
     skipped = 0
     published, plain = model.artifact, uncalibrated(model.artifact)
-    for name, ask in _questions(complete, setting).items():
+    intruders = kinds_of_intruders(
+        complete, setting.structure, setting.complete.train, setting.seed
+    )
+    asks = QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
+    for name, ask in asks.items():
         asked = of_objects.get(name, related)
         found = collect(published, asked, ask, setting.seed)
         skipped += found.skipped
@@ -278,11 +278,3 @@ def calibration_task(model: Model, setting: Setting) -> Outcome | None:
     # Brier skill is undefined if all answers are true or all answers are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None
-
-
-def _questions(complete: SceneTensors, setting: Setting) -> dict[str, Ask]:
-    """Return `QUESTIONS`, where `ask_outliers` draws from the intruders in `kinds_of_intruders`."""
-    intruders = kinds_of_intruders(
-        complete, setting.structure, setting.complete.train, setting.seed
-    )
-    return QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}

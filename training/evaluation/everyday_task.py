@@ -121,8 +121,7 @@ def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
 
 
 def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
-    lines: Lines = {line: [] for line in LINES[:3]}
-    likeliest, vertical, sure = lines.values()
+    likeliest, vertical, sure = [], [], []
     for fact in facts:
         relation = fact["relation"]
         p = _of_eight(artifact, fact["subject"], fact["object"])
@@ -131,7 +130,7 @@ def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
         right = bool(upright) and max(upright, key=upright.__getitem__) == relation
         vertical.append((int(right), 1))
         sure.append((int(p.get(relation, 0.0) >= 0.5), 1))
-    return lines
+    return dict(zip(LINES[:3], (likeliest, vertical, sure), strict=True))
 
 
 def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:

@@ -19,6 +19,7 @@ from training.fit.configuration import Config, ConfigError, first_error
 from training.research.entries import Entry, machine_entry
 from training.research.measure import Plan, Reports, measure_entries, resumable, shown
 from training.runs.config_files import (
+    at_most,
     data_folder,
     load_config,
     own_or_shipped,
@@ -91,7 +92,7 @@ def ablate(
         console.print(f"[red]error:[/red] {configs[0].name}: {failures[configs[0].name]}")
         raise typer.Exit(1)
     with console.status("resampling scenes"):
-        reports: Reports = {row: _with_pools(found) for row, found in measured.items()}
+        reports: Reports = {row: _with_pools(own) for row, own in measured.items()}
         weights, seconds = _costs(plan, entries)
         results = summarise(reports, configs[0].name, weights)
     parts = [
@@ -121,16 +122,13 @@ def _configs(
     full = load_config(reference)
     if limit is not None:
         full = with_settings(full, {"data.limit": limit})
-    found = load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
-    if unknown := sorted(set(names or ()) - {config.name for config in found}):
-        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(c.name for c in found)}")
-    chosen = [full, *(config for config in found if not names or config.name in names)]
-    if epochs is None:
-        return chosen
-    return [
-        with_settings(config, {"training.epochs": min(epochs, config.training.epochs)})
-        for config in chosen
-    ]
+    rows = {
+        row.name: row for row in load_rows(own_or_shipped(path, full, "ablations", "--rows"), full)
+    }
+    if unknown := sorted(set(names or ()) - set(rows)):
+        raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(rows)}")
+    chosen = [full, *(row for name, row in rows.items() if not names or name in names)]
+    return chosen if epochs is None else [at_most(config, epochs) for config in chosen]
 
 
 def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:

@@ -38,7 +38,7 @@ from training.research.measure import (
     slug,
 )
 from training.research.plots import write_plots
-from training.runs.config_files import data_folder, load_config, with_settings
+from training.runs.config_files import at_most, data_folder, load_config, with_settings
 from training.runs.pipeline import SplitScenes, prepare
 from training.seed.protocol import PAPER, SEED_TASKS
 
@@ -125,21 +125,12 @@ class Options:
 
     def configs(self, domain: Domain, seed: int) -> list[Config]:
         """Return the configurations of the domain with the given training seed."""
-        most = _QUICK_EPOCHS if self.quick else None
-        return [
-            with_settings(
-                config,
-                {
-                    "training.seed": seed,
-                    "training.epochs": min(config.training.epochs, most or config.training.epochs),
-                },
-            )
-            for config in domain.configs
-        ]
+        configs = [with_settings(config, {"training.seed": seed}) for config in domain.configs]
+        return [at_most(config, _QUICK_EPOCHS) for config in configs] if self.quick else configs
 
     def scenes(self, domain: Domain, **changes: Any) -> SplitScenes:
         """Read and split the scenes of the domain. `changes` replace values of its data section."""
-        data: DataConfig = domain.configs[0].data.model_copy(update=changes)
+        data = domain.configs[0].data.model_copy(update=changes)
         if self.quick:
             few = min(data.limit or _QUICK_SCENES, _QUICK_SCENES)
             data = data.model_copy(update={"limit": few})
@@ -206,16 +197,16 @@ def benchmark(
             if shuffled or not seed_protocol:
                 domain.require_groups()
         for domain in domains:
-            place = folder / domain.name
+            results = folder / domain.name
             # With a random split, only the seed protocol (Bozcan et al., 2018) is valid.
             if not domain.leaks:
-                compare_domain(domain, place, options)
+                compare_domain(domain, results, options)
             if seed_protocol:
-                compare_by_seed_protocol(domain, place / "seed-protocol", options)
+                compare_by_seed_protocol(domain, results / "seed-protocol", options)
             if shuffled:
-                compare_on_shuffled(domain, place / "shuffled", options)
+                compare_on_shuffled(domain, results / "shuffled", options)
             console.print(
-                f"all results: results.md and results.json in {place} and its subfolders, with "
+                f"all results: results.md and results.json in {results} and its subfolders, with "
                 "plots beside them",
                 soft_wrap=True,
             )
@@ -258,14 +249,14 @@ def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
     """
     if not wanted:
         return tuple(name for name in TASKS if not quick or name not in _SLOW_TASKS)
-    found: set[str] = set()
+    chosen: set[str] = set()
     for part in wanted:
         # A full name selects only that task, even if it is a prefix of other names.
         named = {part} & set(TASKS) or {name for name in TASKS if name.startswith(part)}
         if not named:
             raise ValueError(f"unknown task {part!r}: use a name, or the start, of {list(TASKS)}")
-        found |= named
-    return tuple(name for name in TASKS if name in found)
+        chosen |= named
+    return tuple(name for name in TASKS if name in chosen)
 
 
 def shuffled_tasks(tasks: Sequence[str]) -> tuple[str, ...]:
@@ -274,20 +265,19 @@ def shuffled_tasks(tasks: Sequence[str]) -> tuple[str, ...]:
     Raises:
         ValueError: no task is supported.
     """
-    found = tuple(task for task in YARDSTICKS if task in tasks)
-    if not found:
+    supported = tuple(task for task in YARDSTICKS if task in tasks)
+    if not supported:
         raise ValueError(f"--shuffled needs at least one of the tasks {', '.join(YARDSTICKS)}")
-    return found
+    return supported
 
 
-def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
+def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
     """Measure the machines and baselines of a domain on its test scenes; write tables and plots.
 
     Raises:
-        ConfigError: the split is random, or the scene files are missing.
+        ConfigError: the scene files are missing.
         ValueError: a baseline in `options` is unknown.
     """
-    domain.require_groups()
     scenes = options.scenes(domain)
     plan = _plan(folder, scenes, options, options.tasks)
     entries: list[Entry] = []
@@ -301,10 +291,9 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
     console.print(*results.tables())
     names = {config.name for config in domain.configs}
     write_plots(plan, [entry for entry in entries if entry.name in names], reports, results)
-    return results
 
 
-def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> Results:
+def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> None:
     """Measure each machine, trained once on a random split, by the seed protocol."""
     scenes = options.scenes(domain, split="random")
     plan = replace(_plan(folder, scenes, options, tuple(SEED_TASKS)), known_tasks=SEED_TASKS)
@@ -313,15 +302,14 @@ def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> 
         for config in options.configs(domain, 0)
     ]
     reports = _measured(plan, entries, options, f"{domain.name}, seed protocol")
-    found = summarise(reports, domain.configs[0].name, plan.parameters(entries))
+    results = summarise(reports, domain.configs[0].name, plan.parameters(entries))
     # The seed protocol does not rank the machines, so the results contain no paired differences.
-    results = replace(found, differences=())
+    results = replace(results, differences=())
     _write(folder, scenes, results.to_dict() | {"paper": PAPER}, _protocol_text(results))
     console.print(*results.tables(_SEED_SHOWN, lambda task: SEED_TASKS[task].words))
-    return results
 
 
-def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[str, Results]:
+def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
     """Run the control experiment: train models on shuffled scenes, and test them on real scenes.
 
     Baseline settings and training epochs are selected on shuffled validation scenes. Each model is
@@ -332,30 +320,28 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
         ValueError: no task is supported (see `shuffled_tasks`), or all supported tasks need
             relations and the scenes contain none.
     """
-    domain.require_groups()
     real = options.scenes(domain)
     scenes = real.shuffled(seed=0)
-    asked = shuffled_tasks(options.tasks)
-    plan = _plan(folder, scenes, options, asked, asked_by=real)
+    tasks = shuffled_tasks(options.tasks)
+    plan = _plan(folder, scenes, options, tasks, asked_by=real)
     if not plan.data.related:
-        asked = tuple(task for task in asked if task not in _RELATION_TASKS)
-        if not asked:
+        tasks = tuple(task for task in tasks if task not in _RELATION_TASKS)
+        if not tasks:
             raise ValueError(
                 f"the scenes of {domain.name} contain no relations, but the selected tasks need "
                 "relations: select other tasks"
             )
-        plan = replace(plan, tasks=asked)
+        plan = replace(plan, tasks=tasks)
     entries = [machine_entry(config, calibrated=False) for config in options.configs(domain, 0)]
     # A baseline that supports several of the tasks is fitted once.
     names = [name for name, one in BASELINES.items() if one.scores in (("missing",), RELATIONS)]
     if options.baselines is not None:
-        yardsticks = {YARDSTICKS[task][0] for task in asked}
+        yardsticks = {YARDSTICKS[task][0] for task in tasks}
         names = [name for name in names if name in yardsticks | set(options.baselines)]
     entries += baseline_entries(0, names, related=plan.data.related, whole=False)
     reports = _measured(plan, entries, options, f"{domain.name}, shuffled")
     weights = plan.parameters(entries)
-    results = {}
-    for task in asked:
+    for task in tasks:
         yardstick, metric = YARDSTICKS[task]
         some: Reports = {
             row: {source: only(report, {task: (metric,)}) for source, report in by_source.items()}
@@ -363,11 +349,10 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
         }
         # A task without metrics needs data that these scenes lack, for example room types.
         if any(report.outcomes[task] for report in some[yardstick, 0].values()):
-            results[task] = summarise(some, yardstick, weights)
-            text = shuffled_text(task, results[task])
-            _write(folder / slug(task), scenes, results[task].to_dict(), text)
-            console.print("trained on shuffled scenes:", *results[task].tables({task: (metric,)}))
-    return results
+            results = summarise(some, yardstick, weights)
+            text = shuffled_text(task, results)
+            _write(folder / slug(task), scenes, results.to_dict(), text)
+            console.print("trained on shuffled scenes:", *results.tables({task: (metric,)}))
 
 
 def _plan(

@@ -48,7 +48,7 @@ from training.research.entries import Entry
 
 # A progress function receives the row, the source, and a note on the current step.
 Progress: TypeAlias = Callable[[str, str, str], None]
-# Measures an entry; returns the error of an entry that failed.
+# Measures an entry, and returns the error of an entry that failed.
 Work: TypeAlias = Callable[[Entry, Progress], Exception | None]
 
 # Seconds between two checks for messages of the processes.

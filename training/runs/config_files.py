@@ -120,6 +120,11 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
         ) from error
 
 
+def at_most(config: Config, epochs: int) -> Config:
+    """Return a configuration with at most this number of epochs."""
+    return with_settings(config, {"training.epochs": min(epochs, config.training.epochs)})
+
+
 def config_toml(config: Config) -> str:
     """Return the configuration as TOML text that `load_config` reads."""
     return sections_toml(config.model_dump(mode="json", exclude_none=True))

@@ -65,10 +65,9 @@ def relations_switched_on(model: Model, setting: Setting) -> Outcome | None:
     on, labelled, hit = (np.zeros(len(scenes)) for _ in range(3))
     for index, batch, generator in _blocks(scenes, setting.seed):
         total, grid = draw_relations(model.machine, batch, generator)
-        place = index.numpy()
-        on[place] = total.double().numpy()
-        labelled[place] = batch.holds.sum((1, 2, 3)).double().numpy()
-        hit[place] = (batch.holds * grid).sum((1, 2, 3)).double().numpy()
+        on[index] = total.double().numpy()
+        labelled[index] = batch.holds.sum((1, 2, 3)).double().numpy()
+        hit[index] = (batch.holds * grid).sum((1, 2, 3)).double().numpy()
     metrics: dict[str, Metric] = {
         "labelled relations switched on": Ratio(hit, labelled),
         "relations switched on per scene": Ratio.of_scenes(on),
@@ -118,12 +117,11 @@ def reconstruction_after_addition(model: Model, setting: Setting) -> Outcome | N
         intruder = added[index].clamp(min=0).unsqueeze(1)
         h1 = _draw_h1(machine, Evidence(batch.v.scatter(1, intruder, 1.0)), generator)
         v = bernoulli(machine.object_logits(h1).sigmoid(), generator)
-        place = index.numpy()
-        weight = asked[place]
-        wrong[place] = (v - batch.v).abs().sum(1).double().numpy() * weight
-        off[place] = (1 - v.gather(1, intruder).squeeze(1)).double().numpy() * weight
-        kept[place] = (v * batch.v).sum(1).double().numpy() * weight
-        there[place] = batch.v.sum(1).double().numpy() * weight
+        weight = asked[index]
+        wrong[index] = (v - batch.v).abs().sum(1).double().numpy() * weight
+        off[index] = (1 - v.gather(1, intruder).squeeze(1)).double().numpy() * weight
+        kept[index] = (v * batch.v).sum(1).double().numpy() * weight
+        there[index] = batch.v.sum(1).double().numpy() * weight
     metrics: dict[str, Metric] = {
         "error measure": Ratio(wrong, asked * V),
         "error measure, doing nothing": Ratio(asked, asked * V),

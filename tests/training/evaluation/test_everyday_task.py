@@ -106,7 +106,7 @@ def test_a_fact_and_its_mirror_image_are_the_same_fact(tmp_path):
     """The likeliest relation of two objects is so too from the other object, as its opposite."""
     model, names = room_model(), ("lamp", "nightstand")
     things = (SceneObject(name, name, model.vocabulary.index(name)) for name in names)
-    found, _ = relations(model, Scene(tuple(things)), top_k=50)
+    found = relations(model, Scene(tuple(things)), top_k=50)
     first = max(found, key=lambda answer: answer.probability)
     subject, object_ = names[first.subject], names[first.object]
     mirrored = opposite(first.relation)

@@ -62,7 +62,12 @@ _EASE_L2 = (10.0, 30.0, 100.0, 300.0)
 
 
 def fit_ease(v: Tensor, l2: float) -> LinearScore:
-    """Fit a ridge regression of every class on all other classes."""
+    """Fit EASE, a ridge regression of every class on all other classes with a free intercept.
+
+    Source: Steck, "Embarrassingly Shallow Autoencoders for Sparse Data", WWW 2019, equation 8. With
+    the centred presence X and P = (X'X + λI)⁻¹, the least-squares weights with zero diagonal are
+    -P[j,i] / P[i,i].
+    """
     mean = v.double().mean(0)
     centred = v.double() - mean
     gram = centred.T @ centred

@@ -93,16 +93,19 @@ class TripleTable:
 
 
 _PAIR = (1.0, 3.0, 10.0, 30.0, 100.0)
-
-
 _END = (3.0, 30.0)
-
-
 _MULTIPLICITY = (0.0, 0.5, 1.0)
 
 
 def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
-    """Return logit p(r | i, j) by the formula above, (relations, classes, classes).
+    """Return logit p(r | i, j), (relations, classes, classes).
+
+    The estimate for a rare pair depends mainly on its two classes, as labels predict most relations
+    (Zellers et al., "Neural Motifs: Scene Graph Parsing with Global Context", CVPR 2018). That for
+    a rare class depends mainly on p(r):
+
+        p(r | i, j) = (held + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
+        p(r | i)    = (held with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
 
     Args:
         pair: smoothing s of a pair of classes, above 0: number of added cases.
@@ -127,14 +130,8 @@ def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Propo
 
 
 _PLACE = (0.3, 1.0, 3.0, 10.0)
-
-
 _RELATION = (1.0, 10.0)
-
-
 _WEIGHTS = (0.25, 0.5, 0.75, 1.0)
-
-
 _CORRECTIONS = (0.0, 0.5, 1.0)
 
 
@@ -156,9 +153,9 @@ class PlacedTable:
 
 @dataclass(frozen=True, eq=False)
 class PlacedProduct:
-    """The product of an object score and a table, as a sum of logs.
+    """The score objects(v) + weight · table - correction · log popularity of a class at a place.
 
-    The score is objects(v) + weight · table - correction · log popularity.
+    Both factors depend on the class frequency. The last term corrects for this.
     """
 
     objects: ObjectScore
@@ -177,6 +174,10 @@ def smoothed_log_p(
     counts: TripleCounts, popularity: Tensor, place: float, relation: float
 ) -> Tensor:
     """Return log p(i | a, j) in the layout of `PlacedTable.log_p`.
+
+        p(i | a, j) = (scenes with a(i, j) + s · p(i | a)) / (scenes with a of any class to j + s)
+
+    p(i | a) is smoothed in the same way towards p(i), with m in place of s.
 
     Args:
         popularity: frequency of each class, (classes,). The function normalises the sum to 1.

@@ -26,7 +26,6 @@ from training.evaluation.model import ObjectScore
 # learning-rate cycle and an exponential moving average of the weights. Several late epochs are
 # candidates, so that selection on validation scenes has the effect of early stopping.
 
-
 _AVERAGING = 0.998
 _WARM_UP = 0.1
 
@@ -132,7 +131,6 @@ def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float)
 # P. Vincent et al., "Extracting and composing robust features with denoising autoencoders",
 # ICML 2008. `train_network` trains the network.
 
-
 _HIDDEN = 600
 _HIDDEN_DROPOUT = (0.15, 0.3)
 _AUTOENCODER = Course(epochs=24, learning_rate=3e-3, weight_decay=0.1)
@@ -178,7 +176,6 @@ def autoencoder_for_parts(
 # Sources: A. Vaswani et al., "Attention is all you need", NeurIPS 2017; J. Devlin et al., "BERT",
 # NAACL 2019, for masking. The classes of a scene have no order, so the network has no position
 # embeddings. `train_network` trains the network.
-
 
 _WIDTH, _HEADS, _LAYERS = 64, 4, 2
 _DROPOUT = (0.0, 0.1)

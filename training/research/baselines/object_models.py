@@ -16,19 +16,12 @@ from training.evaluation.missing_tasks import MachineScore
 from training.evaluation.model import ObjectDensity, ObjectScore
 from training.machines import BoltzmannMachine, MachineSpec, build
 
-# Linear scores: the score of a class is linear in the presence of the other classes.
-
-
-# Class frequencies.
-
-
 # Co-occurrence: Bernoulli naive Bayes, with the present classes as evidence.
 #
 #     log-odds of i = logit p(i) + t · sum_{j present} log p(j | i) / p(j | not i)
 #
 # Absent classes are no evidence, because annotators do not mention every object. The formula treats
 # classes that often occur together as independent evidence. A factor t < 1 corrects for this.
-
 
 _SMOOTHING = (10.0, 100.0, 300.0)
 _EXPONENTS = (0.2, 0.3, 0.5, 1.0)
@@ -68,7 +61,6 @@ def naive_bayes(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposal
 # The score is the logit of p(i). The vote of a neighbour is (cosine similarity of the neighbour /
 # cosine similarity of the nearest neighbour) ** sharpness.
 
-
 _NEIGHBOURS = (100, 200)
 _SHARPNESS = (2.0, 4.0, 8.0, 12.0)
 
@@ -97,14 +89,6 @@ def nearest(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[Ob
             yield {"neighbours": k, "sharpness": power}, score
 
 
-# EASE, a linear model between classes with a closed form.
-#
-# Source: H. Steck, "Embarrassingly Shallow Autoencoders for Sparse Data", WWW 2019, equation 8. X
-# is the matrix of presence, (scenes, classes). With P = (X'X + λI)⁻¹, the least-squares weights
-# with zero diagonal are -P[j,i] / P[i,i]. Here X is centred, which is equivalent to a free
-# intercept. Recommender libraries implement EASE without an intercept.
-
-
 # Pairwise logistic model: an Ising model of classes, fitted by pseudo-likelihood.
 #
 # Source: J. Besag, "Statistical analysis of non-lattice data", The Statistician 24 (1975). The fit
@@ -114,7 +98,6 @@ def nearest(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[Ob
 #     logit p(v_i = 1 | others) = b_i + sum_j W[i,j] v_j,    W symmetric with zero diagonal.
 #
 # The problem is convex. L-BFGS finds its optimum.
-
 
 _PAIRWISE_L2 = (30.0, 10.0, 3.0)
 _ITERATIONS = 40
@@ -177,7 +160,6 @@ def pairwise_densities(
 #
 # The trained weights are copied into a machine of this project without relation units. Both models
 # have the same energy, so `training.machines` can compute the log-odds.
-
 
 _HIDDEN = 200
 # Tested initial learning rates. With higher rates, persistent contrastive divergence learns only

@@ -1,4 +1,4 @@
-"""Baselines for relations, and for objects at a place, from counts of triples."""
+"""Baselines for relations from counts of triples (relation a, subject class i, object class j)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,6 @@ from training.evaluation.baselines.triples import (
 from training.evaluation.contradictions import transitive_closure
 from training.evaluation.model import RelationScore
 
-# Counts of triples (relation a, subject class i, object class j), and score tables over triples.
-
-
-# Frequency of each relation over all pairs of classes.
-
 
 def relation_popularity(
     train: SceneTensors, structure: Tensor, _seed: int
@@ -34,16 +29,6 @@ def relation_popularity(
     yield {}, TripleTable(overall.expand_as(counts.held))
 
 
-# Smoothed frequency table p(r | i, j): a strong baseline for relations.
-#
-# R. Zellers et al., "Neural Motifs: Scene Graph Parsing with Global Context", CVPR 2018, show that
-# the labels of subject and object predict most relations. The estimate for a rare pair depends
-# mainly on its two classes. The estimate for a rare class depends mainly on p(r):
-#
-#     p(r | i, j) = (held + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
-#     p(r | i)    = (held with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
-
-
 # ComplEx: complex embeddings of classes. Complex numbers allow different scores for left(i, j) and
 # left(j, i).
 #
@@ -51,7 +36,6 @@ def relation_popularity(
 # 11: logit p(a, i, j) = d_a + Re sum_k S[i,k] R[a,k] conj(S[j,k]). The fit uses all pairs of
 # classes that occur in the same scene. The likelihood of a triple is binomial, with `held`
 # successes in `together` trials. The penalty is the nuclear 3-norm of T. Lacroix et al., ICML 2018.
-
 
 _RANKS = (16, 64)
 _PENALTIES = (0.03, 0.1, 0.3)
@@ -125,7 +109,6 @@ def complex_embedding(
 # In the batches of task T1b, only the given relations of a scene are marked as observed. This score
 # needs such batches.
 
-
 _CLOSURE_PAIR = (3.0, 10.0, 30.0)
 _CLOSURE_END = 30.0
 _CLOSURE_MULTIPLICITY = (0.5, 1.0)
@@ -169,17 +152,3 @@ def frequency_table_with_closure(
                 for penalty in _PENALTY:
                     parameters = {"pair": pair, "multiplicity": weight, "bonus": bonus}
                     yield parameters | {"penalty": penalty}, ClosureScore(table, bonus, penalty)
-
-
-# Baselines for an object of class i at a place (a, j), such as "on-top of the desk". They are the
-# frequency table p(i | a, j), and the product of this table and an object score.
-#
-#     p(i | a, j) = (scenes with a(i, j) + s · p(i | a)) / (scenes with a of any class to j + s)
-#
-# p(i | a) is smoothed in the same way towards p(i), with m in place of s. There are separate tables
-# for i as subject and for i as object. The score of the product is
-#
-#     score(i | rest) + w · log p(i | a, j) - u · log p(i).
-#
-# score(i | rest) is the log-odds of i given the other objects of the scene. Both factors depend on
-# the class frequency. The last term corrects for this.
