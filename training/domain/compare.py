@@ -254,9 +254,9 @@ def compare(
     groups = len({scene.group for scene in scenes.scenes})
     say("looking for examples")
     first, second = (model.missing for model in models)
-    found: list[Example] = []
+    different: list[Example] = []
     if first is not None and second is not None:
-        found = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
+        different = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
     return Comparison(
         results=results,
         b=titles[1],
@@ -264,7 +264,7 @@ def compare(
         groups=groups,
         certain=held.certain,
         notes=tuple(_notes(a, b, held, limit)),
-        examples=tuple(found),
+        examples=tuple(different),
         unmeasured=unmeasured(results.differences, b),
     )
 
@@ -358,13 +358,13 @@ def changed_most(
         if len(chosen) == count or not change[place]:
             break
         chosen.setdefault(scenes.scenes[int(first.scene[place])].group, place)
-    found = []
+    questions = []
     for place in chosen.values():
         row, target = int(first.scene[place]), int(first.target[place])
         scene, v = scenes.scenes[row], scenes.v[row].clone()
         v[target] = 0.0
         room = vocabulary.room_types[scene.room_type] if scene.room_type >= 0 else ""
-        found.append(
+        questions.append(
             Example(
                 scene=scene.scene_id,
                 room_type=room,
@@ -377,7 +377,7 @@ def changed_most(
                 ),
             )
         )
-    return found
+    return questions
 
 
 @torch.no_grad()

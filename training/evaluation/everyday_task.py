@@ -148,8 +148,8 @@ def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
 def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Lines:
     hits = []
     for fact in facts:
-        found = {entry["label"] for entry in _five(artifact, fact)}
-        hits.append((int(bool(found & set(fact["expected"]))), 1))
+        labels = {entry["label"] for entry in _five(artifact, fact)}
+        hits.append((int(bool(labels & set(fact["expected"]))), 1))
     return {f"{name}: an expected object is among five": hits}
 
 
@@ -171,8 +171,8 @@ def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
     """Return the index of the object with the id `name`, or of the only object of class `name`."""
     index = artifact.vocabulary.index(name)
     named = [k for k, thing in enumerate(scene.objects) if thing.id == name]
-    places = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]
-    return places[0] if len(places) == 1 else None
+    indices = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]
+    return indices[0] if len(indices) == 1 else None
 
 
 def _outliers(
@@ -180,9 +180,9 @@ def _outliers(
 ) -> Lines:
     first, caught, alarms = [], [], []
     for fact in intruders:
-        found = _judged(artifact, [*fact["objects"], fact["intruder"]])
-        first.append((int(bool(found) and found[0]["label"] == fact["intruder"]), 1))
-        flagged = any(a["label"] == fact["intruder"] and a["is_outlier"] for a in found)
+        answers = _judged(artifact, [*fact["objects"], fact["intruder"]])
+        first.append((int(bool(answers) and answers[0]["label"] == fact["intruder"]), 1))
+        flagged = any(a["label"] == fact["intruder"] and a["is_outlier"] for a in answers)
         caught.append((int(flagged), 1))
     for fact in plain:
         loud = any(entry["is_outlier"] for entry in _judged(artifact, fact["objects"]))
@@ -209,7 +209,7 @@ def _drawn(
 ) -> Iterator[tuple[dict[str, Any], list[set[str]]]]:
     for room in rooms:
         index = artifact.vocabulary.room_index(room["room"])
-        given = replace(Scene(()), room_type=index)
+        empty_room = replace(Scene(()), room_type=index)
         for seed in seeds:
-            answer = questions.generate(artifact, given, count=_DRAWN, seed=seed)
+            answer = questions.generate(artifact, empty_room, count=_DRAWN, seed=seed)
             yield room, [set(scene["objects"]) for scene in answer["scenes"]]

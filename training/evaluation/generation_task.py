@@ -238,9 +238,9 @@ def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], floa
 
 def copies(drawn: Tensor, train: Tensor) -> Floats:
     """Return 1 for each generated scene whose classes are those of a training scene, else 0."""
-    known = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
+    training_rows = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
     rows = np.packbits(drawn.numpy() > 0, axis=1)
-    return np.array([row.tobytes() in known for row in rows], dtype=np.float64)
+    return np.array([row.tobytes() in training_rows for row in rows], dtype=np.float64)
 
 
 def generation_metrics(
@@ -259,7 +259,7 @@ def generation_metrics(
         bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
         emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
     """
-    x, y, known = drawn.v[:, asked], held_out[:, asked], train[:, asked]
+    x, y, training = drawn.v[:, asked], held_out[:, asked], train[:, asked]
     ours, theirs = x.double().numpy(), y.double().numpy()
     each = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
 
@@ -270,7 +270,7 @@ def generation_metrics(
         "MMD²": resampled(discrepancy(y, x, bandwidth)),
         "marginal error": resampled(marginal_error(theirs, ours)),
         "classes per scene": Ratio.of_scenes(ours.sum(1)),
-        "copies of training scenes": Ratio.of_scenes(copies(x, known)),
+        "copies of training scenes": Ratio.of_scenes(copies(x, training)),
     }
     pairs = resampled(pair_correlation(theirs, ours))
     if np.isfinite(pairs.value):
@@ -313,7 +313,7 @@ def generation_task(model: Model, setting: Setting) -> Outcome | None:
     metrics: dict[str, Metric] = {}
     for name, (given, room, emphasis) in conditions.items():
         drawn = sampler(given, room, setting.seed)
-        found = generation_metrics(drawn, first.v, setting.train.v, asked, bandwidth, emphasis)
-        metrics |= {f"{metric}, {name}": value for metric, value in found.items()}
+        own = generation_metrics(drawn, first.v, setting.train.v, asked, bandwidth, emphasis)
+        metrics |= {f"{metric}, {name}": value for metric, value in own.items()}
     notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
     return Outcome(metrics, len(first), 0, notes)

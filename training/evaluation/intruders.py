@@ -90,8 +90,8 @@ def signatures(train: SceneTensors) -> tuple[Flags, Floats]:
         typical: (room types, classes) bool, True for the signature classes of each room type.
         share: (room types, classes) p(class | room type). NaN for a room type with too few scenes.
     """
-    known = (train.room >= 0).numpy()
-    v, room = train.v.numpy()[known] > 0, train.room.numpy()[known]
+    has_room = (train.room >= 0).numpy()
+    v, room = train.v.numpy()[has_room] > 0, train.room.numpy()[has_room]
     rooms = int(room.max(initial=-1)) + 1
     share = np.full((rooms, v.shape[1]), np.nan)
     typical = np.zeros(share.shape, dtype=np.bool_)
@@ -255,7 +255,7 @@ def _scores(
             odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
         size, clean = (v > 0).sum(1)[row], added[row] < 0
         parts.append((index[row], thing, odds.double(), thing == added[row], size, clean))
-    scene, thing, log_odds, intruder, size, clean = (
+    scene, things, log_odds, is_intruder, sizes, is_clean = (
         torch.cat(column).numpy() for column in zip(*parts, strict=True)
     )
-    return IntruderScores(scene, thing, log_odds, intruder, size, clean, scenes, skipped)
+    return IntruderScores(scene, things, log_odds, is_intruder, sizes, is_clean, scenes, skipped)

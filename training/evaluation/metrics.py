@@ -127,11 +127,11 @@ def paired_difference(
         both = min(len(x), len(y))
         draws = x[:both] - y[:both]
     else:
-        names, place = np.unique(np.array(groups), return_inverse=True)
+        names, group_of = np.unique(np.array(groups), return_inverse=True)
         if len(names) < 2:
             raise ValueError("an interval needs scenes of at least two groups")
         weights = scene_weights(len(names), resamples, seed)
-        draws = np.array([a.at(weight[place]) - b.at(weight[place]) for weight in weights])
+        draws = np.array([a.at(weight[group_of]) - b.at(weight[group_of]) for weight in weights])
         value = a.value - b.value
         draws = value + _widening(len(names)) * (draws - value)
     return Figure.of(a.value - b.value, draws, min(a.n, b.n))

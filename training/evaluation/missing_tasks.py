@@ -134,9 +134,9 @@ class Ranking:
 
     def with_unknown(self, unknown: Ints) -> Ratio:
         """Return the MRR if each unknown label, (scenes,), is a removed object of score 0."""
-        known = self.mrr()
-        scored = known.denominators > 0
-        return Ratio(known.numerators, known.denominators + unknown * scored)
+        mrr = self.mrr()
+        scored = mrr.denominators > 0
+        return Ratio(mrr.numerators, mrr.denominators + unknown * scored)
 
 
 def leave_one_out(
@@ -267,9 +267,9 @@ def removed_places(
     row, target, relation, anchor, outgoing = table.unbind(1)
     v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
     counts = torch.zeros_like(v)
-    for place, k in enumerate(row.tolist()):
+    for case, k in enumerate(row.tolist()):
         evidence = scenes.scenes[k].evidence
-        counts[place, torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
+        counts[case, torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
     return row, target, Places(v, counts * v, relation, anchor, outgoing.bool())
 
 

@@ -314,15 +314,15 @@ def completion_task(model: Model, setting: Setting) -> Outcome | None:
     if model.completion is None:
         return None
     scenes, structure, seed = setting.scenes, setting.structure, setting.seed
-    given = complete_scenes(scenes, structure, model.completion, seed=seed)
-    if not _any_true(given):
+    candidates = complete_scenes(scenes, structure, model.completion, seed=seed)
+    if not _any_true(candidates):
         return None
-    ranking = rank(given, len(scenes))
+    ranking = rank(candidates, len(scenes))
     metrics: dict[str, Metric] = {
         "R-precision": ranking.pooled(),
         "R-precision, mean over scenes": ranking.per_scene(),
     }
-    metrics |= _parts(given, setting, _RECALLS)
+    metrics |= _parts(candidates, setting, _RECALLS)
     if model.relations is not None:
         blind = complete_scenes(scenes, structure, model.relations, seed=seed)
         metrics["R-precision, nothing given"] = rank(blind, len(scenes)).pooled()

@@ -124,8 +124,8 @@ def digest(setting: Setting) -> str:
     """Return the sha256 of the questions: scene ids, limit, seed and everyday facts."""
     names = [f"{scene.source} {scene.scene_id}" for scene in setting.scenes.scenes]
     facts = [] if setting.everyday is None else [f"facts {facts_digest(setting.everyday)}"]
-    asked = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
-    return sha256(asked.encode()).hexdigest()
+    text = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
+    return sha256(text.encode()).hexdigest()
 
 
 def measure(

@@ -323,15 +323,19 @@ def _range(counts: Iterable[int]) -> str:
 
 def _notes(asked: Sequence[Asked]) -> str:
     """Return a table of notes, with one line per source or row if the others have equal notes."""
-    found: dict[str, Mapping[str, float]] = {}
-    for place in ("{0.source}", "{0.row}, seed {0.seed}", "{0.row}, seed {0.seed}, {0.source}"):
-        found = {place.format(one): one.notes for one in asked}
-        if all(found[place.format(one)] == one.notes for one in asked):
+    notes: dict[str, Mapping[str, float]] = {}
+    for key_format in (
+        "{0.source}",
+        "{0.row}, seed {0.seed}",
+        "{0.row}, seed {0.seed}, {0.source}",
+    ):
+        notes = {key_format.format(one): one.notes for one in asked}
+        if all(notes[key_format.format(one)] == one.notes for one in asked):
             break
-    names = list(dict.fromkeys(name for values in found.values() for name in values))
+    names = list(dict.fromkeys(name for values in notes.values() for name in values))
     rows = (
         [key, *(_number(values[name]) if name in values else "" for name in names)]
-        for key, values in found.items()
+        for key, values in notes.items()
     )
     return grid(["", *names], rows)
 

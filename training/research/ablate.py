@@ -71,11 +71,11 @@ def ablate(
     """
     with resumable(console):
         configs = _configs(configuration, rows, row, limit, epochs)
-        place = folder / configs[0].name
+        results_folder = folder / configs[0].name
         with console.status("reading and encoding scenes"):
             root = data_folder(configuration, configs[0], data)
             scenes = prepare(configs[0], root).complete_data()
-        plan = Plan(place, scenes, _settings(scenes, asked), tasks=tuple(PRIMARY))
+        plan = Plan(results_folder, scenes, _settings(scenes, asked), tasks=tuple(PRIMARY))
         entries = [
             machine_entry(with_settings(config, {"training.seed": seed}))
             for config in configs
@@ -104,11 +104,14 @@ def ablate(
         *(f"- {row} could not be measured: {why}" for row, why in failures.items()),
     ]
     text = "\n\n".join(parts).rstrip() + "\n"
-    write(place, results.to_dict() | {"failures": failures}, text)
+    write(results_folder, results.to_dict() | {"failures": failures}, text)
     console.print(*results.tables(PRIMARY))
     for name, why in failures.items():
         console.print(f"{name} could not be measured: {why}", markup=False, soft_wrap=True)
-    console.print(f"all results: {place / 'results.md'}, {place / 'results.json'}", soft_wrap=True)
+    console.print(
+        f"all results: {results_folder / 'results.md'}, {results_folder / 'results.json'}",
+        soft_wrap=True,
+    )
 
 
 def _configs(

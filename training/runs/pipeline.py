@@ -139,13 +139,13 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     for source in data.sources:
         name = source_name(source)
         if source == "rooms":
-            found = generate_rooms(data.rooms, seed=data.split_seed)
+            source_scenes = generate_rooms(data.rooms, seed=data.split_seed)
         elif source == priors.SOURCE:
-            found = priors.read_prior_scenes(_path(source, root))
+            source_scenes = priors.read_prior_scenes(_path(source, root))
         else:
             path = _path(source, root)
-            found = [replace(scene, source=name) for scene in read_scenes(path)]
-        scenes[name] = found[: data.limit]
+            source_scenes = [replace(scene, source=name) for scene in read_scenes(path)]
+        scenes[name] = source_scenes[: data.limit]
     return scenes
 
 
