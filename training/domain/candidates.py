@@ -110,13 +110,10 @@ def stored_candidate(reference: str, store: Store) -> Candidate:
 
 
 def find(reference: str, store: Store, data: Path | None, say: Say) -> Candidate:
-    """Return the candidate that a reference names.
-
-    Args:
-        reference: folder of a run, `BASELINES`, or a published model.
+    """Return the candidate that a reference names: a folder of a run, `BASELINES`, or a model.
 
     Raises:
-        ConfigError: the reference names neither a run nor the baselines nor a published model.
+        ConfigError: the reference names none of these.
         RunError: the folder holds no finished run. See also `run_candidate` and `stored_candidate`.
     """
     if reference == BASELINES:
@@ -162,13 +159,9 @@ Sources = Mapping[str, Sequence[AnnotatedScene]]
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Scenes held out from both models.
+    """Scenes held out from both models, and the number of test scenes that are left out.
 
-    Attributes:
-        scenes: test scenes of the first model, without scenes that the second model learnt from.
-        dropped: number of test scenes of the first model that are left out.
-        notes: remarks on the choice of scenes.
-        certain: False if a model may have learnt from some of the scenes.
+    `notes` are remarks on the choice. `certain` is False if a model may have learnt from a scene.
     """
 
     scenes: list[AnnotatedScene]

@@ -277,13 +277,10 @@ def side_by_side(
     *,
     progress: Progress = silent,
 ) -> Results:
-    """Measure every metric that both models support, and the paired differences.
-
-    The bootstrap resamples groups of near-duplicate scenes.
+    """Measure every metric that both models support, and the differences, paired by group.
 
     Raises:
-        ValueError: for every task, the scenes belong to fewer than two groups, so intervals are
-            undefined.
+        ValueError: for every task, the scenes belong to fewer than two groups.
     """
     setting = Setting(scenes, structure, limit=None)
 

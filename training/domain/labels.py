@@ -50,8 +50,7 @@ class Lookalike:
         name: the rarer name.
         like: the more frequent name.
         mentions: number of objects with each of the two names.
-        merged: True if the rarer name becomes an alias of the other name. If False, the user has to
-            decide.
+        merged: True if the rarer name becomes an alias. If False, the user has to decide.
     """
 
     name: str

@@ -57,8 +57,7 @@ def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -
     """Return the scores (N, ...) of N cases. The scores are computed in blocks of cases.
 
     Args:
-        score: function with one argument per column. It returns the scores of a block of cases.
-        columns: tensors (N, ...). Entry k of each tensor belongs to case k.
+        score: function of a block of each column. Entry k of each column belongs to case k.
 
     Raises:
         LeakError: a case gets another score when it is queried in another block.
@@ -162,10 +161,7 @@ def relation_probabilities(
 ) -> Floats:
     """Return the probability of each canonical relation, (relations, objects, objects).
 
-    The value is 0 for pairs that were not queried.
-
-    Args:
-        pairs: ordered pairs of object indices to query. None means all pairs.
+    The value is 0 outside `pairs`, ordered pairs of object indices. None means all pairs.
     """
     n = len(scene.objects)
     probabilities = np.zeros((len(CANONICAL), n, n))

@@ -58,8 +58,7 @@ class Case:
 
     Attributes:
         scenes: the scene with labels only, and the scene with evidence.
-        target: index of the removed class in T2, or index of the intruding object in T3. Unused in
-            T1.
+        target: index of the removed class in T2, or of the intruding object in T3.
         truth: (relations, objects, objects) bool, the relations that hold. Empty in T2 and T3.
         asked: (relations, objects, objects) bool, the queried relations. Empty in T2 and T3.
         items: number of relations to find in T1; 1 in T2 and T3.
@@ -76,13 +75,9 @@ class Case:
 def told(
     encoded: EncodedScene, kept: list[int], kind: str, between: Flags | None = None
 ) -> tuple[Scene, Scene] | None:
-    """Return a scene twice: with labels only, and with evidence.
+    """Return a scene with labels only, and with evidence; None if the scene lacks this evidence.
 
-    The result is None if the scene lacks this kind of evidence.
-
-    Args:
-        between: (instances, instances) bool, the pairs of instances with evidence. None means all
-            pairs.
+    `between` (instances, instances) are the pairs of instances with evidence; None means all pairs.
     """
     bare = replace(scene_of(encoded, kept, ()), room_type=None)
     if kind == "room type":

@@ -104,9 +104,6 @@ def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler
 
     Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
     keeps both.
-
-    Args:
-        steps: number of Gibbs sweeps per scene.
     """
     samples = ChainSamples(machine)
 
@@ -167,7 +164,7 @@ def median_distance(v: Tensor) -> float:
 
 
 def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[Floats], float]:
-    """Return a function that takes weights of the held-out scenes and returns MMD².
+    """Return MMD² as a function of the weights of the held-out scenes.
 
     The statistic excludes pairs of a scene with itself, or with a copy of itself in a resample.
     """
@@ -192,10 +189,7 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
 
 
 def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return a function that takes weights of the held-out scenes and returns sum |p - q| / sum q.
-
-    p and q are the frequencies of a class in generated and in held-out scenes.
-    """
+    """Return the marginal error as a function of the weights of the held-out scenes."""
     p = drawn.mean(0)
 
     def at(weight: Floats) -> float:
@@ -208,10 +202,9 @@ def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]
 
 
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return a function that takes weights of the held-out scenes and returns Pearson r.
+    """Return Pearson r of the class covariances as a function of the weights of held-out scenes.
 
-    r correlates the class covariances of generated scenes with those of held-out scenes, over all
-    pairs of the most common held-out classes.
+    The covariances are those of the most common held-out classes.
     """
     common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
     common = common[held_out[:, common].any(0)]

@@ -178,9 +178,7 @@ def _centred(drawn: Floats, value: float) -> Floats:
 class Ratio(Metric):
     """Micro-average: sum(numerators) / sum(denominators) over scenes.
 
-    Attributes:
-        numerators: (scenes,) numerator of each scene.
-        denominators: (scenes,) denominator of each scene. A skipped scene has denominator 0.
+    Both arrays have the shape (scenes,). A skipped scene has denominator 0.
 
     Raises:
         ValueError: all denominators are 0.

@@ -161,13 +161,7 @@ def leave_one_out(
 
 @dataclass(frozen=True, eq=False)
 class Partial:
-    """Scenes with some classes hidden.
-
-    Attributes:
-        scene: (N,) index of the scene in the set.
-        v: (N, V) presence of the shown classes.
-        hidden: (N, V) bool, the hidden classes.
-    """
+    """N scenes with their index in the set (N,), shown and hidden classes (N, V)."""
 
     scene: Tensor
     v: Tensor
@@ -225,12 +219,7 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
 
 
 def partial_score(artifact: Artifact, coverage: float | None = None) -> ObjectScore:
-    """Return a function that computes the log-probabilities of `/missing` from labels only.
-
-    Args:
-        coverage: share of the objects that the scene lists. None means the default of the model.
-            With 1, unlisted objects are absent.
-    """
+    """Return the log-probabilities of `/missing` from labels, see `missing_probabilities`."""
 
     def score(v: Tensor) -> Tensor:
         scenes = [of_classes(row.nonzero().squeeze(1).tolist()) for row in v]

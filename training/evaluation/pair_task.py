@@ -115,9 +115,7 @@ def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
 def accuracy(p: Floats, listed: Flags) -> Floats:
     """Return 1 for each pair whose most probable relation is listed, else 0; expected over ties.
 
-    Args:
-        p: (N, k) probabilities of k relations.
-        listed: (N, k) bool, True for relations that the scene lists.
+    The arguments are the probabilities of k relations and whether the scene lists them, (N, k).
     """
     best = p == p.max(1, keepdims=True)
     return np.asarray((best & listed).sum(1) / best.sum(1))

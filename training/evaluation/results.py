@@ -146,10 +146,7 @@ class Results:
     ) -> Iterator[Table]:
         """Generate one table per task for the terminal, of the pooled sources if there are any.
 
-        A star has the meaning of `markdown`.
-
-        Args:
-            words: function that takes a task name and returns the title of its table.
+        A star has the meaning of `markdown`. `words` returns the title of the table of a task.
         """
         sources = list(dict.fromkeys(cell.source for cell in self.cells))
         chosen = [source for source in sources if "pooled" in source] or sources

@@ -79,12 +79,9 @@ console = Console()
 
 @dataclass(frozen=True)
 class Domain:
-    """Configurations with the same data section, for one comparison.
+    """Configurations with the same data section. The first one is the reference of differences.
 
-    Attributes:
-        name: name of the first configuration without its last word: "indoor" for "indoor-triway".
-        configs: the configurations. The machine of the first one is the reference of all paired
-            differences.
+    The name is that of the first configuration without its last word: "indoor".
     """
 
     name: str
@@ -238,11 +235,9 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
 
 
 def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
-    """Return the names of the wanted tasks. Without `wanted`, return all tasks.
+    """Return the tasks with the wanted names or prefixes; without `wanted`, all tasks.
 
-    Args:
-        wanted: task names, or prefixes of task names.
-        quick: True leaves out slow tasks, unless they are wanted.
+    With `quick`, slow tasks are left out, unless they are wanted.
 
     Raises:
         ValueError: a wanted name matches no task.
@@ -362,11 +357,9 @@ def _plan(
     tasks: tuple[str, ...],
     asked_by: SplitScenes | None = None,
 ) -> Plan:
-    """Plan the measurement of models that learn from the given scenes.
+    """Plan the measurement of models that learn from `scenes`.
 
-    Args:
-        asked_by: scenes whose training part determines the questions, for example the classes that
-            are typical of a room type. None means `scenes`.
+    The training part of `asked_by`, by default `scenes`, determines the questions.
     """
     data = scenes.complete_data()
     train = data.train if asked_by is None else asked_by.training_data().train

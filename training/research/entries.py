@@ -55,13 +55,12 @@ def baseline_entries(
     related: bool = True,
     whole: bool = True,
 ) -> Iterator[Entry]:
-    """Generate the entries of the selected baselines.
+    """Generate the entries of the baselines in `names`; None means all baselines.
 
     Deterministic baselines have an entry for seed 0 only.
 
     Args:
-        names: names of the baselines. None means all baselines.
-        related: True if the scenes contain relations. False leaves out relation baselines.
+        related: False leaves out relation baselines.
         whole: True adds an outlier alarm and place scores to object baselines.
 
     Raises:
@@ -91,11 +90,7 @@ def _floor(data: TrainingData, folder: Path, say: Say) -> Model:  # noqa: ARG001
 
 
 def machine_entry(config: Config, *, calibrated: bool = True) -> Entry:
-    """Return the entry of a machine. An interrupted training resumes from the entry's folder.
-
-    Args:
-        calibrated: True calibrates the machine as for publication.
-    """
+    """Return the entry of a machine, calibrated as for publication if `calibrated`."""
     identity = f"{config.digest}, calibrated" if calibrated else config.digest
     make = partial(_machine, config, calibrated)
     return Entry(config.name, config.training.seed, identity, make)

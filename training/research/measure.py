@@ -170,8 +170,7 @@ class Plan:
     def measure(self, entry: Entry, progress: Progress) -> None:
         """Measure an entry on every data source that lacks a finished report.
 
-        The model is trained only if a report is missing. On KeyboardInterrupt, the results of
-        finished tasks are already on disk.
+        The model is trained only if a report is missing. Results of finished tasks are on disk.
         """
         known, folder = self.known(entry), self.place(entry)
         model: Model | None = None
@@ -213,10 +212,7 @@ def measure_entries(
     fresh: bool = False,
     failures: tuple[type[Exception], ...] = (),
 ) -> tuple[Reports, dict[str, str]]:
-    """Measure all entries, and skip finished reports.
-
-    KeyboardInterrupt stops the processes. The results of finished tasks are then already on
-    disk.
+    """Measure all entries, and skip finished reports. KeyboardInterrupt stops the processes.
 
     Args:
         workers: number of processes with one thread each. 1 measures in this process.

@@ -193,20 +193,17 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
     elif data.vocabulary == "rooms":
         vocabulary = rooms_vocabulary()
     elif data.vocabulary.endswith(".json"):
-        vocabulary = _read_vocabulary(root / data.vocabulary)
+        path = root / data.vocabulary
+        try:
+            vocabulary = read_vocabulary(path)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"data.vocabulary: {path} cannot be used: {error}") from error
     else:
         raise ConfigError(
             f"data.vocabulary is {data.vocabulary!r}; it must be indoor, source, rooms, or the "
             "name of a .json file"
         )
     return with_typical_sizes(vocabulary, scenes)
-
-
-def _read_vocabulary(path: Path) -> Vocabulary:
-    try:
-        return read_vocabulary(path)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"data.vocabulary: {path} cannot be used: {error}") from error
 
 
 def split_and_encode(
@@ -241,11 +238,7 @@ def split_and_encode(
 
 
 def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch.Tensor | None:
-    """Return the word vectors of the classes, (classes, dimensions), or None if none are set.
-
-    Raises:
-        DatasetError: the file of word vectors is missing or invalid.
-    """
+    """Return the word vectors of the classes, (classes, dimensions), or None if none are set."""
     if not data.words:
         return None
     vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)

@@ -161,10 +161,7 @@ def switch_on_probability(
 
     The probability is p(v_i = 1 | h1, relations), with one sample of the hidden layer h1.
 
-    Args:
-        target: (scenes,) int64, the removed class of each scene.
-        left_on: True keeps the relations of the removed class as annotated. False makes these
-            relations unobserved.
+    The relations of the removed class, `target` (scenes,), are unobserved without `left_on`.
     """
     column = target.unsqueeze(1)
     absent, there = batch.v.scatter(1, column, 0.0), batch.v.scatter(1, column, 1.0)
