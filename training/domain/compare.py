@@ -155,18 +155,14 @@ def compare_command(
             a = find(new, models, data, say)
             served = "default" if "default" in models.aliases() else BASELINES
             b = find(old or served, models, data, say)
-            comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
+            root = data or a.data or b.data or DATA
+            comparison = compare(a, b, root, limit=limit, examples=examples, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         fail(error)
     if output is not None:
         text = json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False)
         output.write_text(text + "\n", encoding="utf-8")
     show(comparison, console)
-
-
-def _root(given: Path | None, *candidates: Candidate) -> Path:
-    folders = (candidate.data for candidate in candidates)
-    return given or next((path for path in folders if path is not None), DATA)
 
 
 def show(comparison: Comparison, console: Console) -> None:
@@ -308,31 +304,23 @@ def unmeasured(rows: Sequence[Difference], other: Candidate) -> tuple[str, ...]:
 
 
 def _notes(a: Candidate, b: Candidate, held: HeldOut, limit: int | None) -> Iterator[str]:
-    """Generate remarks on the results, for the user."""
+    """Generate remarks on the results: held-out scenes, unknown classes of the second model."""
     yield from held.notes
-    asked, other = a.vocabulary, b.vocabulary
-    if asked is not None and other is not None and not same_classes(asked, other):
-        yield from _classes_note(a, b, asked, other, held)
+    ours, theirs = a.vocabulary, b.vocabulary
+    if ours is not None and theirs is not None and not same_classes(ours, theirs):
+        own = Translation.between(ours, theirs).own
+        labels = [thing.label for scene in held.scenes for thing in scene.objects]
+        mentions = [index for label in labels if (index := ours.index(label)) is not None]
+        lost = sum(int(own[index]) < 0 for index in mentions)
+        if missing := int((own < 0).sum()):
+            yield (
+                f"the questions use the {len(ours)} classes of {a.title}. {b.title} lacks "
+                f"{missing} of these classes ({lost / max(len(mentions), 1):.0%} of the "
+                "objects in the scenes). Objects of these classes are not part of its input, and "
+                "it ranks these classes last"
+            )
     if limit is not None and len(held.scenes) > limit:
         yield f"only {limit} of {len(held.scenes)} held-out scenes are compared, because of --limit"
-
-
-def _classes_note(
-    a: Candidate, b: Candidate, asked: Vocabulary, other: Vocabulary, held: HeldOut
-) -> Iterator[str]:
-    """Generate a note on the classes of the first model that the second model lacks, if any."""
-    own = Translation.between(asked, other).own
-    if not (missing := int((own < 0).sum())):
-        return
-    labels = [thing.label for scene in held.scenes for thing in scene.objects]
-    mentions = [index for label in labels if (index := asked.index(label)) is not None]
-    lost = sum(int(own[index]) < 0 for index in mentions)
-    yield (
-        f"the questions use the {len(asked)} classes of {a.title}. {b.title} lacks "
-        f"{missing} of these classes ({lost / max(len(mentions), 1):.0%} of the "
-        "objects in the scenes). Objects of these classes are not part of its input, and it ranks "
-        "these classes last"
-    )
 
 
 def changed_most(

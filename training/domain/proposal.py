@@ -130,31 +130,28 @@ def propose(
             f"{FEWEST_SCENES} scenes, better {FEW_SCENES} scenes of {FEW_SCENES // 2} places"
         )
     seed, parts, test_groups = _split(scenes)
-    values, reasons = _configuration(facts, parts)
-    reasons["data.vocabulary"] = (
-        f"{len(vocabulary)} classes with at least {minimum} mentions; edit the file to change them"
-    )
+    settings, reasons = _configuration(facts, parts)
+    reasons |= {
+        "data.vocabulary": f"{len(vocabulary)} classes with at least {minimum} mentions; edit the "
+        "file to change them",
+        "data.split": "the group name fixes the part: you can add scenes, and versions stay "
+        "comparable",
+        "data.split_seed": f"{parts['train']} training scenes, {parts['validation']} validation "
+        f"scenes, {parts['test']} test scenes",
+    }
     data: dict[str, Any] = {
         "sources": list(sources),
         "vocabulary": "vocabulary.json",
         "split": "stable",
         "split_seed": seed,
-    }
-    if terms:
-        data["terms"] = terms
-    reasons["data.split"] = (
-        "the group name fixes the part: you can add scenes, and versions stay comparable"
-    )
-    reasons["data.split_seed"] = (
-        f"{parts['train']} training scenes, {parts['validation']} validation scenes, "
-        f"{parts['test']} test scenes"
-    )
+    } | ({"terms": terms} if terms else {})
+    variant = settings["machine"]["variant"].capitalize()
     values = {
         "name": name,
-        "description": f"{values['machine']['variant'].capitalize()} machine over {name} scenes.",
+        "description": f"{variant} machine over {name} scenes.",
         "examples": "examples.json",
         "data": data,
-    } | values
+    } | settings
     return Proposal(
         name=name,
         facts=facts,

@@ -231,10 +231,19 @@ def summarise(
     Raises:
         ValueError: the reports lack the reference row.
     """
+    members: dict[tuple[str, str, str, str], list[Metric]] = {}
+    rows = list(dict.fromkeys(row for row, _ in reports))
+    for row, seed in sorted(reports, key=lambda key: rows.index(key[0])):
+        for source, report in reports[row, seed].items():
+            for task, outcome in report.outcomes.items():
+                for name, metric in (outcome.metrics if outcome else {}).items():
+                    members.setdefault((row, source, task, name), []).append(metric)
+    # A pooled metric is left out if its data sources differ between seeds. For example, the Brier
+    # skill of a seed is undefined on a source where all queried relations hold.
     means = {
-        (row, source, task, name): MeanOverSeeds(metrics)
-        for row in dict.fromkeys(name for name, _ in reports)
-        for source, task, name, metrics in _by_metric(reports, row)
+        key: MeanOverSeeds(metrics)
+        for key, metrics in members.items()
+        if len({metric.scenes for metric in metrics}) == 1
     }
     if not any(key[0] == ours for key in means):
         raise ValueError(f"the reports contain no metric of the reference row {ours}")
@@ -278,25 +287,6 @@ def _asked(reports: Reports) -> Iterator[Asked]:
                 if outcome is not None:
                     counts = outcome.scenes, outcome.skipped
                     yield Asked(row, seed, task, source, *counts, outcome.notes)
-
-
-def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:
-    """Iterate over (data source, task, metric name, metrics) of a row, with one metric per seed.
-
-    A pooled metric is left out if its data sources differ between seeds. For example, the Brier
-    skill of a seed is undefined on a source where all queried relations hold.
-    """
-    found: dict[tuple[str, str, str], list[Metric]] = {}
-    for (name, _), by_source in reports.items():
-        if name != row:
-            continue
-        for source, report in by_source.items():
-            for task, outcome in report.outcomes.items():
-                for metric, value in (outcome.metrics if outcome else {}).items():
-                    found.setdefault((source, task, metric), []).append(value)
-    for (source, task, metric), values in found.items():
-        if len({value.scenes for value in values}) == 1:
-            yield source, task, metric, values
 
 
 def remarks(asked: Sequence[Asked]) -> list[str]:

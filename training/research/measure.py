@@ -182,8 +182,9 @@ class Plan:
             if model is None:
                 say("training")
                 model = entry.make(self.data, folder, say)
-                row = _read_row(folder / "row.json") | {"parameters": model.parameters}
-                write_whole(folder / "row.json", json.dumps(row))
+                if model.parameters is not None:
+                    row = _read_row(folder / "row.json") | {"parameters": model.parameters}
+                    write_whole(folder / "row.json", json.dumps(row))
             measure(
                 *(model, setting, source),
                 tasks=self.asked(source),
