@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,8 +17,6 @@ from torch import Tensor
 from app.scene import Vocabulary
 from training.datasets.batches import Batch
 from training.evaluation.model import Model, ObjectScore, PlacedScore, Places, RelationScore
-
-Score = TypeVar("Score")
 
 # Absolute score of unknown classes. The score is finite and larger than all log-odds, so that
 # unknown classes rank last.
@@ -58,15 +56,20 @@ class Translation:
         the highest score ranks first. Unknown classes rank last in every task.
         """
         reverse = replace(self, unknown=BEYOND)
-        return Model(
-            missing=_maybe(self._objects, model.missing),
-            outliers=_maybe(reverse._objects, model.outliers),
-            relations=_maybe(self._relations, model.relations),
-            completion=_maybe(self._relations, model.completion),
-            at_place=_maybe(self._placed, model.at_place),
-            false_relations=_maybe(reverse._relations, model.false_relations),
-            parameters=model.parameters,
-        )
+        translated: dict[str, Callable[[Any], Any]] = {
+            "missing": self._objects,
+            "outliers": reverse._objects,
+            "at_place": self._placed,
+            "relations": self._relations,
+            "completion": self._relations,
+            "false_relations": reverse._relations,
+        }
+        scores = {
+            name: translate(score)
+            for name, translate in translated.items()
+            if (score := getattr(model, name)) is not None
+        }
+        return Model(**scores, parameters=model.parameters)
 
     def presence(self, v: Tensor) -> Tensor:
         """Map presence or counts from the scene classes to the model's classes.
@@ -144,7 +147,3 @@ class Translation:
         # The model has no relations between two objects of the same class.
         apart = index_of[:, None] != index_of[None, :]
         found[scene_pair] = torch.where(apart, values, torch.tensor(self.unknown))
-
-
-def _maybe(change: Callable[[Score], Score], score: Score | None) -> Score | None:
-    return None if score is None else change(score)

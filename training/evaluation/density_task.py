@@ -29,6 +29,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from scipy.special import expit
 from torch import Tensor
 from torch.nn.functional import logsigmoid, softplus
 
@@ -237,7 +238,7 @@ class Ising:
         rng = np.random.default_rng(seed)
         log_base = float(np.logaddexp(0, a).sum())
         chains = len(start)
-        state = State(self, (rng.random((len(a), chains)) < _sigmoid(a)[:, None]).astype(float))
+        state = State(self, (rng.random((len(a), chains)) < expit(a)[:, None]).astype(float))
         weight = np.zeros(chains)
         for warm, cold in pairwise(betas):
             weight += (cold - warm) * state.gain(a)
@@ -280,7 +281,3 @@ class State:
             if len(changed):
                 self.field[:, changed] += np.outer(self.model.W[i], new[changed] - old[changed])
                 self.v[i] = new
-
-
-def _sigmoid(x: Floats) -> Floats:
-    return np.asarray(1 / (1 + np.exp(-x)))

@@ -92,20 +92,6 @@ class Domain:
         """True if the training part may contain near-duplicates of test scenes."""
         return self.configs[0].data.split == "random"
 
-    def require_groups(self) -> None:
-        """Check that the split keeps near-duplicates of test scenes out of the training part.
-
-        Raises:
-            ConfigError: the domain uses a random split, which separates near-duplicates.
-        """
-        if self.leaks:
-            names = ", ".join(config.name for config in self.configs)
-            raise ConfigError(
-                f'{names}: data.split = "random" leaves near-duplicates of test scenes in the '
-                'training part. Set data.split = "group", or run only --seed-protocol, which uses '
-                "a random split"
-            )
-
 
 @dataclass(frozen=True)
 class Options:
@@ -191,8 +177,12 @@ def benchmark(
         if shuffled:
             shuffled_tasks(options.tasks)  # report invalid tasks before hours of training
         for domain in domains:
-            if shuffled or not seed_protocol:
-                domain.require_groups()
+            if domain.leaks and (shuffled or not seed_protocol):
+                raise ConfigError(
+                    f"{', '.join(config.name for config in domain.configs)}: data.split = "
+                    '"random" leaves near-duplicates of test scenes in the training part. Set '
+                    'data.split = "group", or run only --seed-protocol, which uses a random split'
+                )
         for domain in domains:
             results = folder / domain.name
             # With a random split, only the seed protocol (Bozcan et al., 2018) is valid.

@@ -77,16 +77,13 @@ def baseline_entries(
 
 def reference_entries() -> Iterator[Entry]:
     """Generate the untrained references for the evaluation of generated scenes and densities."""
-    for name, make in (("independent classes", _independent), ("held-out scenes (floor)", _floor)):
-        yield Entry(name, 0, name, make)
+    for name in ("independent classes", "held-out scenes (floor)"):
+        yield Entry(name, 0, name, partial(_reference, name))
 
 
-def _independent(data: TrainingData, folder: Path, say: Say) -> Model:  # noqa: ARG001
-    return independent_model(data.train.v.shape[1])
-
-
-def _floor(data: TrainingData, folder: Path, say: Say) -> Model:  # noqa: ARG001
-    return floor_model()
+def _reference(name: str, data: TrainingData, folder: Path, say: Say) -> Model:  # noqa: ARG001
+    classes = data.train.v.shape[1]
+    return independent_model(classes) if name == "independent classes" else floor_model()
 
 
 def machine_entry(config: Config, *, calibrated: bool = True) -> Entry:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -117,7 +116,13 @@ def publish_run(
         spec=machine.spec.to_dict(),
         vocabulary=VocabularyEntry.of(with_room_aliases(scenes.vocabulary), machine.spec.A),
         calibration=calibrated.calibration,
-        training=_training(run, measured),
+        training={
+            **({} if measured is None else {"measured_split": measured[0].config.data.split}),
+            "config": json.loads(run.config.model_dump_json()),
+            "best_epoch": run.best_epoch,
+            "epochs": run.epochs,
+            "parameters": run.machine.parameter_count,
+        },
         data=data_sources(scenes),
         metrics=tuple(rows),
         terms=terms(scenes),
@@ -274,16 +279,6 @@ def _measure(
         tasks=tasks,
         progress=progress,
     )
-
-
-def _training(run: FinishedRun, measured: tuple[FinishedRun, SplitScenes] | None) -> dict[str, Any]:
-    kept = {} if measured is None else {"measured_split": measured[0].config.data.split}
-    return kept | {
-        "config": json.loads(run.config.model_dump_json()),
-        "best_epoch": run.best_epoch,
-        "epochs": run.epochs,
-        "parameters": run.machine.parameter_count,
-    }
 
 
 def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
