@@ -22,7 +22,7 @@ from training.datasets import DatasetError, annotated_classes, encode
 from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
 from training.datasets.files import DATA
-from training.domain.candidates import BASELINES, Candidate, HeldOut, Say, find, held_out
+from training.domain.candidates import BASELINES, Candidate, HeldOut, find, held_out
 from training.domain.init_command import fail
 from training.domain.translation import BEYOND, Translation, same_classes
 from training.evaluation.missing_tasks import leave_one_out
@@ -150,7 +150,7 @@ def compare_command(
     """
     try:
         with console.status("reading") as status:
-            say: Say = status.update
+            say: Progress = status.update
             models = Store(store)
             a = find(new, models, data, say)
             served = "default" if "default" in models.aliases() else BASELINES
@@ -213,7 +213,7 @@ def show(comparison: Comparison, console: Console) -> None:
 
 
 def compare(
-    a: Candidate, b: Candidate, root: Path, *, limit: int | None, examples: int, say: Say
+    a: Candidate, b: Candidate, root: Path, *, limit: int | None, examples: int, say: Progress
 ) -> Comparison:
     """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
 

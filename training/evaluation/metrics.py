@@ -4,7 +4,7 @@ The values per scene allow resampling, pairing with another model, pooling over 
 as JSON.
 
 A resample draws scenes with replacement, as many as the set has. It is stored as the number of
-times that each scene was drawn. The draws depend only on the seed and the number of scenes. So two
+times that each scene was drawn. The draws depend only on the number of scenes. So two
 metrics of the same scenes use the same resamples, and their difference is paired.
 
 Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993).

@@ -276,9 +276,6 @@ def leave_one_out_at(
     return Ranking.of(row, target, values, len(scenes), skipped), places.relation.numpy()
 
 
-# ------------------------------------------------------------------------------------------ tasks
-
-
 def missing_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T2."""
     if model.missing is None:

@@ -156,8 +156,6 @@ def _bound(worst: Floats, group: NDArray[np.str_], rng: Rng, share: float) -> fl
     return float(np.quantile(thresholds, _CONFIDENCE))
 
 
-# ------------------------------------------------------------------------------------------ tasks
-
 # Lengths of short lists, as at the start of an exploration by a robot.
 _SHORT_LISTS = (1, 2, 4, 6)
 

@@ -276,9 +276,6 @@ def placement_scores(
     return Items(scene.astype(np.int64), suspicion, false > 0, len(scenes), skipped)
 
 
-# ------------------------------------------------------------------------------------------ tasks
-
-
 def relations_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T1a."""
     if model.relations is None:

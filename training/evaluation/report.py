@@ -282,17 +282,14 @@ def pool(parts: Sequence[Metric]) -> Metric | None:
 
 
 _KINDS: dict[str, type[Any]] = {
-    "ratio": Ratio,
-    "macro": Macro,
-    "scored": Scored,
-    "resampled": Resampled,
+    cls.__name__.lower(): cls for cls in (Ratio, Macro, Scored, Resampled)
 }
 _TYPES: dict[str, type] = {"scene": np.int64, "group": np.int64, "truth": np.bool_}
 
 
 def metric_to_dict(metric: Metric) -> dict[str, Any]:
     """Return the values of a metric for JSON. Floats are rounded to nine significant digits."""
-    kind = next(name for name, cls in _KINDS.items() if type(metric) is cls)
+    kind = type(metric).__name__.lower()
     names = [field.name for field in fields(_KINDS[kind])]
     return {"kind": kind} | {name: _plain(getattr(metric, name)) for name in names}
 
@@ -307,8 +304,8 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
     kind = rest.pop("kind", None)
     if kind not in _KINDS:
         raise ValueError(f"metric kind must be one of {sorted(_KINDS)}, not {kind!r}")
-    found: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in rest.items()})
-    return found
+    metric: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in rest.items()})
+    return metric
 
 
 def _array(name: str, value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,12 +12,12 @@ from rich.console import Console
 
 from training.datasets.batches import TrainingData, seen_triples
 from training.evaluation.report import SourceReport, pooled, settings_by_source
-from training.evaluation.results import grid, only, summarise, write
+from training.evaluation.results import Reports, grid, only, summarise, write
 from training.evaluation.setting import Setting
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, first_error
 from training.research.entries import Entry, machine_entry
-from training.research.measure import Plan, Reports, measure_entries, resumable, shown
+from training.research.measure import Plan, measure_entries, resumable, shown
 from training.runs.config_files import (
     at_most,
     data_folder,
@@ -147,7 +147,7 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
     }
 
 
-def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
+def _with_pools(reports: Mapping[str, SourceReport]) -> dict[str, SourceReport]:
     """Return the `PRIMARY` metrics, first of the pooled validation and test parts."""
     pools = {
         f"{part} pooled": pooled(
@@ -155,7 +155,7 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
         )
         for part in ("validation", "test")
     }
-    return {name: only(report, PRIMARY) for name, report in (pools | reports).items()}
+    return {name: only(report, PRIMARY) for name, report in {**pools, **reports}.items()}
 
 
 def _costs(plan: Plan, entries: Sequence[Entry]) -> tuple[dict[str, int], dict[str, float]]:

@@ -22,7 +22,7 @@ from training.datasets.batches import seen_triples
 from training.evaluation.baselines import RELATIONS
 from training.evaluation.everyday_task import EVERYDAY, facts_file
 from training.evaluation.report import settings_by_source
-from training.evaluation.results import Results, grid, only, summarise, write
+from training.evaluation.results import Reports, Results, grid, only, summarise, write
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
 from training.fit.configuration import Config, ConfigError, DataConfig
@@ -31,7 +31,6 @@ from training.research.entries import Entry, baseline_entries, machine_entry, re
 from training.research.measure import (
     POOLED,
     Plan,
-    Reports,
     measure_entries,
     resumable,
     shown,

@@ -15,7 +15,7 @@ from training.evaluation.baselines import PLACED, placed_product
 from training.evaluation.baselines.fitting import Baseline
 from training.evaluation.model import Model
 from training.evaluation.outlier_tasks import fitted_alarm
-from training.evaluation.report import write_whole
+from training.evaluation.report import Progress, write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config
@@ -27,8 +27,6 @@ from training.runs.publish import as_stored, draft_artifact
 
 CALIBRATION = "calibration.json"
 """File name of a machine's calibration, in the folder of its run."""
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +43,7 @@ class Entry:
     name: str
     seed: int
     identity: str
-    make: Callable[[TrainingData, Path, Say], Model]
+    make: Callable[[TrainingData, Path, Progress], Model]
 
 
 def baseline_entries(
@@ -81,7 +79,7 @@ def reference_entries() -> Iterator[Entry]:
         yield Entry(name, 0, name, partial(_reference, name))
 
 
-def _reference(name: str, data: TrainingData, folder: Path, say: Say) -> Model:  # noqa: ARG001
+def _reference(name: str, data: TrainingData, folder: Path, say: Progress) -> Model:  # noqa: ARG001
     classes = data.train.v.shape[1]
     return independent_model(classes) if name == "independent classes" else floor_model()
 
@@ -94,7 +92,7 @@ def machine_entry(config: Config, *, calibrated: bool = True) -> Entry:
 
 
 def _fitted(
-    baseline: Baseline, seed: int, whole: bool, data: TrainingData, folder: Path, say: Say
+    baseline: Baseline, seed: int, whole: bool, data: TrainingData, folder: Path, say: Progress
 ) -> Model:
     """Fit a baseline.
 
@@ -112,7 +110,7 @@ def _fitted(
     return replace(model, at_place=product.at_place)
 
 
-def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: Say) -> Model:
+def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: Progress) -> Model:
     """Fit a baseline, and write its trials into trials.jsonl in place of its earlier trials."""
     model = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
@@ -123,7 +121,9 @@ def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: S
     return model
 
 
-def _machine(config: Config, calibrated: bool, data: TrainingData, folder: Path, say: Say) -> Model:
+def _machine(
+    config: Config, calibrated: bool, data: TrainingData, folder: Path, say: Progress
+) -> Model:
     run, seed = folder / "run", config.training.seed
     machine = _trained(config, data, run, say)
     if not calibrated:
@@ -142,7 +142,7 @@ def _machine(config: Config, calibrated: bool, data: TrainingData, folder: Path,
     return artifact_model(artifact, data.train, seed=seed)
 
 
-def _trained(config: Config, data: TrainingData, run: Path, say: Say) -> BoltzmannMachine:
+def _trained(config: Config, data: TrainingData, run: Path, say: Progress) -> BoltzmannMachine:
     try:
         return load_run(run).machine
     except RunError:

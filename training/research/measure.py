@@ -40,6 +40,7 @@ from training.datasets import DatasetError
 from training.datasets.batches import TrainingData
 from training.evaluation.model import Model
 from training.evaluation.report import SourceReport, digest, measure, pooled, write_whole
+from training.evaluation.results import Reports
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, WHOLE_SET, Task
 from training.fit.checkpoint import RunError
@@ -58,7 +59,6 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 # The last note on a row and source tells whether the report was measured now or read from a file.
 DONE, KNOWN = "done", "known"
-Reports = dict[tuple[str, int], dict[str, SourceReport]]
 
 POOLED = "pooled"
 """Name of the union of all data sources."""

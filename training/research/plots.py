@@ -17,13 +17,10 @@ from matplotlib.figure import Figure
 from training.evaluation.calibration_task import QUESTIONS
 from training.evaluation.item_statistics import reliability
 from training.evaluation.metrics import Scored
-from training.evaluation.report import SourceReport
-from training.evaluation.results import Results
+from training.evaluation.results import Reports, Results
 from training.evaluation.setting import Outcome
 from training.research.entries import Entry
 from training.research.measure import POOLED, Plan, slug
-
-Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
 
 _CURVES = {
     "mrr_validation": "MRR of removed objects",
