@@ -72,7 +72,7 @@ class Case:
     items: int = 1
 
 
-def told(
+def with_evidence(
     encoded: EncodedScene, kept: list[int], kind: str, between: Flags | None = None
 ) -> tuple[Scene, Scene] | None:
     """Return a scene with labels only, and with evidence; None if the scene lacks this evidence.
@@ -103,7 +103,7 @@ def removals(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -
             continue
         for target in scene_rng(encoded, seed).permutation(removable)[:_REMOVALS]:
             kept = np.flatnonzero(encoded.instance_classes != target).tolist()
-            if (both := told(encoded, kept, kind)) is not None:
+            if (both := with_evidence(encoded, kept, kind)) is not None:
                 yield Case(index, both, int(target))
 
 
@@ -115,7 +115,7 @@ def intrusions(
 ) -> Iterator[Case]:
     """Generate the T3 questions: each scene with its intruder, (scenes,); -1 skips the scene."""
     for index, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
-        both = told(encoded, list(range(len(encoded.instance_classes))), kind)
+        both = with_evidence(encoded, list(range(len(encoded.instance_classes))), kind)
         if intruder < 0 or both is None:
             continue
         bare, more = (_intruded(artifact, scene, int(intruder)) for scene in both)
@@ -142,7 +142,7 @@ def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> 
         half = scene_rng(encoded, seed).permutation(usable)[: max(2, len(usable) // 2)]
         in_half, plain = np.isin(own, half), ~structure[own]
         between = in_half[:, None] & in_half
-        both = told(encoded, list(range(len(own))), kind, between)
+        both = with_evidence(encoded, list(range(len(own))), kind, between)
         pair = plain[:, None] & plain & ~between & ~np.eye(len(own), dtype=np.bool_)
         queried = np.broadcast_to(pair, encoded.instance_holds.shape)
         truth = encoded.instance_holds & queried
@@ -231,13 +231,13 @@ def _changes(
             ask_every(lambda case: np.array([value(artifact, s, case) for s in case.scenes]), cases)
         )
         index = [case.place for case in cases]
-        without, with_evidence, below = (
+        without, informed, below = (
             np.bincount(index, weights=column, minlength=len(scenes)).astype(np.float64)
             for column in (*values.T, [case.items for case in cases])
         )
         metrics |= {
-            f"change of {metric}, {kind}": Ratio(with_evidence - without, below),
-            f"{metric}, {kind}": Ratio(with_evidence, below),
+            f"change of {metric}, {kind}": Ratio(informed - without, below),
+            f"{metric}, {kind}": Ratio(informed, below),
             f"{metric}, {kind} withheld": Ratio(without, below),
         }
         skipped.append(int((below == 0).sum()))

@@ -144,14 +144,14 @@ def leave_one_out(
     structure: Tensor,
     score: ObjectScore | RoomScore,
     *,
-    told_room: bool = False,
+    with_room: bool = False,
 ) -> Ranking:
-    """Rank each class of each scene when it is removed; `told_room` passes the room types."""
+    """Rank each class of each scene when it is removed; `with_room` passes the room types."""
     removable = (scenes.v > 0) & ~structure
     enough = removable.sum(1) >= 2
     row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
     v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
-    values = ask_rows(score, v, scenes.room[row]) if told_room else ask_rows(score, v)
+    values = ask_rows(score, v, scenes.room[row]) if with_room else ask_rows(score, v)
     values = values.masked_fill((v > 0) | structure, -torch.inf)
     return Ranking.of(row, target, values, len(scenes), int((~enough).sum()))
 
@@ -295,7 +295,7 @@ def missing_in_room_task(model: Model, setting: Setting) -> Outcome | None:
     scenes, structure, score = setting.scenes, setting.structure, model.missing_in_room
     if score is None or not len(scenes):
         return None
-    ranking = leave_one_out(scenes, structure, score, told_room=True)
+    ranking = leave_one_out(scenes, structure, score, with_room=True)
     if not len(ranking.target):
         return None
     metrics = ranking.metrics()

@@ -56,12 +56,6 @@ class ScenePairs:
     ends: Ints
     listed: Flags
 
-    @property
-    def classes(self) -> Ints:
-        """Class indices of the two classes of each pair, (P, 2)."""
-        ends: Ints = self.scene.evidence.classes[self.ends]
-        return ends
-
 
 # Function that returns probabilities (P, 8) for the pairs of a scene.
 PairScore = Callable[[ScenePairs], Floats]
@@ -154,7 +148,7 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
         ),
         "log-loss": Ratio.of_items(scene, loss, len(scenes)),
     }
-    classes = np.concatenate([one.classes for one in questions])
+    classes = np.concatenate([one.scene.evidence.classes[one.ends] for one in questions])
     for name, some in _little_known(classes, setting).items():
         if some.any():
             metrics[f"accuracy, {name}"] = Ratio.of_items(scene[some], right[some], len(scenes))

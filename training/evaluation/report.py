@@ -134,21 +134,21 @@ def measure(
     source: str,
     *,
     tasks: Iterable[str] = tuple(TASKS),
-    known: Mapping[str, Task] = EVERY_TASK,
+    registry: Mapping[str, Task] = EVERY_TASK,
     path: Path | None = None,
     progress: Progress = silent,
 ) -> SourceReport:
     """Measure tasks. With `path`, skip the tasks in this file, and write it after every task.
 
     Args:
-        tasks: names of the tasks, which are keys of `known`.
+        tasks: names of the tasks, which are keys of `registry`.
 
     Raises:
         ValueError: a task is unknown, or the file belongs to other scenes or questions.
     """
     wanted = list(tasks)
-    if unknown := sorted(set(wanted) - set(known)):
-        raise ValueError(f"unknown tasks {unknown}: choose from {list(known)}")
+    if unknown := sorted(set(wanted) - set(registry)):
+        raise ValueError(f"unknown tasks {unknown}: choose from {list(registry)}")
     report = SourceReport(source, digest(setting))
     if path is not None and path.exists():
         report = SourceReport.read(path, setting)
@@ -157,7 +157,7 @@ def measure(
             continue
         progress(f"{source}: {task}")
         began = time.perf_counter()
-        report.outcomes[task] = known[task](model, setting)
+        report.outcomes[task] = registry[task](model, setting)
         report.seconds[task] = time.perf_counter() - began
         if path is not None:
             write_whole(path, json.dumps(report.to_dict(), allow_nan=False))

@@ -163,7 +163,7 @@ def _costs(plan: Plan, entries: Sequence[Entry]) -> tuple[dict[str, int], dict[s
     weights, seconds = {}, {}
     for name in dict.fromkeys(entry.name for entry in entries):
         try:
-            runs = [load_run(plan.place(one) / "run") for one in entries if one.name == name]
+            runs = [load_run(plan.folder_of(one) / "run") for one in entries if one.name == name]
         except RunError:
             continue
         held = {"kappa", *runs[0].config.machine.without}

@@ -280,7 +280,7 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
 def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> None:
     """Measure each machine, trained once on a random split, by the seed protocol."""
     scenes = options.scenes(domain, split="random")
-    plan = replace(_plan(folder, scenes, options, tuple(SEED_TASKS)), known_tasks=SEED_TASKS)
+    plan = replace(_plan(folder, scenes, options, tuple(SEED_TASKS)), registry=SEED_TASKS)
     entries = [
         machine_entry(with_settings(config, {"data.split": "random"}), calibrated=False)
         for config in options.configs(domain, 0)

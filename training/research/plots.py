@@ -45,7 +45,7 @@ def write_plots(
     """
     runs: dict[str, list[Path]] = {}
     for entry in machines:
-        runs.setdefault(entry.name, []).append(plan.place(entry) / "run" / "curve.csv")
+        runs.setdefault(entry.name, []).append(plan.folder_of(entry) / "run" / "curve.csv")
     drawn = {"learning-curves": learning_curves(runs), "recall": recall_curves(results, POOLED)}
     for entry in machines:
         outcome = reports[entry.name, entry.seed][POOLED].outcomes.get("Calibration")
