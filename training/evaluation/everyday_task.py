@@ -8,9 +8,9 @@ parameters of the service. Labels outside the vocabulary are ignored.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from hashlib import sha256
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -198,20 +198,13 @@ def _judged(artifact: Artifact, labels: Sequence[str]) -> list[Fields]:
 
 
 def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -> Lines:
-    typical, foreign, empty = [], [], []
-    for room, drawn in _drawn(artifact, rooms, seeds):
-        typical.append((sum(bool(one & set(room["one_of"])) for one in drawn), len(drawn)))
-        foreign.append((sum(bool(one & set(room["never"])) for one in drawn), len(drawn)))
-        empty.append((sum(len(one) < _FEW for one in drawn), len(drawn)))
-    return dict(zip(LINES[8:], (typical, foreign, empty), strict=True))
-
-
-def _drawn(
-    artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]
-) -> Iterator[tuple[dict[str, Any], list[set[str]]]]:
-    for room in rooms:
-        index = artifact.vocabulary.room_index(room["room"])
-        empty_room = replace(Scene(()), room_type=index)
-        for seed in seeds:
-            answer = questions.generate(artifact, empty_room, count=_DRAWN, seed=seed)
-            yield room, [set(scene["objects"]) for scene in answer["scenes"]]
+    rows = []
+    for room, seed in product(rooms, seeds):
+        given = Scene((), room_type=artifact.vocabulary.room_index(room["room"]))
+        answer = questions.generate(artifact, given, count=_DRAWN, seed=seed)
+        drawn = [set(scene["objects"]) for scene in answer["scenes"]]
+        typical = sum(bool(one & set(room["one_of"])) for one in drawn)
+        foreign = sum(bool(one & set(room["never"])) for one in drawn)
+        few = sum(len(one) < _FEW for one in drawn)
+        rows.append([(count, len(drawn)) for count in (typical, foreign, few)])
+    return {name: [row[k] for row in rows] for k, name in enumerate(LINES[8:])}
