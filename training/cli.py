@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -200,8 +200,13 @@ def publish(
         root = data or (Path(run.data) if run.data else DATA)
         scenes = _prepare(run.config, root)
         if promote:
-            gate = _Gate(alias or "default", margin, limit, even_if_worse)
-            _promote(run, scenes, root, models, version, gate)
+            _promote(
+                *(run, scenes, root, models, version),
+                alias=alias or "default",
+                margin=margin,
+                limit=limit,
+                even_if_worse=even_if_worse,
+            )
             command = f"SCENE_STORE={shlex.quote(store)} SCENE_PORT=8055 python -m app"
             console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)
         else:
@@ -372,39 +377,38 @@ def _published(artifact: Artifact, unmoved: str | None = None) -> None:
         console.print(f"no alias moved; to serve it as default: {command}", soft_wrap=True)
 
 
-@dataclass(frozen=True)
-class _Gate:
-    """Settings of the comparison before a promotion. `publish` describes the comparison."""
-
-    alias: str
-    margin: float
-    limit: int
-    even_if_worse: bool
-
-
 def _promote(
-    run: FinishedRun, scenes: SplitScenes, root: Path, store: Store, version: str, gate: _Gate
+    run: FinishedRun,
+    scenes: SplitScenes,
+    root: Path,
+    store: Store,
+    version: str,
+    *,
+    alias: str,
+    margin: float,
+    limit: int,
+    even_if_worse: bool,
 ) -> None:
     """Publish the version and point the alias at it, unless the gate refuses the version."""
-    before = seat(store, gate.alias)
+    before = seat(store, alias)
     with console.status("publishing") as status:
 
         def judged(artifact: Artifact) -> list[str]:
-            limit, say = gate.limit, status.update
+            say = status.update
             useful = measure_usefulness(artifact, scenes.training_data(), limit=limit, say=say)
             for line in useful.lines():
                 console.print(line, highlight=False)
             reasons = useful.objections()
-            if before.holder is not None and (gate.even_if_worse or not reasons):
+            if before.holder is not None and (even_if_worse or not reasons):
                 try:
                     new = Candidate(NEW, run.config, scenes.digests, artifact, root)
                     comparison = compare(
                         *(new, before.holder, root), limit=limit, examples=3, say=say
                     )
                     show(comparison, console)
-                    reasons += losses(comparison, gate.margin)
+                    reasons += losses(comparison, margin)
                 except ConfigError as error:
-                    if not gate.even_if_worse:
+                    if not even_if_worse:
                         raise
                     console.print(f"the versions were not compared: {error}", soft_wrap=True)
             return reasons
@@ -412,7 +416,7 @@ def _promote(
         artifact = publish_run(
             *(run, scenes, store, version),
             judge=judged,
-            accept=_accept if gate.even_if_worse else None,
+            accept=_accept if even_if_worse else None,
             progress=status.update,
         )
     if before.note:
@@ -420,9 +424,9 @@ def _promote(
     _published(artifact)
     # `expected` makes the change fail if another process changed the alias during the comparison.
     target = AliasTarget(name=artifact.manifest.name, version=version)
-    store.set_alias(gate.alias, target, expected=before.target)
+    store.set_alias(alias, target, expected=before.target)
     was = f", before {before.target}" if before.target is not None else ""
-    console.print(f"promoted: {gate.alias} → {target}{was}", soft_wrap=True)
+    console.print(f"promoted: {alias} → {target}{was}", soft_wrap=True)
 
 
 def _show(tables: dict[str, list[Metric]]) -> None:

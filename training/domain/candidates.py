@@ -5,7 +5,7 @@ A candidate is the model of a finished run, a published model, or a set of basel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from training.evaluation.artifact_model import artifact_model
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, placed_product
 from training.evaluation.baselines.fitting import Baseline
 from training.evaluation.model import Model
+from training.evaluation.report import Progress
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, DataConfig, source_name
 from training.runs.folder import load_run
@@ -32,8 +33,6 @@ BASELINES = "baselines"
 
 Objects at a place are scored by the product of EASE and a frequency table of places.
 """
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ class Candidate:
         """Classes of the model. None for the baselines, which use those of the other candidate."""
         return None if self.artifact is None else self.artifact.vocabulary
 
-    def model(self, scenes: Vocabulary, data: TrainingData, say: Say) -> Model:
+    def model(self, scenes: Vocabulary, data: TrainingData, say: Progress) -> Model:
         """Return the scores of this candidate, which take and return values in the scene classes.
 
         Args:
@@ -72,7 +71,7 @@ class Candidate:
         return Translation.between(scenes, self.artifact.vocabulary).model(own)
 
 
-def run_candidate(folder: Path, data: Path | None, say: Say) -> Candidate:
+def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
     """Load a finished run as a candidate, and calibrate its model as for publication.
 
     Args:
@@ -109,14 +108,11 @@ def stored_candidate(reference: str, store: Store) -> Candidate:
     return Candidate(f"{name}@{version}", config, learnt, artifact)
 
 
-def find(reference: str, store: Store, data: Path | None, say: Say) -> Candidate:
-    """Return the candidate that a reference names.
-
-    Args:
-        reference: folder of a run, `BASELINES`, or a published model.
+def find(reference: str, store: Store, data: Path | None, say: Progress) -> Candidate:
+    """Return the candidate that a reference names: a folder of a run, `BASELINES`, or a model.
 
     Raises:
-        ConfigError: the reference names neither a run nor the baselines nor a published model.
+        ConfigError: the reference names none of these.
         RunError: the folder holds no finished run. See also `run_candidate` and `stored_candidate`.
     """
     if reference == BASELINES:
@@ -136,7 +132,7 @@ def find(reference: str, store: Store, data: Path | None, say: Say) -> Candidate
         ) from error
 
 
-def _baselines(data: TrainingData, say: Say) -> Model:
+def _baselines(data: TrainingData, say: Progress) -> Model:
     def fit(baseline: Baseline) -> Model:
         say(f"fitting {baseline.name}")
         return baseline.fit(data.train, data.validation, data.structure, progress=say)
@@ -162,13 +158,9 @@ Sources = Mapping[str, Sequence[AnnotatedScene]]
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Scenes held out from both models.
+    """Scenes held out from both models, and the number of test scenes that are left out.
 
-    Attributes:
-        scenes: test scenes of the first model, without scenes that the second model learnt from.
-        dropped: number of test scenes of the first model that are left out.
-        notes: remarks on the choice of scenes.
-        certain: False if a model may have learnt from some of the scenes.
+    `notes` are remarks on the choice. `certain` is False if a model may have learnt from a scene.
     """
 
     scenes: list[AnnotatedScene]

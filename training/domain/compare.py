@@ -22,7 +22,7 @@ from training.datasets import DatasetError, annotated_classes, encode
 from training.datasets.batches import SceneTensors, scene_tensors
 from training.datasets.cases import some_scenes
 from training.datasets.files import DATA
-from training.domain.candidates import BASELINES, Candidate, HeldOut, Say, find, held_out
+from training.domain.candidates import BASELINES, Candidate, HeldOut, find, held_out
 from training.domain.init_command import fail
 from training.domain.translation import BEYOND, Translation, same_classes
 from training.evaluation.missing_tasks import leave_one_out
@@ -150,23 +150,19 @@ def compare_command(
     """
     try:
         with console.status("reading") as status:
-            say: Say = status.update
+            say: Progress = status.update
             models = Store(store)
             a = find(new, models, data, say)
             served = "default" if "default" in models.aliases() else BASELINES
             b = find(old or served, models, data, say)
-            comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
+            root = data or a.data or b.data or DATA
+            comparison = compare(a, b, root, limit=limit, examples=examples, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         fail(error)
     if output is not None:
         text = json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False)
         output.write_text(text + "\n", encoding="utf-8")
     show(comparison, console)
-
-
-def _root(given: Path | None, *candidates: Candidate) -> Path:
-    folders = (candidate.data for candidate in candidates)
-    return given or next((path for path in folders if path is not None), DATA)
 
 
 def show(comparison: Comparison, console: Console) -> None:
@@ -217,7 +213,7 @@ def show(comparison: Comparison, console: Console) -> None:
 
 
 def compare(
-    a: Candidate, b: Candidate, root: Path, *, limit: int | None, examples: int, say: Say
+    a: Candidate, b: Candidate, root: Path, *, limit: int | None, examples: int, say: Progress
 ) -> Comparison:
     """Measure both models on the tasks of `COMPARED`. The questions use the first model's classes.
 
@@ -254,9 +250,9 @@ def compare(
     groups = len({scene.group for scene in scenes.scenes})
     say("looking for examples")
     first, second = (model.missing for model in models)
-    found: list[Example] = []
+    different: list[Example] = []
     if first is not None and second is not None:
-        found = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
+        different = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
     return Comparison(
         results=results,
         b=titles[1],
@@ -264,7 +260,7 @@ def compare(
         groups=groups,
         certain=held.certain,
         notes=tuple(_notes(a, b, held, limit)),
-        examples=tuple(found),
+        examples=tuple(different),
         unmeasured=unmeasured(results.differences, b),
     )
 
@@ -277,13 +273,10 @@ def side_by_side(
     *,
     progress: Progress = silent,
 ) -> Results:
-    """Measure every metric that both models support, and the paired differences.
-
-    The bootstrap resamples groups of near-duplicate scenes.
+    """Measure every metric that both models support, and the differences, paired by group.
 
     Raises:
-        ValueError: for every task, the scenes belong to fewer than two groups, so intervals are
-            undefined.
+        ValueError: for every task, the scenes belong to fewer than two groups.
     """
     setting = Setting(scenes, structure, limit=None)
 
@@ -311,31 +304,23 @@ def unmeasured(rows: Sequence[Difference], other: Candidate) -> tuple[str, ...]:
 
 
 def _notes(a: Candidate, b: Candidate, held: HeldOut, limit: int | None) -> Iterator[str]:
-    """Generate remarks on the results, for the user."""
+    """Generate remarks on the results: held-out scenes, unknown classes of the second model."""
     yield from held.notes
-    asked, other = a.vocabulary, b.vocabulary
-    if asked is not None and other is not None and not same_classes(asked, other):
-        yield from _classes_note(a, b, asked, other, held)
+    ours, theirs = a.vocabulary, b.vocabulary
+    if ours is not None and theirs is not None and not same_classes(ours, theirs):
+        own = Translation.between(ours, theirs).own
+        labels = [thing.label for scene in held.scenes for thing in scene.objects]
+        mentions = [index for label in labels if (index := ours.index(label)) is not None]
+        lost = sum(int(own[index]) < 0 for index in mentions)
+        if missing := int((own < 0).sum()):
+            yield (
+                f"the questions use the {len(ours)} classes of {a.title}. {b.title} lacks "
+                f"{missing} of these classes ({lost / max(len(mentions), 1):.0%} of the "
+                "objects in the scenes). Objects of these classes are not part of its input, and "
+                "it ranks these classes last"
+            )
     if limit is not None and len(held.scenes) > limit:
         yield f"only {limit} of {len(held.scenes)} held-out scenes are compared, because of --limit"
-
-
-def _classes_note(
-    a: Candidate, b: Candidate, asked: Vocabulary, other: Vocabulary, held: HeldOut
-) -> Iterator[str]:
-    """Generate a note on the classes of the first model that the second model lacks, if any."""
-    own = Translation.between(asked, other).own
-    if not (missing := int((own < 0).sum())):
-        return
-    labels = [thing.label for scene in held.scenes for thing in scene.objects]
-    mentions = [index for label in labels if (index := asked.index(label)) is not None]
-    lost = sum(int(own[index]) < 0 for index in mentions)
-    yield (
-        f"the questions use the {len(asked)} classes of {a.title}. {b.title} lacks "
-        f"{missing} of these classes ({lost / max(len(mentions), 1):.0%} of the "
-        "objects in the scenes). Objects of these classes are not part of its input, and it ranks "
-        "these classes last"
-    )
 
 
 def changed_most(
@@ -358,13 +343,13 @@ def changed_most(
         if len(chosen) == count or not change[place]:
             break
         chosen.setdefault(scenes.scenes[int(first.scene[place])].group, place)
-    found = []
+    questions = []
     for place in chosen.values():
         row, target = int(first.scene[place]), int(first.target[place])
         scene, v = scenes.scenes[row], scenes.v[row].clone()
         v[target] = 0.0
         room = vocabulary.room_types[scene.room_type] if scene.room_type >= 0 else ""
-        found.append(
+        questions.append(
             Example(
                 scene=scene.scene_id,
                 room_type=room,
@@ -377,7 +362,7 @@ def changed_most(
                 ),
             )
         )
-    return found
+    return questions
 
 
 @torch.no_grad()

@@ -19,12 +19,13 @@ from app.registry import Artifact, ArtifactError, Store, StoreError
 from app.registry.references import AliasTarget
 from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
-from training.domain.candidates import Candidate, Say, stored_candidate
+from training.domain.candidates import Candidate, stored_candidate
 from training.domain.compare import Comparison
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
 from training.evaluation.missing_tasks import MachineScore, leave_one_out
 from training.evaluation.model import ObjectScore
+from training.evaluation.report import Progress
 from training.evaluation.tasks import in_words
 from training.machines.arrays import machine_of
 
@@ -98,7 +99,7 @@ def _signed(figure: Figure) -> str:
 
 
 def measure_usefulness(
-    artifact: Artifact, data: TrainingData, *, limit: int | None, say: Say
+    artifact: Artifact, data: TrainingData, *, limit: int | None, say: Progress
 ) -> Usefulness:
     """Compare a new version with popularity and EASE on the test scenes of its run.
 

@@ -75,12 +75,12 @@ def init(
                 "another folder with --output"
             )
         with console.status("reading scenes"):
-            found = {file: _read(file, format_) for file in files}
+            scenes_of = {file: _read(file, format_) for file in files}
         for file in files:
-            if not found[file]:
+            if not scenes_of[file]:
                 raise DatasetError(file, "", "the file contains no scene")
-        sources, copies = _sources(folder, found)
-        scenes = [scene for some in found.values() for scene in some]
+        sources, copies = _sources(folder, scenes_of)
+        scenes = [scene for some in scenes_of.values() for scene in some]
         with console.status("analysing scenes"):
             proposal = propose(name, scenes, sources, terms=terms)
             proposal.config  # noqa: B018  # raises an error if the proposal is invalid
@@ -118,11 +118,11 @@ def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
         return READERS[format_ or guess_format(path)](path)
     scenes: list[AnnotatedScene] = []
     errors: list[DatasetError] = []
-    for found in scan_jsonl(path):
-        if isinstance(found, DatasetError):
-            errors.append(found)
+    for line in scan_jsonl(path):
+        if isinstance(line, DatasetError):
+            errors.append(line)
         else:
-            scenes.append(found)
+            scenes.append(line)
     if errors:
         raise BadLinesError(errors)
     return scenes

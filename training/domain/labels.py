@@ -50,8 +50,7 @@ class Lookalike:
         name: the rarer name.
         like: the more frequent name.
         mentions: number of objects with each of the two names.
-        merged: True if the rarer name becomes an alias of the other name. If False, the user has to
-            decide.
+        merged: True if the rarer name becomes an alias. If False, the user has to decide.
     """
 
     name: str
@@ -99,7 +98,7 @@ def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
             shown.setdefault(key, Counter())[name] += 1
             here.add(key)
         seen.update(here)
-    found = [
+    labels = [
         Label(
             name=_first(shown[key]),
             mentions=counts.total(),
@@ -108,7 +107,7 @@ def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
         )
         for key, counts in spellings.items()
     ]
-    return sorted(found, key=lambda label: (-label.mentions, label.name))
+    return sorted(labels, key=lambda label: (-label.mentions, label.name))
 
 
 def _first(counts: Counter[str]) -> str:
@@ -127,7 +126,7 @@ def lookalikes(
     curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}
     pairs = list(_pairs([label_key(label.name) for label in compared]))
     together = _together({compared[k].name for pair in pairs for k in pair}, scenes, names)
-    found = []
+    similar = []
     for i, j in pairs:
         # Labels are sorted by frequency, so the second name of a pair is rarer.
         like, rare = compared[i], compared[j]
@@ -143,8 +142,8 @@ def lookalikes(
         else:
             merged, why = True, "rare, one or two letters differ, never in one scene"
         mentions = (rare.mentions, like.mentions)
-        found.append(Lookalike(rare.name, like.name, mentions, merged, why))
-    return _once(found)
+        similar.append(Lookalike(rare.name, like.name, mentions, merged, why))
+    return _once(similar)
 
 
 def _pairs(keys: Sequence[str]) -> Iterator[tuple[int, int]]:
@@ -165,12 +164,12 @@ def _together(
 ) -> set[frozenset[str]]:
     """Return the pairs of names in `wanted` that occur in the same scene."""
     by_key = {label_key(name): name for name in wanted}
-    known = cache(lambda label: by_key.get(label_key(names.canonical(label))))
-    found: set[frozenset[str]] = set()
+    name_of = cache(lambda label: by_key.get(label_key(names.canonical(label))))
+    together: set[frozenset[str]] = set()
     for scene in scenes:
-        here = {name for thing in scene.objects if (name := known(thing.label)) is not None}
-        found |= {frozenset((a, b)) for a in here for b in here if a < b}
-    return found
+        here = {name for thing in scene.objects if (name := name_of(thing.label)) is not None}
+        together |= {frozenset((a, b)) for a in here for b in here if a < b}
+    return together
 
 
 def _once(found: list[Lookalike]) -> list[Lookalike]:

@@ -130,31 +130,28 @@ def propose(
             f"{FEWEST_SCENES} scenes, better {FEW_SCENES} scenes of {FEW_SCENES // 2} places"
         )
     seed, parts, test_groups = _split(scenes)
-    values, reasons = _configuration(facts, parts)
-    reasons["data.vocabulary"] = (
-        f"{len(vocabulary)} classes with at least {minimum} mentions; edit the file to change them"
-    )
+    settings, reasons = _configuration(facts, parts)
+    reasons |= {
+        "data.vocabulary": f"{len(vocabulary)} classes with at least {minimum} mentions; edit the "
+        "file to change them",
+        "data.split": "the group name fixes the part: you can add scenes, and versions stay "
+        "comparable",
+        "data.split_seed": f"{parts['train']} training scenes, {parts['validation']} validation "
+        f"scenes, {parts['test']} test scenes",
+    }
     data: dict[str, Any] = {
         "sources": list(sources),
         "vocabulary": "vocabulary.json",
         "split": "stable",
         "split_seed": seed,
-    }
-    if terms:
-        data["terms"] = terms
-    reasons["data.split"] = (
-        "the group name fixes the part: you can add scenes, and versions stay comparable"
-    )
-    reasons["data.split_seed"] = (
-        f"{parts['train']} training scenes, {parts['validation']} validation scenes, "
-        f"{parts['test']} test scenes"
-    )
+    } | ({"terms": terms} if terms else {})
+    variant = settings["machine"]["variant"].capitalize()
     values = {
         "name": name,
-        "description": f"{values['machine']['variant'].capitalize()} machine over {name} scenes.",
+        "description": f"{variant} machine over {name} scenes.",
         "examples": "examples.json",
         "data": data,
-    } | values
+    } | settings
     return Proposal(
         name=name,
         facts=facts,
@@ -183,10 +180,10 @@ def _minimum(
     covered: dict[int, tuple[int, float]] = {}
     for minimum in sorted({*_TABLE, *MINIMA}):
         try:
-            found = _vocabulary(scenes, pairs, minimum)
+            vocabulary = _vocabulary(scenes, pairs, minimum)
         except ValueError:
             continue  # no label has so many mentions
-        covered[minimum] = (len(found), coverage(found, scenes))
+        covered[minimum] = (len(vocabulary), coverage(vocabulary, scenes))
     if not covered:
         raise ConfigError("every label occurs only once: training needs labels with more objects")
     enough = [
@@ -268,12 +265,12 @@ def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
     """
     best: tuple[float, int, dict[str, int], int] | None = None
     for seed in range(_SPLIT_SEEDS):
-        found = split(scenes, seed=seed, protocol="stable")
-        parts: dict[str, int] = {part: len(some) for part, some in found.items()}
+        scenes_of = split(scenes, seed=seed, protocol="stable")
+        parts: dict[str, int] = {part: len(some) for part, some in scenes_of.items()}
         shares = FRACTIONS["stable"]
         off = max(abs(parts[p] / (share * len(scenes)) - 1) for p, share in shares.items())
-        if min(_telling(some) for some in found.values()) and (best is None or off < best[0]):
-            best = (off, seed, parts, len({scene.group for scene in found["test"]}))
+        if min(_telling(some) for some in scenes_of.values()) and (best is None or off < best[0]):
+            best = (off, seed, parts, len({scene.group for scene in scenes_of["test"]}))
         if best is not None and best[0] <= _TOLERANCE:
             break
     if best is None:

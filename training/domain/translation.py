@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,8 +17,6 @@ from torch import Tensor
 from app.scene import Vocabulary
 from training.datasets.batches import Batch
 from training.evaluation.model import Model, ObjectScore, PlacedScore, Places, RelationScore
-
-Score = TypeVar("Score")
 
 # Absolute score of unknown classes. The score is finite and larger than all log-odds, so that
 # unknown classes rank last.
@@ -58,15 +56,20 @@ class Translation:
         the highest score ranks first. Unknown classes rank last in every task.
         """
         reverse = replace(self, unknown=BEYOND)
-        return Model(
-            missing=_maybe(self._objects, model.missing),
-            outliers=_maybe(reverse._objects, model.outliers),
-            relations=_maybe(self._relations, model.relations),
-            completion=_maybe(self._relations, model.completion),
-            at_place=_maybe(self._placed, model.at_place),
-            false_relations=_maybe(reverse._relations, model.false_relations),
-            parameters=model.parameters,
-        )
+        translated: dict[str, Callable[[Any], Any]] = {
+            "missing": self._objects,
+            "outliers": reverse._objects,
+            "at_place": self._placed,
+            "relations": self._relations,
+            "completion": self._relations,
+            "false_relations": reverse._relations,
+        }
+        scores = {
+            name: translate(score)
+            for name, translate in translated.items()
+            if (score := getattr(model, name)) is not None
+        }
+        return Model(**scores, parameters=model.parameters)
 
     def presence(self, v: Tensor) -> Tensor:
         """Map presence or counts from the scene classes to the model's classes.
@@ -74,14 +77,14 @@ class Translation:
         `v` has the shape (scenes, scene classes); the result has the shape (scenes, model classes).
         If several scene classes map to one model class, the result is their maximum.
         """
-        known = self.own >= 0
-        index = self.own[known].expand(len(v), -1)
-        return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, known], "amax")
+        has_class = self.own >= 0
+        index = self.own[has_class].expand(len(v), -1)
+        return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, has_class], "amax")
 
     def scores(self, values: Tensor) -> Tensor:
         """Map scores (scenes, model classes) to scene classes; unknown classes get `unknown`."""
-        found = values[:, self.own.clamp(min=0)]
-        return found.masked_fill(self.own < 0, self.unknown)
+        scores = values[:, self.own.clamp(min=0)]
+        return scores.masked_fill(self.own < 0, self.unknown)
 
     def _objects(self, score: ObjectScore) -> ObjectScore:
         return lambda v: self.scores(score(self.presence(v)))
@@ -121,20 +124,20 @@ class Translation:
         kept = (own >= 0).nonzero().squeeze(1)
         if not len(kept):
             return
-        known, place = own[kept].unique(return_inverse=True)
-        n, A = len(known), batch.holds.shape[1]
-        counts = torch.zeros(n, dtype=torch.int64).index_add(0, place, batch.counts[row, kept])
+        model_classes, index_of = own[kept].unique(return_inverse=True)
+        n, A = len(model_classes), batch.holds.shape[1]
+        counts = torch.zeros(n, dtype=torch.int64).index_add(0, index_of, batch.counts[row, kept])
         holds, observed = torch.zeros(A, n, n), torch.zeros(A, n, n, dtype=torch.bool)
-        pair = (slice(None), place[:, None], place[None, :])
-        told = (slice(None), kept[:, None], kept[None, :])
+        pair = (slice(None), index_of[:, None], index_of[None, :])
+        scene_pair = (slice(None), kept[:, None], kept[None, :])
         # Scene classes that map to one model class share their observed relations.
-        for a, i, j in batch.observed[row][told].nonzero().tolist():
-            observed[a, place[i], place[j]] = True
-            holds[a, place[i], place[j]] += batch.holds[row][told][a, i, j]
+        for a, i, j in batch.observed[row][scene_pair].nonzero().tolist():
+            observed[a, index_of[i], index_of[j]] = True
+            holds[a, index_of[i], index_of[j]] += batch.holds[row][scene_pair][a, i, j]
         small = replace(
             batch.rows(torch.tensor([row])),
-            v=torch.zeros(1, self.size).index_fill(1, known, 1.0),
-            classes=known.unsqueeze(0),
+            v=torch.zeros(1, self.size).index_fill(1, model_classes, 1.0),
+            classes=model_classes.unsqueeze(0),
             counts=counts.unsqueeze(0),
             holds=holds.clamp(max=1.0).unsqueeze(0),
             observed=observed.unsqueeze(0),
@@ -142,9 +145,5 @@ class Translation:
         )
         values = score(small)[0].clamp(min=-BEYOND)[pair]
         # The model has no relations between two objects of the same class.
-        apart = place[:, None] != place[None, :]
-        found[told] = torch.where(apart, values, torch.tensor(self.unknown))
-
-
-def _maybe(change: Callable[[Score], Score], score: Score | None) -> Score | None:
-    return None if score is None else change(score)
+        apart = index_of[:, None] != index_of[None, :]
+        found[scene_pair] = torch.where(apart, values, torch.tensor(self.unknown))

@@ -1,7 +1,4 @@
-"""Build models, the models that an evaluation compares.
-
-A model is a trained model or one of two references: held-out scenes and independent classes.
-"""
+"""Models for the evaluation: a trained model, and two references for generated scenes."""
 
 from __future__ import annotations
 
@@ -45,12 +42,7 @@ def artifact_model(
     *,
     calibrated: bool = True,
 ) -> Model:
-    """Build the model of a model.
-
-    Args:
-        calibrated: True includes the calibrated probabilities and the outlier alarm. False includes
-            only the uncalibrated scores of the machine.
-    """
+    """Return the scores of a trained model, and if `calibrated` its probabilities and alarm."""
     machine = machine_of(artifact.weights)
     missing, completion = MachineScore(machine), relation_score(artifact, given=True)
     sampler = machine_sampler(machine)
@@ -74,30 +66,27 @@ def artifact_model(
 def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
     """Return a function that computes the log-odds of each relation between two present classes.
 
-    The log-odds of a relation do not use the observed value of this relation.
-
-    Args:
-        given: True uses the other observed relations that hold as evidence. False uses no
-            relations.
+    With `given`, the other observed relations that hold are evidence. The log-odds of a relation
+    never use the observed value of this relation.
     """
 
     def score(batch: Batch) -> Tensor:
-        found = torch.full(batch.holds.shape, -torch.inf)
+        log_odds = torch.full(batch.holds.shape, -torch.inf)
         stated = batch.holds * batch.observed * given
         for row, padded in enumerate(batch.classes):
             n = int((padded >= 0).sum())
             scene, first = _instances(padded[:n], batch.counts[row, :n])
-            told = set(map(tuple, stated[row].nonzero().tolist()))
+            observed = set(map(tuple, stated[row].nonzero().tolist()))
             # a(x, y) and a(y, x) can both hold between classes, but for different instances.
             last = first + batch.counts[row, :n].clamp(min=1) - 1
             triples = [
-                (a, *(last[[x, y]] if (a, y, x) in told and x > y else first[[x, y]]).tolist())
-                for a, x, y in sorted(told)
+                (a, *(last[[x, y]] if (a, y, x) in observed and x > y else first[[x, y]]).tolist())
+                for a, x, y in sorted(observed)
             ]
             scene = Scene(scene.objects, tuple(triples) or None)
             values = posterior_of(artifact, scene).relation_log_odds()
-            found[row, : len(values), :n, :n] = torch.from_numpy(values)
-        return found
+            log_odds[row, : len(values), :n, :n] = torch.from_numpy(values)
+        return log_odds
 
     return score
 

@@ -57,8 +57,7 @@ def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -
     """Return the scores (N, ...) of N cases. The scores are computed in blocks of cases.
 
     Args:
-        score: function with one argument per column. It returns the scores of a block of cases.
-        columns: tensors (N, ...). Entry k of each tensor belongs to case k.
+        score: function of a block of each column. Entry k of each column belongs to case k.
 
     Raises:
         LeakError: a case gets another score when it is queried in another block.
@@ -71,18 +70,18 @@ def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -
     ]
     if not blocks:
         return torch.zeros_like(columns[0])
-    found = torch.cat(blocks)
+    scores = torch.cat(blocks)
     probed = torch.from_numpy(np.random.default_rng(0).permutation(count)[:_PROBED_ROWS])
     again = score(*(column[probed] for column in columns))
-    if not torch.allclose(again, found[probed], rtol=1e-3, atol=1e-3, equal_nan=True):
+    if not torch.allclose(again, scores[probed], rtol=1e-3, atol=1e-3, equal_nan=True):
         raise LeakError(_LEAK)
-    return found
+    return scores
 
 
 def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Scene:
     """Return a scene of labels, without relations and poses, of the instances in `kept` or all."""
-    places = range(len(encoded.instance_classes)) if kept is None else kept
-    return replace(scene_of(encoded, places, ()), room_type=None)
+    instances = range(len(encoded.instance_classes)) if kept is None else kept
+    return replace(scene_of(encoded, instances, ()), room_type=None)
 
 
 def of_classes(classes: Sequence[int]) -> Scene:
@@ -99,8 +98,8 @@ def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
 def things(scene: Scene, structure: Flags) -> Flags:
     """Return a mask (n,) that is False for structure, such as walls and floors."""
     classes = [-1 if thing.class_index is None else thing.class_index for thing in scene.objects]
-    found: Flags = ~structure[classes]
-    return found
+    is_thing: Flags = ~structure[classes]
+    return is_thing
 
 
 def index_of_ids(scene: Scene) -> dict[str, int]:
@@ -133,13 +132,13 @@ def missing_probabilities(
             missing object has this relation. None means the whole scene.
     """
     vocabulary = artifact.vocabulary
-    found = np.full(len(vocabulary), -np.inf)
+    probabilities = np.full(len(vocabulary), -np.inf)
     answer = questions.missing(
         artifact, scene, top_k=len(vocabulary), coverage=coverage, at=at, details=False
     )
     for entry in answer["missing"]:
-        found[vocabulary.index(entry["label"])] = entry["probability"]
-    return found
+        probabilities[vocabulary.index(entry["label"])] = entry["probability"]
+    return probabilities
 
 
 def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Floats:
@@ -162,15 +161,12 @@ def relation_probabilities(
 ) -> Floats:
     """Return the probability of each canonical relation, (relations, objects, objects).
 
-    The value is 0 for pairs that were not queried.
-
-    Args:
-        pairs: ordered pairs of object indices to query. None means all pairs.
+    The value is 0 outside `pairs`, ordered pairs of object indices. None means all pairs.
     """
     n = len(scene.objects)
-    found = np.zeros((len(CANONICAL), n, n))
+    probabilities = np.zeros((len(CANONICAL), n, n))
     most = max(1, len(CANONICAL) * n * n)
     answer = questions.relations(artifact, scene, top_k=most, pairs=pairs)
     for entry in answer["relations"]:
-        found[canonical_triple(scene, entry)] = entry["probability"]
-    return found
+        probabilities[canonical_triple(scene, entry)] = entry["probability"]
+    return probabilities

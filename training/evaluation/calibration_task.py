@@ -98,19 +98,19 @@ def ask_relations(
     rng: Rng,  # noqa: ARG001
 ) -> Answered | None:
     """Ask for all relations of a scene. The request contains only the labels of the objects."""
-    known = annotated_relations(encoded)
-    if not known.any():
+    is_known = annotated_relations(encoded)
+    if not is_known.any():
         return None
-    return _judged(artifact, encoded, labels_alone(encoded), known) or None
+    return _judged(artifact, encoded, labels_alone(encoded), is_known) or None
 
 
 def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for the relations of half of the pairs. The relations of the other half are evidence."""
-    asked, given = observed_pairs(encoded, artifact.vocabulary.structure, rng)
-    if not given:
+    is_asked, evidence = observed_pairs(encoded, artifact.vocabulary.structure, rng)
+    if not evidence:
         return None
-    scene = replace(scene_of(encoded, range(len(asked)), given), room_type=None)
-    return _judged(artifact, encoded, scene, annotated_relations(encoded) & asked) or None
+    scene = replace(scene_of(encoded, range(len(is_asked)), evidence), room_type=None)
+    return _judged(artifact, encoded, scene, annotated_relations(encoded) & is_asked) or None
 
 
 def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Flags) -> Answered:
@@ -136,16 +136,16 @@ def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answe
         return []
     target, kept = taken
     gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
-    known = annotated_relations(encoded)
-    found: Answered = []
+    is_known = annotated_relations(encoded)
+    answers: Answered = []
     scene = labels_alone(encoded, kept)
     index = index_of_ids(scene)
     for entry in missing(artifact, scene, candidates=[target])["missing"]:
         for place in entry["placements"]:
             triple = canonicalise(gone, place["relation"], kept[index[place["object"]]])
-            if known[triple]:
-                found.append((place["probability"], bool(encoded.instance_holds[triple])))
-    return found
+            if is_known[triple]:
+                answers.append((place["probability"], bool(encoded.instance_holds[triple])))
+    return answers
 
 
 def ask_missing(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
@@ -267,13 +267,13 @@ def calibration_task(model: Model, setting: Setting) -> Outcome | None:
     )
     asks = QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
     for name, ask in asks.items():
-        asked = of_objects.get(name, related)
-        found = collect(published, asked, ask, setting.seed)
-        skipped += found.skipped
-        if len(found.scene):
-            before = collect(plain, asked, ask, setting.seed)
+        scenes = of_objects.get(name, related)
+        answers = collect(published, scenes, ask, setting.seed)
+        skipped += answers.skipped
+        if len(answers.scene):
+            before = collect(plain, scenes, ask, setting.seed)
             for figure in ("ECE", "Brier skill"):
-                metrics[f"{figure}, {name}"] = found.metric(figure)
+                metrics[f"{figure}, {name}"] = answers.metric(figure)
                 metrics[f"{figure}, {name}, uncalibrated"] = before.metric(figure)
     # Brier skill is undefined if all answers are true or all answers are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}

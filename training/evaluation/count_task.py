@@ -89,15 +89,15 @@ def _asked(
     An answer is (class, number in the scene, listed number, expected number, low, high,
     probability).
     """
-    part, asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
+    part, is_asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
     room = part.room if part.room >= 0 else None
     listed = replace(of_classes(np.repeat(part.classes, part.listed).tolist()), room_type=room)
-    wanted = part.classes[asked].tolist()
+    wanted = part.classes[is_asked].tolist()
     labels = artifact.vocabulary.labels
     pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
-    known = {labels[index]: (index, number) for index, number in pairs}
+    number_of = {labels[index]: (index, number) for index, number in pairs}
     entries = more(artifact, listed, top_k=len(wanted), candidates=wanted)
-    return [(*known[entry.pop("label")], *entry.values()) for entry in entries]
+    return [(*number_of[entry.pop("label")], *entry.values()) for entry in entries]
 
 
 def _means(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:

@@ -29,6 +29,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from scipy.special import expit
 from torch import Tensor
 from torch.nn.functional import logsigmoid, softplus
 
@@ -104,9 +105,8 @@ def machine_density(
 ) -> ObjectDensity:
     """Return the density of a machine of the local form, in which relations do not affect p(v).
 
-    Args:
-        train: training scenes. Annealing starts at independent classes with the frequencies of
-            these scenes. The reverse AIS run starts its Gibbs chains at these scenes.
+    Annealing starts at independent classes with the frequencies of the training scenes. The Gibbs
+    chains of the reverse run start at these scenes.
 
     Raises:
         ValueError: the machine has the seed form, in which relations affect p(v).
@@ -162,10 +162,7 @@ def log_partition(
 
 @torch.no_grad()
 def _log_sum(machine: BoltzmannMachine, v: Tensor, draws: int) -> Tensor:
-    """Return log p(v) + log Z for each presence vector, (B,).
-
-    The value is the log of a sum over the hidden units h1 and h2, estimated with samples of h1.
-    """
+    """Return log p(v) + log Z for presence (B, V), estimated with samples of h1."""
     if not machine.spec.H2:
         return -machine.free_energy(v)
     y = mean_field(machine, Evidence(v)).y
@@ -205,11 +202,7 @@ def density_task(model: Model, setting: Setting) -> Outcome | None:
 
 @dataclass(frozen=True, eq=False)
 class Ising:
-    """A fully visible Boltzmann machine over presence vectors of V classes.
-
-    Attributes:
-        b: (V,) biases of the classes.
-        W: (V, V) pairwise weights of the classes.
+    """A fully visible Boltzmann machine with biases b (V,) and pairwise weights W (V, V).
 
     Raises:
         ValueError: the shapes of b and W disagree, or W is not symmetric with a zero diagonal.
@@ -245,7 +238,7 @@ class Ising:
         rng = np.random.default_rng(seed)
         log_base = float(np.logaddexp(0, a).sum())
         chains = len(start)
-        state = State(self, (rng.random((len(a), chains)) < _sigmoid(a)[:, None]).astype(float))
+        state = State(self, (rng.random((len(a), chains)) < expit(a)[:, None]).astype(float))
         weight = np.zeros(chains)
         for warm, cold in pairwise(betas):
             weight += (cold - warm) * state.gain(a)
@@ -273,10 +266,7 @@ class State:
         self.field = model.W @ v
 
     def gain(self, a: Floats) -> Floats:
-        """Return the log ratio of the unnormalised densities of each chain state, (chains,).
-
-        The numerator is the pairwise model. The denominator is independent classes with log-odds a.
-        """
+        """Return the log ratio of the pairwise model to independent classes, (chains,)."""
         linear = (self.model.b - a) @ self.v
         return np.asarray(linear + (self.field * self.v).sum(0) / 2)
 
@@ -291,7 +281,3 @@ class State:
             if len(changed):
                 self.field[:, changed] += np.outer(self.model.W[i], new[changed] - old[changed])
                 self.v[i] = new
-
-
-def _sigmoid(x: Floats) -> Floats:
-    return np.asarray(1 / (1 + np.exp(-x)))

@@ -8,9 +8,9 @@ parameters of the service. Labels outside the vocabulary are ignored.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from hashlib import sha256
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -121,16 +121,19 @@ def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
 
 
 def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
-    likeliest, vertical, sure = [], [], []
+    rows = []
     for fact in facts:
-        relation = fact["relation"]
         p = _of_eight(artifact, fact["subject"], fact["object"])
         upright = {name: value for name, value in p.items() if name in _VERTICAL}
-        likeliest.append((int(bool(p) and max(p, key=p.__getitem__) == relation), 1))
-        right = bool(upright) and max(upright, key=upright.__getitem__) == relation
-        vertical.append((int(right), 1))
-        sure.append((int(p.get(relation, 0.0) >= 0.5), 1))
-    return dict(zip(LINES[:3], (likeliest, vertical, sure), strict=True))
+        relation = fact["relation"]
+        first = [max(some, key=some.__getitem__, default="") == relation for some in (p, upright)]
+        rows.append((*first, p.get(relation, 0.0) >= 0.5))
+    return _lines(LINES[:3], rows)
+
+
+def _lines(names: Sequence[str], rows: Sequence[Sequence[bool]]) -> Lines:
+    """Return the hits of each name, from one row of hits per fact."""
+    return {name: [(int(row[k]), 1) for row in rows] for k, name in enumerate(names)}
 
 
 def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
@@ -146,11 +149,9 @@ def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
 
 
 def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Lines:
-    hits = []
-    for fact in facts:
-        found = {entry["label"] for entry in _five(artifact, fact)}
-        hits.append((int(bool(found & set(fact["expected"]))), 1))
-    return {f"{name}: an expected object is among five": hits}
+    answers = [({entry["label"] for entry in _five(artifact, fact)}, fact) for fact in facts]
+    hits = [[bool(labels & set(fact["expected"]))] for labels, fact in answers]
+    return _lines([f"{name}: an expected object is among five"], hits)
 
 
 def _five(artifact: Artifact, fact: dict[str, Any]) -> list[Fields]:
@@ -171,23 +172,24 @@ def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
     """Return the index of the object with the id `name`, or of the only object of class `name`."""
     index = artifact.vocabulary.index(name)
     named = [k for k, thing in enumerate(scene.objects) if thing.id == name]
-    places = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]
-    return places[0] if len(places) == 1 else None
+    indices = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]
+    return indices[0] if len(indices) == 1 else None
 
 
 def _outliers(
     artifact: Artifact, intruders: list[dict[str, Any]], plain: list[dict[str, Any]]
 ) -> Lines:
-    first, caught, alarms = [], [], []
+    rows = []
     for fact in intruders:
-        found = _judged(artifact, [*fact["objects"], fact["intruder"]])
-        first.append((int(bool(found) and found[0]["label"] == fact["intruder"]), 1))
-        flagged = any(a["label"] == fact["intruder"] and a["is_outlier"] for a in found)
-        caught.append((int(flagged), 1))
-    for fact in plain:
-        loud = any(entry["is_outlier"] for entry in _judged(artifact, fact["objects"]))
-        alarms.append((int(loud), 1))
-    return dict(zip(LINES[5:8], (first, caught, alarms), strict=True))
+        answers = _judged(artifact, [*fact["objects"], fact["intruder"]])
+        own = [answer for answer in answers if answer["label"] == fact["intruder"]]
+        first = bool(answers) and answers[0]["label"] == fact["intruder"]
+        rows.append((first, any(answer["is_outlier"] for answer in own)))
+    alarms = [
+        [any(answer["is_outlier"] for answer in _judged(artifact, fact["objects"]))]
+        for fact in plain
+    ]
+    return _lines(LINES[5:7], rows) | _lines(LINES[7:8], alarms)
 
 
 def _judged(artifact: Artifact, labels: Sequence[str]) -> list[Fields]:
@@ -196,20 +198,13 @@ def _judged(artifact: Artifact, labels: Sequence[str]) -> list[Fields]:
 
 
 def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -> Lines:
-    typical, foreign, empty = [], [], []
-    for room, drawn in _drawn(artifact, rooms, seeds):
-        typical.append((sum(bool(one & set(room["one_of"])) for one in drawn), len(drawn)))
-        foreign.append((sum(bool(one & set(room["never"])) for one in drawn), len(drawn)))
-        empty.append((sum(len(one) < _FEW for one in drawn), len(drawn)))
-    return dict(zip(LINES[8:], (typical, foreign, empty), strict=True))
-
-
-def _drawn(
-    artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]
-) -> Iterator[tuple[dict[str, Any], list[set[str]]]]:
-    for room in rooms:
-        index = artifact.vocabulary.room_index(room["room"])
-        given = replace(Scene(()), room_type=index)
-        for seed in seeds:
-            answer = questions.generate(artifact, given, count=_DRAWN, seed=seed)
-            yield room, [set(scene["objects"]) for scene in answer["scenes"]]
+    rows = []
+    for room, seed in product(rooms, seeds):
+        given = Scene((), room_type=artifact.vocabulary.room_index(room["room"]))
+        answer = questions.generate(artifact, given, count=_DRAWN, seed=seed)
+        drawn = [set(scene["objects"]) for scene in answer["scenes"]]
+        typical = sum(bool(one & set(room["one_of"])) for one in drawn)
+        foreign = sum(bool(one & set(room["never"])) for one in drawn)
+        few = sum(len(one) < _FEW for one in drawn)
+        rows.append([(count, len(drawn)) for count in (typical, foreign, few)])
+    return {name: [row[k] for row in rows] for k, name in enumerate(LINES[8:])}

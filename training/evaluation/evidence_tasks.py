@@ -58,8 +58,7 @@ class Case:
 
     Attributes:
         scenes: the scene with labels only, and the scene with evidence.
-        target: index of the removed class in T2, or index of the intruding object in T3. Unused in
-            T1.
+        target: index of the removed class in T2, or of the intruding object in T3.
         truth: (relations, objects, objects) bool, the relations that hold. Empty in T2 and T3.
         asked: (relations, objects, objects) bool, the queried relations. Empty in T2 and T3.
         items: number of relations to find in T1; 1 in T2 and T3.
@@ -73,21 +72,17 @@ class Case:
     items: int = 1
 
 
-def told(
+def with_evidence(
     encoded: EncodedScene, kept: list[int], kind: str, between: Flags | None = None
 ) -> tuple[Scene, Scene] | None:
-    """Return a scene twice: with labels only, and with evidence.
+    """Return a scene with labels only, and with evidence; None if the scene lacks this evidence.
 
-    The result is None if the scene lacks this kind of evidence.
-
-    Args:
-        between: (instances, instances) bool, the pairs of instances with evidence. None means all
-            pairs.
+    `between` (instances, instances) are the pairs of instances with evidence; None means all pairs.
     """
     bare = replace(scene_of(encoded, kept, ()), room_type=None)
     if kind == "room type":
-        known = scene_of(encoded, kept, ())
-        return None if known.room_type is None else (bare, known)
+        with_room = scene_of(encoded, kept, ())
+        return None if with_room.room_type is None else (bare, with_room)
     mask = np.ones((len(kept),) * 2, dtype=np.bool_) if between is None else between
     holds = encoded.instance_holds[:, kept][:, :, kept] & mask
     triples = tuple((int(a), int(i), int(j)) for a, i, j in np.argwhere(holds))
@@ -101,15 +96,15 @@ def told(
 
 def removals(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
     """Generate the T2 questions: up to two questions per scene, each with one removed class."""
-    for place, encoded in enumerate(scenes.scenes):
+    for index, encoded in enumerate(scenes.scenes):
         classes = encoded.evidence.classes
         removable = classes[~structure[classes]]
         if len(removable) < 2:
             continue
         for target in scene_rng(encoded, seed).permutation(removable)[:_REMOVALS]:
             kept = np.flatnonzero(encoded.instance_classes != target).tolist()
-            if (both := told(encoded, kept, kind)) is not None:
-                yield Case(place, both, int(target))
+            if (both := with_evidence(encoded, kept, kind)) is not None:
+                yield Case(index, both, int(target))
 
 
 def intrusions(
@@ -119,12 +114,12 @@ def intrusions(
     kind: str,
 ) -> Iterator[Case]:
     """Generate the T3 questions: each scene with its intruder, (scenes,); -1 skips the scene."""
-    for place, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
-        both = told(encoded, list(range(len(encoded.instance_classes))), kind)
+    for index, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
+        both = with_evidence(encoded, list(range(len(encoded.instance_classes))), kind)
         if intruder < 0 or both is None:
             continue
         bare, more = (_intruded(artifact, scene, int(intruder)) for scene in both)
-        yield Case(place, (bare, more), len(bare.objects) - 1)
+        yield Case(index, (bare, more), len(bare.objects) - 1)
 
 
 def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
@@ -139,20 +134,20 @@ def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
 
 def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
     """Generate the T1 questions: evidence about half of the classes, all other pairs queried."""
-    for place, encoded in enumerate(scenes.scenes):
+    for index, encoded in enumerate(scenes.scenes):
         own, classes = encoded.instance_classes, encoded.evidence.classes
         usable = classes[~structure[classes]]
         if len(usable) < 3:
             continue
         half = scene_rng(encoded, seed).permutation(usable)[: max(2, len(usable) // 2)]
-        known, plain = np.isin(own, half), ~structure[own]
-        between = known[:, None] & known
-        both = told(encoded, list(range(len(own))), kind, between)
+        in_half, plain = np.isin(own, half), ~structure[own]
+        between = in_half[:, None] & in_half
+        both = with_evidence(encoded, list(range(len(own))), kind, between)
         pair = plain[:, None] & plain & ~between & ~np.eye(len(own), dtype=np.bool_)
-        asked = np.broadcast_to(pair, encoded.instance_holds.shape)
-        truth = encoded.instance_holds & asked
+        queried = np.broadcast_to(pair, encoded.instance_holds.shape)
+        truth = encoded.instance_holds & queried
         if both is not None and truth.any():
-            yield Case(place, both, truth=truth, asked=asked, items=int(truth.sum()))
+            yield Case(index, both, truth=truth, asked=queried, items=int(truth.sum()))
 
 
 def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
@@ -235,14 +230,14 @@ def _changes(
         values = np.array(
             ask_every(lambda case: np.array([value(artifact, s, case) for s in case.scenes]), cases)
         )
-        place = [case.place for case in cases]
-        without, given, below = (
-            np.bincount(place, weights=column, minlength=len(scenes)).astype(np.float64)
+        index = [case.place for case in cases]
+        without, informed, below = (
+            np.bincount(index, weights=column, minlength=len(scenes)).astype(np.float64)
             for column in (*values.T, [case.items for case in cases])
         )
         metrics |= {
-            f"change of {metric}, {kind}": Ratio(given - without, below),
-            f"{metric}, {kind}": Ratio(given, below),
+            f"change of {metric}, {kind}": Ratio(informed - without, below),
+            f"{metric}, {kind}": Ratio(informed, below),
             f"{metric}, {kind} withheld": Ratio(without, below),
         }
         skipped.append(int((below == 0).sum()))

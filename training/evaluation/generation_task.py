@@ -105,9 +105,6 @@ def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler
 
     Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
     keeps both.
-
-    Args:
-        steps: number of Gibbs sweeps per scene.
     """
     samples = ChainSamples(machine)
 
@@ -168,7 +165,7 @@ def median_distance(v: Tensor) -> float:
 
 
 def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[Floats], float]:
-    """Return a function that takes weights of the held-out scenes and returns MMD².
+    """Return MMD² as a function of the weights of the held-out scenes.
 
     The statistic excludes pairs of a scene with itself, or with a copy of itself in a resample.
     """
@@ -193,10 +190,7 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
 
 
 def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return a function that takes weights of the held-out scenes and returns sum |p - q| / sum q.
-
-    p and q are the frequencies of a class in generated and in held-out scenes.
-    """
+    """Return the marginal error as a function of the weights of the held-out scenes."""
     p = drawn.mean(0)
 
     def at(weight: Floats) -> float:
@@ -209,10 +203,9 @@ def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]
 
 
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Return a function that takes weights of the held-out scenes and returns Pearson r.
+    """Return Pearson r of the class covariances as a function of the weights of held-out scenes.
 
-    r correlates the class covariances of generated scenes with those of held-out scenes, over all
-    pairs of the most common held-out classes.
+    The covariances are those of the most common held-out classes.
     """
     common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
     common = common[held_out[:, common].any(0)]
@@ -239,9 +232,9 @@ def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], floa
 
 def copies(drawn: Tensor, train: Tensor) -> Floats:
     """Return 1 for each generated scene whose classes are those of a training scene, else 0."""
-    known = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
+    training_rows = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
     rows = np.packbits(drawn.numpy() > 0, axis=1)
-    return np.array([row.tobytes() in known for row in rows], dtype=np.float64)
+    return np.array([row.tobytes() in training_rows for row in rows], dtype=np.float64)
 
 
 def generation_metrics(
@@ -260,7 +253,7 @@ def generation_metrics(
         bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
         emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
     """
-    x, y, known = drawn.v[:, asked], held_out[:, asked], train[:, asked]
+    x, y, training = drawn.v[:, asked], held_out[:, asked], train[:, asked]
     ours, theirs = x.double().numpy(), y.double().numpy()
     each = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
 
@@ -271,7 +264,7 @@ def generation_metrics(
         "MMD²": resampled(discrepancy(y, x, bandwidth)),
         "marginal error": resampled(marginal_error(theirs, ours)),
         "classes per scene": Ratio.of_scenes(ours.sum(1)),
-        "copies of training scenes": Ratio.of_scenes(copies(x, known)),
+        "copies of training scenes": Ratio.of_scenes(copies(x, training)),
     }
     pairs = resampled(pair_correlation(theirs, ours))
     if np.isfinite(pairs.value):
@@ -314,7 +307,7 @@ def generation_task(model: Model, setting: Setting) -> Outcome | None:
     metrics: dict[str, Metric] = {}
     for name, (given, room, emphasis) in conditions.items():
         drawn = sampler(given, room, setting.seed)
-        found = generation_metrics(drawn, first.v, setting.train.v, asked, bandwidth, emphasis)
-        metrics |= {f"{metric}, {name}": value for metric, value in found.items()}
+        own = generation_metrics(drawn, first.v, setting.train.v, asked, bandwidth, emphasis)
+        metrics |= {f"{metric}, {name}": value for metric, value in own.items()}
     notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
     return Outcome(metrics, len(first), 0, notes)

@@ -90,8 +90,8 @@ def signatures(train: SceneTensors) -> tuple[Flags, Floats]:
         typical: (room types, classes) bool, True for the signature classes of each room type.
         share: (room types, classes) p(class | room type). NaN for a room type with too few scenes.
     """
-    known = (train.room >= 0).numpy()
-    v, room = train.v.numpy()[known] > 0, train.room.numpy()[known]
+    has_room = (train.room >= 0).numpy()
+    v, room = train.v.numpy()[has_room] > 0, train.room.numpy()[has_room]
     rooms = int(room.max(initial=-1)) + 1
     share = np.full((rooms, v.shape[1]), np.nan)
     typical = np.zeros(share.shape, dtype=np.bool_)
@@ -256,7 +256,7 @@ def _scores(
         sizes = (v > 0).sum(1)[row]
         flags = things == added[row], added[row] < 0
         parts.append((index[row], things, log_odds.double(), flags[0], sizes, flags[1]))
-    scene, thing, odds, intruder, size, clean = (
+    scene, thing, odds, is_intruder, size, is_clean = (
         torch.cat(column).numpy() for column in zip(*parts, strict=True)
     )
-    return IntruderScores(scene, thing, odds, intruder, size, clean, scenes, skipped)
+    return IntruderScores(scene, thing, odds, is_intruder, size, is_clean, scenes, skipped)

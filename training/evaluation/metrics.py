@@ -4,7 +4,7 @@ The values per scene allow resampling, pairing with another model, pooling over 
 as JSON.
 
 A resample draws scenes with replacement, as many as the set has. It is stored as the number of
-times that each scene was drawn. The draws depend only on the seed and the number of scenes. So two
+times that each scene was drawn. The draws depend only on the number of scenes. So two
 metrics of the same scenes use the same resamples, and their difference is paired.
 
 Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993).
@@ -82,23 +82,14 @@ class Metric(ABC):
         """The metric over all scenes."""
         return self.at(np.ones(self.scenes))
 
-    def resampled(self, resamples: int, seed: int) -> Floats:
-        """Return the metric over resampled scenes, (resamples,); NaN where undefined."""
-        return resample(self.at, self.scenes, resamples, seed)
-
-    def draws(self, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
-        """Return `resampled`, cached."""
-        if (resamples, seed) not in self._known:
-            self._known[resamples, seed] = self.resampled(resamples, seed)
-        return self._known[resamples, seed]
-
     @cached_property
-    def _known(self) -> dict[tuple[int, int], Floats]:
-        return {}
+    def draws(self) -> Floats:
+        """The metric over resampled scenes, (resamples,); NaN where undefined."""
+        return resample(self.at, self.scenes)
 
-    def figure(self, *, resamples: int = RESAMPLES, seed: int = 0) -> Figure:
+    def figure(self) -> Figure:
         """Return the value with its interval."""
-        return Figure.of(self.value, self.draws(resamples, seed), self.n)
+        return Figure.of(self.value, self.draws, self.n)
 
 
 def paired_difference(
@@ -107,7 +98,6 @@ def paired_difference(
     *,
     groups: Sequence[str] | None = None,
     resamples: int = RESAMPLES,
-    seed: int = 0,
 ) -> Figure:
     """Return a minus b on the same scenes, with the interval of the difference.
 
@@ -115,6 +105,7 @@ def paired_difference(
         groups: group of each scene. With groups, a resample draws groups instead of scenes, because
             scenes of one group are near-duplicates (Field and Welsh, "Bootstrapping clustered
             data", 2007). The draws are widened by `_widening`.
+        resamples: number of draws of groups.
 
     Raises:
         ValueError: the numbers of scenes differ, or all scenes belong to one group.
@@ -123,15 +114,14 @@ def paired_difference(
         of = "" if groups is None else f" and {len(groups)} group labels"
         raise ValueError(f"cannot pair {a.scenes} scenes with {b.scenes} scenes{of}")
     if groups is None:
-        x, y = a.draws(resamples, seed), b.draws(resamples, seed)
-        both = min(len(x), len(y))
-        draws = x[:both] - y[:both]
+        both = min(len(a.draws), len(b.draws))
+        draws = a.draws[:both] - b.draws[:both]
     else:
-        names, place = np.unique(np.array(groups), return_inverse=True)
+        names, group_of = np.unique(np.array(groups), return_inverse=True)
         if len(names) < 2:
             raise ValueError("an interval needs scenes of at least two groups")
-        weights = scene_weights(len(names), resamples, seed)
-        draws = np.array([a.at(weight[place]) - b.at(weight[place]) for weight in weights])
+        weights = scene_weights(len(names), resamples)
+        draws = np.array([a.at(weight[group_of]) - b.at(weight[group_of]) for weight in weights])
         value = a.value - b.value
         draws = value + _widening(len(names)) * (draws - value)
     return Figure.of(a.value - b.value, draws, min(a.n, b.n))
@@ -152,9 +142,9 @@ def _widening(groups: int) -> float:
 
 
 @lru_cache(maxsize=4)  # many metrics resample the same scenes one after the other
-def scene_weights(scenes: int, resamples: int, seed: int) -> Floats:
+def scene_weights(scenes: int, resamples: int = RESAMPLES) -> Floats:
     """Return how often each resample draws each scene, (resamples, scenes); read-only."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     weights = np.empty((resamples, scenes))
     for row in weights:
         row[:] = np.bincount(rng.integers(scenes, size=scenes), minlength=scenes)
@@ -163,10 +153,10 @@ def scene_weights(scenes: int, resamples: int, seed: int) -> Floats:
 
 
 def resample(
-    statistic: Callable[[Floats], float], scenes: int, resamples: int = RESAMPLES, seed: int = 0
+    statistic: Callable[[Floats], float], scenes: int, resamples: int = RESAMPLES
 ) -> Floats:
     """Return a statistic of the scene weights for each resample, (resamples,)."""
-    return np.array([statistic(weight) for weight in scene_weights(scenes, resamples, seed)])
+    return np.array([statistic(weight) for weight in scene_weights(scenes, resamples)])
 
 
 def _centred(drawn: Floats, value: float) -> Floats:
@@ -178,9 +168,7 @@ def _centred(drawn: Floats, value: float) -> Floats:
 class Ratio(Metric):
     """Micro-average: sum(numerators) / sum(denominators) over scenes.
 
-    Attributes:
-        numerators: (scenes,) numerator of each scene.
-        denominators: (scenes,) denominator of each scene. A skipped scene has denominator 0.
+    Both arrays have the shape (scenes,). A skipped scene has denominator 0.
 
     Raises:
         ValueError: all denominators are 0.
@@ -217,12 +205,12 @@ class Ratio(Metric):
         below = float(weight @ self.denominators)
         return float(weight @ self.numerators) / below if below > 0 else float("nan")
 
-    def resampled(self, resamples: int, seed: int) -> Floats:
+    @cached_property
+    def draws(self) -> Floats:
         # Two matrix products compute all resamples.
-        weights = scene_weights(self.scenes, resamples, seed)
+        weights = scene_weights(self.scenes)
         top, below = weights @ self.numerators, weights @ self.denominators
-        share: Floats = np.divide(top, below, where=below > 0, out=np.full(resamples, np.nan))
-        return share
+        return np.divide(top, below, where=below > 0, out=np.full(len(weights), np.nan))
 
     def mean_over_scenes(self) -> Ratio:
         """Return the metric with equal weight for every scored scene."""
@@ -310,8 +298,9 @@ class Macro(_OfItems):
         some = below > 0
         return float((top[some] / below[some]).mean()) if some.any() else float("nan")
 
-    def resampled(self, resamples: int, seed: int) -> Floats:
-        return _centred(super().resampled(resamples, seed), self.value)
+    @cached_property
+    def draws(self) -> Floats:
+        return _centred(resample(self.at, self.scenes), self.value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,8 +339,9 @@ class Scored(_OfItems):
     def at(self, weight: Floats) -> float:
         return self._prepared(weight[self.scene])
 
-    def resampled(self, resamples: int, seed: int) -> Floats:
-        drawn = super().resampled(resamples, seed)
+    @cached_property
+    def draws(self) -> Floats:
+        drawn = resample(self.at, self.scenes)
         # Resampling inflates calibration errors, so these resamples are centred on the value.
         return _centred(drawn, self.value) if self.statistic == "ECE" else drawn
 
@@ -392,7 +382,7 @@ class Resampled(Metric):
     """A metric of whole sets; only its value and its resamples are kept.
 
     Attributes:
-        drawn: (resamples,) from `resample` with seed 0.
+        drawn: (resamples,) from `resample`.
         items: number of scenes in the other set of the comparison.
     """
 
@@ -425,10 +415,9 @@ class Resampled(Metric):
     def at(self, weight: Floats) -> float:
         raise NotImplementedError("a metric of whole sets cannot be computed for scene weights")
 
-    def resampled(self, resamples: int, seed: int) -> Floats:
-        if seed != 0:
-            raise ValueError(f"only the resamples of seed 0 are stored, not those of seed {seed}")
-        return self.drawn[:resamples]
+    @cached_property
+    def draws(self) -> Floats:
+        return self.drawn
 
 
 class MeanOverSeeds(Metric):
@@ -449,8 +438,8 @@ class MeanOverSeeds(Metric):
     def at(self, weight: Floats) -> float:
         return float(np.mean([member.at(weight) for member in self.members]))
 
-    def resampled(self, resamples: int, seed: int) -> Floats:
-        draws = [member.draws(resamples, seed) for member in self.members]
-        shortest = min(len(draw) for draw in draws)
-        mean: Floats = np.mean([draw[:shortest] for draw in draws], axis=0)
+    @cached_property
+    def draws(self) -> Floats:
+        shortest = min(len(member.draws) for member in self.members)
+        mean: Floats = np.mean([member.draws[:shortest] for member in self.members], axis=0)
         return mean

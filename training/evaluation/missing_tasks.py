@@ -134,9 +134,9 @@ class Ranking:
 
     def with_unknown(self, unknown: Ints) -> Ratio:
         """Return the MRR if each unknown label, (scenes,), is a removed object of score 0."""
-        known = self.mrr()
-        scored = known.denominators > 0
-        return Ratio(known.numerators, known.denominators + unknown * scored)
+        mrr = self.mrr()
+        scored = mrr.denominators > 0
+        return Ratio(mrr.numerators, mrr.denominators + unknown * scored)
 
 
 def leave_one_out(
@@ -144,14 +144,14 @@ def leave_one_out(
     structure: Tensor,
     score: ObjectScore | RoomScore,
     *,
-    told_room: bool = False,
+    with_room: bool = False,
 ) -> Ranking:
-    """Rank each class of each scene when it is removed; `told_room` passes the room types."""
+    """Rank each class of each scene when it is removed; `with_room` passes the room types."""
     removable = (scenes.v > 0) & ~structure
     enough = removable.sum(1) >= 2
     row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
     v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
-    values = ask_rows(score, v, scenes.room[row]) if told_room else ask_rows(score, v)
+    values = ask_rows(score, v, scenes.room[row]) if with_room else ask_rows(score, v)
     values = values.masked_fill((v > 0) | structure, -torch.inf)
     return Ranking.of(row, target, values, len(scenes), int((~enough).sum()))
 
@@ -161,13 +161,7 @@ def leave_one_out(
 
 @dataclass(frozen=True, eq=False)
 class Partial:
-    """Scenes with some classes hidden.
-
-    Attributes:
-        scene: (N,) index of the scene in the set.
-        v: (N, V) presence of the shown classes.
-        hidden: (N, V) bool, the hidden classes.
-    """
+    """N scenes with their index in the set (N,), shown and hidden classes (N, V)."""
 
     scene: Tensor
     v: Tensor
@@ -225,12 +219,7 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
 
 
 def partial_score(artifact: Artifact, coverage: float | None = None) -> ObjectScore:
-    """Return a function that computes the log-probabilities of `/missing` from labels only.
-
-    Args:
-        coverage: share of the objects that the scene lists. None means the default of the model.
-            With 1, unlisted objects are absent.
-    """
+    """Return the log-probabilities of `/missing` from labels, see `missing_probabilities`."""
 
     def score(v: Tensor) -> Tensor:
         scenes = [of_classes(row.nonzero().squeeze(1).tolist()) for row in v]
@@ -267,9 +256,9 @@ def removed_places(
     row, target, relation, anchor, outgoing = table.unbind(1)
     v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
     counts = torch.zeros_like(v)
-    for place, k in enumerate(row.tolist()):
+    for case, k in enumerate(row.tolist()):
         evidence = scenes.scenes[k].evidence
-        counts[place, torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
+        counts[case, torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
     return row, target, Places(v, counts * v, relation, anchor, outgoing.bool())
 
 
@@ -285,9 +274,6 @@ def leave_one_out_at(
     values = values.masked_fill((places.v > 0) | structure, -torch.inf)
     skipped = len(scenes) - len(row.unique())
     return Ranking.of(row, target, values, len(scenes), skipped), places.relation.numpy()
-
-
-# ------------------------------------------------------------------------------------------ tasks
 
 
 def missing_task(model: Model, setting: Setting) -> Outcome | None:
@@ -309,7 +295,7 @@ def missing_in_room_task(model: Model, setting: Setting) -> Outcome | None:
     scenes, structure, score = setting.scenes, setting.structure, model.missing_in_room
     if score is None or not len(scenes):
         return None
-    ranking = leave_one_out(scenes, structure, score, told_room=True)
+    ranking = leave_one_out(scenes, structure, score, with_room=True)
     if not len(ranking.target):
         return None
     metrics = ranking.metrics()

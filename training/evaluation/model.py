@@ -18,10 +18,7 @@ from training.machines import BoltzmannMachine
 
 # Function that takes presence (scenes, classes) and returns log-odds (scenes, classes).
 ObjectScore = Callable[[Tensor], Tensor]
-
-
-# Function that takes presence (scenes, classes) and room types (scenes,), with -1 for an unknown
-# room type. It returns log-odds (scenes, classes).
+# Function that also takes room types (scenes,), with -1 for an unknown room type.
 RoomScore = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -50,8 +47,6 @@ class Places:
 
 # Function that returns scores (B, V): higher means more likely missing from the place.
 PlacedScore = Callable[[Places], Tensor]
-
-
 # Function that returns scores (B, A, n, n) of the relations between the classes of a batch.
 RelationScore = Callable[[Batch], Tensor]
 

@@ -43,21 +43,21 @@ def offsets_task(model: Model, setting: Setting) -> Outcome | None:
         return None
     scenes = setting.scenes.scenes
     every = observed_offsets(scenes)
-    known = offsets.relation_scenes[every.relation] > 0
-    if not known.any():
+    has_statistics = offsets.relation_scenes[every.relation] > 0
+    if not has_statistics.any():
         return None
-    seen = every.rows(known)
+    seen = every.rows(has_statistics)
     values, _ = offsets.find(seen.relation, seen.subject, seen.other)
     away = seen.offset - values[:, :3]
     squares = np.square(away / values[:, 3:])
     metrics: dict[str, Metric] = {}
     for a, name in enumerate(CANONICAL):
-        asked = seen.relation == a
+        related = seen.relation == a
         for region, axes in _REGIONS.items():
-            inside = squares[asked, :axes].sum(axis=1) <= chi2.ppf(SHARE, axes)
-            if asked.any():
+            inside = squares[related, :axes].sum(axis=1) <= chi2.ppf(SHARE, axes)
+            if related.any():
                 metrics[f"in {region}, {name}"] = Ratio.of_items(
-                    seen.scene[asked], inside.astype(np.float64), len(scenes)
+                    seen.scene[related], inside.astype(np.float64), len(scenes)
                 )
     alone = seen.offset - offsets.relation[seen.relation, :3]
     for name, vectors in (("distance (m)", away), ("distance (m), relation alone", alone)):

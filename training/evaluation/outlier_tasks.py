@@ -91,10 +91,7 @@ def alarm_threshold(
     rng: Rng,
     share: float = ALARMS["medium"],
 ) -> float:
-    """Compute the suspicion from which an object raises the alarm.
-
-    The target share of false alarms holds within each source, because a robot sees scenes of one
-    kind. One quantile over all sources would cause too many alarms in the most varied source.
+    """Compute the suspicion from which an object raises the alarm, see `kept_in_each_source`.
 
     Args:
         suspicion: (N,) score per object; higher = more likely an intruder.
@@ -125,9 +122,9 @@ def kept_in_each_source(
 ) -> float:
     """Return the threshold that keeps the share of alarms within every source.
 
-    The source with the highest threshold decides; other sources have fewer alarms. Small sources
-    are pooled and use their plain quantile, because resampling a few places mostly reflects their
-    strangest scene.
+    A robot sees scenes of one source. So the source with the highest threshold decides, and other
+    sources have fewer alarms. Small sources are pooled and use their plain quantile, because
+    resampling a few places mostly reflects their strangest scene.
 
     Args:
         worst: (N,) highest suspicion of each clean scene.
@@ -158,8 +155,6 @@ def _bound(worst: Floats, group: NDArray[np.str_], rng: Rng, share: float) -> fl
         thresholds.append(np.quantile(np.concatenate([members[k] for k in drawn]), 1 - share))
     return float(np.quantile(thresholds, _CONFIDENCE))
 
-
-# ------------------------------------------------------------------------------------------ tasks
 
 # Lengths of short lists, as at the start of an exploration by a robot.
 _SHORT_LISTS = (1, 2, 4, 6)
@@ -250,9 +245,7 @@ def judge_intruders(
 ) -> dict[str, Metric]:
     """Return hit@1 by probability and by log-odds, and the detected share at each sensitivity.
 
-    Args:
-        intruders: (N,) class of the intruder of each scene, or -1 for a scene without intruder.
-        law: suffix of the metric names, for the distribution of the intruders.
+    `intruders` (N,) are classes from `draw_intruders`; `law` is the suffix of the metric names.
     """
     index = np.flatnonzero((intruders >= 0).numpy())
     cases = [

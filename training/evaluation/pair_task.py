@@ -56,12 +56,6 @@ class ScenePairs:
     ends: Ints
     listed: Flags
 
-    @property
-    def classes(self) -> Ints:
-        """Class indices of the two classes of each pair, (P, 2)."""
-        ends: Ints = self.scene.evidence.classes[self.ends]
-        return ends
-
 
 # Function that returns probabilities (P, 8) for the pairs of a scene.
 PairScore = Callable[[ScenePairs], Floats]
@@ -70,8 +64,8 @@ PairScore = Callable[[ScenePairs], Floats]
 def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
     """Return the vertical pairs of every scene that has such pairs."""
     plain = ~structure.numpy()
-    found = []
-    for place, scene in enumerate(scenes.scenes):
+    pairs = []
+    for index, scene in enumerate(scenes.scenes):
         holds = scene.evidence.holds
         vertical = holds[[a for a in VERTICAL if a < len(holds)]].any(0)
         usable = plain[scene.evidence.classes]
@@ -80,8 +74,8 @@ def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
         if len(ends):
             x, y = ends.T
             listed = np.concatenate([holds[:, x, y], holds[:, y, x]]).T
-            found.append(ScenePairs(place, scene, ends, listed))
-    return found
+            pairs.append(ScenePairs(index, scene, ends, listed))
+    return pairs
 
 
 def service_score(artifact: Artifact) -> PairScore:
@@ -115,9 +109,7 @@ def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
 def accuracy(p: Floats, listed: Flags) -> Floats:
     """Return 1 for each pair whose most probable relation is listed, else 0; expected over ties.
 
-    Args:
-        p: (N, k) probabilities of k relations.
-        listed: (N, k) bool, True for relations that the scene lists.
+    The arguments are the probabilities of k relations and whether the scene lists them, (N, k).
     """
     best = p == p.max(1, keepdims=True)
     return np.asarray((best & listed).sum(1) / best.sum(1))
@@ -137,16 +129,16 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
         return None
     index = torch.tensor(sorted(related), dtype=torch.int64)
     scenes = setting.at(index).some()
-    asked = vertical_pairs(scenes, setting.structure)
+    questions = vertical_pairs(scenes, setting.structure)
     if model.artifact is not None:
         score = service_score(model.artifact)
     elif model.relations is not None:
         score = baseline_score(scenes, model.relations)
     else:
         return None
-    p = np.concatenate(ask_every(score, asked))
-    listed = np.concatenate([one.listed for one in asked])
-    scene = np.repeat([one.place for one in asked], [len(one.ends) for one in asked])
+    p = np.concatenate(ask_every(score, questions))
+    listed = np.concatenate([one.listed for one in questions])
+    scene = np.repeat([one.place for one in questions], [len(one.ends) for one in questions])
     upright = [a + back for back in (0, p.shape[1] // 2) for a in VERTICAL]
     right, loss = accuracy(p, listed), log_loss(p, listed)
     metrics: dict[str, Metric] = {
@@ -156,7 +148,7 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
         ),
         "log-loss": Ratio.of_items(scene, loss, len(scenes)),
     }
-    classes = np.concatenate([one.classes for one in asked])
+    classes = np.concatenate([one.scene.evidence.classes[one.ends] for one in questions])
     for name, some in _little_known(classes, setting).items():
         if some.any():
             metrics[f"accuracy, {name}"] = Ratio.of_items(scene[some], right[some], len(scenes))
@@ -177,8 +169,8 @@ def _little_known(classes: Ints, setting: Setting) -> dict[str, Flags]:
         if setting.train is None:
             return {}
         triples = seen_triples(setting.train.scenes, V)
-    known = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
-    partners = np.bincount(known.ravel(), minlength=V)
+    related = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
+    partners = np.bincount(related.ravel(), minlength=V)
     rare: Flags = np.any(partners[classes] <= RARE, axis=1)
-    unseen = ~np.isin(classes @ np.array([V, 1]), known @ np.array([V, 1]))
+    unseen = ~np.isin(classes @ np.array([V, 1]), related @ np.array([V, 1]))
     return {"unseen pairs": unseen, "rare classes": rare}

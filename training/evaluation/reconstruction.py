@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import torch
 
-from training.datasets.batches import Batch, SceneTensors, relation_units
+from training.datasets.batches import SceneTensors, relation_units
 from training.machines import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
 
@@ -26,17 +26,13 @@ def reconstruction_error(machine: BoltzmannMachine, scenes: SceneTensors) -> tup
     chosen = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:_SCENES]
     for index in chosen.split(_BLOCK):
         batch = scenes.batch(index)
-        error, error_r, units = _errors(machine, batch)
-        object_sum, objects = object_sum + error, objects + batch.v.numel()
-        relation_sum, relations = relation_sum + error_r, relations + units
+        edges, r, observed = relation_units(machine, batch)
+        field = mean_field(machine, Evidence(batch.v, edges, r, observed, batch.room))
+        h1 = field.y.sigmoid()
+        object_sum += float((batch.v - machine.object_logits(h1).sigmoid()).abs().sum())
+        objects += batch.v.numel()
+        weight = observed * machine.gate(edges, batch.v)
+        p = machine.relation_logits(edges, batch.v, h1).sigmoid()
+        relation_sum += float(((r - p).abs() * weight).sum())
+        relations += int(weight.sum())
     return object_sum / max(objects, 1), relation_sum / relations if relations else float("nan")
-
-
-def _errors(machine: BoltzmannMachine, batch: Batch) -> tuple[float, float, int]:
-    edges, r, observed = relation_units(machine, batch)
-    field = mean_field(machine, Evidence(batch.v, edges, r, observed, batch.room))
-    h1 = field.y.sigmoid()
-    objects = (batch.v - machine.object_logits(h1).sigmoid()).abs().sum()
-    weight = observed * machine.gate(edges, batch.v)
-    p = machine.relation_logits(edges, batch.v, h1).sigmoid()
-    return float(objects), float(((r - p).abs() * weight).sum()), int(weight.sum())

@@ -168,12 +168,7 @@ def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed:
 
 @dataclass(frozen=True, eq=False)
 class RelationRanking:
-    """Number of annotated triples per scene, and number of hits among the predictions.
-
-    Attributes:
-        annotated: (scenes,) int64, 0 for a skipped scene.
-        hits: (scenes,) expected number of annotated triples among the predictions.
-    """
+    """Number of annotated triples of each scene, and of hits among the predictions, (scenes,)."""
 
     annotated: Ints
     hits: Floats
@@ -256,13 +251,8 @@ def placement_scores(
 ) -> Items:
     """Score all triples of scenes in which one triple is false.
 
-    Args:
-        score: function of a batch that observes the triples. It must judge each triple without
-            using that triple; higher means more likely true.
-
-    Returns:
-        The triples as items. The score of an item is the suspicion that its triple is false, and
-        the truth of an item is True for the false triple.
+    The score of an item is the suspicion that its triple is false. Its truth is True for the false
+    triple. `score` must judge each observed triple without using that triple.
     """
     parts: list[Tensor] = [torch.zeros(0, 3, dtype=torch.float64)]
     for index, batch in _batches(scenes, 2):
@@ -284,9 +274,6 @@ def placement_scores(
     scene, suspicion, false = torch.cat(parts).numpy().T
     skipped = len(scenes) - len(np.unique(scene))
     return Items(scene.astype(np.int64), suspicion, false > 0, len(scenes), skipped)
-
-
-# ------------------------------------------------------------------------------------------ tasks
 
 
 def relations_task(model: Model, setting: Setting) -> Outcome | None:
@@ -314,15 +301,15 @@ def completion_task(model: Model, setting: Setting) -> Outcome | None:
     if model.completion is None:
         return None
     scenes, structure, seed = setting.scenes, setting.structure, setting.seed
-    given = complete_scenes(scenes, structure, model.completion, seed=seed)
-    if not _any_true(given):
+    candidates = complete_scenes(scenes, structure, model.completion, seed=seed)
+    if not _any_true(candidates):
         return None
-    ranking = rank(given, len(scenes))
+    ranking = rank(candidates, len(scenes))
     metrics: dict[str, Metric] = {
         "R-precision": ranking.pooled(),
         "R-precision, mean over scenes": ranking.per_scene(),
     }
-    metrics |= _parts(given, setting, _RECALLS)
+    metrics |= _parts(candidates, setting, _RECALLS)
     if model.relations is not None:
         blind = complete_scenes(scenes, structure, model.relations, seed=seed)
         metrics["R-precision, nothing given"] = rank(blind, len(scenes)).pooled()

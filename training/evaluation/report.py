@@ -124,8 +124,8 @@ def digest(setting: Setting) -> str:
     """Return the sha256 of the questions: scene ids, limit, seed and everyday facts."""
     names = [f"{scene.source} {scene.scene_id}" for scene in setting.scenes.scenes]
     facts = [] if setting.everyday is None else [f"facts {facts_digest(setting.everyday)}"]
-    asked = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
-    return sha256(asked.encode()).hexdigest()
+    text = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
+    return sha256(text.encode()).hexdigest()
 
 
 def measure(
@@ -134,21 +134,21 @@ def measure(
     source: str,
     *,
     tasks: Iterable[str] = tuple(TASKS),
-    known: Mapping[str, Task] = EVERY_TASK,
+    registry: Mapping[str, Task] = EVERY_TASK,
     path: Path | None = None,
     progress: Progress = silent,
 ) -> SourceReport:
     """Measure tasks. With `path`, skip the tasks in this file, and write it after every task.
 
     Args:
-        tasks: names of the tasks, which are keys of `known`.
+        tasks: names of the tasks, which are keys of `registry`.
 
     Raises:
         ValueError: a task is unknown, or the file belongs to other scenes or questions.
     """
     wanted = list(tasks)
-    if unknown := sorted(set(wanted) - set(known)):
-        raise ValueError(f"unknown tasks {unknown}: choose from {list(known)}")
+    if unknown := sorted(set(wanted) - set(registry)):
+        raise ValueError(f"unknown tasks {unknown}: choose from {list(registry)}")
     report = SourceReport(source, digest(setting))
     if path is not None and path.exists():
         report = SourceReport.read(path, setting)
@@ -157,7 +157,7 @@ def measure(
             continue
         progress(f"{source}: {task}")
         began = time.perf_counter()
-        report.outcomes[task] = known[task](model, setting)
+        report.outcomes[task] = registry[task](model, setting)
         report.seconds[task] = time.perf_counter() - began
         if path is not None:
             write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
@@ -282,17 +282,14 @@ def pool(parts: Sequence[Metric]) -> Metric | None:
 
 
 _KINDS: dict[str, type[Any]] = {
-    "ratio": Ratio,
-    "macro": Macro,
-    "scored": Scored,
-    "resampled": Resampled,
+    cls.__name__.lower(): cls for cls in (Ratio, Macro, Scored, Resampled)
 }
 _TYPES: dict[str, type] = {"scene": np.int64, "group": np.int64, "truth": np.bool_}
 
 
 def metric_to_dict(metric: Metric) -> dict[str, Any]:
     """Return the values of a metric for JSON. Floats are rounded to nine significant digits."""
-    kind = next(name for name, cls in _KINDS.items() if type(metric) is cls)
+    kind = type(metric).__name__.lower()
     names = [field.name for field in fields(_KINDS[kind])]
     return {"kind": kind} | {name: _plain(getattr(metric, name)) for name in names}
 
@@ -307,8 +304,8 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
     kind = rest.pop("kind", None)
     if kind not in _KINDS:
         raise ValueError(f"metric kind must be one of {sorted(_KINDS)}, not {kind!r}")
-    found: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in rest.items()})
-    return found
+    metric: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in rest.items()})
+    return metric
 
 
 def _array(name: str, value: Any) -> Any:

@@ -146,10 +146,7 @@ class Results:
     ) -> Iterator[Table]:
         """Generate one table per task for the terminal, of the pooled sources if there are any.
 
-        A star has the meaning of `markdown`.
-
-        Args:
-            words: function that takes a task name and returns the title of its table.
+        A star has the meaning of `markdown`. `words` returns the title of the table of a task.
         """
         sources = list(dict.fromkeys(cell.source for cell in self.cells))
         chosen = [source for source in sources if "pooled" in source] or sources
@@ -234,10 +231,19 @@ def summarise(
     Raises:
         ValueError: the reports lack the reference row.
     """
+    members: dict[tuple[str, str, str, str], list[Metric]] = {}
+    rows = list(dict.fromkeys(row for row, _ in reports))
+    for row, seed in sorted(reports, key=lambda key: rows.index(key[0])):
+        for source, report in reports[row, seed].items():
+            for task, outcome in report.outcomes.items():
+                for name, metric in (outcome.metrics if outcome else {}).items():
+                    members.setdefault((row, source, task, name), []).append(metric)
+    # A pooled metric is left out if its data sources differ between seeds. For example, the Brier
+    # skill of a seed is undefined on a source where all queried relations hold.
     means = {
-        (row, source, task, name): MeanOverSeeds(metrics)
-        for row in dict.fromkeys(name for name, _ in reports)
-        for source, task, name, metrics in _by_metric(reports, row)
+        key: MeanOverSeeds(metrics)
+        for key, metrics in members.items()
+        if len({metric.scenes for metric in metrics}) == 1
     }
     if not any(key[0] == ours for key in means):
         raise ValueError(f"the reports contain no metric of the reference row {ours}")
@@ -283,25 +289,6 @@ def _asked(reports: Reports) -> Iterator[Asked]:
                     yield Asked(row, seed, task, source, *counts, outcome.notes)
 
 
-def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:
-    """Iterate over (data source, task, metric name, metrics) of a row, with one metric per seed.
-
-    A pooled metric is left out if its data sources differ between seeds. For example, the Brier
-    skill of a seed is undefined on a source where all queried relations hold.
-    """
-    found: dict[tuple[str, str, str], list[Metric]] = {}
-    for (name, _), by_source in reports.items():
-        if name != row:
-            continue
-        for source, report in by_source.items():
-            for task, outcome in report.outcomes.items():
-                for metric, value in (outcome.metrics if outcome else {}).items():
-                    found.setdefault((source, task, metric), []).append(value)
-    for (source, task, metric), values in found.items():
-        if len({value.scenes for value in values}) == 1:
-            yield source, task, metric, values
-
-
 def remarks(asked: Sequence[Asked]) -> list[str]:
     """Return remarks on one task: the number of skipped scenes, and a table of the notes."""
     skipped = []
@@ -323,15 +310,19 @@ def _range(counts: Iterable[int]) -> str:
 
 def _notes(asked: Sequence[Asked]) -> str:
     """Return a table of notes, with one line per source or row if the others have equal notes."""
-    found: dict[str, Mapping[str, float]] = {}
-    for place in ("{0.source}", "{0.row}, seed {0.seed}", "{0.row}, seed {0.seed}, {0.source}"):
-        found = {place.format(one): one.notes for one in asked}
-        if all(found[place.format(one)] == one.notes for one in asked):
+    notes: dict[str, Mapping[str, float]] = {}
+    for key_format in (
+        "{0.source}",
+        "{0.row}, seed {0.seed}",
+        "{0.row}, seed {0.seed}, {0.source}",
+    ):
+        notes = {key_format.format(one): one.notes for one in asked}
+        if all(notes[key_format.format(one)] == one.notes for one in asked):
             break
-    names = list(dict.fromkeys(name for values in found.values() for name in values))
+    names = list(dict.fromkeys(name for values in notes.values() for name in values))
     rows = (
         [key, *(_number(values[name]) if name in values else "" for name in names)]
-        for key, values in found.items()
+        for key, values in notes.items()
     )
     return grid(["", *names], rows)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,12 +12,12 @@ from rich.console import Console
 
 from training.datasets.batches import TrainingData, seen_triples
 from training.evaluation.report import SourceReport, pooled, settings_by_source
-from training.evaluation.results import grid, only, summarise, write
+from training.evaluation.results import Reports, grid, only, summarise, write
 from training.evaluation.setting import Setting
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, first_error
 from training.research.entries import Entry, machine_entry
-from training.research.measure import Plan, Reports, measure_entries, resumable, shown
+from training.research.measure import Plan, measure_entries, resumable, shown
 from training.runs.config_files import (
     at_most,
     data_folder,
@@ -71,11 +71,11 @@ def ablate(
     """
     with resumable(console):
         configs = _configs(configuration, rows, row, limit, epochs)
-        place = folder / configs[0].name
+        results_folder = folder / configs[0].name
         with console.status("reading and encoding scenes"):
             root = data_folder(configuration, configs[0], data)
             scenes = prepare(configs[0], root).complete_data()
-        plan = Plan(place, scenes, _settings(scenes, asked), tasks=tuple(PRIMARY))
+        plan = Plan(results_folder, scenes, _settings(scenes, asked), tasks=tuple(PRIMARY))
         entries = [
             machine_entry(with_settings(config, {"training.seed": seed}))
             for config in configs
@@ -104,11 +104,14 @@ def ablate(
         *(f"- {row} could not be measured: {why}" for row, why in failures.items()),
     ]
     text = "\n\n".join(parts).rstrip() + "\n"
-    write(place, results.to_dict() | {"failures": failures}, text)
+    write(results_folder, results.to_dict() | {"failures": failures}, text)
     console.print(*results.tables(PRIMARY))
     for name, why in failures.items():
         console.print(f"{name} could not be measured: {why}", markup=False, soft_wrap=True)
-    console.print(f"all results: {place / 'results.md'}, {place / 'results.json'}", soft_wrap=True)
+    console.print(
+        f"all results: {results_folder / 'results.md'}, {results_folder / 'results.json'}",
+        soft_wrap=True,
+    )
 
 
 def _configs(
@@ -144,7 +147,7 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
     }
 
 
-def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
+def _with_pools(reports: Mapping[str, SourceReport]) -> dict[str, SourceReport]:
     """Return the `PRIMARY` metrics, first of the pooled validation and test parts."""
     pools = {
         f"{part} pooled": pooled(
@@ -152,7 +155,7 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
         )
         for part in ("validation", "test")
     }
-    return {name: only(report, PRIMARY) for name, report in (pools | reports).items()}
+    return {name: only(report, PRIMARY) for name, report in {**pools, **reports}.items()}
 
 
 def _costs(plan: Plan, entries: Sequence[Entry]) -> tuple[dict[str, int], dict[str, float]]:
@@ -160,7 +163,7 @@ def _costs(plan: Plan, entries: Sequence[Entry]) -> tuple[dict[str, int], dict[s
     weights, seconds = {}, {}
     for name in dict.fromkeys(entry.name for entry in entries):
         try:
-            runs = [load_run(plan.place(one) / "run") for one in entries if one.name == name]
+            runs = [load_run(plan.folder_of(one) / "run") for one in entries if one.name == name]
         except RunError:
             continue
         held = {"kappa", *runs[0].config.machine.without}

@@ -22,7 +22,7 @@ from training.datasets.batches import seen_triples
 from training.evaluation.baselines import RELATIONS
 from training.evaluation.everyday_task import EVERYDAY, facts_file
 from training.evaluation.report import settings_by_source
-from training.evaluation.results import Results, grid, only, summarise, write
+from training.evaluation.results import Reports, Results, grid, only, summarise, write
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
 from training.fit.configuration import Config, ConfigError, DataConfig
@@ -31,7 +31,6 @@ from training.research.entries import Entry, baseline_entries, machine_entry, re
 from training.research.measure import (
     POOLED,
     Plan,
-    Reports,
     measure_entries,
     resumable,
     shown,
@@ -79,12 +78,9 @@ console = Console()
 
 @dataclass(frozen=True)
 class Domain:
-    """Configurations with the same data section, for one comparison.
+    """Configurations with the same data section. The first one is the reference of differences.
 
-    Attributes:
-        name: name of the first configuration without its last word: "indoor" for "indoor-triway".
-        configs: the configurations. The machine of the first one is the reference of all paired
-            differences.
+    The name is that of the first configuration without its last word: "indoor".
     """
 
     name: str
@@ -94,20 +90,6 @@ class Domain:
     def leaks(self) -> bool:
         """True if the training part may contain near-duplicates of test scenes."""
         return self.configs[0].data.split == "random"
-
-    def require_groups(self) -> None:
-        """Check that the split keeps near-duplicates of test scenes out of the training part.
-
-        Raises:
-            ConfigError: the domain uses a random split, which separates near-duplicates.
-        """
-        if self.leaks:
-            names = ", ".join(config.name for config in self.configs)
-            raise ConfigError(
-                f'{names}: data.split = "random" leaves near-duplicates of test scenes in the '
-                'training part. Set data.split = "group", or run only --seed-protocol, which uses '
-                "a random split"
-            )
 
 
 @dataclass(frozen=True)
@@ -194,8 +176,12 @@ def benchmark(
         if shuffled:
             shuffled_tasks(options.tasks)  # report invalid tasks before hours of training
         for domain in domains:
-            if shuffled or not seed_protocol:
-                domain.require_groups()
+            if domain.leaks and (shuffled or not seed_protocol):
+                raise ConfigError(
+                    f"{', '.join(config.name for config in domain.configs)}: data.split = "
+                    '"random" leaves near-duplicates of test scenes in the training part. Set '
+                    'data.split = "group", or run only --seed-protocol, which uses a random split'
+                )
         for domain in domains:
             results = folder / domain.name
             # With a random split, only the seed protocol (Bozcan et al., 2018) is valid.
@@ -238,11 +224,9 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
 
 
 def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
-    """Return the names of the wanted tasks. Without `wanted`, return all tasks.
+    """Return the tasks with the wanted names or prefixes; without `wanted`, all tasks.
 
-    Args:
-        wanted: task names, or prefixes of task names.
-        quick: True leaves out slow tasks, unless they are wanted.
+    With `quick`, slow tasks are left out, unless they are wanted.
 
     Raises:
         ValueError: a wanted name matches no task.
@@ -296,7 +280,7 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
 def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> None:
     """Measure each machine, trained once on a random split, by the seed protocol."""
     scenes = options.scenes(domain, split="random")
-    plan = replace(_plan(folder, scenes, options, tuple(SEED_TASKS)), known_tasks=SEED_TASKS)
+    plan = replace(_plan(folder, scenes, options, tuple(SEED_TASKS)), registry=SEED_TASKS)
     entries = [
         machine_entry(with_settings(config, {"data.split": "random"}), calibrated=False)
         for config in options.configs(domain, 0)
@@ -362,11 +346,9 @@ def _plan(
     tasks: tuple[str, ...],
     asked_by: SplitScenes | None = None,
 ) -> Plan:
-    """Plan the measurement of models that learn from the given scenes.
+    """Plan the measurement of models that learn from `scenes`.
 
-    Args:
-        asked_by: scenes whose training part determines the questions, for example the classes that
-            are typical of a room type. None means `scenes`.
+    The training part of `asked_by`, by default `scenes`, determines the questions.
     """
     data = scenes.complete_data()
     train = data.train if asked_by is None else asked_by.training_data().train

@@ -15,7 +15,7 @@ from training.evaluation.baselines import PLACED, placed_product
 from training.evaluation.baselines.fitting import Baseline
 from training.evaluation.model import Model
 from training.evaluation.outlier_tasks import fitted_alarm
-from training.evaluation.report import write_whole
+from training.evaluation.report import Progress, write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config
@@ -27,8 +27,6 @@ from training.runs.publish import as_stored, draft_artifact
 
 CALIBRATION = "calibration.json"
 """File name of a machine's calibration, in the folder of its run."""
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +43,7 @@ class Entry:
     name: str
     seed: int
     identity: str
-    make: Callable[[TrainingData, Path, Say], Model]
+    make: Callable[[TrainingData, Path, Progress], Model]
 
 
 def baseline_entries(
@@ -55,13 +53,12 @@ def baseline_entries(
     related: bool = True,
     whole: bool = True,
 ) -> Iterator[Entry]:
-    """Generate the entries of the selected baselines.
+    """Generate the entries of the baselines in `names`; None means all baselines.
 
     Deterministic baselines have an entry for seed 0 only.
 
     Args:
-        names: names of the baselines. None means all baselines.
-        related: True if the scenes contain relations. False leaves out relation baselines.
+        related: False leaves out relation baselines.
         whole: True adds an outlier alarm and place scores to object baselines.
 
     Raises:
@@ -78,31 +75,24 @@ def baseline_entries(
 
 def reference_entries() -> Iterator[Entry]:
     """Generate the untrained references for the evaluation of generated scenes and densities."""
-    for name, make in (("independent classes", _independent), ("held-out scenes (floor)", _floor)):
-        yield Entry(name, 0, name, make)
+    for name in ("independent classes", "held-out scenes (floor)"):
+        yield Entry(name, 0, name, partial(_reference, name))
 
 
-def _independent(data: TrainingData, folder: Path, say: Say) -> Model:  # noqa: ARG001
-    return independent_model(data.train.v.shape[1])
-
-
-def _floor(data: TrainingData, folder: Path, say: Say) -> Model:  # noqa: ARG001
-    return floor_model()
+def _reference(name: str, data: TrainingData, folder: Path, say: Progress) -> Model:  # noqa: ARG001
+    classes = data.train.v.shape[1]
+    return independent_model(classes) if name == "independent classes" else floor_model()
 
 
 def machine_entry(config: Config, *, calibrated: bool = True) -> Entry:
-    """Return the entry of a machine. An interrupted training resumes from the entry's folder.
-
-    Args:
-        calibrated: True calibrates the machine as for publication.
-    """
+    """Return the entry of a machine, calibrated as for publication if `calibrated`."""
     identity = f"{config.digest}, calibrated" if calibrated else config.digest
     make = partial(_machine, config, calibrated)
     return Entry(config.name, config.training.seed, identity, make)
 
 
 def _fitted(
-    baseline: Baseline, seed: int, whole: bool, data: TrainingData, folder: Path, say: Say
+    baseline: Baseline, seed: int, whole: bool, data: TrainingData, folder: Path, say: Progress
 ) -> Model:
     """Fit a baseline.
 
@@ -120,7 +110,7 @@ def _fitted(
     return replace(model, at_place=product.at_place)
 
 
-def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: Say) -> Model:
+def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: Progress) -> Model:
     """Fit a baseline, and write its trials into trials.jsonl in place of its earlier trials."""
     model = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
@@ -131,7 +121,9 @@ def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: S
     return model
 
 
-def _machine(config: Config, calibrated: bool, data: TrainingData, folder: Path, say: Say) -> Model:
+def _machine(
+    config: Config, calibrated: bool, data: TrainingData, folder: Path, say: Progress
+) -> Model:
     run, seed = folder / "run", config.training.seed
     machine = _trained(config, data, run, say)
     if not calibrated:
@@ -150,7 +142,7 @@ def _machine(config: Config, calibrated: bool, data: TrainingData, folder: Path,
     return artifact_model(artifact, data.train, seed=seed)
 
 
-def _trained(config: Config, data: TrainingData, run: Path, say: Say) -> BoltzmannMachine:
+def _trained(config: Config, data: TrainingData, run: Path, say: Progress) -> BoltzmannMachine:
     try:
         return load_run(run).machine
     except RunError:

@@ -40,6 +40,7 @@ from training.datasets import DatasetError
 from training.datasets.batches import TrainingData
 from training.evaluation.model import Model
 from training.evaluation.report import SourceReport, digest, measure, pooled, write_whole
+from training.evaluation.results import Reports
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, WHOLE_SET, Task
 from training.fit.checkpoint import RunError
@@ -58,7 +59,6 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 # The last note on a row and source tells whether the report was measured now or read from a file.
 DONE, KNOWN = "done", "known"
-Reports = dict[tuple[str, int], dict[str, SourceReport]]
 
 POOLED = "pooled"
 """Name of the union of all data sources."""
@@ -97,20 +97,20 @@ class Plan:
         folder: folder of the reports.
         data: scenes for training, validation and test.
         settings: evaluation setting by data source. The key `POOLED` is the union of all sources.
-        tasks: names of the tasks to measure, which are keys of `known_tasks`.
+        tasks: names of the tasks to measure, which are keys of `registry`.
     """
 
     folder: Path
     data: TrainingData
     settings: Mapping[str, Setting]
     tasks: Sequence[str]
-    known_tasks: Mapping[str, Task] = field(default_factory=lambda: EVERY_TASK)
+    registry: Mapping[str, Task] = field(default_factory=lambda: EVERY_TASK)
 
-    def place(self, entry: Entry) -> Path:
+    def folder_of(self, entry: Entry) -> Path:
         """Return the folder of an entry and its training seed."""
         return self.folder / slug(entry.name) / f"seed-{entry.seed}"
 
-    def asked(self, source: str) -> list[str]:
+    def tasks_on(self, source: str) -> list[str]:
         """Return the names of the tasks to measure on a data source, or on `POOLED`."""
         if source == POOLED:
             return [task for task in self.tasks if task in WHOLE_SET]
@@ -122,7 +122,7 @@ class Plan:
         Raises:
             BenchmarkError: the folder belongs to an entry with other settings or other scenes.
         """
-        path = self.place(entry) / "row.json"
+        path = self.folder_of(entry) / "row.json"
         values = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
         if not path.exists():
             write_whole(path, json.dumps(values | {"material": self.data.digest}))
@@ -142,10 +142,10 @@ class Plan:
 
     def parameters(self, entries: Sequence[Entry]) -> dict[str, int]:
         """Return the number of trained weights by name, for entries that record this number."""
-        rows = [_read_row(self.place(entry) / "row.json") for entry in entries]
+        rows = [_read_row(self.folder_of(entry) / "row.json") for entry in entries]
         return {row["name"]: row["parameters"] for row in rows if row.get("parameters") is not None}
 
-    def known(self, entry: Entry) -> dict[str, SourceReport]:
+    def finished(self, entry: Entry) -> dict[str, SourceReport]:
         """Return the finished reports of an entry, by data source.
 
         Raises:
@@ -155,40 +155,40 @@ class Plan:
         self.claim(entry)
         reports = {}
         for source, setting in self.settings.items():
-            path = self.place(entry) / f"{source}.json"
-            if not self.asked(source):
+            path = self.folder_of(entry) / f"{source}.json"
+            if not self.tasks_on(source):
                 reports[source] = SourceReport(source, digest(setting))
             elif path.exists():
                 try:
                     report = SourceReport.read(path, setting)
                 except ValueError as error:
                     raise BenchmarkError(str(error)) from error
-                if set(self.asked(source)) <= set(report.outcomes):
+                if set(self.tasks_on(source)) <= set(report.outcomes):
                     reports[source] = report
         return reports
 
     def measure(self, entry: Entry, progress: Progress) -> None:
         """Measure an entry on every data source that lacks a finished report.
 
-        The model is trained only if a report is missing. On KeyboardInterrupt, the results of
-        finished tasks are already on disk.
+        The model is trained only if a report is missing. Results of finished tasks are on disk.
         """
-        known, folder = self.known(entry), self.place(entry)
+        reports, folder = self.finished(entry), self.folder_of(entry)
         model: Model | None = None
         for source, setting in self.settings.items():
-            if source in known:
+            if source in reports:
                 progress(entry.name, source, KNOWN)
                 continue
             say = partial(progress, entry.name, source)
             if model is None:
                 say("training")
                 model = entry.make(self.data, folder, say)
-                row = _read_row(folder / "row.json") | {"parameters": model.parameters}
-                write_whole(folder / "row.json", json.dumps(row))
+                if model.parameters is not None:
+                    row = _read_row(folder / "row.json") | {"parameters": model.parameters}
+                    write_whole(folder / "row.json", json.dumps(row))
             measure(
                 *(model, setting, source),
-                tasks=self.asked(source),
-                known=self.known_tasks,
+                tasks=self.tasks_on(source),
+                registry=self.registry,
                 path=folder / f"{source}.json",
                 progress=say,
             )
@@ -196,7 +196,7 @@ class Plan:
 
     def report(self, entry: Entry) -> dict[str, SourceReport]:
         """Return the reports of an entry, by data source. The pooled report has all tasks."""
-        reports = self.known(entry)
+        reports = self.finished(entry)
         if POOLED in self.settings:
             every = pooled([reports[name] for name in self.settings if name != POOLED], POOLED)
             every.outcomes |= reports[POOLED].outcomes
@@ -213,10 +213,7 @@ def measure_entries(
     fresh: bool = False,
     failures: tuple[type[Exception], ...] = (),
 ) -> tuple[Reports, dict[str, str]]:
-    """Measure all entries, and skip finished reports.
-
-    KeyboardInterrupt stops the processes. The results of finished tasks are then already on
-    disk.
+    """Measure all entries, and skip finished reports. KeyboardInterrupt stops the processes.
 
     Args:
         workers: number of processes with one thread each. 1 measures in this process.
@@ -231,9 +228,9 @@ def measure_entries(
     """
     if fresh:
         for entry in entries:
-            shutil.rmtree(plan.place(entry), ignore_errors=True)
+            shutil.rmtree(plan.folder_of(entry), ignore_errors=True)
     failed: dict[tuple[str, int], Exception] = {}
-    missing = [entry for entry in entries if len(plan.known(entry)) < len(plan.settings)]
+    missing = [entry for entry in entries if len(plan.finished(entry)) < len(plan.settings)]
     for entry in entries:
         if entry not in missing:
             plan.measure(entry, progress)

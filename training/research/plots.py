@@ -17,13 +17,10 @@ from matplotlib.figure import Figure
 from training.evaluation.calibration_task import QUESTIONS
 from training.evaluation.item_statistics import reliability
 from training.evaluation.metrics import Scored
-from training.evaluation.report import SourceReport
-from training.evaluation.results import Results
+from training.evaluation.results import Reports, Results
 from training.evaluation.setting import Outcome
 from training.research.entries import Entry
 from training.research.measure import POOLED, Plan, slug
-
-Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
 
 _CURVES = {
     "mrr_validation": "MRR of removed objects",
@@ -48,7 +45,7 @@ def write_plots(
     """
     runs: dict[str, list[Path]] = {}
     for entry in machines:
-        runs.setdefault(entry.name, []).append(plan.place(entry) / "run" / "curve.csv")
+        runs.setdefault(entry.name, []).append(plan.folder_of(entry) / "run" / "curve.csv")
     drawn = {"learning-curves": learning_curves(runs), "recall": recall_curves(results, POOLED)}
     for entry in machines:
         outcome = reports[entry.name, entry.seed][POOLED].outcomes.get("Calibration")
@@ -91,10 +88,10 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
     Each bin holds the same number of answers. The axes are logarithmic because most probabilities
     are small.
     """
-    asked = [name for name in QUESTIONS if f"ECE, {name}" in outcome.metrics]
-    figure = Figure(figsize=(3.2 * max(len(asked), 1), 3.6), layout="constrained")
+    questions = [name for name in QUESTIONS if f"ECE, {name}" in outcome.metrics]
+    figure = Figure(figsize=(3.2 * max(len(questions), 1), 3.6), layout="constrained")
     figure.suptitle(title)
-    for axis, name in zip(_axes(figure, len(asked)), asked, strict=True):
+    for axis, name in zip(_axes(figure, len(questions)), questions, strict=True):
         axis.plot([1e-5, 1], [1e-5, 1], color="0.7", linewidth=1)
         for suffix, marker in ((", uncalibrated", "x"), ("", "o")):
             metric = outcome.metrics[f"ECE, {name}{suffix}"]
@@ -131,12 +128,12 @@ def recall_points(
     results: Results, task: str, prefix: str, source: str
 ) -> dict[str, list[tuple[int, float]]]:
     """Return the points (k, recall at k) of the metrics "<prefix>k", by model name."""
-    found: dict[str, list[tuple[int, float]]] = {}
+    curves: dict[str, list[tuple[int, float]]] = {}
     for cell in results.cells:
         k = cell.metric.removeprefix(prefix)
         if (cell.task, cell.source) == (task, source) and k != cell.metric and k.isdigit():
-            found.setdefault(cell.row, []).append((int(k), cell.figure.value))
-    return {row: sorted(points) for row, points in found.items()}
+            curves.setdefault(cell.row, []).append((int(k), cell.figure.value))
+    return {row: sorted(points) for row, points in curves.items()}
 
 
 def _axes(figure: Figure, columns: int) -> Iterator[Any]:

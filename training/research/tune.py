@@ -119,22 +119,22 @@ def tune(
     with resumable(console):
         original = load_config(configuration)
         distributions = load_space(own_or_shipped(space, original, "spaces", "--space"), original)
-        place = folder / original.name
-        journal = study or place / "study.log"
+        results = folder / original.name
+        journal = study or results / "study.log"
         if fresh:
-            shutil.rmtree(place, ignore_errors=True)
+            shutil.rmtree(results, ignore_errors=True)
             journal.unlink(missing_ok=True)
         config = with_settings(original, {"training.epochs": epochs} if epochs else {})
         with console.status("reading and encoding scenes"):
             scenes = prepare(config, data_folder(configuration, config, data))
-        search = Search(place, config, scenes.training_data(), distributions, by, journal)
-        found = search.open(scenes.digest, seed, prune=prune)
-        search.run(found, trials + 1, seed)
-    console.print(_table(found, original.name))
-    if not _finished(found):
+        search = Search(results, config, scenes.training_data(), distributions, by, journal)
+        trial_study = search.open(scenes.digest, seed, prune=prune)
+        search.run(trial_study, trials + 1, seed)
+    console.print(_table(trial_study, original.name))
+    if not _finished(trial_study):
         console.print("[red]error:[/red] all trials failed or were stopped early")
         raise typer.Exit(1)
-    _conclude(search, found, original)
+    _conclude(search, trial_study, original)
 
 
 def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
@@ -150,12 +150,12 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
     values = read_toml(path)
     if not values:
         raise ConfigError(f"the search space {path.name} contains no settings")
-    found = {}
+    distributions = {}
     for name, entry in values.items():
         if name.startswith(_FIXED):
             raise ConfigError(f"{name!r} must be equal in all trials: remove it from the space")
         try:
-            found[name] = _distribution(entry)
+            distributions[name] = _distribution(entry)
         except ValueError as error:
             reason = first_error(error) if isinstance(error, ValidationError) else error
             raise ConfigError(
@@ -164,7 +164,7 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
             ) from error
         for value in entry if isinstance(entry, list) else (entry["low"], entry["high"]):
             with_settings(config, {name: value})
-    return found
+    return distributions
 
 
 def _distribution(entry: Any) -> BaseDistribution:
@@ -372,15 +372,15 @@ def _finished(study: Study) -> list[FrozenTrial]:
 def _suggested(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str, Any]:
     from optuna.distributions import FloatDistribution, IntDistribution
 
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     for name, entry in space.items():
         if isinstance(entry, IntDistribution):
-            found[name] = trial.suggest_int(name, entry.low, entry.high, log=entry.log)
+            settings[name] = trial.suggest_int(name, entry.low, entry.high, log=entry.log)
         elif isinstance(entry, FloatDistribution):
-            found[name] = trial.suggest_float(name, entry.low, entry.high, log=entry.log)
+            settings[name] = trial.suggest_float(name, entry.low, entry.high, log=entry.log)
         else:
-            found[name] = trial.suggest_categorical(name, entry.choices)  # type: ignore[attr-defined]
-    return found
+            settings[name] = trial.suggest_categorical(name, entry.choices)  # type: ignore[attr-defined]
+    return settings
 
 
 def _table(study: Study, title: str) -> Table:

@@ -82,9 +82,9 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     """
     path = config_path(reference)
     if not path.is_file():
-        known = ", ".join(shipped_configs())
+        shipped = ", ".join(shipped_configs())
         raise ConfigError(
-            f"there is no configuration {reference!r}: pass a TOML file or one of {known}"
+            f"there is no configuration {reference!r}: pass a TOML file or one of {shipped}"
         )
     values = read_toml(path)
     if seed is not None:
@@ -107,9 +107,9 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
     values = config.model_dump()
     for name, value in settings.items():
         section, _, entry = name.partition(".")
-        known = getattr(type(getattr(config, section, None)), "model_fields", {})
-        if entry not in known:
-            choice = f"{section} has {', '.join(known)}" if known else "name it section.entry"
+        entries = getattr(type(getattr(config, section, None)), "model_fields", {})
+        if entry not in entries:
+            choice = f"{section} has {', '.join(entries)}" if entries else "name it section.entry"
             raise ConfigError(f"there is no setting {name!r}: {choice}")
         values[section][entry] = value
     try:

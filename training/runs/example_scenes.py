@@ -100,14 +100,14 @@ def choose_examples(
     type: in a complete scene, nothing would be missing. Scenes with positions take precedence.
     Scenes of research-only data sets are left out.
     """
-    known = {
+    usable_objects = {
         scene: _known(scene, vocabulary)
         for scene in scenes
         if scene.source not in SOURCES or not SOURCES[scene.source].research_only
     }
-    classes = {scene: {index for index, _ in found} for scene, found in known.items()}
+    classes = {scene: {index for index, _ in found} for scene, found in usable_objects.items()}
     frequency = Counter(index for found in classes.values() for index in found)
-    usable = [scene for scene in known if len(classes[scene]) >= _FEWEST_CLASSES]
+    usable = [scene for scene in usable_objects if len(classes[scene]) >= _FEWEST_CLASSES]
     sizes: dict[str | None, list[int]] = {}
     for scene in usable:
         sizes.setdefault(scene.room_type, []).append(len(classes[scene]))
@@ -115,7 +115,7 @@ def choose_examples(
     ranked = sorted(
         usable,
         key=lambda scene: (
-            not any(thing.position for _, thing in known[scene]),
+            not any(thing.position for _, thing in usable_objects[scene]),
             abs(len(classes[scene]) - usual[scene.room_type]),
             -sum(frequency[index] for index in classes[scene]),
         ),
@@ -126,22 +126,22 @@ def choose_examples(
     groups = {scene.group for scene in first.values()}
     others = [scene for scene in ranked if scene.group not in groups]
     return tuple(
-        _example(scene, known[scene], vocabulary, frequency)
+        _example(scene, usable_objects[scene], vocabulary, frequency)
         for scene in [*first.values(), *others][:_CHOSEN]
     )
 
 
 def _known(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, AnnotatedObject]]:
     """Return the objects of a scene that a request can contain, with their class indices."""
-    found = []
+    objects = []
     for thing in scene.objects:
         index = vocabulary.index(thing.label)
         if index is None or vocabulary.structure[index]:
             continue
         label = vocabulary.labels[index]
         if len(label) <= MAX_WORD and label.isprintable():
-            found.append((index, thing))
-    return found
+            objects.append((index, thing))
+    return objects
 
 
 def _example(
@@ -212,21 +212,21 @@ def _pose(thing: AnnotatedObject) -> dict[str, Any]:
 
 def _relations(scene: AnnotatedScene, names: dict[str, str]) -> list[dict[str, str]]:
     """Return the annotated relations between named objects, without contradictions."""
-    place = {thing.id: index for index, thing in enumerate(scene.objects)}
+    index_of = {thing.id: index for index, thing in enumerate(scene.objects)}
     held = list(scene.relations or ())
     if scene.relations is None:
         held = [
-            (place[thing.id], "on-top", place[thing.supported_by])
+            (index_of[thing.id], "on-top", index_of[thing.supported_by])
             for thing in scene.objects
             if thing.supported_by is not None
         ]
     canonical = {canonicalise(*triple) for triple in held}
-    found = []
+    relations = []
     for triple in held:
         relation, i, j = canonicalise(*triple)
         ends = [scene.objects[end].id for end in (triple[0], triple[2])]
         if i == j or (relation, j, i) in canonical or not names.keys() >= set(ends):
             continue
         subject, other = (names[end] for end in ends)
-        found.append({"subject": subject, "relation": triple[1], "object": other})
-    return found[:_MOST_RELATIONS]
+        relations.append({"subject": subject, "relation": triple[1], "object": other})
+    return relations[:_MOST_RELATIONS]

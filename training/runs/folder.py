@@ -40,11 +40,7 @@ class FinishedRun:
     scenes: str = ""
 
     def require(self, scenes: str) -> None:
-        """Check that the run was trained on given scenes.
-
-        Raises:
-            RunError: the run was trained on other scenes.
-        """
+        """Raise RunError if the run was trained on scenes of another digest."""
         if self.scenes and self.scenes != scenes:
             raise RunError(
                 "the scenes, vocabulary or split have changed since the training of "

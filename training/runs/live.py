@@ -66,10 +66,10 @@ class Display(Progress):
 
 def scores(epoch: Epoch) -> str:
     """Return the validation scores of an epoch as text."""
-    found = f"MRR {epoch.mrr_validation:.3f}"
+    text = f"MRR {epoch.mrr_validation:.3f}"
     if not math.isnan(epoch.r_precision_validation):
-        found += f", R-precision {epoch.r_precision_validation:.3f}"
-    return found
+        text += f", R-precision {epoch.r_precision_validation:.3f}"
+    return text
 
 
 def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
@@ -101,13 +101,13 @@ def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
     """Return the values, or means of several, as at most `width` blocks of different heights."""
-    known = [value for value in values if math.isfinite(value)]
-    if not known:
+    finite = [value for value in values if math.isfinite(value)]
+    if not finite:
         return ""
-    size = max(1, math.ceil(len(known) / width))
+    size = max(1, math.ceil(len(finite) / width))
     means = [
         sum(part) / len(part)
-        for part in (known[start : start + size] for start in range(0, len(known), size))
+        for part in (finite[start : start + size] for start in range(0, len(finite), size))
     ]
     low, high = min(means), max(means)
     step = (high - low) / (len(_LEVELS) - 1)

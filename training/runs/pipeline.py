@@ -139,13 +139,13 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     for source in data.sources:
         name = source_name(source)
         if source == "rooms":
-            found = generate_rooms(data.rooms, seed=data.split_seed)
+            source_scenes = generate_rooms(data.rooms, seed=data.split_seed)
         elif source == priors.SOURCE:
-            found = priors.read_prior_scenes(_path(source, root))
+            source_scenes = priors.read_prior_scenes(_path(source, root))
         else:
             path = _path(source, root)
-            found = [replace(scene, source=name) for scene in read_scenes(path)]
-        scenes[name] = found[: data.limit]
+            source_scenes = [replace(scene, source=name) for scene in read_scenes(path)]
+        scenes[name] = source_scenes[: data.limit]
     return scenes
 
 
@@ -193,20 +193,17 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
     elif data.vocabulary == "rooms":
         vocabulary = rooms_vocabulary()
     elif data.vocabulary.endswith(".json"):
-        vocabulary = _read_vocabulary(root / data.vocabulary)
+        path = root / data.vocabulary
+        try:
+            vocabulary = read_vocabulary(path)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"data.vocabulary: {path} cannot be used: {error}") from error
     else:
         raise ConfigError(
             f"data.vocabulary is {data.vocabulary!r}; it must be indoor, source, rooms, or the "
             "name of a .json file"
         )
     return with_typical_sizes(vocabulary, scenes)
-
-
-def _read_vocabulary(path: Path) -> Vocabulary:
-    try:
-        return read_vocabulary(path)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"data.vocabulary: {path} cannot be used: {error}") from error
 
 
 def split_and_encode(
@@ -241,11 +238,7 @@ def split_and_encode(
 
 
 def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch.Tensor | None:
-    """Return the word vectors of the classes, (classes, dimensions), or None if none are set.
-
-    Raises:
-        DatasetError: the file of word vectors is missing or invalid.
-    """
+    """Return the word vectors of the classes, (classes, dimensions), or None if none are set."""
     if not data.words:
         return None
     vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -90,22 +89,25 @@ def publish_run(
     progress("calibrating")
     if measured is None:
         calibrated = calibrated_draft(run, scenes.vocabulary, data)
-        asked = calibrated = with_statistics(calibrated, scenes)
+        evaluated = calibrated = with_statistics(calibrated, scenes)
         test = data
     else:
         other, kept_back = measured
         other.require(kept_back.digest)
         test = kept_back.training_data()
-        asked = calibrated_draft(other, kept_back.vocabulary, test)
-        calibrated = calibrated_draft(run, scenes.vocabulary, data, asked.calibration)
-        asked, calibrated = with_statistics(asked, kept_back), with_statistics(calibrated, scenes)
+        evaluated = calibrated_draft(other, kept_back.vocabulary, test)
+        calibrated = calibrated_draft(run, scenes.vocabulary, data, evaluated.calibration)
+        evaluated, calibrated = (
+            with_statistics(evaluated, kept_back),
+            with_statistics(calibrated, scenes),
+        )
     untouched = untouched_alarms(calibrated, scenes.parts["validation"])
     reasons = [*filter(None, (one.objection() for one in untouched)), *judge(calibrated)]
     for reason in reasons:
         if accept is None:
             raise RefusedError(reasons)
         accept(reason)
-    rows = _measure(asked, test, progress)
+    rows = _measure(evaluated, test, progress)
     progress("publishing")
     description = Description(
         name=run.config.name,
@@ -114,7 +116,13 @@ def publish_run(
         spec=machine.spec.to_dict(),
         vocabulary=VocabularyEntry.of(with_room_aliases(scenes.vocabulary), machine.spec.A),
         calibration=calibrated.calibration,
-        training=_training(run, measured),
+        training={
+            **({} if measured is None else {"measured_split": measured[0].config.data.split}),
+            "config": json.loads(run.config.model_dump_json()),
+            "best_epoch": run.best_epoch,
+            "epochs": run.epochs,
+            "parameters": run.machine.parameter_count,
+        },
         data=data_sources(scenes),
         metrics=tuple(rows),
         terms=terms(scenes),
@@ -175,8 +183,8 @@ def refit(
             root,
         )
     progress("fitting statistics")
-    asked = with_statistics(artifact, kept_back)
-    rows = _measure(asked, kept_back.training_data(), progress, tuple(STATISTICS))
+    evaluated = with_statistics(artifact, kept_back)
+    rows = _measure(evaluated, kept_back.training_data(), progress, tuple(STATISTICS))
     fields = {name: getattr(manifest, name) for name in Description.model_fields}
     fields["metrics"] = (
         *(metric for metric in manifest.metrics if metric.task not in STATISTICS),
@@ -271,16 +279,6 @@ def _measure(
         tasks=tasks,
         progress=progress,
     )
-
-
-def _training(run: FinishedRun, measured: tuple[FinishedRun, SplitScenes] | None) -> dict[str, Any]:
-    kept = {} if measured is None else {"measured_split": measured[0].config.data.split}
-    return kept | {
-        "config": json.loads(run.config.model_dump_json()),
-        "best_epoch": run.best_epoch,
-        "epochs": run.epochs,
-        "parameters": run.machine.parameter_count,
-    }
 
 
 def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:

@@ -161,19 +161,16 @@ def switch_on_probability(
 
     The probability is p(v_i = 1 | h1, relations), with one sample of the hidden layer h1.
 
-    Args:
-        target: (scenes,) int64, the removed class of each scene.
-        left_on: True keeps the relations of the removed class as annotated. False makes these
-            relations unobserved.
+    The relations of the removed class, `target` (scenes,), are unobserved without `left_on`.
     """
-    place = target.unsqueeze(1)
-    absent, there = batch.v.scatter(1, place, 0.0), batch.v.scatter(1, place, 1.0)
+    column = target.unsqueeze(1)
+    absent, there = batch.v.scatter(1, column, 0.0), batch.v.scatter(1, column, 1.0)
     edges, r, observed = relation_units(machine, batch)
     if not left_on:
         touched = _touches(edges, target)
         r, observed = r * ~touched, observed & ~touched
     h1 = _draw_h1(machine, Evidence(absent, edges, r, observed), generator)
-    logit = machine.object_logits(h1).gather(1, place).squeeze(1)
+    logit = machine.object_logits(h1).gather(1, column).squeeze(1)
     for v, sign in ((there, 1.0), (absent, -1.0)):
         logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
         logit = logit + sign * machine.relation_term(logits, gate, r, observed).sum(-1)
@@ -196,13 +193,13 @@ def _touches(edges: Edges, target: Tensor) -> Tensor:
 
 def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
     """Draw a class to remove from each scene, (scenes,); -1 with fewer than two plain classes."""
-    found = torch.full((len(scenes),), -1, dtype=torch.int64)
+    targets = torch.full((len(scenes),), -1, dtype=torch.int64)
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
         removable = scene.evidence.classes[plain[scene.evidence.classes]]
         if len(removable) >= 2:
-            found[k] = int(scene_rng(scene, seed).choice(removable))
-    return found
+            targets[k] = int(scene_rng(scene, seed).choice(removable))
+    return targets
 
 
 def _blocks(scenes: SceneTensors, seed: int) -> Iterator[tuple[Tensor, Batch, torch.Generator]]:

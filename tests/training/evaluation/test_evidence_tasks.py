@@ -20,7 +20,7 @@ from training.evaluation.evidence_tasks import (
     reciprocal_rank,
     relations_evidence_task,
     removals,
-    told,
+    with_evidence,
 )
 from training.evaluation.model import Model
 from training.evaluation.setting import Setting
@@ -52,7 +52,7 @@ def test_a_removed_class_is_nowhere(kind):
 def test_all_relations_among_what_stays_are_told():
     encoded = DATA.scenes[0]
     kept = np.flatnonzero(encoded.instance_classes != encoded.instance_classes[0]).tolist()
-    _, more = told(encoded, kept, "relations")
+    _, more = with_evidence(encoded, kept, "relations")
     listed = {
         (int(a), kept.index(i), kept.index(j))
         for a, i, j in np.argwhere(encoded.instance_holds)

@@ -166,7 +166,7 @@ def test_the_interval_covers_the_truth():
     A binomial of 200 and .95 leaves that range with probability below 1e-4.
     """
     rng = np.random.default_rng(0)
-    figures = [mean_of(rng.normal(size=100)).figure(resamples=300, seed=k) for k in range(200)]
+    figures = [mean_of(rng.normal(size=100)).figure() for _ in range(200)]
     assert 170 <= sum(figure.low <= 0 <= figure.high for figure in figures) <= 199
 
 
@@ -258,7 +258,7 @@ def test_a_mean_over_seeds_is_resampled_scene_by_scene():
     mean = MeanOverSeeds([mean_of([0, 1, 1, 0]), mean_of([1, 1, 0, 0])])
     together = mean_of([0.5, 1.0, 0.5, 0.0])
     assert mean.value == together.value
-    np.testing.assert_allclose(mean.draws(), together.draws())
+    np.testing.assert_allclose(mean.draws, together.draws)
     difference = paired_difference(mean, together)
     assert (difference.low, difference.high) == pytest.approx((0.0, 0.0))
     with pytest.raises(ValueError, match="same number of scenes"):

@@ -135,7 +135,7 @@ def test_the_room_type_of_the_scene_is_told():
         return torch.eye(5)[room + 1]
 
     data = tensors([scene([0, 1, 2], room=0), scene([0, 1, 2], room=1)])
-    result = leave_one_out(data, NO_STRUCTURE, score, told_room=True)
+    result = leave_one_out(data, NO_STRUCTURE, score, with_room=True)
     assert told[:6] == [0, 0, 0, 1, 1, 1]
     assert result.above[[1, 5]].tolist() == [0, 0]
     assert result.ties[0] > 0

@@ -54,7 +54,7 @@ def test_only_vertical_relations_between_two_things_are_asked():
         ]
     )
     (asked,) = vertical_pairs(data, structure)
-    assert asked.classes.tolist() == [[0, 1]]
+    assert asked.scene.evidence.classes[asked.ends].tolist() == [[0, 1]]
     # left(0, 1) and on-top(1, 0): the first to the second, then back.
     assert np.flatnonzero(asked.listed[0]).tolist() == [LEFT, 4 + ON]
 
@@ -164,7 +164,8 @@ def test_the_service_is_asked_about_its_first_instances():
     p = service_score(room_model())(asked)
     every = relation_probabilities(room_model(), labels_alone(asked.scene))
     own = asked.scene.instance_classes
-    for (i, j), row in zip(asked.classes.tolist(), p, strict=True):
+    classes = asked.scene.evidence.classes[asked.ends]
+    for (i, j), row in zip(classes.tolist(), p, strict=True):
         x, y = (int(np.flatnonzero(own == c)[0]) for c in (i, j))
         assert row == pytest.approx([*every[:, x, y], *every[:, y, x]])
     assert p.max() <= 1

@@ -34,11 +34,6 @@ PLACED: Final = Baseline(
 
 
 def placed_product(name: str, objects: Model, table: Model) -> Baseline:
-    """Return the baseline of T2-at whose score is the product of two fitted scores.
-
-    Args:
-        objects: a model with a score of missing objects.
-        table: the fitted `PLACED`.
-    """
+    """Return the baseline of T2-at that multiplies a score of missing objects by `PLACED`."""
     propose = triples.times(objects.missing, table.at_place)
     return Baseline(f"{PLACED.name} × {name}", propose, fitting.placed_mrr, ("at_place",))

@@ -69,11 +69,8 @@ class Baseline:
     """One baseline, shown as one row of a result table.
 
     Attributes:
-        propose: generator function that yields (parameters, score) for each grid point. Its
-            arguments are the training scenes, a mask of structure classes, (classes,) bool, and a
-            seed.
-        judge: function that returns the metric of a score; higher is better. Its arguments are the
-            validation scenes, the mask of structure classes and the score.
+        propose: function of training scenes, structure classes and seed, see the module.
+        judge: function of validation scenes, structure classes and score; higher is better.
         scores: fields of `Model` for which the score is used.
         stochastic: True if the fit depends on the seed.
     """

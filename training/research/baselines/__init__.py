@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Final
 
 from training.evaluation.baselines import (
@@ -27,7 +28,7 @@ _EVERY: tuple[Baseline, ...] = (
     Baseline("denoising autoencoder", networks.autoencoder, stochastic=True),
     Baseline(
         "autoencoder, heavily masked",
-        networks.autoencoder_for_parts,
+        partial(networks.autoencoder, course=networks.HEAVILY_MASKED),
         fitting.partial_mrr,
         stochastic=True,
     ),

@@ -134,7 +134,8 @@ def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float)
 _HIDDEN = 600
 _HIDDEN_DROPOUT = (0.15, 0.3)
 _AUTOENCODER = Course(epochs=24, learning_rate=3e-3, weight_decay=0.1)
-_HEAVY = replace(_AUTOENCODER, noise=1.0)
+HEAVILY_MASKED = replace(_AUTOENCODER, noise=1.0)
+"""Training whose noise hides up to all classes except the target."""
 
 
 def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
@@ -161,13 +162,6 @@ def autoencoder(
         network = build_autoencoder(train.v, _HIDDEN, dropout, seed)
         for epoch, score in train_network(network, train.v, structure, course, seed):
             yield {"dropout": dropout, "epochs": epoch}, score
-
-
-def autoencoder_for_parts(
-    train: SceneTensors, structure: Tensor, seed: int
-) -> Proposals[ObjectScore]:
-    """Yield scores of autoencoders whose noise hides up to all classes except the target."""
-    return autoencoder(train, structure, seed, _HEAVY)
 
 
 # Masked transformer. The classes of a scene are tokens, and one query token predicts the removed

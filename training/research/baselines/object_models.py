@@ -38,9 +38,9 @@ def evidence(v: Tensor, smoothing: float) -> Tensor:
     """
     both, count, scenes = v.T @ v, v.sum(0), len(v)
     average = frequency(v).unsqueeze(1) * smoothing
-    given = (both + average) / (count + smoothing)
-    otherwise = (count.unsqueeze(1) - both + average) / (scenes - count + smoothing)
-    return (given / otherwise).log().fill_diagonal_(0.0)
+    with_class = (both + average) / (count + smoothing)
+    without_class = (count.unsqueeze(1) - both + average) / (scenes - count + smoothing)
+    return (with_class / without_class).log().fill_diagonal_(0.0)
 
 
 def naive_bayes(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:

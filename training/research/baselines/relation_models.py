@@ -122,9 +122,8 @@ class ClosureScore:
 
     Attributes:
         table: score without observed relations.
-        bonus: value that is added to the log-odds of an implied relation, at least 0.
-        penalty: value that is subtracted from the log-odds of the reverse of an observed or implied
-            relation, at least 0.
+        bonus: added log-odds of an implied relation, at least 0.
+        penalty: subtracted log-odds of the reverse of an observed or implied relation, at least 0.
     """
 
     table: TripleTable
