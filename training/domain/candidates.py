@@ -158,13 +158,12 @@ Sources = Mapping[str, Sequence[AnnotatedScene]]
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Scenes held out from both models, and the number of test scenes that are left out.
+    """Scenes held out from both models, and remarks on their choice.
 
-    `notes` are remarks on the choice. `certain` is False if a model may have learnt from a scene.
+    `certain` is False if a model may have learnt from some of the scenes.
     """
 
     scenes: list[AnnotatedScene]
-    dropped: int
     notes: tuple[str, ...]
     certain: bool
 
@@ -200,18 +199,17 @@ def held_out(a: Candidate, b: Candidate, sources: Sources, root: Path) -> HeldOu
         kept, note, sure = _not_learnt(candidate, kept, sources, root)
         notes += [note] if note else []
         certain &= sure
-    dropped = len(candidates) - len(kept)
     if not kept:
         raise ConfigError(
             f"no scene is held out from both models: {b.title} has learnt from all test scenes of "
             f"{a.title}"
         )
-    if dropped:
+    if dropped := len(candidates) - len(kept):
         notes.append(
             f"{dropped} of {len(candidates)} test scenes of {a.title} are left out: {b.title} has "
             "learnt from these scenes or from near-duplicates (same group)"
         )
-    return HeldOut(kept, dropped, tuple(notes), certain)
+    return HeldOut(kept, tuple(notes), certain)
 
 
 def _not_learnt(
