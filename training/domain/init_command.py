@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
 
@@ -69,17 +70,13 @@ def init(
         _check_name(name)
         names = (f"{name}.toml", "vocabulary.json", "examples.json")
         targets = [folder / file for file in names]
-        if not force and (there := [path for path in targets if path.exists()]):
-            raise ConfigError(
-                f"{' and '.join(map(str, there))} would be overwritten: use --force, or choose "
-                "another folder with --output"
-            )
         with console.status("reading scenes"):
             scenes_of = {file: _read(file, format_) for file in files}
         for file in files:
             if not scenes_of[file]:
                 raise DatasetError(file, "", "the file contains no scene")
         sources, copies = _sources(folder, scenes_of)
+        _require_new([*targets, *copies], force=force)
         scenes = [scene for some in scenes_of.values() for scene in some]
         with console.status("analysing scenes"):
             proposal = propose(name, scenes, sources, terms=terms)
@@ -147,6 +144,16 @@ def _sources(
             sources.append(copy)
             copies[folder / copy] = scenes
     return sources, copies
+
+
+def _require_new(paths: Sequence[Path], *, force: bool) -> None:
+    """Refuse to overwrite files, unless ``force`` is True."""
+    existing = [str(path) for path in paths if path.exists()]
+    if existing and not force:
+        raise ConfigError(
+            f"{' and '.join(existing)} would be overwritten: use --force, or choose another folder "
+            "with --output"
+        )
 
 
 def _next(

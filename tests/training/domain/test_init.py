@@ -82,6 +82,14 @@ def test_nothing_is_overwritten_silently(file, tmp_path) -> None:
     assert (folder / "lab.toml").read_text() == "mine"
     invoke("init", "lab", file, "--output", folder, "--force")
     assert "[machine]" in (folder / "lab.toml").read_text()
+    # A file with another ending is copied as jsonl.
+    scenes, copy = tmp_path / "rec.dat", tmp_path / "other" / "rec.jsonl"
+    scenes.write_text(file.read_text())
+    copy.parent.mkdir()
+    copy.write_text("mine")
+    command = ("init", "lab", scenes, "--format", "jsonl", "--output", copy.parent)
+    assert "--force" in invoke(*command, code=1)
+    assert [path.read_text() for path in copy.parent.iterdir()] == ["mine"]
 
 
 def test_every_bad_line_is_named_up_to_a_bound(tmp_path) -> None:
