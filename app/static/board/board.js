@@ -6,7 +6,7 @@ import { edgesOf } from './edges.js';
 import { drawGhosts } from './ghost_drawing.js';
 import { UNKNOWN_SIZE } from './geometry.js';
 import { ghostsOf, ROBOT_SIDE } from './ghosts.js';
-import { labelPlaces, LINE, Indices, widthOf } from './labels.js';
+import { labelPlaces, LINE, Places, widthOf } from './labels.js';
 import { inWords, reading, refusedBy, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
@@ -164,7 +164,7 @@ export function createBoard(node, store, actions, takeGhost) {
     const shown = ghostsOf(state);
     const wrong = outliersOf(state);
     if (!dragging || !view) view = fit([...boxes, ...shown], state.viewer, size.width, size.height);
-    const places = new Indices(size.width, size.height);
+    const places = new Places(size.width, size.height);
     drawGrid();
     drawRobot(state);
     drawObjects(state, boxes, wrong);

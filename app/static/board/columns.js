@@ -81,7 +81,7 @@ const ROWS = {
     const alarms = wrongIn(answer).outliers.length; // the first ones, because the least fitting objects come first
     return [
       ...objects.slice(0, alarms), ...misplaced, ...objects.slice(alarms),
-      stated ? null : el('li', { class: 'quiet' }, 'Indices are not judged, because positions do not count as evidence.'),
+      stated ? null : el('li', { class: 'quiet' }, 'Places are not judged, because positions do not count as evidence.'),
     ].filter(Boolean);
   },
 

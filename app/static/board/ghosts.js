@@ -1,4 +1,4 @@
-/** Indices on the board for missing objects ("ghosts"). */
+/** Places on the board for missing objects ("ghosts"). */
 
 import { gap, halves, inside, overlap, round, UNKNOWN_SIZE } from './geometry.js';
 import { LIKELY, sizesOf } from './questions.js';
@@ -146,7 +146,7 @@ function height(anchor, relation, size, learnt) {
   return heights[relation]?.() ?? learnt ?? 0;
 }
 
-/** Indices on, above or below the anchor, with overlapping footprints; nearest to the learnt offset first. */
+/** Places on, above or below the anchor, with overlapping footprints; nearest to the learnt offset first. */
 function over(anchor, relation, size, learnt) {
   const half = halves({ size, yaw: -anchor.yaw });
   const room = (axis) => anchor.size[axis] / 2 - half[axis];
@@ -163,7 +163,7 @@ function over(anchor, relation, size, learnt) {
   });
 }
 
-/** Indices along the axis of a horizontal relation, with separate footprints and the larger offset on this axis. */
+/** Places along the axis of a horizontal relation, with separate footprints and the larger offset on this axis. */
 function beside(anchor, relation, size, viewer, learnt) {
   const [ahead, left] = DIRECTION[relation];
   const [axis, other] = ahead ? ['x', 'y'] : ['y', 'x'];

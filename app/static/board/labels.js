@@ -16,7 +16,7 @@ export function widthOf(text, font) {
   return widths.get(key);
 }
 
-export class Indices {
+export class Places {
   #texts = [];
   #boxes = [];
 

@@ -1,4 +1,4 @@
-/** Indices for objects without a position, from the relations between them. */
+/** Places for objects without a position, from the relations between them. */
 
 import { halves, round } from './geometry.js';
 
@@ -59,7 +59,7 @@ function beside(triples, nodes) {
 }
 
 /**
- * Indices `free` boxes among `fixed` boxes.
+ * Places `free` boxes among `fixed` boxes.
  * @param {object[]} fixed
  * @param {object[]} free boxes; given x and y are the start of the search
  * @param {{subject: string, relation: string, object: string}[]} relations by id
