@@ -124,7 +124,9 @@ def test_a_condition_fails_with_a_reason(
 
 def test_a_service_that_is_not_there_fails_the_condition(behaviours: Any, plant: Plant) -> None:
     with Client("http://127.0.0.1:9") as client:
-        condition = behaviours.SceneComplete("complete", client, lambda: {"objects": ["bed"]})
+        condition = behaviours.SceneComplete(
+            "complete", client, lambda: {"objects": ["bed"]}, timeout=30.0
+        )
         assert settle(plant(condition)) is Status.FAILURE
     assert condition.feedback_message.startswith("UnreachableError: ")
 
