@@ -234,9 +234,9 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
     outgoing, anchor = np.empty(N * kept, np.bool_), np.empty(N * kept, np.int64)
     probabilities = np.empty(N * kept, np.float64)
     for c in range(N):
-        one, other = to[c].reshape(-1), back[c].reshape(-1)
+        p_to, p_back = to[c].reshape(-1), back[c].reshape(-1)
         for e in range(size):
-            p[e], p[size + e] = exclusive(one[e], other[e])
+            p[e], p[size + e] = exclusive(p_to[e], p_back[e])
         where = best(p, usable, kept - begin)
         for k in range(kept):
             place, at = first if k < begin else where[k - begin], c * kept + k
@@ -306,9 +306,10 @@ def observed_pairs(triples, row, judged, classes, relations):
         for y in range(x + 1, size):
             if holds[x, y] and (judged[x, y] or judged[y, x]):
                 # The subject of the pair is the subject of its observed relation with the lowest
-                # number.
-                one, other = holds[x, y] & forward, holds[y, x] & forward
-                swapped = one == 0 or (other != 0 and (other & -other) < (one & -one))
+                # number. n & -n is the lowest bit of n.
+                from_x, from_y = holds[x, y] & forward, holds[y, x] & forward
+                y_is_lower = from_y != 0 and (from_y & -from_y) < (from_x & -from_x)
+                swapped = from_x == 0 or y_is_lower
                 subject, object_ = (y, x) if swapped else (x, y)
                 columns[0, pairs], columns[1, pairs] = subject, object_
                 columns[2, pairs] = holds[subject, object_]

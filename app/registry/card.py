@@ -74,7 +74,6 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
     """Return the model card in Markdown.
 
     Args:
-        description: description of the model.
         tensors: maps the name of each stored tensor to its dtype and shape.
     """
     words, spec = description.vocabulary, description.spec
