@@ -132,15 +132,15 @@ def _make_private(folder: Path) -> None:
 
 def _remove_old(current: Path) -> None:
     """Remove cache directories of other versions, except the `_KEPT` newest and recent ones."""
-    others = []
+    folders = []
     for folder in current.parent.glob(_NAMES):
         with suppress(FileNotFoundError):  # another process has removed the directory
             status = folder.lstat()
             is_ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid()
             if is_ours and folder != current:
-                others.append((status.st_mtime, folder))
-    others.sort(reverse=True)
-    for last_use, folder in others[_KEPT:]:
+                folders.append((status.st_mtime, folder))
+    folders.sort(reverse=True)
+    for last_use, folder in folders[_KEPT:]:
         if time.time() - last_use > _RECENT:
             shutil.rmtree(folder, ignore_errors=True)
 

@@ -146,26 +146,26 @@ def gains(x, exp_w, group, classes):
     for t in range(tiles):
         tile = exp_w[t]
         for m in range(M):
-            offs, ons, into = off[m], on[m], gain[m, t * width :]
+            off_m, on_m, gain_m = off[m], on[m], gain[m, t * width :]
             product[:], exponents[:] = _ONE, np.int32(0)
             for start in range(0, units, group):
                 end = min(start + group, units)
                 # The loop takes two factors at a time. This halves the reads and writes of the
                 # product.
                 for k in range(start, end - 1, 2):
-                    a1, b1, row1 = offs[k], ons[k], tile[k]
-                    a2, b2, row2 = offs[k + 1], ons[k + 1], tile[k + 1]
+                    a1, b1, row1 = off_m[k], on_m[k], tile[k]
+                    a2, b2, row2 = off_m[k + 1], on_m[k + 1], tile[k + 1]
                     for i in range(width):
                         product[i] *= (a1 + b1 * row1[i]) * (a2 + b2 * row2[i])
                 if (end - start) % 2:
-                    a1, b1, row1 = offs[end - 1], ons[end - 1], tile[end - 1]
+                    a1, b1, row1 = off_m[end - 1], on_m[end - 1], tile[end - 1]
                     for i in range(width):
                         product[i] *= a1 + b1 * row1[i]
                 for i in range(width):
                     exponents[i] += exponent(product[i])
                     product[i] = mantissa(product[i])
             for i in range(min(width, classes - t * width)):
-                into[i] = log(product[i]) + _LN2 * np.float32(exponents[i])
+                gain_m[i] = log(product[i]) + _LN2 * np.float32(exponents[i])
     return gain
 
 

@@ -115,14 +115,14 @@ def spreads(C, q):
             weights, rows, variance, t = C[b, c], q[b, c], spread[b, c], 0
             variance[:] = np.float32(0.0)
             for d in range(r):
-                row[:], this = np.float32(0.0), rows[d]
+                row[:], q_d = np.float32(0.0), rows[d]
                 for u in range(d + 1):
-                    weight, other = weights[t + u], rows[u]
+                    weight, q_u = weights[t + u], rows[u]
                     for p in range(P):
-                        row[p] += weight * other[p]
+                        row[p] += weight * q_u[p]
                 t += d + 1
                 for p in range(P):
-                    variance[p] += row[p] * this[p]
+                    variance[p] += row[p] * q_d[p]
             for p in range(P):
                 variance[p] = np.sqrt(np.float32(3.0) * max(variance[p], np.float32(0.0)))
     return spread
@@ -251,12 +251,12 @@ def normal_without_itself(y, U, base, slopes):
         slopes: (E,) see `RelationUnits.fixed_point`.
     """
     mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
-    rest, m = np.empty_like(y), np.empty_like(y)
+    y_without, m = np.empty_like(y), np.empty_like(y)
     for e in range(len(U)):
         row = U[e]
         for k in range(len(y)):
-            rest[k] = y[k] - slopes[e] * row[k]
-        _set_means(rest, m)
+            y_without[k] = y[k] - slopes[e] * row[k]
+        _set_means(y_without, m)
         mean[e], variance = _moments(row, m)
         mean[e] += base[e]
         spread[e] = np.sqrt(np.float32(3.0) * variance)
@@ -338,43 +338,43 @@ def _empty_steps(relations, n):
     Returns:
         degree: (2A kinds, n classes) number of steps of each kind that start at each class.
         near: (2A kinds, n classes, n) end classes of these steps.
-        seen: (n, n, 2A) paths of two steps from one class to another class. The last axis is the
+        path_kinds: (n, n, 2A) paths of two steps from one class to another. The last axis is the
             kind of the first step. Each value is a bit set of the kinds of the second step.
         paths: (n, n, A) change of the logit of each relation by the paths between its two classes.
     """
     steps = 2 * relations
     degree, near = np.zeros((steps, n), np.int64), np.empty((steps, n, n), np.int64)
-    seen = np.zeros((n, n, steps), np.uint64)
-    return degree, near, seen, np.zeros((n, n, relations), np.float32)
+    path_kinds = np.zeros((n, n, steps), np.uint64)
+    return degree, near, path_kinds, np.zeros((n, n, relations), np.float32)
 
 
 @compiled
 def _add_relation(tables, weight, a, i, j):
     """Add the steps of relation a between classes i and j, and the new paths, to the tables."""
     # The loops use plain indices, because a slice would cost more time.
-    degree, near, seen, paths = tables
+    degree, near, path_kinds, paths = tables
     steps = len(degree)
-    both = (a, i, j), (steps // 2 + a, j, i)
-    for c, x, y in both:
+    directions = (a, i, j), (steps // 2 + a, j, i)
+    for c, x, y in directions:
         near[c, x, degree[c, x]] = y
         degree[c, x] += 1
-    for c, x, y in both:
+    for c, x, y in directions:
         for d in range(steps):
-            for at in range(degree[d, y]):
-                _add_path(seen, paths, weight, x, near[d, y, at], c, d)
+            for step in range(degree[d, y]):
+                _add_path(path_kinds, paths, weight, x, near[d, y, step], c, d)
             # If a step of kind d leads from x to another class, then a step of the opposite kind
             # leads from the other class to x.
             back = (d + steps // 2) % steps
-            for at in range(degree[d, x]):
-                _add_path(seen, paths, weight, near[d, x, at], y, back, c)
+            for step in range(degree[d, x]):
+                _add_path(path_kinds, paths, weight, near[d, x, step], y, back, c)
 
 
 @inlined
-def _add_path(seen, paths, weight, x, y, first, second):
+def _add_path(path_kinds, paths, weight, x, y, first, second):
     """Add a path of two steps (kinds first, second) from x to y, unless it is in the tables."""
-    steps, bit = seen.shape[2], np.uint64(1) << np.uint64(second)
-    if not seen[x, y, first] & bit:
-        seen[x, y, first] |= bit
+    steps, bit = path_kinds.shape[2], np.uint64(1) << np.uint64(second)
+    if not path_kinds[x, y, first] & bit:
+        path_kinds[x, y, first] |= bit
         for b in range(paths.shape[2]):
             paths[x, y, b] += weight[steps + first * steps + second, b]
 
@@ -392,23 +392,23 @@ def _shifts(tables, weight, direct):
     degree, near, _, paths = tables
     (steps, n), A = degree.shape, weight.shape[1]
     shift, degrees = paths.copy(), weight[steps + steps * steps :]
-    out, into = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
+    out_shift, in_shift = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
     for c in range(steps):
         # Each step of kind c that ends at a class has an opposite step that starts at this class.
         back = (c + A) % steps
         for x in range(n):
             for b in range(A):
-                out[x, b] += degrees[c, b] * min(np.float32(degree[c, x]), _MOST)
-                into[x, b] += degrees[steps + c, b] * min(np.float32(degree[back, x]), _MOST)
+                out_shift[x, b] += degrees[c, b] * min(np.float32(degree[c, x]), _MOST)
+                in_shift[x, b] += degrees[steps + c, b] * min(np.float32(degree[back, x]), _MOST)
     for x in range(n):
         for y in range(n):
             for b in range(A):
-                shift[x, y, b] += out[x, b] + into[y, b]
+                shift[x, y, b] += out_shift[x, b] + in_shift[y, b]
     for c in range(steps):
         back = (c + A) % steps
         for x in range(n):
-            for at in range(degree[c, x]):
-                y = near[c, x, at]
+            for step in range(degree[c, x]):
+                y = near[c, x, step]
                 for b in range(A):
                     if direct:
                         shift[x, y, b] += weight[c, b]

@@ -129,24 +129,24 @@ def distribution(
         Then the probability of 1, 2, ... M instances, (k, M).
     """
     M = counts.log_share.shape[1]
-    row = np.searchsorted(counts.classes, classes)
-    row[row == len(counts.classes)] = 0
-    which = np.flatnonzero((counts.classes[row] == classes) & (listed <= counts.most[row]))
-    row, number, k = row[which], np.arange(1, M + 1), listed[which, None]
-    weights, is_several = counts.weights[row, :, :ROOM].astype(np.float64), listed > 1
+    entry = np.searchsorted(counts.classes, classes)
+    entry[entry == len(counts.classes)] = 0
+    rows = np.flatnonzero((counts.classes[entry] == classes) & (listed <= counts.most[entry]))
+    entry, number, k = entry[rows], np.arange(1, M + 1), listed[rows, None]
+    weights, is_several = counts.weights[entry, :, :ROOM].astype(np.float64), listed > 1
     exponents = weights[..., INTERCEPT] + weights[..., SINGLE] * (k == 1)
-    exponents += weights[..., SEVERAL] * (is_several.sum() > is_several[which, None])
+    exponents += weights[..., SEVERAL] * (is_several.sum() > is_several[rows, None])
     if room is not None:
-        exponents += counts.weights[row, :, ROOM + room]
+        exponents += counts.weights[entry, :, ROOM + room]
     if (others := len(classes) - 1) > 0:
         # The effect of a class on itself is 0, so the sum over all listed classes is correct.
-        effects = counts.weights[row[:, None], :, counts.weights.shape[-1] - V + classes]
+        effects = counts.weights[entry[:, None], :, counts.weights.shape[-1] - V + classes]
         exponents += effects.sum(axis=1, dtype=np.float64) / math.sqrt(others)
-    logits = counts.log_share[row] + exponents @ functions(M)
+    logits = counts.log_share[entry] + exponents @ functions(M)
     logits += (number - k) * math.log(max(unlisted, sys.float_info.min))
     logits[number < k] = -np.inf
     p = np.exp(logits - logits.max(axis=1, keepdims=True, initial=-np.inf))
-    return which, p / p.sum(axis=1, keepdims=True)
+    return rows, p / p.sum(axis=1, keepdims=True)
 
 
 def functions(M: int) -> Floats:

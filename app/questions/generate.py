@@ -113,7 +113,7 @@ def generate(
     if not temperature > 0:
         raise ValueError(f"temperature must be positive, not {temperature}")
     conditions = _conditions(artifact, scene, context or {})
-    conditioned = artifact.scene_chains.under(conditions, temperature)
+    chains = artifact.scene_chains.under(conditions, temperature)
     shown = ~artifact.vocabulary.structure
     shown[conditions.classes] = True
     class_of = [thing.class_index or 0 for thing in scene.objects]
@@ -123,10 +123,10 @@ def generate(
     while len(scenes) < count and not stop():
         stream = random_stream(seed, len(scenes))
         for attempt in range(ATTEMPTS):
-            drawn = conditioned.draw(steps, stream)
-            is_shown = shown[drawn.classes]
-            if plausible(drawn.classes[is_shown].tolist()) or stop() or attempt == ATTEMPTS - 1:
-                scenes.append(_scene(artifact, conditioned, drawn, is_shown, evidence))
+            state = chains.draw(steps, stream)
+            is_shown = shown[state.classes]
+            if plausible(state.classes[is_shown].tolist()) or stop() or attempt == ATTEMPTS - 1:
+                scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
     if size_limit is not None:
         size_limit.check("count", *_size(scenes))
@@ -166,30 +166,30 @@ def _conditions(
 def _scene(
     artifact: Artifact,
     chains: ConditionedChains,
-    drawn: ChainState,
+    state: ChainState,
     shown: NDArray[np.bool_],
     evidence: set[Triple],
 ) -> Fields:
     """Return the fields of `scene_client.schemas.GeneratedScene` for a drawn scene.
 
-    ``shown`` (n,) is True for the classes of ``drawn`` that the answer lists.
+    ``shown`` (n,) is True for the classes of ``state`` that the answer lists.
     """
     labels = artifact.vocabulary.labels
-    units = np.nonzero(drawn.r & shown[:, None] & shown)
+    units = np.nonzero(state.r & shown[:, None] & shown)
     a, i, j = units
-    named = np.stack([a, drawn.classes[i], drawn.classes[j]], axis=1)
-    stay = staying(named, drawn.logits[units], evidence, artifact.vocabulary.structure)
-    kept = np.zeros_like(drawn.r)
+    named = np.stack([a, state.classes[i], state.classes[j]], axis=1)
+    stay = staying(named, state.logits[units], evidence, artifact.vocabulary.structure)
+    kept = np.zeros_like(state.r)
     kept[units] = stay
     triples = sorted({*map(tuple, named[stay].tolist()), *evidence})
     return {
-        "objects": [labels[index] for index in drawn.classes[shown].tolist()],
+        "objects": [labels[index] for index in state.classes[shown].tolist()],
         "relations": [
             {"subject": labels[i], "relation": CANONICAL[a], "object": labels[j]}
             for a, i, j in triples
         ],
-        "log_score": rounded_number(chains.log_score(drawn, shown, kept)),
-        "context": {layer: getattr(drawn, layer).tolist() for layer in _layer_sizes(artifact.spec)},
+        "log_score": rounded_number(chains.log_score(state, shown, kept)),
+        "context": {layer: getattr(state, layer).tolist() for layer in _layer_sizes(artifact.spec)},
     }
 
 

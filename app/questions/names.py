@@ -158,8 +158,8 @@ class Unknown:
             match = self._guess(label, is_room=is_room)
         if match is not None:
             entry, similarity, rule = match
-            name = (self.vocabulary.room_types if is_room else self.vocabulary.labels)[entry]
-            mapped = Mapped(label=label, class_=name, similarity=similarity, rule=rule)
+            names = self.vocabulary.room_types if is_room else self.vocabulary.labels
+            mapped = Mapped(label=label, class_=names[entry], similarity=similarity, rule=rule)
             self.mapped[label, is_room] = mapped
             return entry
         if self.treatment.endswith("ignore"):

@@ -246,7 +246,6 @@ def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
 
 
 def _refusal(error: StoreError) -> Exception:
-    """Convert an error of the store to an error of the service, without paths of the store."""
     match error.code:
         case "alias_conflict":
             return errors.AliasConflictError("The alias points to another version than expected.")

@@ -164,8 +164,8 @@ def _restore(kind: type[ClientError], args: tuple[Any, ...], state: dict[str, An
 
 def _located_message(error: FieldError) -> str:
     # The pointer "#" means the whole body, so the message needs no location.
-    where = "" if error.pointer == "#" else f"{error.pointer}: "
-    return where + _message(error)
+    prefix = "" if error.pointer == "#" else f"{error.pointer}: "
+    return prefix + _message(error)
 
 
 def _message(error: FieldError) -> str:
