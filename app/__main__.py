@@ -107,7 +107,6 @@ def serve(settings: Settings, began: float) -> int:
     """Serve until the process is stopped. Return its exit status: 0, or 3 if it could not start.
 
     Args:
-        settings: settings of the service.
         began: `time.monotonic()` at the start of the process.
     """
     try:

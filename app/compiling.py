@@ -115,31 +115,33 @@ def _make_private(folder: Path) -> None:
     """Create a directory that only this user can write to. Raise OSError on failure."""
     folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     folder.mkdir(mode=0o700, exist_ok=True)
-    own, root = folder.lstat(), folder.parent.stat()
-    if not stat.S_ISDIR(own.st_mode):
+    status, parent = folder.lstat(), folder.parent.stat()
+    if not stat.S_ISDIR(status.st_mode):
         raise NotADirectoryError(f"{folder} is not a directory")
-    if own.st_uid != os.geteuid() or root.st_uid not in {os.geteuid(), 0}:
+    if status.st_uid != os.geteuid() or parent.st_uid not in {os.geteuid(), 0}:
         raise PermissionError(f"{folder} or its parent belongs to another user")
     # A parent with the sticky bit, such as /tmp, is safe. Other users can add files to this parent,
     # but they cannot replace files of this user.
-    others = stat.S_IWGRP | stat.S_IWOTH
-    if own.st_mode & others or (root.st_mode & others and not root.st_mode & stat.S_ISVTX):
+    by_others = stat.S_IWGRP | stat.S_IWOTH
+    unsafe_parent = parent.st_mode & by_others and not parent.st_mode & stat.S_ISVTX
+    if status.st_mode & by_others or unsafe_parent:
         raise PermissionError(f"other users can write to {folder} or to its parent")
     tempfile.TemporaryFile(dir=folder).close()
     os.utime(folder)
 
 
 def _remove_old(current: Path) -> None:
-    others = []
+    """Remove cache directories of other versions, except the `_KEPT` newest and recent ones."""
+    folders = []
     for folder in current.parent.glob(_NAMES):
         with suppress(FileNotFoundError):  # another process has removed the directory
             status = folder.lstat()
             is_ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid()
             if is_ours and folder != current:
-                others.append((status.st_mtime, folder))
-    others.sort(reverse=True)
-    for used, folder in others[_KEPT:]:
-        if time.time() - used > _RECENT:
+                folders.append((status.st_mtime, folder))
+    folders.sort(reverse=True)
+    for last_use, folder in folders[_KEPT:]:
+        if time.time() - last_use > _RECENT:
             shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -192,7 +194,7 @@ def inlined(function: Function) -> Function:
 
 
 def check_cache() -> None:
-    """Log the cache directory of compiled kernels, unless it is the preferred directory."""
+    """Log a warning without a cache directory, and an info if it is not the preferred directory."""
     if _FOLDER is None:
         _logger.warning(
             "each start compiles the kernels, because no cache directory is usable: %s", _PROBLEM

@@ -44,9 +44,9 @@ ERRORS: Final[dict[str, type[ServiceError]]] = {}
 
 def some_of(names: Iterable[str]) -> str:
     """Return the first `MOST_NAMED` names in alphabetical order, as text for a message."""
-    found = sorted(names)
-    text = ", ".join(found[:MOST_NAMED]) or "none"
-    return f"{text} and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else text
+    ordered = sorted(names)
+    text = ", ".join(ordered[:MOST_NAMED]) or "none"
+    return f"{text} and {len(ordered) - MOST_NAMED} more" if len(ordered) > MOST_NAMED else text
 
 
 @dataclass(frozen=True, slots=True)

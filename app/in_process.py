@@ -81,13 +81,15 @@ class InProcess(httpx.BaseTransport):
 
 
 def _run(app: FastAPI, started: Future[asyncio.AbstractEventLoop], ending: asyncio.Event) -> None:
-    async def live() -> None:
+    """Run the application until ``ending`` is set. ``started`` receives the loop or the error."""
+
+    async def run_until_end() -> None:
         async with app.router.lifespan_context(app):
             started.set_result(asyncio.get_running_loop())
             await ending.wait()
 
     try:
-        asyncio.run(live())
+        asyncio.run(run_until_end())
     except BaseException as error:
         if started.done():
             raise

@@ -127,7 +127,10 @@ def _page(host: str, port: int) -> str:
 
 
 def build(settings: Settings, began: float) -> Server:
-    """Build the server, without a start. ``began`` is `time.monotonic()` at the process start."""
+    """Return the server, not yet started. Warn if other machines can use it without a key.
+
+    ``began`` is `time.monotonic()` at the start of the process.
+    """
     app = create_app(settings)
     config = uvicorn.Config(
         app,

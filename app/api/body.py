@@ -45,9 +45,6 @@ event loop parses small bodies itself, and leaves larger bodies to a thread.
 class Bodies:
     """Reader of request bodies. It limits size and transfer time, and the size of all bodies.
 
-    Args:
-        settings: settings of the service.
-
     Attributes:
         held: total size in bytes of the bodies of all requests in progress.
     """

@@ -82,7 +82,6 @@ class Gateway:
 
     Args:
         app: the ASGI application that answers the requests.
-        settings: settings of the service.
         runtime: owner of the backlog, the metrics and the models.
     """
 

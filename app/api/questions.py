@@ -47,7 +47,9 @@ def serving_request(http: Request) -> serving.Request:
     """Create the serving request of an HTTP request. It uses one snapshot of the models."""
     state, runtime = http.scope["state"], http.scope["app"].state.runtime
     return serving.Request(
-        *(state["deadline"], http.is_disconnected, state["request_id"]),
+        deadline=state["deadline"],
+        is_gone=http.is_disconnected,
+        id=state["request_id"],
         record=state["record"],
         models=runtime.models,
         limits=runtime.limits,
@@ -65,15 +67,15 @@ async def _answer_each(
 
     results: list[bytes] = []
     left = request.limits.answer_bytes
-    with request.for_batch([_reference(scene) for scene in batch.scenes]) as held:
+    with request.for_batch([_reference(scene) for scene in batch.scenes]) as admitted:
         for number, scene in enumerate(batch.scenes):
             try:
-                held.check()
-                one = held.with_answer_bytes(left)
+                admitted.check()
+                scene_request = admitted.with_answer_bytes(left)
                 # Only this validation may fail because of the client. Any later validation error is
                 # a defect of the service.
                 data = validated(scene, question.request, at=("scenes", number))
-                answer = written(await one.answer(question, data))
+                answer = written(await scene_request.answer(question, data))
                 results.append(b'{"status":200,"result":%b}' % answer)
                 count(serving.SUCCESS)
             except Exception as error:  # noqa: BLE001 — any error fails only this scene

@@ -34,17 +34,17 @@ def _bernoulli(logits, beta, uniform, on):
 @compiled
 def _add_rows(rows, on, total):
     """Add each row with on[row] = 1 to total, four rows at a time. on has the shape (n,)."""
-    which, count = np.empty(len(on), np.int64), 0
+    active, count = np.empty(len(on), np.int64), 0
     for i in range(len(on)):
-        which[count] = i
+        active[count] = i  # the next index overwrites the index of a row that is off
         count += on[i]
     whole = count - count % 4
     for k in range(0, whole, 4):
-        a, b, c, d = rows[which[k]], rows[which[k + 1]], rows[which[k + 2]], rows[which[k + 3]]
+        a, b, c, d = rows[active[k]], rows[active[k + 1]], rows[active[k + 2]], rows[active[k + 3]]
         for i in range(len(total)):
             total[i] += (a[i] + b[i]) + (c[i] + d[i])
     for k in range(whole, count):
-        row = rows[which[k]]
+        row = rows[active[k]]
         for i in range(len(total)):
             total[i] += row[i]
 
@@ -93,42 +93,45 @@ def sweeps(w, bias, always, held, held2, observed, beta, uniform, on, h1, h2):
 def _propose(w, x, held, observed, beta, h1, blocks, uniform):
     """Update h1 given objects and observed relations, by Metropolis–Hastings.
 
-    Proposals come from the conditional of h1 without relations, block by block.
+    A proposal comes from the conditional of h1 without relations, which has the logits x. Each
+    changed unit belongs to a random block. The function accepts or rejects one block after the
+    other. ``blocks`` (H1 + PROPOSALS,) has random numbers for the blocks of the units and for the
+    acceptances, and ``uniform`` (H1,) for the proposed states.
     """
     H1 = len(x)
     proposal, block = np.empty(H1, np.uint8), np.empty(H1, np.int64)
     _bernoulli(x, beta, uniform, proposal)
     proposal |= held
     for k in range(H1):
-        block[k] = np.int64(blocks[k] * PROPOSALS) if proposal[k] != h1[k] else -1
-    through = np.zeros(w.directions.shape[1], np.float32)
-    _add_rows(w.directions, h1, through)
+        block[k] = np.int64(blocks[k] * PROPOSALS) if proposal[k] != h1[k] else -1  # unchanged
+    factors = np.zeros(w.directions.shape[1], np.float32)
+    _add_rows(w.directions, h1, factors)
     terms = np.empty(len(observed.r), np.float32)
-    weight = _observed_weight(through, observed, beta, terms)
-    changed = np.empty_like(through)
+    weight = _observed_weight(factors, observed, beta, terms)
+    proposed_factors = np.empty_like(factors)
     for number in range(PROPOSALS):
-        changed[:] = through
+        proposed_factors[:] = factors
         size = 0
         for k in range(H1):
             if block[k] == number:
                 row, sign = w.directions[k], np.float32(1.0 if proposal[k] else -1.0)
                 size += 1
                 for i in range(len(row)):
-                    changed[i] += sign * row[i]
+                    proposed_factors[i] += sign * row[i]
         if size:
-            proposed = _observed_weight(changed, observed, beta, terms)
+            proposed = _observed_weight(proposed_factors, observed, beta, terms)
             if np.log(max(np.float64(blocks[H1 + number]), 1e-9)) < proposed - weight:
                 weight = proposed
-                through[:] = changed
+                factors[:] = proposed_factors
                 for k in range(H1):
                     if block[k] == number:
                         h1[k] = proposal[k]
 
 
 @compiled
-def _observed_weight(through, observed, beta, terms):
-    """Compute the log-probability of the observed relations, log p(r | v, h1)."""
-    _observed_logits(through.reshape(-1, observed.z.shape[1]), observed, terms)
+def _observed_weight(factors, observed, beta, terms):
+    """Return log p(r | v, h1) of the observed relations. ``terms`` (E,) is a buffer."""
+    _observed_logits(factors.reshape(-1, observed.z.shape[1]), observed, terms)
     for e in range(len(terms)):
         logit = beta * terms[e]
         terms[e] = observed.r[e] * logit - _softplus(logit)
@@ -139,9 +142,10 @@ def _observed_weight(through, observed, beta, terms):
 
 
 @compiled_in_any_order
-def _observed_logits(through, observed, out):
+def _observed_logits(factors, observed, out):
+    """Write the logit base_e + z_e·(contribution of h1 to the factors of relation a_e) to out."""
     for e in range(len(out)):
-        z, own, total = observed.z[e], through[observed.a[e]], observed.base[e]
+        z, h1_factors, logit = observed.z[e], factors[observed.a[e]], observed.base[e]
         for k in range(len(z)):
-            total += z[k] * own[k]
-        out[e] = total
+            logit += z[k] * h1_factors[k]
+        out[e] = logit

@@ -134,7 +134,6 @@ class SceneChains:
     """Gibbs chains of a machine.
 
     Args:
-        weights: weights of the machine.
         units: relation units of the machine. With None, the class builds them.
 
     Raises:
@@ -175,19 +174,22 @@ class SceneChains:
         return ConditionedChains(self, conditions, temperature)
 
     def sample_weights(self, conditions: Conditions) -> NDArray[np.float64]:
-        """Return the probability of each stored scene as the start of a chain, (N,)."""
+        """Return the probability of each stored scene as the start of a chain, (N,); see module."""
         spec, Q, room = self.machine.spec, self.machine["Q"], conditions.room
-        total = np.zeros(len(self.mean), np.float32)
+        log_weights = np.zeros(len(self.mean), np.float32)
         if room is not None and spec.C:
-            own = self.machine["fantasy_rooms"] == room
-            total += np.where(own, 0, -OTHER_ROOM) if own.any() else self.mean @ Q[room]
+            same_room = self.machine["fantasy_rooms"] == room
+            if same_room.any():
+                log_weights += np.where(same_room, 0, -OTHER_ROOM)
+            else:
+                log_weights += self.mean @ Q[room]
         classes = conditions.classes
         logits = self.machine["b"][classes] + self.mean @ self.machine["W"][classes].T
-        total -= softplus(-logits).sum(1)
-        total += np.log(np.maximum(self.mean[:, conditions.held], 1e-37)).sum(1)
-        weight = np.exp(total - total.max()).astype(np.float64)
-        share: NDArray[np.float64] = weight / weight.sum()
-        return share
+        log_weights -= softplus(-logits).sum(1)
+        log_weights += np.log(np.maximum(self.mean[:, conditions.held], 1e-37)).sum(1)
+        weights = np.exp(log_weights - log_weights.max()).astype(np.float64)
+        probabilities: NDArray[np.float64] = weights / weights.sum()
+        return probabilities
 
 
 class ConditionedChains:
@@ -201,47 +203,47 @@ class ConditionedChains:
         spec = chains.machine.spec
         self._beta = np.float32(1.0 / temperature)
         self._bias = chains.machine.room_bias(conditions.room)
-        self._always, self._held, self._held2 = (
-            _indicator(size, where)
-            for size, where in (
-                (spec.V, conditions.classes),
-                (spec.H1, conditions.held),
-                (spec.H2, conditions.held2),
-            )
-        )
+        self._required_classes = _indicator(spec.V, conditions.classes)
+        self._required_h1 = _indicator(spec.H1, conditions.held)
+        self._required_h2 = _indicator(spec.H2, conditions.held2)
         self._classes, self._observed_relations = conditions.classes, conditions.observed
         self._observed = self._observed_units(conditions)
-        self._cumulative = np.zeros(0)
+        # Cumulative probabilities of the stored scenes as the start of a chain.
+        self._start_cdf = np.zeros(0)
         if spec.N:
-            self._cumulative = np.cumsum(chains.sample_weights(conditions))
+            self._start_cdf = np.cumsum(chains.sample_weights(conditions))
 
     def _observed_units(self, conditions: Conditions) -> ObservedUnits:
         observed, units = conditions.observed, self._chains.units
         if observed is None:
-            nothing = np.zeros(0, np.float32)
+            empty = np.zeros(0, np.float32)
             width = units.G.shape[1] if len(units.G) else self._machine.spec.H1
-            return ObservedUnits(
-                np.zeros(0, np.int64), np.zeros((0, width), np.float32), nothing, nothing
-            )
+            no_factors = np.zeros((0, width), np.float32)
+            return ObservedUnits(a=np.zeros(0, np.int64), z=no_factors, base=empty, r=empty)
         ends = _present(conditions.classes, observed.i, observed.j, conditions.log_counts)
         selected = units.select(observed.a, ends)
         a = selected.a if len(units.G) else np.zeros_like(selected.a)
         return ObservedUnits(a, selected.z, selected.base, observed.r[selected.kept])
 
     def draw(self, steps: int, stream: np.random.Generator) -> ChainState:
-        """Run ``steps`` sweeps of one chain with its random stream and return its final state."""
+        """Run ``steps`` sweeps of one chain with its random stream and return its final state.
+
+        The chain starts at a random stored scene; see `SceneChains.sample_weights`. If the machine
+        stores no scenes, the start has only the required classes, and h1 follows from its biases.
+        """
         V, H1 = self._w.W.shape
-        on, mean = np.zeros(V, np.uint8), sigmoid(self._bias)
-        if len(self._cumulative):
-            chosen = int(np.searchsorted(self._cumulative[:-1], stream.random(), "right"))
-            on = unpack_scenes(self._machine["fantasies"][chosen : chosen + 1], V)[0]
-            on, mean = on.astype(np.uint8), self._chains.mean[chosen]
-        h1 = (stream.random(H1, np.float32) < mean).astype(np.uint8) | self._held
-        h2 = np.zeros_like(self._held2)
+        present, h1_mean = np.zeros(V, np.uint8), sigmoid(self._bias)
+        if len(self._start_cdf):
+            start = int(np.searchsorted(self._start_cdf[:-1], stream.random(), "right"))
+            packed = self._machine["fantasies"][start : start + 1]
+            present = unpack_scenes(packed, V)[0].astype(np.uint8)
+            h1_mean = self._chains.mean[start]
+        h1 = (stream.random(H1, np.float32) < h1_mean).astype(np.uint8) | self._required_h1
+        h2 = np.zeros_like(self._required_h2)
         if len(h2):
-            m2 = sigmoid(self._machine["c2"] + h1 @ self._machine["J"])
-            h2 = (stream.random(len(h2), np.float32) < m2) | self._held2
-        return self.move(on | self._always, h1, h2, steps, stream)
+            h2_mean = sigmoid(self._machine["c2"] + h1 @ self._machine["J"])
+            h2 = (stream.random(len(h2), np.float32) < h2_mean) | self._required_h2
+        return self.move(present | self._required_classes, h1, h2, steps, stream)
 
     def move(
         self, on: Bits, h1: Bits, h2: Bits, steps: int, stream: np.random.Generator
@@ -250,12 +252,13 @@ class ConditionedChains:
 
         The state has the presence of the classes (V,) and the hidden units h1 (H1,) and h2 (H2,).
         """
-        numbers = len(on) + 2 * len(h1) + len(h2) + kernels.PROPOSALS
+        per_sweep = len(on) + 2 * len(h1) + len(h2) + kernels.PROPOSALS
+        required = self._required_classes, self._required_h1, self._required_h2
+        chain = on, h1, h2
         while steps > 0:
-            uniform = stream.random((min(steps, _AT_ONCE), numbers), np.float32)
+            uniform = stream.random((min(steps, _AT_ONCE), per_sweep), np.float32)
             kernels.sweeps(
-                *(self._w, self._bias, self._always, self._held, self._held2),
-                *(self._observed, self._beta, uniform, on, h1, h2),
+                self._w, self._bias, *required, self._observed, self._beta, uniform, *chain
             )
             steps -= _AT_ONCE
         classes = np.flatnonzero(on)
@@ -286,16 +289,17 @@ class ConditionedChains:
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
         observed = self._observed_relations
         if observed is not None:
-            where = np.searchsorted(classes, self._classes)
-            a, i, j = observed.a, where[observed.i], where[observed.j]
-            with_unit = logits[a, i, j] > NEVER / 2
-            units = a[with_unit], i[with_unit], j[with_unit]
-            r[units], free[units] = observed.r[with_unit] > 0, False
-        uniform, other = stream.random((2, *r.shape), np.float32)
+            # The observed classes are always present, so ``classes`` contains each of them.
+            rows = np.searchsorted(classes, self._classes)
+            a, i, j = observed.a, rows[observed.i], rows[observed.j]
+            has_unit = logits[a, i, j] > NEVER / 2
+            units = a[has_unit], i[has_unit], j[has_unit]
+            r[units], free[units] = observed.r[has_unit] > 0, False
+        uniform, group_numbers = stream.random((2, *r.shape), np.float32)
         if self._machine.spec.G:
             x, _ = self._context_bias(classes, float(self._beta))
             weight = self._chains.units.implication_weights(x, float(self._beta))
-            draw_in_groups(weight, self._beta * logits, free, uniform, other, r)
+            draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
         else:
             r |= free & (uniform < sigmoid(self._beta * logits))
         return r
@@ -317,17 +321,18 @@ class ConditionedChains:
         """
         listed = state.classes[shown]
         x, m = self._context_bias(listed)
-        inner = m[(m > 0) & (m < 1)].astype(np.float64)
-        entropy = -(inner * np.log(inner) + (1 - inner) * np.log1p(-inner)).sum()
+        # A mean of exactly 0 or 1 has the entropy 0, but its logarithm would be infinite.
+        uncertain = m[(m > 0) & (m < 1)].astype(np.float64)
+        entropy = -(uncertain * np.log(uncertain) + (1 - uncertain) * np.log1p(-uncertain)).sum()
         logits = state.logits[:, shown][:, :, shown].astype(np.float64)
         on = kept[:, shown][:, :, shown]
         score = self._machine["b"][listed].sum() + softplus(x).sum() + self._machine["c2"] @ m
         return float(score + entropy + (on * logits - softplus(logits)).sum())
 
 
-def _indicator(size: int, where: Indices) -> Bits:
+def _indicator(size: int, units: Indices) -> Bits:
     indicator = np.zeros(size, np.uint8)
-    indicator[where] = 1
+    indicator[units] = 1
     return indicator
 
 

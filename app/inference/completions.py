@@ -100,14 +100,15 @@ class Completions:
         self._scorer, self._structure = scorer, structure
         self._W, self._b = weights["W"], weights["b"]
         generator = np.random.Generator(np.random.Philox(SEED))
-        contexts = _contexts(weights, generator)
+        contexts = _draw_hidden_units(weights, generator)
         logits = self._b + contexts @ self._W.T
         # Shapes (V, N) for samples and (V, M) for completions: each class is contiguous in memory.
         self._odds_against = np.exp(-np.maximum(logits, _LEAST_LOGIT)).T.copy()
+        # e^-logit(u): a completion adds class j if the odds against j are below (1 - c) times this.
         self._noise = np.exp(-_stratified_logits(count, len(self._b), generator)).T.copy()
         self._rooms = _room_weights(weights, contexts)
         # Each instance has its own cache: a cache of the method would keep every instance alive.
-        self._empty = lru_cache(maxsize=_KEPT)(self._unlisted_evidence)
+        self._cached_evidence = lru_cache(maxsize=_KEPT)(self._unlisted_evidence)
 
     @staticmethod
     def supports(weights: Weights) -> bool:
@@ -133,34 +134,36 @@ class Completions:
             coverage: probability c that a present class is listed. It must be below 1.
             room: index of the room type, or None if the room type is unknown.
         """
-        base = self._empty(coverage)
+        log_weights = self._cached_evidence(coverage)
         if room is not None and len(self._rooms):
-            base = base + self._rooms[room]
-        unlisted = np.float32(math.log1p(-coverage))
+            log_weights = log_weights + self._rooms[room]
         informative = ~self._structure[classes]
-        picked = objects.resampled(
-            *(base, self._odds_against, classes[informative], presence[informative]),
-            *(np.float32(1 - coverage), self._noise.shape[1]),
+        listed, p_listed = classes[informative], presence[informative]
+        closed, count = np.float32(1 - coverage), self._noise.shape[1]
+        samples = objects.resampled(
+            log_weights, self._odds_against, listed, p_listed, closed, count
         )
         usable = ~self._structure
         usable[classes] = False
+        log_closed = np.float32(math.log1p(-coverage))
+        limits, bias = np.exp(log_closed) * self._noise, self._b + log_closed
+        exp_w, group = self._scorer.exp_w, self._scorer.group
         log_odds: Floats = objects.completed_log_odds(
-            *(y, picked, self._odds_against, np.exp(unlisted) * self._noise, usable),
-            *(self._b + unlisted, self._W, self._scorer.exp_w, self._scorer.group),
+            y, samples, self._odds_against, limits, usable, bias, self._W, exp_w, group
         )
         return log_odds
 
     def _unlisted_evidence(self, coverage: float) -> Floats:
         """Return sum_i log(1 - c σ(l_i)) for each sample, (N,). The sum excludes structure."""
-        chance = 1 / (1 + self._odds_against[~self._structure])
-        total = np.zeros(chance.shape[1], np.float32)
-        for start in range(0, len(chance), _FACTORS):
-            factors = 1 - np.float32(coverage) * chance[start : start + _FACTORS]
-            total += np.log(np.maximum(factors, _LEAST).prod(0))
-        return total
+        p_present = 1 / (1 + self._odds_against[~self._structure])
+        evidence = np.zeros(p_present.shape[1], np.float32)
+        for start in range(0, len(p_present), _FACTORS):
+            factors = 1 - np.float32(coverage) * p_present[start : start + _FACTORS]
+            evidence += np.log(np.maximum(factors, _LEAST).prod(0))
+        return evidence
 
 
-def _contexts(weights: Weights, generator: np.random.Generator) -> Floats:
+def _draw_hidden_units(weights: Weights, generator: np.random.Generator) -> Floats:
     """Draw hidden units h_f ~ p(h1 | v_f) for each of the N stored samples, (N, H1).
 
     If the machine has a second layer, its units are fixed at their means by a mean-field iteration.
@@ -179,33 +182,37 @@ def _stratified_logits(count: int, classes: int, generator: np.random.Generator)
 
     For each class, each of M equal parts of (0, 1) contains one of the M numbers.
     """
-    strata = generator.random((count, classes)).argsort(0)
+    strata = generator.random((count, classes)).argsort(0)  # a random order for each class
     uniform = (strata + generator.random((count, classes))) / count
     uniform = uniform.clip(1e-12, 1 - 1e-12)
     return (np.log(uniform) - np.log1p(-uniform)).astype(np.float32)
 
 
 def _room_weights(weights: Weights, contexts: Floats) -> Floats:
-    """Return the term `room` of log w_f for each room type and each stored sample, (C, N)."""
+    """Return the term `room` of log w_f for each room type and each stored sample, (C, N).
+
+    The iteration computes the log Z_s of the module, relative to the first type in the samples.
+    """
     spec = weights.spec
     if not spec.C:
         return np.zeros((0, 0), dtype=np.float32)
-    pull = contexts.astype(np.float64) @ weights["Q"].T.astype(np.float64)
+    room_logits = contexts.astype(np.float64) @ weights["Q"].T.astype(np.float64)
     # The last column stands for "no room type".
-    pull = np.concatenate([pull, np.zeros((len(pull), 1))], 1)
+    room_logits = np.concatenate([room_logits, np.zeros((len(room_logits), 1))], 1)
     rooms = weights["fantasy_rooms"]
     present, sizes = np.unique(np.where(rooms < 0, spec.C, rooms), return_counts=True)
     # share[f, s] is exp(Q[s]·h_f), divided by the largest entry of the row. With this array, both
     # sums of the iteration are matrix products. The lower limit keeps the sums above 0.
-    top = pull[:, present].max(1)
-    share = np.exp(np.maximum(pull[:, present] - top[:, None], _LEAST_PULL))
+    largest = room_logits[:, present].max(1)
+    share = np.exp(np.maximum(room_logits[:, present] - largest[:, None], _LEAST_PULL))
     log_z = np.zeros(len(present))
-    mixture = np.ones(len(pull))
+    mixture = np.ones(len(room_logits))
     for _ in range(_ROOM_SWEEPS):
         mixture = share @ (sizes * np.exp(-log_z))
-        before, log_z = log_z, np.log((1 / mixture) @ share)
+        previous, log_z = log_z, np.log((1 / mixture) @ share)
         log_z -= log_z[0]
-        if np.abs(log_z - before).max() < _SETTLED:
+        if np.abs(log_z - previous).max() < _SETTLED:
             break
-    log_mixture = top + np.log(mixture)
-    return np.ascontiguousarray((pull[:, : spec.C] - log_mixture[:, None]).T.astype(np.float32))
+    log_mixture = largest + np.log(mixture)
+    terms = room_logits[:, : spec.C] - log_mixture[:, None]
+    return np.ascontiguousarray(terms.T.astype(np.float32))

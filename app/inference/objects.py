@@ -146,26 +146,26 @@ def gains(x, exp_w, group, classes):
     for t in range(tiles):
         tile = exp_w[t]
         for m in range(M):
-            offs, ons, into = off[m], on[m], gain[m, t * width :]
+            off_m, on_m, gain_m = off[m], on[m], gain[m, t * width :]
             product[:], exponents[:] = _ONE, np.int32(0)
             for start in range(0, units, group):
                 end = min(start + group, units)
                 # The loop takes two factors at a time. This halves the reads and writes of the
                 # product.
                 for k in range(start, end - 1, 2):
-                    a1, b1, row1 = offs[k], ons[k], tile[k]
-                    a2, b2, row2 = offs[k + 1], ons[k + 1], tile[k + 1]
+                    a1, b1, row1 = off_m[k], on_m[k], tile[k]
+                    a2, b2, row2 = off_m[k + 1], on_m[k + 1], tile[k + 1]
                     for i in range(width):
                         product[i] *= (a1 + b1 * row1[i]) * (a2 + b2 * row2[i])
                 if (end - start) % 2:
-                    a1, b1, row1 = offs[end - 1], ons[end - 1], tile[end - 1]
+                    a1, b1, row1 = off_m[end - 1], on_m[end - 1], tile[end - 1]
                     for i in range(width):
                         product[i] *= a1 + b1 * row1[i]
                 for i in range(width):
                     exponents[i] += exponent(product[i])
                     product[i] = mantissa(product[i])
             for i in range(min(width, classes - t * width)):
-                into[i] = log(product[i]) + _LN2 * np.float32(exponents[i])
+                gain_m[i] = log(product[i]) + _LN2 * np.float32(exponents[i])
     return gain
 
 
@@ -174,7 +174,8 @@ def _gain(off, on, growth, group, product):
     """Return the gain of one class: sum_k log((off_k + on_k growth_k) / (off_k + on_k)).
 
     Args:
-        off, on: (H1,) sigmoid(-x) and sigmoid(x) of the logits x of the hidden units.
+        off, on: (H1,) sigmoid(-x) and sigmoid(x) of the logits x of the hidden units. Only the
+            ratio on / off matters, so both may have a common factor.
         growth: (H1,) e^W of the class.
         group: maximum number of factors per product; see `ContextScorer`.
         product: (32,) buffer for intermediate products.
@@ -227,24 +228,25 @@ def gains_without_others(y, share, W, rows, common, index, group):
         index: (n, n) row of each pair of classes in ``common``, or -1 for a pair without relations.
     """
     n, size = share.shape
-    gain, both = np.zeros((len(rows), n), np.float32), np.empty_like(y)
-    off, on, fall, growth = np.empty_like(y), np.empty_like(y), _exps(-share), _exps(W)
-    twice, product = _exps(common), np.empty(_SIDE_BY_SIDE, np.float32)
+    gain, off, on = np.zeros((len(rows), n), np.float32), np.empty_like(y), np.empty_like(y)
+    on_without_both, product = np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
+    # To subtract a share from y is to multiply on / off by exp(-share).
+    fall, rise, growth = _exps(-share), _exps(common), _exps(W)
     _set_halves(y, off, on)
     for c in range(len(rows)):
         i = rows[c]
-        left = on * fall[i]
+        on_without_i = on * fall[i]
         for j in range(n):
-            down = fall[j]
+            fall_j = fall[j]
             for k in range(size):
-                both[k] = left[k] * down[k]
+                on_without_both[k] = on_without_i[k] * fall_j[k]
             if index[i, j] >= 0:
-                # The relations between i and j are part of both shares. They must be removed once,
-                # not twice.
-                again = twice[index[i, j]]
+                # The relations between i and j are part of both shares, so they were subtracted
+                # twice. Add them once.
+                rise_ij = rise[index[i, j]]
                 for k in range(size):
-                    both[k] *= again[k]
-            gain[c, j] = _gain(off, both, growth[i], group, product)
+                    on_without_both[k] *= rise_ij[k]
+            gain[c, j] = _gain(off, on_without_both, growth[i], group, product)
     return gain
 
 
@@ -260,15 +262,15 @@ def reasons_for_absent(y, share, W, group):
         W: (N, H1) weights between each absent class and the hidden units.
     """
     n, growth = len(share), _exps(W)
-    change, all_of = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)
+    change, full_gain = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)
     off, on, product = np.empty_like(y), np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
     _set_halves(y, off, on)
     for c in range(len(W)):
-        all_of[c] = _gain(off, on, growth[c], group, product)
+        full_gain[c] = _gain(off, on, growth[c], group, product)
     for j in range(n):
         _set_halves(y - share[j], off, on)
         for c in range(len(W)):
-            change[c, j] = all_of[c] - _gain(off, on, growth[c], group, product)
+            change[c, j] = full_gain[c] - _gain(off, on, growth[c], group, product)
     return change
 
 
@@ -277,9 +279,9 @@ def _exps(x):
     """Compute e^x for x (N, H1)."""
     powers = np.empty_like(x)
     for n in range(len(x)):
-        row, into = x[n], powers[n]
+        exponents, row = x[n], powers[n]
         for k in range(len(row)):
-            into[k] = exp(row[k])
+            row[k] = exp(exponents[k])
     return powers
 
 
@@ -298,53 +300,53 @@ def resampled(weight, against, classes, presence, closed, count):
     Returns:
         (M,) indices of the selected samples, in ascending order.
     """
-    weight, below = weight.copy(), np.empty(len(weight))
+    weight, cumulative = weight.copy(), np.empty(len(weight))
     for i in range(len(classes)):
-        row, here = against[classes[i]], presence[i]
+        odds, p_present = against[classes[i]], presence[i]
         # log σ(l) - log(1 - c σ(l)) = -log(1 - c + e^-l)
-        for n in range(len(row)):
-            weight[n] -= here * log(closed + row[n])
+        for n in range(len(odds)):
+            weight[n] -= p_present * log(closed + odds[n])
     largest = weight.max()
     for n in range(len(weight)):
         weight[n] = exp(weight[n] - largest)
-    below[:] = np.cumsum(weight.astype(np.float64))
-    picked, n = np.empty(count, np.int64), 0
+    cumulative[:] = np.cumsum(weight.astype(np.float64))
+    samples, n = np.empty(count, np.int64), 0
     for m in range(count):
-        quantile = (m + 0.5) / count * below[-1]
-        while n < len(below) - 1 and below[n] < quantile:
+        quantile = (m + 0.5) / count * cumulative[-1]
+        while n < len(cumulative) - 1 and cumulative[n] < quantile:
             n += 1
-        picked[m] = n
-    return picked
+        samples[m] = n
+    return samples
 
 
 @compiled
-def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
+def completed_log_odds(y, samples, against, limits, usable, bias, W, exp_w, group):
     """Average the probability of each class over M completions and return its log-odds, (V,).
 
     A completion is the scene with some unlisted classes added. Each completion belongs to one
     stored sample. The completion adds a usable class if the odds against this class in the sample
-    are below ``most``.
+    are below its limit.
 
     Args:
         y: (H1,) logits of h1 without unlisted classes.
-        picked: (M,) index of the sample of each completion.
+        samples: (M,) index of the sample of each completion.
         against: (V, N) odds against each class in each sample.
-        most: (V, M) limit of ``against`` for each class and completion.
+        limits: (V, M) limit of ``against`` for each class and completion.
         usable: (V,) bool, classes that a completion may add.
         bias: (V,) log-odds of each class without the hidden units.
         W, exp_w, group: see `ContextScorer`.
     """
-    (V, size), M = W.shape, len(picked)
+    (V, size), M = W.shape, len(samples)
     completed, added = np.empty((M, size), np.float32), np.zeros((M, V), np.bool_)
     completed[:] = y
     for i in range(V):
         if usable[i]:
             for m in range(M):
-                if against[i, picked[m]] < most[i, m]:
+                if against[i, samples[m]] < limits[i, m]:
                     added[m, i] = True
                     completed[m] += W[i]
     gain = gains(completed, exp_w, group, V)
-    here, away = np.zeros(V, np.float32), np.zeros(V, np.float32)
+    sum_present, sum_absent = np.zeros(V, np.float32), np.zeros(V, np.float32)
     off, on, fall = np.empty_like(y), np.empty_like(y), np.empty_like(y)
     product = np.empty(_SIDE_BY_SIDE, np.float32)
     for m in range(M):
@@ -362,8 +364,9 @@ def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
             # lose digits.
             odds = exp(min(max(-bias[i] - gain[m, i], -_MOST_LOGIT), _MOST_LOGIT))
             p = _ONE / (_ONE + odds)
-            here[i] += p
-            away[i] += odds * p
+            sum_present[i] += p
+            sum_absent[i] += odds * p
+    log_odds = np.empty(V, np.float32)
     for i in range(V):
-        here[i] = log(here[i]) - log(away[i])
-    return here
+        log_odds[i] = log(sum_present[i]) - log(sum_absent[i])
+    return log_odds

@@ -117,8 +117,9 @@ class ClosedForm:
             x, through = self._second_layer(x, classes, presence)
         scene = classes, presence, log_counts
         if observed is None or not len(observed.a):
-            none = _NO_SLOPES
-            return Context(*scene, x, x, None, None, none, x, none, through)
+            # Without observed relations, y and object_y are x, and there are no slopes.
+            empty = _NO_SLOPES
+            return Context(*scene, x, x, None, None, empty, x, empty, through)
         ends = ends_of(*scene, observed.i, observed.j)
         y, units, slopes = self.units.fixed_point(x, observed, ends)
         object_y, object_slopes = _scaled(pull.objects, x, y, slopes)
@@ -128,12 +129,16 @@ class ClosedForm:
     def _second_layer(
         self, base: Floats, classes: Indices, presence: Floats
     ) -> tuple[Floats, Floats]:
-        """Return x (H1,), and the effect of each class on x through the second layer (n, H1)."""
-        without = base - presence[:, None] * self.W[classes]
-        bases = np.concatenate([base[None], without]).astype(np.float32)
+        """Return x (H1,), and the effect of each class on x through the second layer (n, H1).
+
+        ``base`` is x without the term J m2. The effect of a class is J m2 for the whole scene minus
+        J m2 for the scene without this class.
+        """
+        base_without_class = base - presence[:, None] * self.W[classes]
+        bases = np.concatenate([base[None], base_without_class]).astype(np.float32)
         x, _ = self._weights.with_second_layer(bases)
-        pulled = (x - bases).astype(np.float32)
-        return x[0].astype(np.float32), pulled[0] - pulled[1:]
+        second_layer_term = (x - bases).astype(np.float32)
+        return x[0].astype(np.float32), second_layer_term[0] - second_layer_term[1:]
 
 
 class ScenePosterior:
@@ -157,15 +162,16 @@ class ScenePosterior:
     def relation_log_odds(self) -> Floats:
         """Return the log-odds of every relation between the classes of the scene, (A, n, n).
 
-        The observation of a relation is not evidence for the same relation.
+        The observation of a relation is not evidence for the same relation. A first-order formula
+        subtracts its effect; for relations with a large slope, the exact formula replaces it.
         """
         log_odds = self._units.log_odds(self._between)
         observed, units, slopes = self.context.observed, self.context.units, self.context.slopes
         if observed is not None and units is not None:
             steep = np.flatnonzero(np.abs(slopes) > _GENTLE)
             if len(steep):
-                kept = units.kept[steep]
-                triples = observed.a[kept], observed.i[kept], observed.j[kept]
+                rows = units.kept[steep]
+                triples = observed.a[rows], observed.i[rows], observed.j[rows]
                 log_odds[triples] = self._units.log_odds_without_itself(
                     self.context, *triples, slopes[steep], self._between.shift
                 )
@@ -181,18 +187,19 @@ class ScenePosterior:
                 and object classes in the scene.
         """
         slopes, shift, _ = self._units.observed_effects(self.context)
-        none = np.zeros(len(relation), dtype=np.float32)
-        own = slopes[relation, subject, object_] if len(slopes) else none
+        unit_slopes = np.zeros(len(relation), dtype=np.float32)
+        if len(slopes):
+            unit_slopes = slopes[relation, subject, object_]
         return self._units.log_odds_without_itself(
-            self.context, relation, subject, object_, own, shift
+            self.context, relation, subject, object_, unit_slopes, shift
         )
 
-    def log_odds_apart(self, one: Indices, other: Indices) -> tuple[Floats, Floats]:
-        """Return the log-odds (A, P) of all relations from `one` to `other`, and (A, P) back.
+    def log_odds_apart(self, i: Indices, j: Indices) -> tuple[Floats, Floats]:
+        """Return the log-odds (A, P) of all relations from classes i to j, and (A, P) from j to i.
 
         `RelationUnits.log_odds_apart` describes the arguments.
         """
-        forward, backward = self._units.log_odds_apart(self.context, self._between, one, other)
+        forward, backward = self._units.log_odds_apart(self.context, self._between, i, j)
         return forward, backward
 
     def placement_log_odds(
@@ -216,8 +223,8 @@ class ScenePosterior:
             anchor: index of the anchor's class in the scene.
             outgoing: True if the candidate is the relation's subject, False if the anchor is.
         """
-        both = self.placement_log_odds(candidates, np.array([anchor]), relation)
-        log_odds = both[0 if outgoing else 1][:, 0, 0]
+        forward, backward = self.placement_log_odds(candidates, np.array([anchor]), relation)
+        log_odds = (forward if outgoing else backward)[:, 0, 0]
         return -np.logaddexp(np.float32(0.0), -log_odds)
 
     def log_odds_given_rest(self) -> Floats:
@@ -237,12 +244,13 @@ class ScenePosterior:
         Args:
             rows: (N,) indices of the classes i in the scene.
         """
-        context, closed = self.context, self._closed
-        without: Floats = objects.gains_without_others(
-            *(context.object_y, self._shares, closed.W[context.classes], rows),
-            *(*self._units.common(context), closed.group),
+        context, group = self.context, self._closed.group
+        W = self._closed.W[context.classes]
+        common, index = self._units.common(context)
+        gains: Floats = objects.gains_without_others(
+            context.object_y, self._shares, W, rows, common, index, group
         )
-        change = self._gains[rows, None] - without
+        change = self._gains[rows, None] - gains
         change[np.arange(len(rows)), rows] = 0
         return change
 
@@ -271,10 +279,9 @@ class ScenePosterior:
     @cached_property
     def _gains(self) -> Floats:
         """The change of the log-odds of each class i from b_i by the rest of the scene, (n,)."""
-        gains: Floats = objects.gains_without(
-            *(self.context.object_y, self._shares, self._closed.W[self.context.classes]),
-            self._closed.group,
-        )
+        y, group = self.context.object_y, self._closed.group
+        W = self._closed.W[self.context.classes]
+        gains: Floats = objects.gains_without(y, self._shares, W, group)
         return gains
 
 

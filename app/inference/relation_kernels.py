@@ -88,13 +88,13 @@ def pair_terms(w, first, ends, z, base):
         pairs = pair_rows(w.start, w.key, subjects * len(S) + objects)
         for p in range(len(pairs)):
             i, j = subjects[p], objects[p]
-            S_i, O_j, own = S[i], O[j], residual[pairs[p]]
+            S_i, O_j, pair_residual = S[i], O[j], residual[pairs[p]]
             for k in range(z.shape[1]):
                 z[b, k, p] = S_i[k] * O_j[k]
             for c in range(base.shape[1]):
                 a = first + c
                 of_counts = n[a, 0] * log_i[p] + n[a, 1] * log_j[p]
-                base[b, c, p] = s[i, a] + o[j, a] + of_counts + own[a]
+                base[b, c, p] = s[i, a] + o[j, a] + of_counts + pair_residual[a]
 
 
 @compiled_in_any_order
@@ -115,14 +115,14 @@ def spreads(C, q):
             weights, rows, variance, t = C[b, c], q[b, c], spread[b, c], 0
             variance[:] = np.float32(0.0)
             for d in range(r):
-                row[:], this = np.float32(0.0), rows[d]
+                row[:], q_d = np.float32(0.0), rows[d]
                 for u in range(d + 1):
-                    weight, other = weights[t + u], rows[u]
+                    weight, q_u = weights[t + u], rows[u]
                     for p in range(P):
-                        row[p] += weight * other[p]
+                        row[p] += weight * q_u[p]
                 t += d + 1
                 for p in range(P):
-                    variance[p] += row[p] * this[p]
+                    variance[p] += row[p] * q_d[p]
             for p in range(P):
                 variance[p] = np.sqrt(np.float32(3.0) * max(variance[p], np.float32(0.0)))
     return spread
@@ -141,17 +141,18 @@ _TAIL = np.exp(-0.5 * (0.25 * np.arange(1, 21)) ** 2).astype(np.float32)
 def log_odds(means, spreads, least):
     """Replace the means (E,) of logits by log-odds of at least ``least``; see `to_log_odds`."""
     wide = np.flatnonzero(spreads >= _NARROW)
-    some = _wide_log_odds(means[wide], spreads[wide])
+    wide_log_odds = _wide_log_odds(means[wide], spreads[wide])
     one, four = np.float32(1.0), np.float32(4.0)
+    # The sums over the three nodes have the common denominator a b c; see `to_log_odds`.
     for e in range(len(means)):
         size, q = abs(means[e]), exp(spreads[e])
         u = exp(-size)
         a, b, c = one + u, one + u * q, q + u
         middle = four * b * c
-        away = size - log((middle + a * (q * c + b)) / (middle + a * (c + q * b)))
-        means[e] = max(away if means[e] >= 0.0 else -away, least)
+        log_odds = size - log((middle + a * (q * c + b)) / (middle + a * (c + q * b)))
+        means[e] = max(log_odds if means[e] >= 0.0 else -log_odds, least)
     for k in range(len(wide)):
-        means[wide[k]] = max(some[k], least)
+        means[wide[k]] = max(wide_log_odds[k], least)
 
 
 @compiled
@@ -171,8 +172,8 @@ def _wide_log_odds(means, spreads):
             on[e] += weight * (q[e] * up + down)
             off[e] += weight * (up + q[e] * down)
     for e in range(E):
-        away = abs(means[e]) - log(on[e] / off[e])
-        on[e] = away if means[e] >= 0.0 else -away
+        log_odds = abs(means[e]) - log(on[e] / off[e])
+        on[e] = log_odds if means[e] >= 0.0 else -log_odds
     return on
 
 
@@ -191,9 +192,9 @@ def accumulate(keys, weights, rows, size):
     for n in range(len(keys)):
         if keys[n] >= 0:
             e = n % len(rows)
-            into, row, weight = sums[keys[n]], rows[e], weights[e]
+            key_sum, row, weight = sums[keys[n]], rows[e], weights[e]
             for k in range(len(row)):
-                into[k] += weight * row[k]
+                key_sum[k] += weight * row[k]
     return sums
 
 
@@ -227,12 +228,12 @@ def _products(rows, m, out):
 
 
 @compiled_in_any_order
-def _selected_products(rows, a, through, out):
-    """Write the dot product of rows[e] and through[a[e]] to out[e], for each e."""
+def _selected_products(rows, a, columns, out):
+    """Write the dot product of rows[e] and columns[a[e]] to out[e], for each e."""
     for e in range(len(rows)):
-        row, other, total = rows[e], through[a[e]], np.float32(0.0)
+        row, column, total = rows[e], columns[a[e]], np.float32(0.0)
         for k in range(len(row)):
-            total += row[k] * other[k]
+            total += row[k] * column[k]
         out[e] = total
 
 
@@ -250,12 +251,12 @@ def normal_without_itself(y, U, base, slopes):
         slopes: (E,) see `RelationUnits.fixed_point`.
     """
     mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
-    rest, m = np.empty_like(y), np.empty_like(y)
+    y_without, m = np.empty_like(y), np.empty_like(y)
     for e in range(len(U)):
         row = U[e]
         for k in range(len(y)):
-            rest[k] = y[k] - slopes[e] * row[k]
-        _set_means(rest, m)
+            y_without[k] = y[k] - slopes[e] * row[k]
+        _set_means(y_without, m)
         mean[e], variance = _moments(row, m)
         mean[e] += base[e]
         spread[e] = np.sqrt(np.float32(3.0) * variance)
@@ -264,6 +265,7 @@ def normal_without_itself(y, U, base, slopes):
 
 @compiled_in_any_order
 def _moments(row, m):
+    """Return mean and variance of the sum of row_k h_k for independent bits h_k with means m_k."""
     mean = variance = np.float32(0.0)
     for k in range(len(row)):
         mean += row[k] * m[k]
@@ -300,9 +302,9 @@ def fixed_point(x, G, a, base, z, r, gate, sweeps):
         for e in range(E):
             logits[e] += base[e]
         _set_means(logits, on)
-        kept = _DAMPING if sweep else np.float32(0.0)
+        damping = _DAMPING if sweep else np.float32(0.0)
         for e in range(E):
-            slopes[e] = kept * slopes[e] + (np.float32(1.0) - kept) * gate[e] * (r[e] - on[e])
+            slopes[e] = damping * slopes[e] + (np.float32(1.0) - damping) * gate[e] * (r[e] - on[e])
         y[:] = x
         if A:
             factors[:] = np.float32(0.0)
@@ -318,6 +320,7 @@ def fixed_point(x, G, a, base, z, r, gate, sweeps):
 
 @compiled
 def _add_rows(weights, rows, out):
+    """Add the sum of weights[e] rows[e] to out."""
     for e in range(len(rows)):
         row, weight = rows[e], weights[e]
         for k in range(len(out)):
@@ -335,42 +338,43 @@ def _empty_steps(relations, n):
     Returns:
         degree: (2A kinds, n classes) number of steps of each kind that start at each class.
         near: (2A kinds, n classes, n) end classes of these steps.
-        seen: (n, n, 2A) paths of two steps from one class to another class. The last axis is the
+        path_kinds: (n, n, 2A) paths of two steps from one class to another. The last axis is the
             kind of the first step. Each value is a bit set of the kinds of the second step.
         paths: (n, n, A) change of the logit of each relation by the paths between its two classes.
     """
     steps = 2 * relations
     degree, near = np.zeros((steps, n), np.int64), np.empty((steps, n, n), np.int64)
-    seen = np.zeros((n, n, steps), np.uint64)
-    return degree, near, seen, np.zeros((n, n, relations), np.float32)
+    path_kinds = np.zeros((n, n, steps), np.uint64)
+    return degree, near, path_kinds, np.zeros((n, n, relations), np.float32)
 
 
 @compiled
 def _add_relation(tables, weight, a, i, j):
     """Add the steps of relation a between classes i and j, and the new paths, to the tables."""
     # The loops use plain indices, because a slice would cost more time.
-    degree, near, seen, paths = tables
+    degree, near, path_kinds, paths = tables
     steps = len(degree)
-    both = (a, i, j), (steps // 2 + a, j, i)
-    for c, x, y in both:
+    directions = (a, i, j), (steps // 2 + a, j, i)
+    for c, x, y in directions:
         near[c, x, degree[c, x]] = y
         degree[c, x] += 1
-    for c, x, y in both:
+    for c, x, y in directions:
         for d in range(steps):
-            for at in range(degree[d, y]):
-                _add_path(seen, paths, weight, x, near[d, y, at], c, d)
+            for step in range(degree[d, y]):
+                _add_path(path_kinds, paths, weight, x, near[d, y, step], c, d)
             # If a step of kind d leads from x to another class, then a step of the opposite kind
             # leads from the other class to x.
             back = (d + steps // 2) % steps
-            for at in range(degree[d, x]):
-                _add_path(seen, paths, weight, near[d, x, at], y, back, c)
+            for step in range(degree[d, x]):
+                _add_path(path_kinds, paths, weight, near[d, x, step], y, back, c)
 
 
 @inlined
-def _add_path(seen, paths, weight, x, y, first, second):
-    steps, bit = seen.shape[2], np.uint64(1) << np.uint64(second)
-    if not seen[x, y, first] & bit:
-        seen[x, y, first] |= bit
+def _add_path(path_kinds, paths, weight, x, y, first, second):
+    """Add a path of two steps (kinds first, second) from x to y, unless it is in the tables."""
+    steps, bit = path_kinds.shape[2], np.uint64(1) << np.uint64(second)
+    if not path_kinds[x, y, first] & bit:
+        path_kinds[x, y, first] |= bit
         for b in range(paths.shape[2]):
             paths[x, y, b] += weight[steps + first * steps + second, b]
 
@@ -388,23 +392,23 @@ def _shifts(tables, weight, direct):
     degree, near, _, paths = tables
     (steps, n), A = degree.shape, weight.shape[1]
     shift, degrees = paths.copy(), weight[steps + steps * steps :]
-    out, into = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
+    out_shift, in_shift = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
     for c in range(steps):
         # Each step of kind c that ends at a class has an opposite step that starts at this class.
         back = (c + A) % steps
         for x in range(n):
             for b in range(A):
-                out[x, b] += degrees[c, b] * min(np.float32(degree[c, x]), _MOST)
-                into[x, b] += degrees[steps + c, b] * min(np.float32(degree[back, x]), _MOST)
+                out_shift[x, b] += degrees[c, b] * min(np.float32(degree[c, x]), _MOST)
+                in_shift[x, b] += degrees[steps + c, b] * min(np.float32(degree[back, x]), _MOST)
     for x in range(n):
         for y in range(n):
             for b in range(A):
-                shift[x, y, b] += out[x, b] + into[y, b]
+                shift[x, y, b] += out_shift[x, b] + in_shift[y, b]
     for c in range(steps):
         back = (c + A) % steps
         for x in range(n):
-            for at in range(degree[c, x]):
-                y = near[c, x, at]
+            for step in range(degree[c, x]):
+                y = near[c, x, step]
                 for b in range(A):
                     if direct:
                         shift[x, y, b] += weight[c, b]
@@ -438,7 +442,7 @@ def implication_shifts(weight, n, a, i, j):
 
 
 @compiled
-def draw_in_groups(weight, logits, free, uniform, other, r):
+def draw_in_groups(weight, logits, free, uniform, group_numbers, r):
     """Sample relations that change each other's logits, group after group.
 
     Each group is sampled given the relations of all earlier groups. The function assigns relations
@@ -449,7 +453,7 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
         logits: (A, n, n) logits of the relations without the changes by other relations.
         free: (A, n, n) bool, True for relations to sample. Other relations keep their value.
         uniform: (A, n, n) random numbers in [0, 1) that decide whether each relation holds.
-        other: (A, n, n) random numbers in [0, 1) that select the group of each relation.
+        group_numbers: (A, n, n) random numbers in [0, 1) that select the group of each relation.
         r: (A, n, n) bool, True for relations that hold. The function writes the samples into r.
     """
     A, n, _ = r.shape
@@ -460,9 +464,11 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
                 if free[a, i, j]:
                     # a(i, j) and a(j, i) share one random number, which decides whether a(i, j) or
                     # a(j, i) is sampled first.
-                    later = other[a, min(i, j), max(i, j)] < 0.5
-                    half = _GROUPS if later == (i < j) else 0
-                    group[a, i, j] = half + np.int64(2 * _GROUPS * other[a, i, j]) % _GROUPS
+                    first_is_late = group_numbers[a, min(i, j), max(i, j)] < 0.5
+                    half = _GROUPS if first_is_late == (i < j) else 0
+                    number = np.int64(2 * _GROUPS * group_numbers[a, i, j]) % _GROUPS
+                    group[a, i, j] = half + number
+    # Turn -1 only adds the relations that are on and not free.
     for turn in range(-1, 2 * _GROUPS):
         if turn >= 0:
             shift = _shifts(tables, weight, True)

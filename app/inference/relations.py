@@ -258,8 +258,8 @@ class RelationUnits(ABC):
 
         The result has no rows for relations without a unit.
         """
-        none = np.zeros(len(a), np.float32)
-        return self.rows(self.select(a, Ends(i, j, none, none, none, none)))
+        zeros = np.zeros(len(a), np.float32)  # counts and presence do not change the weights
+        return self.rows(self.select(a, Ends(i, j, zeros, zeros, zeros, zeros)))
 
     def fixed_point(
         self, x: Floats, observed: ObservedRelations, ends: Ends, sweeps: int = SWEEPS
@@ -393,6 +393,7 @@ class RelationUnits(ABC):
             anchor as subject.
         """
         m = len(anchors)
+        # In the first m columns, the candidate is the subject. In the others, the anchor is.
         shape = len(candidates), 2 * m
         i, j = np.empty(shape, np.int64), np.empty(shape, np.int64)
         log_i, log_j = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -401,9 +402,9 @@ class RelationUnits(ABC):
         j[:, :m] = i[:, m:] = context.classes[anchors]
         log_j[:, :m] = log_i[:, m:] = context.log_counts[anchors]
         p_j[:, :m] = p_i[:, m:] = context.presence[anchors]
-        both = Ends(i, j, log_i, log_j, p_i, p_j)
+        ends = Ends(i, j, log_i, log_j, p_i, p_j)
         means = sigmoid(context.y + self._W[candidates])
-        log_odds = to_log_odds(*self.normal(means, both, only))
+        log_odds = to_log_odds(*self.normal(means, ends, only))
         return log_odds[:, :, :m], log_odds[:, :, m:]
 
     def shares(self, context: Context) -> Floats:
@@ -419,6 +420,8 @@ class RelationUnits(ABC):
     def common(self, context: Context) -> tuple[Floats, Indices]:
         """Return the contribution of the observed relations of each pair of classes to `object_y`.
 
+        `shares` counts these relations twice, once for each of the two classes.
+
         Returns:
             Contributions (P, H1) of the P pairs with observed relations, and an array (n, n) with
             the row of each pair of classes in the contributions. The row is -1 for a pair without
@@ -431,9 +434,9 @@ class RelationUnits(ABC):
             return np.zeros((0, self._W.shape[1]), np.float32), index
         i, j = observed.i[units.kept], observed.j[units.kept]
         keys = np.where(i == j, -1, np.minimum(i, j) * n + np.maximum(i, j))
-        filled = np.zeros(n * n, np.bool_)
-        filled[keys[keys >= 0]] = True
-        pairs = np.flatnonzero(filled)
+        has_relations = np.zeros(n * n, np.bool_)
+        has_relations[keys[keys >= 0]] = True
+        pairs = np.flatnonzero(has_relations)
         index.reshape(-1)[pairs] = np.arange(len(pairs))
         rows = np.where(keys < 0, -1, index.reshape(-1)[keys])
         contributions = self._sums(units, rows, context.object_slopes, len(pairs))
@@ -465,7 +468,6 @@ class FreeUnits(RelationUnits):
     training scenes have no unit. Such triples are not evidence, and their log-odds are `NO_UNIT`.
 
     Args:
-        weights: weights of the machine.
         U: (T, H1) weights between units and h1.
         g: (T, 2) weights of the presence of subject and object class. None means that all these
             weights are 0.
@@ -496,8 +498,9 @@ class FreeUnits(RelationUnits):
         del certain  # unused: the formula gives variance 0 for means of 0 and 1
         chosen = _chosen_relations(self._A, only)
         shape = len(means), chosen.stop - chosen.start, ends.i.shape[1]
-        b, a, p = (part.reshape(-1) for part in np.indices(shape))
-        units = self.select(chosen.start + a, Ends(*(end[b, p] for end in ends)))
+        # Row b of the means, relation a and pair p of each entry of the result.
+        b, a, p = (indices.reshape(-1) for indices in np.indices(shape))
+        units = self.select(chosen.start + a, Ends(*(values[b, p] for values in ends)))
         mean, spread = np.full(shape, NEVER), np.zeros(shape, np.float32)
         U, kept = units.z, units.kept
         if len(means) == 1:
@@ -520,8 +523,9 @@ class FreeUnits(RelationUnits):
         observed, units, n = context.observed, context.units, len(context.classes)
         if observed is not None and units is not None:
             keys = observed.i[units.kept] * n + observed.j[units.kept]
-            pulls = kernels.accumulate(keys, context.slopes, units.z, n * n)
-            y -= pulls[i * n + j] + np.where((i != j)[:, None], pulls[j * n + i], 0)
+            contributions = kernels.accumulate(keys, context.slopes, units.z, n * n)
+            backward = np.where((i != j)[:, None], contributions[j * n + i], 0)
+            y -= contributions[i * n + j] + backward
         log_odds = to_log_odds(*self.normal(sigmoid(y), ends))
         return np.ascontiguousarray(log_odds.transpose(2, 1, 0))
 
@@ -529,7 +533,7 @@ class FreeUnits(RelationUnits):
 class SharedUnits(RelationUnits):
     """One unit for every triple (relation a, subject class i, object class j); see `Triway`.
 
-    The units share weights. A sparse residual adds an own weight for some triples. The factors are
+    The units share weights. A sparse residual adds a weight for some triples. The factors are
     z_e = (S_i * O_j, 1), and the weights are U_e = G[a]'z_e. The rows of G[a] are the rows of M[a],
     followed by P[a]. The variance of a logit is q'C q, with C = F_a diag(m (1 - m)) F_a'. The rows
     of F_a are the directions with the largest variance. The vector q = Y[a] z_e has the coordinates
@@ -616,6 +620,7 @@ class SharedUnits(RelationUnits):
         sum_e' slope_e' cov(ℓ_e, ℓ_e'), where cov = sum_k U_ek U_e'k m_k (1 - m_k).
         """
         A, P = self._A, len(i)
+        # The first P columns have the direction from i to j, and the others from j to i.
         start, end = np.concatenate([i, j]), np.concatenate([j, i])
         mean, spread = between.mean[:, start, end], between.spread[:, start, end]
         if len(between.slopes):
@@ -626,9 +631,10 @@ class SharedUnits(RelationUnits):
             slopes = between.slopes[:, start, end].T.reshape(2, P, A, 1).copy()
             # For a pair of a class with itself, both directions belong to the same unit.
             slopes[1, i == j] = 0
-            pull = (slopes * q).sum(0).reshape(P, -1)
-            back = (pull @ self._F) * (m * (1 - m)) @ self._F.T
-            mean -= (q * back.reshape(P, A, -1)).sum(3).reshape(2 * P, A).T
+            # The sum of slope_e' U_e' of each pair, in coordinates of the directions F.
+            pair_sum = (slopes * q).sum(0).reshape(P, -1)
+            covariance = (pair_sum @ self._F) * (m * (1 - m)) @ self._F.T
+            mean -= (q * covariance.reshape(P, A, -1)).sum(3).reshape(2 * P, A).T
         if len(between.apart):
             mean += between.apart[:, start, end]
         log_odds = to_log_odds(mean, spread).reshape(A, 2, P)
@@ -645,8 +651,8 @@ def relation_units(weights: Weights) -> RelationUnits:
 @lru_cache(maxsize=128)
 def all_pairs(n: int) -> tuple[Indices, Indices]:
     """Return all n² pairs of n classes: the indices of first and second classes, each (1, n²)."""
-    every = np.arange(n)
-    return np.repeat(every, n)[None], np.tile(every, n)[None]
+    indices = np.arange(n)
+    return np.repeat(indices, n)[None], np.tile(indices, n)[None]
 
 
 def _columns(matrices: Floats) -> Floats:
@@ -696,21 +702,21 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     """
     spec = weights.spec
     rows = np.concatenate([weights["P"][:, None], weights["M"]], 1).astype(np.float64)
-    share, spread = np.ones(spec.V), np.full(spec.H1, 0.25)
+    frequency, variance = np.ones(spec.V), np.full(spec.H1, 0.25)
     if spec.N:
-        share = weights.scenes.mean(0).astype(np.float64)
+        frequency = weights.scenes.mean(0).astype(np.float64)
         mean = sigmoid(weights["c1"] + weights.scenes @ weights["W"]).astype(np.float64)
-        spread = (mean * (1 - mean)).mean(0)
-    share = share / share.sum()
+        variance = (mean * (1 - mean)).mean(0)
+    p = (frequency / frequency.sum())[:, None]
     ones = np.ones((spec.V, 1))
-    left, right = (
+    S, O = (  # noqa: E741
         np.concatenate([ones, weights[name].astype(np.float64)], 1) for name in ("S", "O")
     )
     # moment is E[z z'] of z = (1, S_i * O_j) for independent i and j. root is its Cholesky factor.
-    moment = (left.T @ (share[:, None] * left)) * (right.T @ (share[:, None] * right))
+    moment = (S.T @ (p * S)) * (O.T @ (p * O))
     scale = np.trace(moment) / len(moment)
     root = np.linalg.cholesky(moment + 1e-9 * scale * np.eye(len(moment)))
-    covariance = root.T @ ((rows * spread) @ rows.transpose(0, 2, 1)) @ root
+    covariance = root.T @ ((rows * variance) @ rows.transpose(0, 2, 1)) @ root
     values, vectors = np.linalg.eigh(covariance)
     left_out = np.cumsum(values.clip(min=0), axis=1)
     kept = max(1, int((left_out > _LEFT_OUT).sum(1).max()))

@@ -50,7 +50,7 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     if spec.N:
         ints |= {"fantasies": (spec.N, -(-V // WORD)), "fantasy_rooms": (spec.N,)}
     kinds = ((float, floats | spec.kind.shapes(spec)), (int, ints))
-    return {name: (kind, shape) for kind, some in kinds for name, shape in some.items()}
+    return {name: (kind, shape) for kind, shapes in kinds for name, shape in shapes.items()}
 
 
 @dataclass(frozen=True, eq=False)

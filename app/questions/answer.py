@@ -79,8 +79,6 @@ def reasons(
     reason is the first object of the class that causes the change.
 
     Args:
-        scene: the scene.
-        present: classes of the scene.
         change: (N, n) change of each explained class's log-odds by each of the n classes of the
             scene.
         rows: (N,) index of each explained class among the n classes. None means that the explained
@@ -93,13 +91,10 @@ def reasons(
     columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
     strong = (np.abs(values) >= least) & (values != 0)
     entries: list[list[Fields]] = [[] for _ in change]
-    for one, number, value in zip(
-        np.nonzero(strong)[0].tolist(),
-        present.first[columns[strong]].tolist(),
-        significant(values[strong]),
-        strict=True,
-    ):
-        entries[one].append({"object": scene.objects[number].id, "log_odds_change": value})
+    rows_of_entries, _ = np.nonzero(strong)
+    numbers, changes = present.first[columns[strong]].tolist(), significant(values[strong])
+    for row, number, value in zip(rows_of_entries.tolist(), numbers, changes, strict=True):
+        entries[row].append({"object": scene.objects[number].id, "log_odds_change": value})
     return entries
 
 
@@ -128,8 +123,9 @@ def _round(values: NDArray[np.float64]) -> bool:
     for k in range(len(values)):
         size = np.abs(values[k])
         if 1e-16 < size < 1e5:
-            shift = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
-            scale = _POWERS[shift]
+            # A number with d digits before the point keeps DIGITS - d decimal places.
+            places = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
+            scale = _POWERS[places]
             values[k] = np.rint(values[k] * scale) / scale
         elif size != 0.0:
             exact = False

@@ -47,30 +47,25 @@ def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
         (vocabulary.labels[i], CANONICAL[a], vocabulary.labels[j])
         for a, i, j in table[shown].tolist()
     ]
-    objects, standing, rooms = weights["W"][named], artifact.context_rows()[shown], weights["Q"]
-    layers: dict[str, tuple[Floats, Floats, Floats]] = {"h1": (objects, standing, rooms)}
+    W, U, Q = weights["W"][named], artifact.context_rows()[shown], weights["Q"]
+    layers: dict[str, tuple[Floats, Floats, Floats]] = {"h1": (W, U, Q)}
     if weights.spec.H2:
         J = weights["J"]
-        layers["h2"] = (objects @ J, standing @ J, rooms @ J)
-    return {
-        layer: [
-            _described(unit, *columns)
-            for unit, columns in enumerate(
-                zip(
-                    _strongest(to_objects, labels, OBJECTS),
-                    _strongest(
-                        to_relations - to_relations.mean(1, keepdims=True), relations, RELATIONS
-                    ),
-                    _strongest(to_rooms, vocabulary.room_types, ROOM_TYPES),
-                    strict=True,
-                )
-            )
-        ]
-        for layer, (to_objects, to_relations, to_rooms) in layers.items()
-    }
+        layers["h2"] = (W @ J, U @ J, Q @ J)
+    descriptions: dict[str, list[ContextUnit]] = {}
+    for layer, (to_objects, to_relations, to_rooms) in layers.items():
+        deviations = to_relations - to_relations.mean(1, keepdims=True)
+        units = zip(
+            _strongest(to_objects, labels, OBJECTS),
+            _strongest(deviations, relations, RELATIONS),
+            _strongest(to_rooms, vocabulary.room_types, ROOM_TYPES),
+            strict=True,
+        )
+        descriptions[layer] = [_description(unit, *names) for unit, names in enumerate(units)]
+    return descriptions
 
 
-def _described(
+def _description(
     unit: int,
     objects: Weighted[str],
     relations: Weighted[tuple[str, str, str]],

@@ -53,7 +53,6 @@ def more(
     classes, classes without statistics, or classes with more listed objects than these cover.
 
     Args:
-        artifact: the model.
         scene: the listed objects and the room type.
         top_k: maximum number of classes in the answer.
         candidates: indices of classes. The answer then contains these classes at any probability,
@@ -76,23 +75,23 @@ def more(
     usual, unlisted = artifact.calibration.coverage, 1.0
     if coverage is not None and coverage > usual:
         unlisted = (1 - coverage) / (1 - usual)
-    which, p = distribution(
+    rows, p = distribution(
         artifact.counts, artifact.spec.V, classes, listed, scene.room_type, unlisted
     )
-    classes, listed = classes[which], listed[which]
-    numbers, below = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
-    beyond = 1 - p[np.arange(len(p)), listed - 1]
-    usable = beyond >= LIKELY if candidates is None else np.isin(classes, list(candidates))
+    classes, listed = classes[rows], listed[rows]
+    numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
+    p_more = 1 - p[np.arange(len(p)), listed - 1]
+    usable = p_more >= LIKELY if candidates is None else np.isin(classes, list(candidates))
     order = np.flatnonzero(usable)
-    order = order[np.argsort(-beyond[order], kind="stable")][:top_k]
-    below = below[order]
+    order = order[np.argsort(-p_more[order], kind="stable")][:top_k]
+    cumulative = cumulative[order]
     columns = (
         classes[order].tolist(),
         listed[order].tolist(),
         significant(p[order] @ numbers),
-        ((below < _TAIL).sum(axis=1) + 1).tolist(),
-        ((below < 1 - _TAIL).sum(axis=1) + 1).tolist(),
-        significant(beyond[order]),
+        ((cumulative < _TAIL).sum(axis=1) + 1).tolist(),
+        ((cumulative < 1 - _TAIL).sum(axis=1) + 1).tolist(),
+        significant(p_more[order]),
     )
     return [
         {
@@ -130,24 +129,24 @@ def distribution(
         Then the probability of 1, 2, ... M instances, (k, M).
     """
     M = counts.log_share.shape[1]
-    row = np.searchsorted(counts.classes, classes)
-    row[row == len(counts.classes)] = 0
-    which = np.flatnonzero((counts.classes[row] == classes) & (listed <= counts.most[row]))
-    row, number, k = row[which], np.arange(1, M + 1), listed[which, None]
-    own, several = counts.weights[row, :, :ROOM].astype(np.float64), listed > 1
-    exponents = own[..., INTERCEPT] + own[..., SINGLE] * (k == 1)
-    exponents += own[..., SEVERAL] * (several.sum() > several[which, None])
+    entry = np.searchsorted(counts.classes, classes)
+    entry[entry == len(counts.classes)] = 0
+    rows = np.flatnonzero((counts.classes[entry] == classes) & (listed <= counts.most[entry]))
+    entry, number, k = entry[rows], np.arange(1, M + 1), listed[rows, None]
+    weights, is_several = counts.weights[entry, :, :ROOM].astype(np.float64), listed > 1
+    exponents = weights[..., INTERCEPT] + weights[..., SINGLE] * (k == 1)
+    exponents += weights[..., SEVERAL] * (is_several.sum() > is_several[rows, None])
     if room is not None:
-        exponents += counts.weights[row, :, ROOM + room]
+        exponents += counts.weights[entry, :, ROOM + room]
     if (others := len(classes) - 1) > 0:
         # The effect of a class on itself is 0, so the sum over all listed classes is correct.
-        effects = counts.weights[row[:, None], :, counts.weights.shape[-1] - V + classes]
+        effects = counts.weights[entry[:, None], :, counts.weights.shape[-1] - V + classes]
         exponents += effects.sum(axis=1, dtype=np.float64) / math.sqrt(others)
-    logits = counts.log_share[row] + exponents @ functions(M)
+    logits = counts.log_share[entry] + exponents @ functions(M)
     logits += (number - k) * math.log(max(unlisted, sys.float_info.min))
     logits[number < k] = -np.inf
     p = np.exp(logits - logits.max(axis=1, keepdims=True, initial=-np.inf))
-    return which, p / p.sum(axis=1, keepdims=True)
+    return rows, p / p.sum(axis=1, keepdims=True)
 
 
 def functions(M: int) -> Floats:

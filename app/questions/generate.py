@@ -26,13 +26,7 @@ from app.errors import InvalidRequestError
 from app.inference import MachineSpec, Weights
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.elementary import softplus
-from app.questions.answer import (
-    OBJECT_BYTES,
-    RELATION_BYTES,
-    Fields,
-    SizeLimit,
-    rounded_number,
-)
+from app.questions.answer import OBJECT_BYTES, RELATION_BYTES, Fields, SizeLimit, rounded_number
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
 from app.questions.posterior import given_relations, present
@@ -90,8 +84,6 @@ def generate(
     relates a class to itself. Structural classes have only the relations of the evidence.
 
     Args:
-        artifact: the model.
-        scene: the evidence.
         count: number of scenes.
         seed: seed of the random numbers. The same seed gives the same scenes.
         steps: number of Gibbs sweeps for each draw. None means `STEPS`.
@@ -121,20 +113,20 @@ def generate(
     if not temperature > 0:
         raise ValueError(f"temperature must be positive, not {temperature}")
     conditions = _conditions(artifact, scene, context or {})
-    conditioned = artifact.scene_chains.under(conditions, temperature)
+    chains = artifact.scene_chains.under(conditions, temperature)
     shown = ~artifact.vocabulary.structure
     shown[conditions.classes] = True
-    of = [thing.class_index or 0 for thing in scene.objects]
-    evidence = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
+    class_of = [thing.class_index or 0 for thing in scene.objects]
+    evidence = {(a, class_of[i], class_of[j]) for a, i, j in scene.relations or ()}
     scenes: list[Fields] = []
     plausible = Plausible(artifact, scene)
     while len(scenes) < count and not stop():
         stream = random_stream(seed, len(scenes))
         for attempt in range(ATTEMPTS):
-            drawn = conditioned.draw(steps, stream)
-            seen = shown[drawn.classes]
-            if plausible(drawn.classes[seen].tolist()) or stop() or attempt == ATTEMPTS - 1:
-                scenes.append(_scene(artifact, conditioned, drawn, seen, evidence))
+            state = chains.draw(steps, stream)
+            is_shown = shown[state.classes]
+            if plausible(state.classes[is_shown].tolist()) or stop() or attempt == ATTEMPTS - 1:
+                scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
     if size_limit is not None:
         size_limit.check("count", *_size(scenes))
@@ -149,7 +141,7 @@ def _conditions(
     Raises:
         ValueError: the machine does not have a layer or unit in `context`.
     """
-    spec, classes = artifact.spec, present(scene, artifact.spec)
+    spec, listing = artifact.spec, present(scene, artifact.spec)
     sizes = _layer_sizes(spec)
     for layer, units in context.items():
         if layer not in sizes:
@@ -162,41 +154,42 @@ def _conditions(
                     f"unit {unit} of {layer} does not exist: a unit must be at least 0 and below "
                     f"{sizes[layer]}"
                 )
-    held = [np.unique(np.array(context.get(layer, ()), dtype=np.int64)) for layer in ("h1", "h2")]
+    held, held2 = (
+        np.unique(np.array(context.get(layer, ()), dtype=np.int64)) for layer in ("h1", "h2")
+    )
+    observed = given_relations(scene, listing, spec.A)
     return Conditions(
-        classes.classes,
-        classes.log_counts,
-        given_relations(scene, classes, spec.A),
-        held[0],
-        held[1],
-        scene.room_type,
+        listing.classes, listing.log_counts, observed, held, held2, room=scene.room_type
     )
 
 
 def _scene(
     artifact: Artifact,
     chains: ConditionedChains,
-    drawn: ChainState,
+    state: ChainState,
     shown: NDArray[np.bool_],
     evidence: set[Triple],
 ) -> Fields:
-    """Return the fields of `scene_client.schemas.GeneratedScene` for a drawn scene."""
+    """Return the fields of `scene_client.schemas.GeneratedScene` for a drawn scene.
+
+    ``shown`` (n,) is True for the classes of ``state`` that the answer lists.
+    """
     labels = artifact.vocabulary.labels
-    units = np.nonzero(drawn.r & shown[:, None] & shown)
+    units = np.nonzero(state.r & shown[:, None] & shown)
     a, i, j = units
-    named = np.stack([a, drawn.classes[i], drawn.classes[j]], axis=1)
-    stay = staying(named, drawn.logits[units], evidence, artifact.vocabulary.structure)
-    kept = np.zeros_like(drawn.r)
+    named = np.stack([a, state.classes[i], state.classes[j]], axis=1)
+    stay = staying(named, state.logits[units], evidence, artifact.vocabulary.structure)
+    kept = np.zeros_like(state.r)
     kept[units] = stay
     triples = sorted({*map(tuple, named[stay].tolist()), *evidence})
     return {
-        "objects": [labels[index] for index in drawn.classes[shown].tolist()],
+        "objects": [labels[index] for index in state.classes[shown].tolist()],
         "relations": [
             {"subject": labels[i], "relation": CANONICAL[a], "object": labels[j]}
             for a, i, j in triples
         ],
-        "log_score": rounded_number(chains.log_score(drawn, shown, kept)),
-        "context": {layer: getattr(drawn, layer).tolist() for layer in _layer_sizes(artifact.spec)},
+        "log_score": rounded_number(chains.log_score(state, shown, kept)),
+        "context": {layer: getattr(state, layer).tolist() for layer in _layer_sizes(artifact.spec)},
     }
 
 
@@ -234,12 +227,13 @@ def staying(
     fixed = np.array(sorted(evidence), dtype=np.int64).reshape(-1, 3)
     order = np.lexsort((*units.T[::-1], -logits))
     possible = (units[:, 1] != units[:, 2]) & ~structure[units[:, 1:]].any(axis=1)
-    every = np.concatenate([fixed, units])
-    classes, places = np.unique(every[:, 1:], return_inverse=True)
-    stay: NDArray[np.bool_] = _holding(
-        np.ascontiguousarray(every[:, 0]),
-        *(places.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)),
+    triples = np.concatenate([fixed, units])
+    relation = np.ascontiguousarray(triples[:, 0])
+    classes, ends = np.unique(triples[:, 1:], return_inverse=True)
+    stay: NDArray[np.bool_] = _select_consistent(
+        relation, ends.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
     )
+    # A drawn relation that is part of the evidence always stays.
     if evidence:
         shape = len(CANONICAL), len(structure), len(structure)
         stay |= np.isin(np.ravel_multi_index(units.T, shape), np.ravel_multi_index(fixed.T, shape))
@@ -247,9 +241,9 @@ def staying(
 
 
 @compiled
-def _holding(
+def _select_consistent(
     relation: NDArray[np.int64],
-    places: NDArray[np.int64],
+    ends: NDArray[np.int64],
     order: NDArray[np.int64],
     fixed: int,
     count: int,
@@ -258,30 +252,31 @@ def _holding(
 
     Args:
         relation: (fixed + m,) canonical relations. The relations of the evidence come first.
-        places: (fixed + m, 2) indices of the subject and object classes, from 0 to count - 1.
+        ends: (fixed + m, 2) indices of the subject and object classes, from 0 to count - 1.
         order: indices from 0 to m - 1 of the drawn relations to try, likeliest first.
         fixed: number of relations in the evidence.
         count: number of classes.
     """
-    # beyond[d, x, y] is True if relations of direction d lead from x to y, directly or through
+    # reaches[d, x, y] is True if relations of direction d lead from x to y, directly or through
     # other classes.
-    beyond = np.zeros((3, count, count), np.bool_)
+    reaches = np.zeros((3, count, count), np.bool_)
     related, supported = np.zeros((count, count), np.bool_), np.zeros(count, np.bool_)
     stay = np.zeros(len(relation) - fixed, np.bool_)
     for turn in range(fixed + len(order)):
         e = turn if turn < fixed else fixed + order[turn - fixed]
-        x, y, far = places[e, 0], places[e, 1], beyond[_DIRECTION[relation[e]]]
+        x, y, reached = ends[e, 0], ends[e, 1], reaches[_DIRECTION[relation[e]]]
         on_top = relation[e] == ON_TOP
         if turn >= fixed:
-            if far[y, x] or related[x, y] or (on_top and supported[x]):
+            if reached[y, x] or related[x, y] or (on_top and supported[x]):
                 continue
             stay[e - fixed] = True
         related[x, y] = related[y, x] = True
         supported[x] |= on_top
+        # Each class that leads to x now also leads to y and to all classes after y.
         for k in range(count):
-            if k == x or far[k, x]:
-                far[k] |= far[y]
-                far[k, y] = True
+            if k == x or reached[k, x]:
+                reached[k] |= reached[y]
+                reached[k, y] = True
     return stay
 
 
@@ -292,7 +287,6 @@ class Plausible:
 
     Args:
         artifact: the model that draws the scenes.
-        scene: the evidence.
     """
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
@@ -312,8 +306,8 @@ class Plausible:
             return True
         labels = self._artifact.vocabulary.labels
         objects = [SceneObject(labels[index], labels[index], index) for index in classes]
-        judged = Scene(tuple(objects), room_type=self._room)
-        return self._listed.issuperset(intruders(self._artifact, judged).tolist())
+        drawn_scene = Scene(tuple(objects), room_type=self._room)
+        return self._listed.issuperset(intruders(self._artifact, drawn_scene).tolist())
 
     def _suits_room(self, classes: list[int]) -> bool:
         limits = self._artifact.calibration.room_fit
@@ -335,7 +329,6 @@ def room_fit(weights: Weights, v: NDArray[np.float32], room: int) -> NDArray[np.
     The formula leaves out a second hidden layer.
 
     Args:
-        weights: weights of the machine.
         v: (B, V) presence of each class in each scene.
         room: index t of the room type.
     """
@@ -367,8 +360,7 @@ def _read(request: GenerateRequest, artifact: Artifact, _: Reading) -> Options:
             if unit >= size:
                 message = f"the hidden layer has only the units 0 to {size - 1}"
                 errors.add(InvalidRequestError, ("context", layer, position), message)
-    if errors.by_class:
-        errors.raise_any()
+    errors.raise_any()
     return {
         "count": request.count,
         "seed": secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed,
@@ -386,8 +378,7 @@ def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
 _EXAMPLES: Final = {
     "room": Example("a bedroom", {"room_type": "bedroom", "count": 2, "seed": 7}),
     "evidence": Example(
-        "scenes that contain these objects and this relation",
-        {**BEDROOM, "count": 2, "seed": 7},
+        "scenes that contain these objects and this relation", {**BEDROOM, "count": 2, "seed": 7}
     ),
     "poses": Example("scenes around the objects that the robot sees", {**POSES, "seed": 7}),
     "context": Example(

@@ -66,7 +66,6 @@ def missing(
     probabilities do not sum to 1. The answer never contains listed or structural classes.
 
     Args:
-        artifact: the model.
         scene: the listed objects, their relations and the room type.
         top_k: maximum number of classes in each list of the answer.
         candidates: indices of the classes to rank. Listed and structural classes are ignored. None
@@ -90,12 +89,14 @@ def missing(
     """
     if top_k < 1:
         raise ValueError(f"top_k must be at least 1, not {top_k}")
-    used = artifact.calibration.coverage if coverage is None else coverage
-    if not 0 <= used <= 1:
-        raise ValueError(f"coverage must be in [0, 1], not {used}")
+    used_coverage = artifact.calibration.coverage if coverage is None else coverage
+    if not 0 <= used_coverage <= 1:
+        raise ValueError(f"coverage must be in [0, 1], not {used_coverage}")
     place = None if at is None else Place.of(scene, artifact.spec.A, *at)
     posterior = posterior_of(artifact, scene)
-    classes, probabilities, log_odds = _ranked(artifact, posterior, top_k, candidates, place, used)
+    classes, probabilities, log_odds = _ranked(
+        artifact, posterior, top_k, candidates, place, used_coverage
+    )
     labels = artifact.vocabulary.labels
     columns = classes.tolist(), significant(probabilities), significant(log_odds)
     entries: list[Fields] = [
@@ -103,10 +104,9 @@ def missing(
         for index, probability, value in zip(*columns, strict=True)
     ]
     if details and entries:
-        for entry, places in zip(
-            entries, placements(artifact, posterior, scene, classes, axes, place), strict=True
-        ):
-            entry["placements"], entry["because"] = places, []
+        places = placements(artifact, posterior, scene, classes, axes, place)
+        for entry, class_places in zip(entries, places, strict=True):
+            entry["placements"], entry["because"] = class_places, []
         if len(posterior.present.classes):
             explained = classes[:EXPLAINED]
             change = posterior.reasons_for_absent(explained)
@@ -118,7 +118,7 @@ def missing(
         further = more(artifact, scene, top_k=top_k, candidates=candidates, coverage=coverage)
     if size_limit is not None:
         size_limit.check("top_k", *_size(entries, further))
-    return {"coverage": used, "missing": entries, "more": further}
+    return {"coverage": used_coverage, "missing": entries, "more": further}
 
 
 def _ranked(
@@ -205,8 +205,7 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         candidates = _candidates(request.candidates, reading, errors)
     if request.at is not None:
         at = _at(request.at, artifact, reading, errors)
-    if errors.by_class:
-        errors.raise_any()
+    errors.raise_any()
     return {
         "top_k": request.top_k,
         "candidates": candidates,
@@ -232,6 +231,7 @@ def _candidates(labels: list[str], reading: Reading, errors: ErrorList) -> list[
 def _at(
     at: Anchor, artifact: Artifact, reading: Reading, errors: ErrorList
 ) -> tuple[str, int] | None:
+    """Return relation and anchor index of the request's field `at`, or None after an error."""
     canonical = artifact.manifest.vocabulary.relations
     if at.relation not in {*canonical, *map(opposite, canonical)}:
         errors.add(InvalidRequestError, ("at", "relation"), "the model does not know this relation")
@@ -274,16 +274,13 @@ _EXAMPLES: Final = {
         {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
     ),
     "coverage": Example(
-        "a complete list: unlisted classes count as absent",
-        {**LABELS, "coverage": 1.0},
+        "a complete list: unlisted classes count as absent", {**LABELS, "coverage": 1.0}
     ),
     "candidates": Example(
-        "only these candidates",
-        {**LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3},
+        "only these candidates", {**LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3}
     ),
     "scores": Example(
-        "probabilities only, for a fast and short answer",
-        {**LABELS, "detail": "scores"},
+        "probabilities only, for a fast and short answer", {**LABELS, "detail": "scores"}
     ),
     **REFUSED,
     "invalid-request": Example(

@@ -144,7 +144,6 @@ class Unknown:
         Each treatment accepts the syntax of detectors, such as "chair_12".
 
         Args:
-            label: the label.
             name: name of the object with this label. The list of ignored names contains it if the
                 label is ignored.
             location: location of the label in the request, for an error message.
@@ -159,8 +158,8 @@ class Unknown:
             match = self._guess(label, is_room=is_room)
         if match is not None:
             entry, similarity, rule = match
-            name = (self.vocabulary.room_types if is_room else self.vocabulary.labels)[entry]
-            mapped = Mapped(label=label, class_=name, similarity=similarity, rule=rule)
+            names = self.vocabulary.room_types if is_room else self.vocabulary.labels
+            mapped = Mapped(label=label, class_=names[entry], similarity=similarity, rule=rule)
             self.mapped[label, is_room] = mapped
             return entry
         if self.treatment.endswith("ignore"):
@@ -207,16 +206,12 @@ class Names:
     """Look-up of the objects of a scene by id, or by label if only one object has the label.
 
     Args:
-        objects: objects of the scene.
         unknown: unknown labels of the request and their treatment.
         left_out: pairs (id, label) of the ignored objects.
     """
 
     def __init__(
-        self,
-        objects: Sequence[SceneObject],
-        unknown: Unknown,
-        left_out: Sequence[tuple[str, str]],
+        self, objects: Sequence[SceneObject], unknown: Unknown, left_out: Sequence[tuple[str, str]]
     ) -> None:
         self._objects, self._unknown = objects, unknown
         self._ignored_ids = {name for name, _ in left_out}

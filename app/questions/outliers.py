@@ -86,7 +86,6 @@ def outliers(
     little evidence, so its threshold is higher.
 
     Args:
-        artifact: the model.
         scene: the objects and stated relations to judge.
         sensitivity: name of one of the model's thresholds.
         threshold: minimum probability of an outlier. None means the threshold of `sensitivity`.
@@ -145,11 +144,9 @@ def _judged(
     logits = _intruder_logits(artifact, entry, present.classes, log_odds)
     p = _probability(logits)
     is_outlier = p >= threshold
-    columns = (
-        [artifact.vocabulary.labels[index] for index in present.classes.tolist()],
-        *(significant(p), significant(log_odds), is_outlier.tolist()),
-    )
-    of_class: list[Fields] = [
+    labels = [artifact.vocabulary.labels[index] for index in present.classes.tolist()]
+    columns = labels, significant(p), significant(log_odds), is_outlier.tolist()
+    class_fields: list[Fields] = [
         {"label": label, "probability": probability, "log_odds": value, "is_outlier": flag}
         for label, probability, value, flag in zip(*columns, strict=True)
     ]
@@ -157,7 +154,7 @@ def _judged(
     order = np.argsort(-logits[present.row], kind="stable")
     rows = present.row[order].tolist()
     if details:
-        for fields in of_class:
+        for fields in class_fields:
             fields["because"], fields["usually_with"] = [], []
         explained = np.array(list(dict.fromkeys(rows[: _affordable(posterior)])), dtype=np.int64)
         if len(present.classes) > 1:
@@ -165,16 +162,13 @@ def _judged(
             change = np.where(is_outlier[explained, None] == (change < 0), change, 0)
             causes = reasons(scene, present, change, explained)
             for row, because in zip(explained.tolist(), causes, strict=True):
-                of_class[row]["because"] = because
+                class_fields[row]["because"] = because
         flagged = explained[is_outlier[explained]]
         companions = _companions(artifact, present.classes, present.classes[flagged])
-        for row, labels in zip(flagged.tolist(), companions, strict=True):
-            of_class[row]["usually_with"] = labels
-    things = scene.objects
-    return [
-        {"object": things[number].id} | of_class[row]
-        for number, row in zip(order.tolist(), rows, strict=True)
-    ]
+        for row, companion_labels in zip(flagged.tolist(), companions, strict=True):
+            class_fields[row]["usually_with"] = companion_labels
+    pairs = zip(order.tolist(), rows, strict=True)
+    return [{"object": scene.objects[number].id} | class_fields[row] for number, row in pairs]
 
 
 def misplaced(
@@ -318,11 +312,12 @@ def _companions(
     usable[present] = False
     if not (len(flagged) and usable.any()):
         return [[] for _ in flagged]
+    # The rows of the arrays are outliers i, and the columns are classes j.
     weights, labels = artifact.weights, artifact.vocabulary.labels
-    beside = artifact.scorer.gain(weights["c1"] + weights["W"][flagged])
-    increase = np.where(usable, beside - artifact.empty_gain, 0)
+    gain_with_outlier = artifact.scorer.gain(weights["c1"] + weights["W"][flagged])
+    increase = np.where(usable, gain_with_outlier - artifact.empty_gain, 0)
     least = np.maximum(_LEAST_SHARE * increase.max(1, keepdims=True), 1e-6)
-    score = np.where(increase < least, 0, increase * sigmoid(weights["b"] + beside))
+    score = np.where(increase < least, 0, increase * sigmoid(weights["b"] + gain_with_outlier))
     return [[labels[index] for index in best(row, row > 0, COMPANIONS).tolist()] for row in score]
 
 
@@ -381,16 +376,11 @@ _EXAMPLES: Final = {
         },
     ),
     "sensitivity": Example(
-        "high sensitivity: a lower threshold",
-        {**WITH_TOILET, "sensitivity": "high"},
+        "high sensitivity: a lower threshold", {**WITH_TOILET, "sensitivity": "high"}
     ),
-    "threshold": Example(
-        "a threshold set by the client",
-        {**WITH_TOILET, "threshold": 0.5},
-    ),
+    "threshold": Example("a threshold set by the client", {**WITH_TOILET, "threshold": 0.5}),
     "scores": Example(
-        "probabilities only, for a fast and short answer",
-        {**WITH_TOILET, "detail": "scores"},
+        "probabilities only, for a fast and short answer", {**WITH_TOILET, "detail": "scores"}
     ),
     **REFUSED,
 }

@@ -82,7 +82,8 @@ def place_log_p(
     return placement_log_p(
         artifact.relation_slopes.asked_place[relation],
         posterior.placed_log_p(candidates, relation, row, outgoing=outgoing),
-        *(float(present.log_counts[row]), len(present.classes) + 1),
+        log_count=float(present.log_counts[row]),
+        classes=len(present.classes) + 1,
     )
 
 
@@ -103,9 +104,6 @@ def placements(
     with a position.
 
     Args:
-        artifact: the model.
-        posterior: posterior of the scene.
-        scene: the scene.
         candidates: (N,) indices of absent classes.
         axes: viewer's axes, or None; see `offsets_of`.
         at: the place in the request, or None. It comes first in each result,
@@ -119,64 +117,62 @@ def placements(
     if not len(anchors):
         return [[] for _ in candidates]
     forward, backward = posterior.placement_log_odds(candidates, anchors)
-    A, objects, first = forward.shape[1], present.first[anchors], -1
+    A, objects = forward.shape[1], present.first[anchors]
+    first = -1  # number of the requested place in `likeliest_places`; -1 without a request
     if A > ON_TOP and scene.relations:
         upper = [subject for relation, subject, _ in scene.relations if relation == ON_TOP]
         backward[:, ON_TOP, np.isin(objects, upper)] = NO_UNIT
     if at is not None:
-        relation, anchor, to_anchor = at
-        for column in np.flatnonzero(anchors == present.row[anchor]).tolist():
-            first = ((0 if to_anchor else A) + relation) * len(anchors) + column
-            objects[column] = anchor
-    which, relations, outgoing, columns, p = likeliest_places(
-        *(artifact.relation_slopes.placement, forward, backward, present.log_counts[anchors]),
-        *(len(present.classes) + 1, PLACES, first),
+        # If the anchor is structural, no column matches it.
+        for column in np.flatnonzero(anchors == present.row[at.anchor]).tolist():
+            first = ((0 if at.outgoing else A) + at.relation) * len(anchors) + column
+            objects[column] = at.anchor
+    slopes, log_counts = artifact.relation_slopes.placement, present.log_counts[anchors]
+    rows, relations, outgoing, columns, p = likeliest_places(
+        slopes, forward, backward, log_counts, len(present.classes) + 1, PLACES, first
     )
-    each = len(which) // len(candidates)
+    places = len(rows) // len(candidates)  # the same number for each candidate
     if first >= 0 and at is not None:
-        p[::each] = np.exp(place_log_p(artifact, posterior, candidates, at))
-    likely = np.flatnonzero(p >= LEAST_SHARE * np.repeat(p[::each], each))
-    which, relations, outgoing, columns = (
-        values[likely] for values in (which, relations, outgoing, columns)
-    )
-    numbers, objects = objects[columns].tolist(), objects[columns]
+        p[::places] = np.exp(place_log_p(artifact, posterior, candidates, at))
+    likely = np.flatnonzero(p >= LEAST_SHARE * np.repeat(p[::places], places))
+    rows, relations, outgoing = rows[likely], relations[likely], outgoing[likely]
+    columns = columns[likely]
+    numbers = objects[columns].tolist()
     offsets: Iterator[Fields | None] = iter([None] * len(likely))
     if artifact.offsets is not None and any(
         scene.objects[number].position is not None for number in numbers
     ):
-        ends = candidates[which], present.classes[anchors[columns]]
-        offsets = _offset_fields(*offsets_of(artifact.offsets, relations, *ends, outgoing, axes))
-    listed: list[list[Fields]] = [[] for _ in candidates]
-    for one, relation, out, number, probability, offset in zip(
-        *(which.tolist(), relations.tolist(), outgoing.tolist(), numbers),
-        *(significant(p[likely]), offsets),
-        strict=True,
+        missing, anchor = candidates[rows], present.classes[anchors[columns]]
+        offsets = _offset_fields(
+            *offsets_of(artifact.offsets, relations, missing, anchor, outgoing, axes)
+        )
+    entries: list[list[Fields]] = [[] for _ in candidates]
+    arrays = rows.tolist(), relations.tolist(), outgoing.tolist(), numbers
+    for row, relation, is_subject, number, probability, offset in zip(
+        *arrays, significant(p[likely]), offsets, strict=True
     ):
         thing = scene.objects[number]
-        name = (RELATIONS if out else _SEEN_FROM_ANCHORS)[relation]
+        name = (RELATIONS if is_subject else _SEEN_FROM_ANCHORS)[relation]
         entry: Fields = {"relation": name, "object": thing.id, "probability": probability}
         if offset is not None and thing.position is not None:
             entry["offset"] = offset
-        listed[one].append(entry)
-    return listed
+        entries[row].append(entry)
+    return entries
 
 
 def _offset_fields(
     mean: NDArray[np.float64], std: NDArray[np.float64], scenes: NDArray[np.int64]
 ) -> Iterator[Fields | None]:
     """Yield the fields of `scene_client.schemas.Offset`, or None for an unknown offset."""
-    numbers = iter(significant(np.concatenate([mean, std], axis=1).reshape(-1)))
-    for count, *vectors in zip(scenes.tolist(), *[numbers] * 6, strict=True):
-        x, y, z, dx, dy, dz = vectors
-        yield (
-            None
-            if count == UNOBSERVED
-            else {
-                "mean": {"x": x, "y": y, "z": z},
-                "std": {"x": dx, "y": dy, "z": dz},
-                "scenes": count,
-            }
-        )
+    numbers = significant(np.concatenate([mean, std], axis=1).reshape(-1))
+    for row, count in enumerate(scenes.tolist()):
+        x, y, z, std_x, std_y, std_z = numbers[6 * row : 6 * row + 6]
+        offset = {
+            "mean": {"x": x, "y": y, "z": z},
+            "std": {"x": std_x, "y": std_y, "z": std_z},
+            "scenes": count,
+        }
+        yield None if count == UNOBSERVED else offset
 
 
 def offsets_of(
@@ -190,7 +186,6 @@ def offsets_of(
     """Return the offset from each of n anchors to its missing object, in metres.
 
     Args:
-        offsets: offsets of the model.
         relation: (n,) indices of canonical relations.
         missing: (n,) class indices of the missing objects.
         anchor: (n,) class indices of the anchors.
@@ -204,51 +199,52 @@ def offsets_of(
         scenes that contain the two classes in this relation, (n,). It is `UNOBSERVED` for an
         unknown offset.
     """
-    ends = (relation, missing, anchor, outgoing)
-    turn = _UNTURNED if axes is None else np.array(axes)
-    mean, std, scenes = _lay(offsets.tables, *ends, turn, axes is not None)
+    rotation = _UNTURNED if axes is None else np.array(axes)
+    mean, std, scenes = _rotated_offsets(
+        offsets.tables, relation, missing, anchor, outgoing, rotation, axes is not None
+    )
     return mean, std, scenes
 
 
 @compiled
-def _lay(
+def _rotated_offsets(
     tables: tuple[NDArray[Any], ...],
     relation: NDArray[np.int64],
     missing: NDArray[np.int64],
     anchor: NDArray[np.int64],
     outgoing: NDArray[np.bool_],
     axes: NDArray[np.float64],
-    looking: bool,
+    has_axes: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Compute the mean (n, 3), standard deviation (n, 3) and number of scenes (n,) of n offsets.
 
-    ``looking`` is False if the viewing direction is unknown. For the other arguments, see
+    ``has_axes`` is False if the viewing direction is unknown. For the other arguments, see
     `offsets_of`.
     """
-    subject, other = np.where(outgoing, missing, anchor), np.where(outgoing, anchor, missing)
-    offset, scenes = look_up(tables, relation, subject, other)
+    subject, object_ = np.where(outgoing, missing, anchor), np.where(outgoing, anchor, missing)
+    offset, scenes = look_up(tables, relation, subject, object_)
     n = len(relation)
-    mean, spread = np.zeros((n, 3)), np.zeros((n, 3))
+    mean, variance, std = np.zeros((n, 3)), np.zeros((n, 3)), np.empty((n, 3))
     for k in range(n):
-        if looking:
+        if has_axes:
             for axis in range(3):
-                toward, square = offset[k, axis], offset[k, 3 + axis] ** 2
+                axis_mean, axis_variance = offset[k, axis], offset[k, 3 + axis] ** 2
                 for to in range(3):
-                    mean[k, to] += axes[axis, to] * toward
-                    spread[k, to] += axes[axis, to] ** 2 * square
+                    mean[k, to] += axes[axis, to] * axis_mean
+                    variance[k, to] += axes[axis, to] ** 2 * axis_variance
         else:
             if relation[k] == LEFT or relation[k] == FRONT:
                 scenes[k] = UNOBSERVED
-            mean[k, 2], spread[k, 2] = offset[k, 2], offset[k, 5] ** 2
+            mean[k, 2], variance[k, 2] = offset[k, 2], offset[k, 5] ** 2
+            # Any horizontal direction is equally likely, so x and y share E[x²] + E[y²] equally.
             for axis in range(2):
-                square = (offset[k, axis] ** 2 + offset[k, 3 + axis] ** 2) / 2
-                spread[k, 0] += square
-                spread[k, 1] += square
+                half = (offset[k, axis] ** 2 + offset[k, 3 + axis] ** 2) / 2
+                variance[k, 0] += half
+                variance[k, 1] += half
         for axis in range(3):
             value = mean[k, axis] if outgoing[k] else -mean[k, axis]
             # Adding 0.0 turns -0.0 into 0.0.
             mean[k, axis] = np.rint(value * _PER_METRE) / _PER_METRE + 0.0
-            spread[k, axis] = (
-                max(np.rint(math.sqrt(spread[k, axis]) * _PER_METRE), 1.0) / _PER_METRE
-            )
-    return mean, spread, scenes
+            millimetres = np.rint(math.sqrt(variance[k, axis]) * _PER_METRE)
+            std[k, axis] = max(millimetres, 1.0) / _PER_METRE
+    return mean, std, scenes

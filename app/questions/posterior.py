@@ -75,17 +75,15 @@ def given_relations(scene: Scene, present: Present, relations: int) -> ObservedR
     The result is None if the scene has neither relations nor poses.
 
     Args:
-        scene: the scene.
-        present: the classes of the scene.
         relations: number of canonical relations that the machine knows.
     """
     if not relations_given(scene) and scene.poses is None:
         return None
-    on, seen = pool_relations(present.row, len(present.classes), *instance_evidence(scene))
+    holds, observed = pool_relations(present.row, len(present.classes), *instance_evidence(scene))
     # np.stack() makes contiguous arrays. For another layout, numba would compile the loops again.
-    a, i, j = np.stack(np.nonzero(seen[:relations]))
-    gate = present.presence[i] * present.presence[j]
-    return ObservedRelations(a, i, j, on[a, i, j].astype(np.float32), gate)
+    a, i, j = np.stack(np.nonzero(observed[:relations]))
+    presence = present.presence[i] * present.presence[j]
+    return ObservedRelations(a, i, j, r=holds[a, i, j].astype(np.float32), g=presence)
 
 
 def relations_given(scene: Scene) -> bool:
@@ -111,13 +109,12 @@ class Posterior(ScenePosterior):
     """
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
-        self.present = present(scene, artifact.spec)
+        self.present = listing = present(scene, artifact.spec)
         self._artifact, self._room = artifact, scene.room_type
+        observed = given_relations(scene, listing, artifact.spec.A)
+        pull = pull_of(scene, artifact.calibration.evidence)
         context = artifact.closed_form.context(
-            *(self.present.classes, self.present.presence, self.present.log_counts),
-            scene.room_type,
-            given_relations(scene, self.present, artifact.spec.A),
-            pull_of(scene, artifact.calibration.evidence),
+            listing.classes, listing.presence, listing.log_counts, self._room, observed, pull
         )
         super().__init__(artifact.closed_form, context)
 
@@ -137,9 +134,9 @@ class Posterior(ScenePosterior):
             absent: (N,) indices of the unlisted classes.
             coverage: probability that a present class is listed.
         """
+        log_odds, y = self.absent_log_odds(absent), self.context.object_y
         return with_unlisted(
-            *(self._artifact, self.absent_log_odds(absent), absent, self.context.object_y),
-            *(self.present, self._room, coverage),
+            self._artifact, log_odds, absent, y, self.present, self._room, coverage
         )
 
 
@@ -172,11 +169,9 @@ def with_unlisted(
     the same with c = `FULL`, because c = 1 would give minus infinity.
 
     Args:
-        artifact: the model.
         log_odds: (N,) log-odds of the absent classes. All other unlisted classes count as absent.
         absent: (N,) class indices of the absent classes.
         y: (H1,) logits of h1 in the closed form.
-        present: classes of the scene.
         room: index of the room type, or None if the room type is unknown.
         coverage: probability that a present class is listed.
         closed: (N,) log-odds in closed form at y. None means that `log_odds` are these log-odds.
@@ -220,9 +215,11 @@ def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int
         log_count: log of the number of instances of the anchor's class.
         classes: number of distinct classes in the scene, the candidate included.
     """
-    intercept, gain, weight, size = entry[:4]
-    odds = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-7)))
-    logits = intercept + gain * odds + weight * log_count + size * math.log(classes)
+    intercept, slope, count_weight, classes_weight = entry[:4]
+    # log(p / (1 - p)). The limit avoids log(0) for p = 1.
+    log_odds = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-7)))
+    logits = intercept + slope * log_odds + count_weight * log_count
+    logits = logits + classes_weight * math.log(classes)
     bend(entry, logits)
     log_probability: Floats = -np.logaddexp(0.0, -logits)
     return log_probability
@@ -232,13 +229,13 @@ def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, lis
     """Return the logits of p(present but unlisted) · p(relation holds | present), (N,).
 
     Args:
-        calibration: calibration of the model.
         log_odds: (N,) log-odds that each candidate class is present, not yet calibrated.
         log_p: (N,) calibrated log p(relation holds | present) of each candidate class.
         listed: number of classes that the scene lists.
     """
-    both = log_p - np.logaddexp(0.0, -calibrated(calibration.missing, log_odds, listed))
-    logits: Floats = both - np.log(-np.expm1(np.minimum(both, -1e-7)))
+    presence = calibrated(calibration.missing, log_odds, listed)
+    log_product = log_p - np.logaddexp(0.0, -presence)
+    logits: Floats = log_product - np.log(-np.expm1(np.minimum(log_product, -1e-7)))
     return logits
 
 

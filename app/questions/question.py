@@ -155,9 +155,7 @@ SCENES: Final[dict[str, Example]] = {
 
 REFUSED: Final[dict[str, Example]] = {
     "unknown-labels": Example(
-        "a label that the model does not know",
-        {"objects": ["bed", "nigthstand"]},
-        "unknown-labels",
+        "a label that the model does not know", {"objects": ["bed", "nigthstand"]}, "unknown-labels"
     ),
     "contradictory-evidence": Example(
         "two relations that contradict each other",

@@ -97,12 +97,12 @@ def best(values, usable, count):
         if not usable[position]:
             continue
         if size < kept:
-            at = size
+            node = size
             size += 1
-            while at and not _worse(values, heap[(at - 1) // 2], position):
-                heap[at] = heap[(at - 1) // 2]
-                at = (at - 1) // 2
-            heap[at] = position
+            while node and not _worse(values, heap[(node - 1) // 2], position):
+                heap[node] = heap[(node - 1) // 2]
+                node = (node - 1) // 2
+            heap[node] = position
         elif values[position] > values[heap[0]]:
             _sink(values, heap, size, position)
     ranked = heap[:size]
@@ -122,16 +122,16 @@ def _worse(values, one, other):
 @compiled
 def _sink(values, heap, size, position):
     """Replace the root of the heap by the index `position`, and restore the heap order."""
-    at = 0
-    while 2 * at + 1 < size:
-        below = 2 * at + 1
-        if below + 1 < size and _worse(values, heap[below + 1], heap[below]):
-            below += 1
-        if not _worse(values, heap[below], position):
+    node = 0
+    while 2 * node + 1 < size:
+        child = 2 * node + 1
+        if child + 1 < size and _worse(values, heap[child + 1], heap[child]):
+            child += 1
+        if not _worse(values, heap[child], position):
             break
-        heap[at] = heap[below]
-        at = below
-    heap[at] = position
+        heap[node] = heap[child]
+        node = child
+    heap[node] = position
 
 
 @compiled
@@ -192,9 +192,9 @@ def likeliest_relations(slopes, log_odds, log_counts, row, judged, least, opposi
                     if opposites:
                         grid[x, y, A + a], usable[x, y, A + a] = back, back >= least
     values = grid.reshape(-1)
-    where = best(values, usable.reshape(-1), count)
-    pair = where // names
-    return pair // size, pair % size, where % names, values[where].astype(np.float64)
+    indices = best(values, usable.reshape(-1), count)
+    pair = indices // names
+    return pair // size, pair % size, indices % names, values[indices].astype(np.float64)
 
 
 @compiled
@@ -234,12 +234,12 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
     outgoing, anchor = np.empty(N * kept, np.bool_), np.empty(N * kept, np.int64)
     probabilities = np.empty(N * kept, np.float64)
     for c in range(N):
-        one, other = to[c].reshape(-1), back[c].reshape(-1)
+        p_to, p_back = to[c].reshape(-1), back[c].reshape(-1)
         for e in range(size):
-            p[e], p[size + e] = exclusive(one[e], other[e])
-        where = best(p, usable, kept - begin)
+            p[e], p[size + e] = exclusive(p_to[e], p_back[e])
+        indices = best(p, usable, kept - begin)
         for k in range(kept):
-            place, at = first if k < begin else where[k - begin], c * kept + k
+            place, at = first if k < begin else indices[k - begin], c * kept + k
             candidate[at], relation[at], anchor[at] = c, place // m % A, place % m
             outgoing[at], probabilities[at] = place < size, p[place]
     return candidate, relation, outgoing, anchor, probabilities
@@ -265,11 +265,11 @@ def strongest(change, rows, count):
     for c in range(N):
         if len(rows):
             usable[rows[c]] = False
-        where = best(np.abs(change[c]), usable, kept)
+        indices = best(np.abs(change[c]), usable, kept)
         if len(rows):
             usable[rows[c]] = True
         for k in range(kept):
-            places[c, k], values[c, k] = where[k], change[c, where[k]]
+            places[c, k], values[c, k] = indices[k], change[c, indices[k]]
     return places, values
 
 
@@ -306,9 +306,10 @@ def observed_pairs(triples, row, judged, classes, relations):
         for y in range(x + 1, size):
             if holds[x, y] and (judged[x, y] or judged[y, x]):
                 # The subject of the pair is the subject of its observed relation with the lowest
-                # number.
-                one, other = holds[x, y] & forward, holds[y, x] & forward
-                swapped = one == 0 or (other != 0 and (other & -other) < (one & -one))
+                # number. n & -n is the lowest bit of n.
+                from_x, from_y = holds[x, y] & forward, holds[y, x] & forward
+                y_is_lower = from_y != 0 and (from_y & -from_y) < (from_x & -from_x)
+                swapped = from_x == 0 or y_is_lower
                 subject, object_ = (y, x) if swapped else (x, y)
                 columns[0, pairs], columns[1, pairs] = subject, object_
                 columns[2, pairs] = holds[subject, object_]
@@ -361,5 +362,5 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
             usable[k], expected[k] = True, top
             likely[0, k], likely[1, k] = p[top], observed
             ratio[k] = likely[0, k] / observed
-    where = best(ratio, usable, count)
-    return where, expected[where], likely[0][where], likely[1][where]
+    indices = best(ratio, usable, count)
+    return indices, expected[indices], likely[0][indices], likely[1][indices]

@@ -106,7 +106,6 @@ def read_scene(
     """Convert the scene of a request: find the class of each label, and derive relations.
 
     Args:
-        request: the request.
         vocabulary: classes and room types of the model.
         limits: limits on the scene.
         look_ups: searches for similar classes, shared by all scenes of a batch. None means that the
@@ -142,15 +141,16 @@ def read_scene(
             has_detections = True
             has_poses = has_poses or entry.position is not None
             objects.append(_scene_object(ids[number], entry, index, optical=optical))
-    room, name = None, request.room_type
-    if name is not None and (room := vocabulary.room_index(name)) is None:
-        room = unknown.resolve(name, name, ("room_type",), errors, is_room=True)
+    room, room_name = None, request.room_type
+    if room_name is not None:
+        room = vocabulary.room_index(room_name)
+        if room is None:
+            room = unknown.resolve(room_name, room_name, ("room_type",), errors, is_room=True)
     if not objects and not may_be_empty and not errors.by_class:
         errors.add(
             InvalidRequestError, ("objects",), "the model does not know any of these objects"
         )
-    if errors.by_class:
-        errors.raise_any()
+    errors.raise_any()
 
     reading.scene = Scene(tuple(objects), None, False, room)
     if reading.left_out:
@@ -173,8 +173,7 @@ def _check_sizes(request: SceneRequest, limits: Limits, errors: ErrorList) -> No
     if request.relations is None and request.relations_complete:
         message = "`relations_complete` requires the field `relations`"
         errors.add(InvalidRequestError, ("relations_complete",), message)
-    if errors.by_class:
-        errors.raise_any()
+    errors.raise_any()
 
 
 def _derive(
@@ -207,7 +206,7 @@ def _ids(entries: Sequence[str | Detection], errors: ErrorList) -> list[str]:
     labels: list[str] = [entry for entry in entries if isinstance(entry, str)]
     if len(set(labels)) == len(entries):
         return labels
-    taken: dict[str, None] = {}
+    stated_ids: dict[str, None] = {}  # an ordered set
     labels = []
     for index, entry in enumerate(entries):
         if isinstance(entry, str):
@@ -215,28 +214,28 @@ def _ids(entries: Sequence[str | Detection], errors: ErrorList) -> list[str]:
         elif entry.id is None:
             labels.append(entry.label)
         else:
-            if entry.id in taken:
+            if entry.id in stated_ids:
                 errors.add(
                     InvalidRequestError, ("objects", index, "id"), "another object has this id"
                 )
-            taken[entry.id] = None
-    if len(taken) == len(entries):
-        return list(taken)
-    if not taken and len(set(labels)) == len(labels):
+            stated_ids[entry.id] = None
+    if len(stated_ids) == len(entries):
+        return list(stated_ids)
+    if not stated_ids and len(set(labels)) == len(labels):
         return labels
     repeats = Counter(labels)
-    last: Counter[str] = Counter()
+    last_number: Counter[str] = Counter()
     ids = []
     for entry in entries:
         if isinstance(entry, Detection) and entry.id is not None:
             ids.append(entry.id)
             continue
         label = name = entry if isinstance(entry, str) else entry.label
-        if repeats[name] > 1 or name in taken:
-            while name == label or name in taken:
-                last[label] += 1
-                name = f"{label}_{last[label]}"
-        taken[name] = None
+        if repeats[name] > 1 or name in stated_ids:
+            while name == label or name in stated_ids:
+                last_number[label] += 1
+                name = f"{label}_{last_number[label]}"
+        stated_ids[name] = None
         ids.append(name)
     return ids
 
@@ -244,6 +243,7 @@ def _ids(entries: Sequence[str | Detection], errors: ErrorList) -> list[str]:
 def _scene_object(
     name: str, detection: Detection, class_index: int, *, optical: bool
 ) -> SceneObject:
+    """Convert an object of a request, with its pose in body axes. ``name`` is its id."""
     position = size = None
     yaw = 0.0
     if detection.size is not None:
@@ -267,9 +267,10 @@ def _scene_object(
 def _stated(
     request: SceneRequest, ids: Sequence[str]
 ) -> list[tuple[Location, str, RelationName, str]] | None:
-    """Return the stated relations and supports with their locations.
+    """Return (location, subject, relation, object) of the stated relations and supports.
 
-    None means that positions decide.
+    The result is None without stated relations, if all objects have positions or no object has a
+    support. The service then derives the relations from the positions.
     """
     supports: list[tuple[Location, str, RelationName, str]] = []
     has_positions = True
@@ -282,7 +283,7 @@ def _stated(
     if request.relations is None and (has_positions or not supports):
         return None
     relations = enumerate(request.relations or ())
-    stated = [(("relations", n), one.subject, one.relation, one.object) for n, one in relations]
+    stated = [(("relations", n), r.subject, r.relation, r.object) for n, r in relations]
     return [*stated, *supports]
 
 

@@ -56,7 +56,6 @@ def relations(
     for itself. Structural classes (floor, wall) are left out unless `pairs` contains them.
 
     Args:
-        artifact: the model.
         scene: the objects, their observed relations and the room type.
         top_k: maximum number of relations in the answer. The same limit applies to disagreements.
         min_probability: minimum probability of a relation in the answer. The same limit applies to
@@ -91,16 +90,17 @@ def relations(
     # This limit is slightly lower than the requested minimum, because the final comparison uses
     # rounded probabilities.
     least = min_probability * (1 - 1e-5)
-    *columns, probabilities = likeliest_relations(
-        slopes.relation_given if relations_given(scene) else slopes.relation,
-        *(posterior.relation_log_odds(), present.log_counts, present.row, judged),
-        *(least, include_opposites, top_k),
+    table = slopes.relation_given if relations_given(scene) else slopes.relation
+    log_odds, log_counts, row = posterior.relation_log_odds(), present.log_counts, present.row
+    subjects, objects, kinds, p = likeliest_relations(
+        table, log_odds, log_counts, row, judged, least, include_opposites, top_k
     )
+    columns = subjects.tolist(), objects.tolist(), kinds.tolist(), significant(p)
     disagreements = _disagreements(
         artifact, scene, posterior, judged, flipped, top_k=top_k, least=least
     )
     if size_limit is not None:
-        count = len(probabilities) + 2 * len(disagreements)
+        count = len(p) + 2 * len(disagreements)
         size_limit.check("top_k", count * RELATION_BYTES, 2 * count)
     # Relation A + a is the opposite of relation a.
     names = CANONICAL[: artifact.spec.A]
@@ -114,9 +114,7 @@ def relations(
             "probability": probability,
             "observed": bool(observed) and canonicalise(subject, names[kind], object_) in observed,
         }
-        for subject, object_, kind, probability in zip(
-            *(values.tolist() for values in columns), significant(probabilities), strict=True
-        )
+        for subject, object_, kind, probability in zip(*columns, strict=True)
         if probability >= min_probability
     ]
     return {"relations": entries, "disagreements": disagreements}
@@ -168,39 +166,39 @@ def _disagreements(
     )
     if not len(subjects):
         return []
-    one, other = present.row[subjects], present.row[objects]
-    where, expected, p, observed_p = disagreeing(
-        *(artifact.relation_slopes.relation_given, *posterior.log_odds_apart(one, other)),
-        *(present.log_counts[one] + present.log_counts[other], len(present.classes)),
-        *(holds, of_classes, max(least, EXPECTED), top_k),
+    i, j = present.row[subjects], present.row[objects]
+    table, n = artifact.relation_slopes.relation_given, len(present.classes)
+    forward, backward = posterior.log_odds_apart(i, j)
+    log_counts, least = present.log_counts[i] + present.log_counts[j], max(least, EXPECTED)
+    pairs, expected, p, observed_p = disagreeing(
+        table, forward, backward, log_counts, n, holds, of_classes, least, top_k
     )
-    columns = subjects[where], objects[where], holds[where], expected
+    columns = subjects[pairs], objects[pairs], holds[pairs], expected
+    disagreements = [
+        _disagreement(scene, A, flipped, [subject, object_], bits, kind)
+        for subject, object_, bits, kind in zip(*(c.tolist() for c in columns), strict=True)
+    ]
+    probabilities = zip(disagreements, significant(p), significant(observed_p), strict=True)
     return [
-        _disagreement(scene, A, flipped, pair, held, kind)
-        | {"probability": probability, "observed_probability": observed_probability}
-        for *pair, held, kind, probability, observed_probability in zip(
-            *(values.tolist() for values in columns),
-            *(significant(p), significant(observed_p)),
-            strict=True,
-        )
+        names | {"probability": probability, "observed_probability": observed_probability}
+        for names, probability, observed_probability in probabilities
     ]
 
 
 def _disagreement(
-    scene: Scene, A: int, flipped: Collection[Triple], pair: list[int], held: int, expected: int
+    scene: Scene, A: int, flipped: Collection[Triple], pair: list[int], holds: int, expected: int
 ) -> Fields:
     """Return the names of a disagreement, from the subject of the relation in the request.
 
     Args:
-        scene: the scene.
         A: number of canonical relations that the machine knows.
         flipped: relations that the request states by their opposite.
         pair: indices of subject and object.
-        held: bit set of the observed relations; see `observed_pairs`.
+        holds: bit set of the observed relations; see `observed_pairs`.
         expected: number of the expected relation.
     """
     names = CANONICAL[:A] + tuple(OPPOSITES[name] for name in CANONICAL[:A])
-    observed = [name for bit, name in enumerate(names) if held >> bit & 1]
+    observed = [name for bit, name in enumerate(names) if holds >> bit & 1]
     subject, object_ = pair
     if flipped:
         triples = {canonicalise(subject, relation, object_) for relation in observed}
@@ -230,6 +228,7 @@ def _read(request: RelationsRequest, _: Artifact, reading: Reading) -> Options:
 
 
 def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]:
+    """Return the object indices of the pairs in a request, without pairs of ignored objects."""
     errors, names = ErrorList(), reading.names
     pairs: dict[tuple[int, int], None] = {}
     for position, pair in enumerate(request.pairs or ()):
@@ -246,8 +245,7 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
             )
             continue
         pairs[subject, other] = None
-    if errors.by_class:
-        errors.raise_any()
+    errors.raise_any()
     return list(pairs)
 
 
@@ -259,16 +257,11 @@ def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
 _EXAMPLES: Final = {
     **SCENES,
     "instances": Example(
-        "two instances of one class",
-        {"objects": ["chair", "chair", "desk"], "top_k": 10},
+        "two instances of one class", {"objects": ["chair", "chair", "desk"], "top_k": 10}
     ),
     "pairs": Example(
         "all eight relations of one ordered pair of objects",
-        {
-            **BEDROOM,
-            "pairs": [{"subject": "lamp_1", "object": "bed"}],
-            "include_opposites": True,
-        },
+        {**BEDROOM, "pairs": [{"subject": "lamp_1", "object": "bed"}], "include_opposites": True},
     ),
     "likely": Example(
         "relations with p of at least 0.5; unlisted relations do not hold",

@@ -74,7 +74,6 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
     """Return the model card in Markdown.
 
     Args:
-        description: description of the model.
         tensors: maps the name of each stored tensor to its dtype and shape.
     """
     words, spec = description.vocabulary, description.spec
@@ -142,7 +141,7 @@ def _metrics(description: Description) -> str:
         ("Task", "Metric", *sources),
         [(*name, *(cells.get(source, "") for source in sources)) for name, cells in rows.items()],
     )
-    where = f"\n\n{_OFFSETS}" if any(m.task == "Offsets" for m in description.metrics) else ""
+    note = f"\n\n{_OFFSETS}" if any(m.task == "Offsets" for m in description.metrics) else ""
     calibration = description.calibration
     unjudged = [
         f"`/outliers` judges no {part}, because the calibration had too few scenes."
@@ -150,7 +149,7 @@ def _metrics(description: Description) -> str:
         if entry is None
     ]
     parts = [_MEASURED, table, _PROBABILITIES, *unjudged]
-    return "\n\n".join(parts) + where
+    return "\n\n".join(parts) + note
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -168,9 +168,8 @@ class RelationSlopes:
     """Calibration tables of the A canonical relations, each (A, 4 + 2K).
 
     Each row of a table is the `PairSlope` of one relation: intercept, slope, log_count,
-    log_classes, and K bends of two numbers each.
-
-    The tables have the names of their fields in `Calibration`.
+    log_classes, and K bends of two numbers each. The tables have the names of their fields in
+    `Calibration`.
     """
 
     relation: Floats

@@ -75,9 +75,7 @@ def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
 
 @contextmanager
 def exclusive(path: Path, timeout: float) -> Iterator[None]:
-    """Hold an exclusive lock on a file.
-
-    The kernel releases the lock when the process ends, even after a crash.
+    """Hold an exclusive lock on a file. The kernel releases the lock when the process ends.
 
     The function creates the file if it is missing, and never removes it.
 

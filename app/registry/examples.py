@@ -43,13 +43,13 @@ class Example(Frozen):
     @field_validator("scene")
     @classmethod
     def _makes_a_scene(cls, scene: SceneRequest) -> SceneRequest:
-        if further := sorted(scene.model_fields_set - _FIELDS):
-            raise ValueError(f"an example must not have the field {further[0]!r}")
+        if extra := sorted(scene.model_fields_set - _FIELDS):
+            raise ValueError(f"an example must not have the field {extra[0]!r}")
         names = [
             thing if isinstance(thing, str) else thing.id or thing.label for thing in scene.objects
         ]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two objects are called {twice[0]!r}: give each an id of its own")
+        if doubles := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two objects are called {doubles[0]!r}: give each an id of its own")
         triples = []
         for relation in scene.relations or ():
             for name in (relation.subject, relation.object):

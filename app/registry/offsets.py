@@ -64,12 +64,13 @@ class Offsets(TensorGroup):
             ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
                 `invalid_tensor` if a value is invalid.
         """
+        P = len(np.atleast_1d(tensors.get(f"{PREFIX}pair", ())))
         shapes = {
             "relation": (A, 6),
             "relation_scenes": (A,),
             "subject": (A, V, 6),
             "object": (A, V, 6),
-            "pair": (P := len(np.atleast_1d(tensors.get(f"{PREFIX}pair", ()))),),
+            "pair": (P,),
             "pair_offset": (P, 6),
             "pair_scenes": (P,),
         }
@@ -110,16 +111,15 @@ class Offsets(TensorGroup):
     @cached_property
     def tables(self) -> tuple[NDArray[Any], ...]:
         """The arrays in the order that `look_up` expects."""
-        return (
-            *(self.relation, self.relation_scenes, self.subject, self.object),
-            *(self.pair, self.pair_offset, self.pair_scenes),
-        )
+        by_relation = self.relation, self.relation_scenes, self.subject, self.object
+        by_pair = self.pair, self.pair_offset, self.pair_scenes
+        return by_relation + by_pair
 
 
 @compiled
 def look_up(tables, relation, subject, other):
     """See `Offsets.find`."""
-    usual, relation_scenes, subjects, objects, pair, pair_offset, pair_scenes = tables
+    relation_offset, relation_scenes, subjects, objects, pair, pair_offset, pair_scenes = tables
     n, V = len(relation), subjects.shape[1]
     offset, scenes = np.empty((n, 6)), np.empty(n, np.int64)
     for k in range(n):
@@ -131,6 +131,7 @@ def look_up(tables, relation, subject, other):
             continue
         scenes[k] = 0 if relation_scenes[a] > 0 else UNOBSERVED
         for axis in range(6):
-            value = np.float64(usual[a, axis]) + subjects[a, i, axis] + objects[a, j, axis]
+            value = np.float64(relation_offset[a, axis])
+            value = value + subjects[a, i, axis] + objects[a, j, axis]
             offset[k, axis] = value if axis < 3 else math.sqrt(value)
     return offset, scenes

@@ -127,8 +127,8 @@ class Store:
             StoreError: `invalid_reference`, or `unknown_version`.
         """
         folder = self.root / check_name(name) / check_version(version)
-        is_known = _is_directory(folder.parent) and os.path.lexists(folder)
-        if not is_known or _is_unfinished(folder):
+        exists = _is_directory(folder.parent) and os.path.lexists(folder)
+        if not exists or _is_unfinished(folder):
             raise StoreError("unknown_version", f"model '{name}' does not have version {version}")
         artifact = load_artifact(folder, previous, self._max_weights_bytes)
         manifest = artifact.manifest
@@ -287,6 +287,7 @@ class Store:
         return folder
 
     def _changed_table(self, alias: str, target: AliasTarget | None) -> bytes:
+        """Return the new alias file, with another target of one alias. None removes the alias."""
         table = {name: entry for name, entry in self.aliases().items() if name != alias}
         if target is not None:
             table[alias] = target
@@ -303,8 +304,9 @@ class Store:
             )
 
     def _require_expected(self, alias: str, expected: AliasTarget | Literal["any"] | None) -> None:
-        current = self.aliases().get(alias)
-        if expected not in ("any", current):
+        """Raise StoreError if the alias has another target than ``expected``; see `set_alias`."""
+        current = self.aliases().get(alias)  # None for a missing alias
+        if expected != "any" and expected != current:
             raise StoreError(
                 "alias_conflict",
                 f"alias '{alias}' points at {current or 'nothing'}, not at {expected or 'nothing'}",

@@ -91,9 +91,9 @@ def require_equal(
         ArtifactError: `wrong_shape` for the first tensor that differs.
     """
     for name in sorted(actual.keys() | expected.keys()):
-        one, other = actual.get(name, "none"), expected.get(name, "none")
-        if one != other:
-            raise ArtifactError("wrong_shape", f"tensor '{name}': {has} {one}, {needs} {other}")
+        entry, needed = actual.get(name, "none"), expected.get(name, "none")
+        if entry != needed:
+            raise ArtifactError("wrong_shape", f"tensor '{name}': {has} {entry}, {needs} {needed}")
 
 
 def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray[Any]:

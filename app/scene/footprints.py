@@ -80,11 +80,16 @@ def measure(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b):
 
 @compiled
 def _parallel(offset, half_a, half_b):
-    across = abs(offset[0]) - half_a[0] - half_b[0]
-    along = abs(offset[1]) - half_a[1] - half_b[1]
-    width = max(min(-across, 2 * min(half_a[0], half_b[0])), 0.0)
-    depth = max(min(-along, 2 * min(half_a[1], half_b[1])), 0.0)
-    return width * depth, math.hypot(max(across, 0.0), max(along, 0.0))
+    """Compute the area of the intersection and the gap of two parallel rectangles.
+
+    Along each axis, the intervals of a and b have a gap, or overlap if the gap is negative. The
+    overlap is at most the shorter interval.
+    """
+    gap_x = abs(offset[0]) - half_a[0] - half_b[0]
+    gap_y = abs(offset[1]) - half_a[1] - half_b[1]
+    overlap_x = max(min(-gap_x, 2 * min(half_a[0], half_b[0])), 0.0)
+    overlap_y = max(min(-gap_y, 2 * min(half_a[1], half_b[1])), 0.0)
+    return overlap_x * overlap_y, math.hypot(max(gap_x, 0.0), max(gap_y, 0.0))
 
 
 @compiled
@@ -149,10 +154,11 @@ def _inside(start, end, half):
     # Edges are never parallel to the axes of the rectangle. So x or y is 0 only if rounding has
     # reduced the edge to a point. Such an edge adds no area.
     x, y = end[0] - start[0] or _SHORTEST, end[1] - start[1] or _SHORTEST
-    one_x, other_x = (-half[0] - start[0]) / x, (half[0] - start[0]) / x
-    one_y, other_y = (-half[1] - start[1]) / y, (half[1] - start[1]) / y
-    enter = max(min(one_x, other_x), min(one_y, other_y), 0.0)
-    leave = min(max(one_x, other_x), max(one_y, other_y), 1.0)
+    # A point of the edge is start + t (x, y). The sides of the rectangle have these values of t.
+    low_x, high_x = (-half[0] - start[0]) / x, (half[0] - start[0]) / x
+    low_y, high_y = (-half[1] - start[1]) / y, (half[1] - start[1]) / y
+    enter = max(min(low_x, high_x), min(low_y, high_y), 0.0)
+    leave = min(max(low_x, high_x), max(low_y, high_y), 1.0)
     leave = max(enter, leave)
     return (
         (start[0] + enter * x, start[1] + enter * y),

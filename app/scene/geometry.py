@@ -119,7 +119,7 @@ def derive_relations(
     n = len(points)
     extents = _array("sizes", sizes, (n, 3))
     turns = np.zeros(n) if yaws is None else _array("yaws", yaws, (n,))
-    if not _are_finite(points, extents, turns):
+    if not _are_valid(points, extents, turns):
         raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
     if np.any(extents < 0):
         raise ValueError("sizes must not be negative")
@@ -130,8 +130,8 @@ def derive_relations(
 
 
 @compiled
-def _are_finite(points, extents, turns):
-    """Return whether all yaws are finite, and all positions and extents are finite or NaN."""
+def _are_valid(points, extents, turns):
+    """Return whether yaws are finite, and positions and extents are finite or NaN (unknown)."""
     for i in range(len(points)):
         for k in range(3):
             if math.isinf(points[i, k]) or math.isinf(extents[i, k]):
@@ -143,18 +143,20 @@ def _are_finite(points, extents, turns):
 
 @compiled
 def _relate_all(points, extents, turns, horizontal, holds, observed):
+    """Write the relations of all pairs of neighbours to ``holds`` and ``observed``."""
     n = len(points)
-    located, sized, radius = np.empty(n, np.bool_), np.empty(n, np.bool_), np.empty(n)
+    has_position, has_size = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    radius = np.empty(n)
     for i in range(n):
-        located[i], sized[i] = _is_known(points[i]), _is_known(extents[i])
+        has_position[i], has_size[i] = _is_known(points[i]), _is_known(extents[i])
         radius[i] = math.hypot(extents[i, 0], extents[i, 1]) / 2
     for i in range(n):
         for j in range(i + 1, n):
-            if not (located[i] and located[j]):
+            if not (has_position[i] and has_position[j]):
                 continue
             distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
-            boxed, stacked = sized[i] and sized[j], False
-            if not boxed:
+            have_sizes, overlap = has_size[i] and has_size[j], False
+            if not have_sizes:
                 neighbours = distance <= NEIGHBOUR_DISTANCE
             # The distance between the circles around the footprints is a fast first check, because
             # `measure` is slower.
@@ -162,11 +164,11 @@ def _relate_all(points, extents, turns, horizontal, holds, observed):
                 share, gap = measure(
                     points[i], extents[i], turns[i], points[j], extents[j], turns[j]
                 )
-                neighbours, stacked = gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
+                neighbours, overlap = gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
             else:
                 neighbours = False
             if neighbours:
-                _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed)
+                _relate(points, extents, i, j, have_sizes, overlap, horizontal, holds, observed)
 
 
 @compiled
@@ -175,14 +177,14 @@ def _is_known(row):
 
 
 @compiled
-def _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed):
-    """Set the relations of two neighbours."""
+def _relate(points, extents, i, j, have_sizes, overlap, horizontal, holds, observed):
+    """Set the relations of two neighbours. A vertical relation excludes horizontal relations."""
     # The order of relation indices is left, front, on-top, above.
-    first, last = LEFT if horizontal else ON_TOP, ABOVE if boxed else FRONT
+    first, last = LEFT if horizontal else ON_TOP, ABOVE if have_sizes else FRONT
     for relation in range(first, last + 1):
         observed[relation, i, j] = observed[relation, j, i] = True
     for subject, anchor in ((i, j), (j, i)):
-        relation = _vertical(points, extents, subject, anchor) if stacked else _NONE
+        relation = _vertical(points, extents, subject, anchor) if overlap else _NONE
         if relation != _NONE:
             holds[relation, subject, anchor] = True
             return
@@ -208,13 +210,14 @@ def _vertical(points, extents, i, j):
 @compiled
 def _horizontal(points, i, j):
     """Return the horizontal relation of box i to its neighbour j."""
-    nearer, aside = points[j, 0] - points[i, 0], points[i, 1] - points[j, 1]
-    if abs(aside) >= abs(nearer):
-        return LEFT if aside >= MIN_OFFSET else _NONE
-    return FRONT if nearer >= MIN_OFFSET else _NONE
+    to_front, to_left = points[j, 0] - points[i, 0], points[i, 1] - points[j, 1]
+    if abs(to_left) >= abs(to_front):
+        return LEFT if to_left >= MIN_OFFSET else _NONE
+    return FRONT if to_front >= MIN_OFFSET else _NONE
 
 
 def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return the values as an array of this shape, or raise ValueError with the argument's name."""
     array = np.asarray(values, dtype=np.float64, order="C")
     if array.size == 0 and 0 in shape:
         return array.reshape(shape)

@@ -161,7 +161,6 @@ def readings(label: str, depth: int = 2) -> Iterator[tuple[Rule, str]]:
     """Yield pairs (rule, name) of the names in a detector's label, most certain name first.
 
     Args:
-        label: the label.
         depth: maximum number of rules in sequence. For example, "a photo of a sofa/couch" needs
             two rules. The pair contains the first rule.
     """
@@ -185,12 +184,15 @@ def _alternative(label: str) -> list[str]:
     parts = [part for part in map(str.strip, _OR.split(label, _MOST_ALTERNATIVES)) if part]
     if len(parts) < 2:
         return []
-    *_, shared = last = parts[-1].split()
-    together = [f"{parts[0]} {shared}"] if len(last) > 1 and " " not in parts[0] else []
-    return [*together, *parts]
+    last_words = parts[-1].split()
+    if len(last_words) > 1 and " " not in parts[0]:
+        return [f"{parts[0]} {last_words[-1]}", *parts]
+    return parts
 
 
 def _matched(pattern: re.Pattern[str]) -> Callable[[str], list[str]]:
+    """Return a function that returns group 1 of the pattern, unless it is the whole label."""
+
     def read(label: str) -> list[str]:
         match = pattern.fullmatch(label)
         return [] if match is None or match[1] == label else [match[1]]

@@ -16,6 +16,7 @@ vectors, because the nearest class by cosine similarity is right for only 40 % o
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -129,12 +130,13 @@ class NameIndex:
             corrections |= {word: self._corrections(word) for word in unknown}
         if (guess := self._spelt(words, corrections)) is not None:
             return guess
-        cut = next((k for k, word in enumerate(words) if k and word in _PREPOSITIONS), len(words))
-        if _TOGETHER & {*words[cut : cut + 1]} and self._spelt(words[cut + 1 :], corrections):
+        prepositions = [k for k, word in enumerate(words) if k and word in _PREPOSITIONS]
+        end = prepositions[0] if prepositions else len(words)
+        if _TOGETHER & {*words[end : end + 1]} and self._spelt(words[end + 1 :], corrections):
             return None
-        imitations = [word for word in words[: cut - 1] if word in _IMITATIONS]
-        for start in range(cut):
-            head = imitations[:1] or words[start:cut]
+        imitations = [word for word in words[: end - 1] if word in _IMITATIONS]
+        for start in range(end):
+            head = imitations[:1] or words[start:end]
             if start and len(head) == 1 and head[0] in _AMBIGUOUS:
                 return None
             if (entry := self._by_key.get("".join(head))) is not None:
@@ -144,19 +146,24 @@ class NameIndex:
     def _spelt(
         self, words: Sequence[str], corrections: Mapping[str, Sequence[tuple[str, int]]]
     ) -> Guess | None:
-        """Return the entry whose name is the phrase, perhaps with misspelt words."""
-        costs: dict[int, tuple[int, int]] = {}
+        """Return the entry whose name is the phrase, perhaps with misspelt words.
+
+        The result is None if the edits cost too much, or if another entry costs about the same.
+        """
+        costs: dict[int, tuple[int, int]] = {}  # by entry: cost and maximum cost
         for spelling in itertools.product(*(corrections[word] for word in words)):
             entry = self._by_key.get("".join(known for known, _ in spelling))
             if entry is not None:
                 allowed = sum(_allowed(known) for known, cost in spelling if cost)
-                more = _BY_PHRASE if allowed and len(words) > 1 else 0
-                cost = sum(cost for _, cost in spelling)
-                costs[entry] = min((cost, allowed + more), costs.get(entry, (cost, allowed + more)))
+                if allowed and len(words) > 1:
+                    allowed += _BY_PHRASE
+                pair = (sum(cost for _, cost in spelling), allowed)
+                costs[entry] = min(pair, costs.get(entry, pair))
         if not costs:
             return None
         (entry, (cost, allowed)), *others = sorted(costs.items(), key=lambda match: match[1])
-        if cost > allowed or (others and others[0][1][0] - cost <= _MARGIN):
+        second_cost = others[0][1][0] if others else math.inf
+        if cost > allowed or second_cost - cost <= _MARGIN:
             return None
         return Guess(entry, round(1 - cost / 10 / len("".join(words)), 3), "spelling")
 
@@ -182,8 +189,9 @@ class NameIndex:
                 factor = 1 if key[:1] == joined[:1] else _BY_REST
                 candidates.append((similarity * factor, self._entries[row]))
         for row in self._by_head.get(words[-1], ()) if words else ():
-            common = len({*words} & {*self._words[row]}) / len({*words, *self._words[row]})
-            candidates.append((0.5 + common / 2, self._entries[row]))
+            shared = len({*words} & {*self._words[row]}) / len({*words, *self._words[row]})
+            candidates.append((0.5 + shared / 2, self._entries[row]))
+        # In ascending order, the largest similarity of each entry is the last one.
         best = {entry: similarity for similarity, entry in sorted(candidates)}
         ranked = sorted(best.items(), key=lambda entry: (-entry[1], entry[0]))[:limit]
         least = max(_LEAST, ranked[0][1] - _FARTHER) if ranked else 0.0
@@ -217,14 +225,15 @@ def _cost(word: str, known: str, distance: int) -> int:
     return sum(_edit_cost(word, known, *edit) for edit in edits.as_list())
 
 
-def _edit_cost(word: str, known: str, kind: str, here: int, there: int) -> int:
+def _edit_cost(word: str, known: str, kind: str, word_index: int, known_index: int) -> int:
+    """Return the cost of one edit: replace a letter, delete it from ``word``, or insert it."""
     if kind == "replace":
-        old, new = word[here], known[there]
+        old, new = word[word_index], known[known_index]
         if {old, new} <= _VOWELS:
             return _VOWEL
-        if not here:
+        if not word_index:
             return _FIRST
         return _EDIT if {(old, new), (new, old)} & _NEIGHBOURS else _OTHER
-    text, at = (word, here) if kind == "delete" else (known, there)
+    text, at = (word, word_index) if kind == "delete" else (known, known_index)
     is_double = text[at] in (text[at - 1 : at], text[at + 1 : at + 2])
     return _SLIP if is_double else _EDIT if at else _OTHER

@@ -179,7 +179,6 @@ def observe(
     function then derives only on-top and above.
 
     Args:
-        scene: the scene.
         frame_id: name of the frame of the positions.
         viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
             the origin and looks along x.
@@ -286,8 +285,8 @@ def pool_instances(
         raise ValueError(f"confidence must have the shape {(size,)}, not {confidence.shape}")
     labels = np.asarray(classes, dtype=np.int64)
     distinct, _, row, counts, present = pool_classes(labels, np.asarray(confidence, np.float64))
-    on, seen = pool_relations(row, len(distinct), holds, observed)
-    return ClassEvidence(distinct, counts, present, on, seen, room_type)
+    class_holds, class_observed = pool_relations(row, len(distinct), holds, observed)
+    return ClassEvidence(distinct, counts, present, class_holds, class_observed, room_type)
 
 
 @compiled
@@ -326,14 +325,14 @@ def pool_relations(
     and ``observed`` of `ClassEvidence`.
     """
     size = len(row)
-    on, seen = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
+    class_holds, class_observed = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
     for a in range(A):
         for i in range(size):
             for j in range(size):
                 if i != j and (holds[a, i, j] or observed[a, i, j]):
-                    seen[a, row[i], row[j]] = True
-                    on[a, row[i], row[j]] |= holds[a, i, j]
-    return on, seen
+                    class_observed[a, row[i], row[j]] = True
+                    class_holds[a, row[i], row[j]] |= holds[a, i, j]
+    return class_holds, class_observed
 
 
 def class_evidence(scene: Scene) -> ClassEvidence:

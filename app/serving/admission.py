@@ -84,10 +84,10 @@ class Backlog:
         self.pending = 0
         self.draining = False
         self._ticking = False
-        self._places = self._begun = 0
-        self._began_at = self._seconds = 0.0
-        self._interval = 0.0
-        self._moved_at: float | None = None
+        self._places = self._begun = 0  # requests that this tick may still start, and has started
+        self._began_at = self._seconds = 0.0  # start of the tick; average time of a request
+        self._interval = 0.0  # average time between the starts of two waiting requests
+        self._moved_at: float | None = None  # last start of a waiting request
         self._waiting: _Line = deque()
         self._refused: _Line = deque()
 
@@ -117,6 +117,7 @@ class Backlog:
             raise DeadlinePassedError("The deadline passed before the request started.")
 
     def _is_full(self, allowed: float) -> bool:
+        """Return whether the backlog must refuse a request with the time limit ``allowed``."""
         if not self._waiting:
             return False
         # A new request waits about as long as the oldest waiting request has waited.
@@ -124,14 +125,18 @@ class Backlog:
         return len(self._waiting) >= self.limit or wait > _PATIENCE * allowed
 
     def _begin_tick(self) -> None:
+        """Start waiting requests, refuse requests, and schedule the next tick."""
         now = monotonic()
         if self._begun and self._ticking:
-            took = (now - self._began_at) / self._begun
+            # The time between two ticks is the time of the requests that the earlier tick started.
+            per_request = (now - self._began_at) / self._begun
             share = _NEWEST_PACE if self._seconds else 1.0
-            self._seconds += share * (took - self._seconds)
+            self._seconds += share * (per_request - self._seconds)
         self._began_at = now
-        fit = max(1, int(TICK / self._seconds)) if PACE * self._seconds > TICK else PACE
-        self._places = max(0, min(fit, PACE - self.pending))
+        most = PACE
+        if PACE * self._seconds > TICK:
+            most = max(1, int(TICK / self._seconds))
+        self._places = max(0, min(most, PACE - self.pending))
         begun = self._begun = _wake(self._waiting, self._places) if self._waiting else 0
         self._places -= begun
         if begun or self._moved_at is not None or self._waiting:
@@ -149,6 +154,7 @@ class Backlog:
             self._ticking = False
 
     def _measure_pace(self, begun: int) -> None:
+        """Update the average time between two starts, after ``begun`` waiting requests started."""
         now = monotonic()
         if begun and self._moved_at is not None:
             self._interval += _NEWEST_PACE * ((now - self._moved_at) / begun - self._interval)
@@ -200,7 +206,7 @@ class Ticket:
         if monotonic() >= self.deadline:
             raise DeadlinePassedError("The deadline passed before the computation started.")
 
-    async def check_there(self) -> None:
+    async def check_connected(self) -> None:
         """Check that the client is still connected.
 
         Raises:
@@ -246,10 +252,10 @@ class _Costs:
         if len(self._per_unit) >= _MAX_COSTS:
             self._per_unit.clear()  # clients can cause many kinds, so this bounds the memory
         key, measured = (kind, size.bit_length()), seconds / size
-        known = self._per_unit.get(key, measured)
+        average = self._per_unit.get(key, measured)
         # A measurement counts as at most twice the average. Otherwise, one slow measurement could
         # move all later questions to the worker thread.
-        self._per_unit[key] = known + _NEWEST * (min(measured, 2 * known) - known)
+        self._per_unit[key] = average + _NEWEST * (min(measured, 2 * average) - average)
 
 
 def _one_thread(name: str) -> Executor:
@@ -333,22 +339,20 @@ class WorkQueue:
             DisconnectedError: the client has disconnected.
             Exception: any error of `call`.
         """
-        came = monotonic()
+        called_at = monotonic()
 
-        def measured(_: Callable[[], bool] | None = None) -> Done[T]:
+        def compute(_: Callable[[], bool] | None = None) -> Done[T]:
             # Measure the time inside the computation, because the request may end earlier.
-            began, busy = monotonic(), thread_time()
-            result = call()
-            done = Done(result, began - came, monotonic() - began, thread_time() - busy)
+            done = _timed(call, called_at)
             self._costs.learn(kind, size, done.processor)
             return done
 
         self.backlog.pending += 1
         try:
             if self._costs.expected(kind, size) > CHEAP:
-                return await _in_thread(measured, ticket, self._costly)
+                return await _in_thread(compute, ticket, self._costly)
             ticket.check()
-            done = measured()
+            done = compute()
             ticket.check()
             return done
         finally:
@@ -365,30 +369,39 @@ class WorkQueue:
         Raises:
             DeadlinePassedError, DisconnectedError, Exception: see `run`.
         """
-        came = monotonic()
+        called_at = monotonic()
 
-        def drawn(given_up: Callable[[], bool]) -> Done[T]:
-            began, busy = monotonic(), thread_time()
-            result = call(given_up)
-            return Done(result, began - came, monotonic() - began, thread_time() - busy)
+        def sample(has_ended: Callable[[], bool]) -> Done[T]:
+            return _timed(lambda: call(has_ended), called_at)
 
-        return await _in_thread(drawn, ticket, self.threads.drawing)
+        return await _in_thread(sample, ticket, self.threads.drawing)
+
+
+def _timed(call: Callable[[], T], called_at: float) -> Done[T]:
+    """Return the result of a computation with its times. ``called_at`` is the call of the queue."""
+    began, processor = monotonic(), thread_time()
+    result = call()
+    return Done(result, began - called_at, monotonic() - began, thread_time() - processor)
 
 
 async def _in_thread(
     call: Callable[[Callable[[], bool]], Done[T]], ticket: Ticket, executor: Executor
 ) -> Done[T]:
+    """Run a computation on an executor until its end, the deadline or a disconnect of the client.
+
+    The argument of ``call`` is a function that returns whether the request has ended.
+    """
     ticket.check()
-    await ticket.check_there()
-    given_up = False
+    await ticket.check_connected()
+    has_ended = False
 
-    def unless_given_up() -> Done[T]:
+    def compute() -> Done[T]:
         # The computation of an ended request is still in the executor's queue, so skip it here.
-        if given_up:
+        if has_ended:
             raise DeadlinePassedError("The request ended before the computation started.")
-        return call(lambda: given_up)
+        return call(lambda: has_ended)
 
-    future = asyncio.get_running_loop().run_in_executor(executor, unless_given_up)
+    future = asyncio.get_running_loop().run_in_executor(executor, compute)
     try:
         while True:
             left = ticket.deadline - monotonic()
@@ -397,9 +410,9 @@ async def _in_thread(
                 return future.result()
             if left <= _LOOK:
                 raise DeadlinePassedError("The deadline passed before the computation finished.")
-            await ticket.check_there()
+            await ticket.check_connected()
     finally:
-        given_up = True
+        has_ended = True
         future.cancel()
         # The frame, the future and its error form a reference cycle. Without this deletion, the
         # cycle would keep the whole request in memory until the garbage collector runs.

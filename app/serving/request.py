@@ -120,8 +120,8 @@ class Request(Ticket):
         limit = SizeLimit(reading, self.limits.answer_bytes)
         ask = partial(question.answer, model.artifact, reading.scene, **options, size_limit=limit)
         rows = options["count"] if question.samples else 1
-        held = 0 if self.holding else rows
-        model.queue.take(held)
+        reserved = 0 if self.holding else rows
+        model.queue.take(reserved)
         try:
             if question.samples:
                 done = await model.queue.draw(lambda stop: ask(stop=stop), self)
@@ -131,7 +131,7 @@ class Request(Ticket):
                 size = (1 + len(reading.scene.objects)) ** 2
                 done = await model.queue.run(ask, self, kind=kind, size=size)
         finally:
-            model.queue.give_back(held)
+            model.queue.give_back(reserved)
         self._record(model, question.name, rows, done)
         answer = envelope(scene, self.id, model.reference, reading)
         warnings = [*reading.warnings, *done.result.pop("warnings", ())]
@@ -168,7 +168,10 @@ class Request(Ticket):
 
     @contextmanager
     def for_batch(self, references: Sequence[str]) -> Iterator[Request]:
-        """Reserve one row for each scene of a batch in the queue of its model, if it is usable.
+        """Reserve one row for each scene of a batch in its model's queue, until the block ends.
+
+        ``references`` are the values of the field `model` of the scenes. An unusable model gets no
+        rows: the answers to its scenes contain the error, and the other scenes are answered.
 
         Yields:
             A copy of the request that does not reserve further rows.
@@ -176,14 +179,14 @@ class Request(Ticket):
         Raises:
             QueueFullError: the queue of a model is full.
         """
-        with ExitStack() as held:
+        with ExitStack() as reservations:
             for reference, rows in Counter(references).items():
                 try:
                     model = self.models.resolve(reference)
                 except ServiceError:
                     continue
                 model.queue.take(rows)
-                held.callback(model.queue.give_back, rows)
+                reservations.callback(model.queue.give_back, rows)
             yield replace(self, holding=True)
 
 
@@ -194,12 +197,12 @@ def _kind_of_cost(name: str, scene: Scene, parameters: Mapping[str, object]) -> 
     also depends on the numbers of classes, related classes and related pairs in the scene. So the
     key contains the orders of magnitude of these numbers.
     """
-    of = [thing.class_index for thing in scene.objects]
-    orders = [len(set(of)).bit_length(), 0, 0]
+    classes = [thing.class_index for thing in scene.objects]
+    orders = [len(set(classes)).bit_length(), 0, 0]
     if scene.relations:
-        pairs = {(of[subject], of[object_]) for _, subject, object_ in scene.relations}
-        related = {end for pair in pairs for end in pair}
-        orders[1:] = len(related).bit_length(), len(pairs).bit_length()
+        pairs = {(classes[subject], classes[object_]) for _, subject, object_ in scene.relations}
+        related_classes = {index for pair in pairs for index in pair}
+        orders[1:] = len(related_classes).bit_length(), len(pairs).bit_length()
     for value in parameters.values():
         if isinstance(value, int) and not isinstance(value, bool):
             value = value.bit_length()

@@ -35,9 +35,6 @@ _SWITCH_INTERVAL = 5e-4
 class Runtime:
     """The runtime of the service. It contains the current snapshot of the models.
 
-    Args:
-        settings: settings of the service.
-
     Attributes:
         backlog: queue of requests that wait for admission.
         limits: limits on scenes and answers.
@@ -59,7 +56,7 @@ class Runtime:
         self._polling: asyncio.Task[None] | None = None
         self._changing = asyncio.Lock()
         self.models = NO_MODELS
-        self._seen: StoreState | None = None
+        self._loaded_state: StoreState | None = None
 
     @property
     def draining(self) -> bool:
@@ -162,16 +159,14 @@ class Runtime:
             await asyncio.sleep(self._poll)
             try:
                 async with self._changing:
-                    changed = await asyncio.to_thread(self._store.state) != self._seen
+                    changed = await asyncio.to_thread(self._store.state) != self._loaded_state
                 if changed:
                     async with self._change("poll"):
                         await self._load_and_serve(self.models.usable.__contains__)
             except errors.RefreshRefusedError as error:
                 for failure in error.failures:
-                    _logger.error(
-                        "the service refused the changes in the store: %s: %s: %s",
-                        *(failure.subject, failure.reason, failure.detail),
-                    )
+                    reason = f"{failure.subject}: {failure.reason}: {failure.detail}"
+                    _logger.error("the service refused the changes in the store: %s", reason)
             except Exception:
                 _logger.exception("the service could not load the changes in the store")
 
@@ -209,18 +204,18 @@ class Runtime:
         return new
 
     def _serve(self, models: ServedModels) -> None:
-        before, self.models = self.models, models
+        previous, self.models = self.models, models
         for alias, target in models.store.aliases.items():
-            if before is not NO_MODELS and before.store.aliases.get(alias) != target:
+            if previous is not NO_MODELS and previous.store.aliases.get(alias) != target:
                 _logger.info("the alias %s names %s now", alias, target)
         self.metrics.serving(models)
-        if before is NO_MODELS or before.served != models.served:
+        if previous is NO_MODELS or previous.served != models.served:
             _freeze_memory()
 
     def _load(self) -> ServedModels:
         # Read the state before the files. So the next check of the store finds changes that other
         # processes make during the load.
-        self._seen = self._store.state()
+        self._loaded_state = self._store.state()
         models = self.models
         with progress():
             return prepare(load_model_set(self._store, models.store), self._new_queue, models)

@@ -96,8 +96,9 @@ class Call(Generic[T]):
         if isinstance(error, ProblemError):
             # The random pause spreads the retries of many clients over time.
             return pause + (error.retry_after or 0.0) if error.status in (429, 503) else None
-        sent = not isinstance(error.__cause__, httpx.ConnectError)
-        return pause if self.repeatable or not sent else None
+        # Without a connection, the service has not received the request.
+        may_have_arrived = not isinstance(error.__cause__, httpx.ConnectError)
+        return pause if self.repeatable or not may_have_arrived else None
 
 
 def segment(name: str) -> str:
@@ -191,27 +192,29 @@ def _request(
     model: str | None,
     at: tuple[str | int, ...] = (),
 ) -> RequestT:
+    """Return the validated request of a question; see `ask`. ``at`` is its location in the body."""
     if isinstance(scene, schemas.SceneRequest | Mapping):
         if fields:
             names = ", ".join(fields)
             message = f"these fields must be members of the whole request: {names}"
             raise InvalidRequestError.about(message)
-        members = _plain(scene)
+        members = _json_value(scene)
     else:
         members = {"objects": scene, **fields}
     if model is not None:
         members.setdefault("model", model)
-    return validated(kind, {name: _listed(value) for name, value in members.items()}, at)
+    return validated(kind, {name: _field_value(value) for name, value in members.items()}, at)
 
 
-def _listed(value: Any) -> Any:
+def _field_value(value: Any) -> Any:
     """Return the value of a field as a dictionary, a list or a single value."""
     if isinstance(value, str | BaseModel | Mapping) or not isinstance(value, Iterable):
-        return _plain(value)
-    return [_plain(entry) for entry in value]
+        return _json_value(value)
+    return [_json_value(entry) for entry in value]
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
+    """Return a schema object without its unset fields, or a mapping, as a dictionary."""
     if isinstance(value, BaseModel):
         return value.model_dump(exclude_unset=True)
     return dict(value) if isinstance(value, Mapping) else value

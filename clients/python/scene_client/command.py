@@ -56,16 +56,18 @@ class _Group(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Move the general options before the subcommand, then parse all arguments."""
-        own, others = [], []
+        general_options, other_words = [], []
         words = iter(args)
         for word in words:
-            if word == "--":
-                others += [word, *words]
+            if word == "--":  # all later words are arguments of the subcommand
+                other_words += [word, *words]
+            elif word in _VALUED:  # the next word is the value
+                general_options += [word, *islice(words, 1)]
             elif word in _FLAGS or word.partition("=")[0] in _VALUED:
-                own += [word, *islice(words, word in _VALUED)]
+                general_options.append(word)
             else:
-                others.append(word)
-        parsed: list[str] = super().parse_args(ctx, own + others)
+                other_words.append(word)
+        parsed: list[str] = super().parse_args(ctx, general_options + other_words)
         return parsed
 
 
@@ -118,7 +120,7 @@ def _show(
         request: body of the request, for the messages of errors.
     """
     options: Options = context.obj
-    with _failing(request), options.client() as client:
+    with _exit_on_error(request), options.client() as client:
         answer = question(client)
     if options.as_json:
         print(answer.model_dump_json(exclude_unset=True))
@@ -133,8 +135,9 @@ def _show(
     return answer
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(is_set: bool) -> None:
+    """Print the version and end the program, if the option ``--version`` is set."""
+    if is_set:
         print(f"scene {__version__}")
         raise typer.Exit
 
@@ -352,7 +355,7 @@ def contexts(context: typer.Context) -> None:
 def ready(context: typer.Context) -> None:
     """Check that the service is ready. The only output is the exit status."""
     options: Options = context.obj
-    with _failing(None), options.client() as client:
+    with _exit_on_error(None), options.client() as client:
         client.check_ready()
 
 
@@ -378,7 +381,7 @@ def _scene(
         _fail(f"{files[0]} is a whole scene: remove the labels and other files", MEANINGLESS)
     labels = {} if label_map is None else _label_map(label_map)
     scene = _read(files[0], labels) if files else {"objects": things}
-    return _labelled(scene, labels) | _named(
+    return _with_labels(scene, labels) | _named(
         relations=[_relation(text) for text in stated] if stated else None,
         room_type=room_type,
         unknown_labels=unknown_labels,
@@ -420,7 +423,7 @@ def _label_map(option: str) -> dict[str, str | None]:
         _fail(f"--label-map: {option} does not contain labels", MEANINGLESS)
 
 
-def _labelled(scene: dict[str, Any], labels: dict[str, str | None]) -> dict[str, Any]:
+def _with_labels(scene: dict[str, Any], labels: dict[str, str | None]) -> dict[str, Any]:
     """Replace the labels of objects that are class ids."""
     if not isinstance(scene.get("objects"), list):
         return scene
@@ -430,14 +433,15 @@ def _labelled(scene: dict[str, Any], labels: dict[str, str | None]) -> dict[str,
         if str(label).isdecimal():
             label = labels.get(str(label))
             if label is None:
-                wanted = "set --label-map to coco80, coco91 or a file with the labels of the ids"
-                _fail(f"an object has a class id instead of a label: {wanted}", MEANINGLESS)
+                remedy = "set --label-map to coco80, coco91 or a file with the labels of the ids"
+                _fail(f"an object has a class id instead of a label: {remedy}", MEANINGLESS)
             thing = {**thing, "label": label} if isinstance(thing, dict) else label
         objects.append(thing)
     return scene | {"objects": objects}
 
 
 def _bytes(name: str) -> bytes:
+    """Return the contents of a file, or of standard input for the name ``-``."""
     try:
         if name == "-":
             text = sys.stdin.buffer.read(MAX_FILE + 1)
@@ -452,6 +456,7 @@ def _bytes(name: str) -> bytes:
 
 
 def _read(argument: str, labels: dict[str, str | None]) -> dict[str, Any]:
+    """Return the request fields of a file: a request, a ROS message, or a scene of the training."""
     lines = _LINES.match(argument)
     name = lines["file"] if lines else argument
     text = _bytes(name)
@@ -462,7 +467,7 @@ def _read(argument: str, labels: dict[str, str | None]) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         _fail(f"{argument} is not JSON: {error}", MEANINGLESS)
     if is_message(scene):
-        return _detected(name, scene, labels)
+        return _of_message(name, scene, labels)
     if is_annotated(scene):
         try:
             return from_annotated(scene)
@@ -497,7 +502,7 @@ def _line(name: str, text: bytes, line: str | None) -> bytes:
     return lines[number - 1]
 
 
-def _detected(name: str, message: Any, labels: dict[str, str | None]) -> dict[str, Any]:
+def _of_message(name: str, message: Any, labels: dict[str, str | None]) -> dict[str, Any]:
     """Return the request fields for a ROS message with detections, as JSON from rosbridge."""
     try:
         fields = from_message(message, labels or None)
@@ -512,18 +517,19 @@ def _detected(name: str, message: Any, labels: dict[str, str | None]) -> dict[st
 def _anchor(text: str) -> dict[str, str]:
     relation, _, object = text.strip().partition(" ")
     if relation not in _RELATIONS or not object:
-        wanted = '--at must be a relation and an object, such as "on-top desk"'
-        _fail(f"{wanted}; {_relations_for([relation])}", MEANINGLESS)
+        rule = '--at must be a relation and an object, such as "on-top desk"'
+        _fail(f"{rule}; {_relations_for([relation])}", MEANINGLESS)
     return {"relation": relation, "object": object.strip()}
 
 
 def _relation(text: str) -> dict[str, str]:
     # Labels may contain spaces. The first name of a relation separates the two labels.
     words = text.split()
-    middle = next((n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS), None)
-    if middle is None:
-        wanted = '--relations must be a subject, a relation and an object, as in "lamp on-top desk"'
-        _fail(f"{wanted}; {_relations_for(words[1:-1])}", MEANINGLESS)
+    positions = [n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS]
+    if not positions:
+        rule = '--relations must be a subject, a relation and an object, as in "lamp on-top desk"'
+        _fail(f"{rule}; {_relations_for(words[1:-1])}", MEANINGLESS)
+    middle = positions[0]
     subject, object = " ".join(words[:middle]), " ".join(words[middle + 1 :])
     return {"subject": subject, "relation": words[middle], "object": object}
 
@@ -539,7 +545,8 @@ def _relations_for(words: Iterable[str]) -> str:
 
 
 @contextmanager
-def _failing(request: Any) -> Iterator[None]:
+def _exit_on_error(request: Any) -> Iterator[None]:
+    """End the program with a message and an exit status if the block raises an error."""
     try:
         yield
     except InvalidRequestError as error:

@@ -88,10 +88,13 @@ class Options:
         return seconds
 
     def ssl_context(self) -> ssl.SSLContext:
-        """Return the SSL context. For an https URL, it contains the CA bundle of the system."""
+        """Return the SSL context. For https, it trusts the authorities of the package certifi.
+
+        The environment variable SSL_CERT_FILE or SSL_CERT_DIR selects other authorities.
+        """
         if urlsplit(self.url).scheme == "https":
             return httpx.create_ssl_context()
-        # For http, the CA bundle is not needed. To load it takes longer than a question.
+        # For http, no authorities are needed. To load them takes longer than a question.
         return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 
     def headers(self, call: Call[T], left: float) -> dict[str, str]:
@@ -153,28 +156,30 @@ def deadline(seconds: float) -> Iterator[None]:
         _DEADLINE.ends = float("inf")
 
 
-def _left(timeout: float | None) -> float:
+def _seconds_left(timeout: float | None) -> float:
     """Return the maximum time of the next wait in seconds.
 
     Raises:
         httpcore.TimeoutException: the deadline has passed. Without this exception, a read of data
             that have already arrived would succeed after the deadline.
     """
-    left = _DEADLINE.ends - monotonic()
-    if left <= 0:
+    seconds = _DEADLINE.ends - monotonic()
+    if seconds <= 0:
         raise httpcore.TimeoutException("the timeout of the call has expired")
-    return left if timeout is None else min(timeout, left)
+    return seconds if timeout is None else min(timeout, seconds)
 
 
 class _Stream(httpcore.NetworkStream):
+    """A stream whose waits end at the `deadline`."""
+
     def __init__(self, stream: httpcore.NetworkStream) -> None:
         self._stream = stream
 
     def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
-        return self._stream.read(max_bytes, _left(timeout))
+        return self._stream.read(max_bytes, _seconds_left(timeout))
 
     def write(self, buffer: bytes, timeout: float | None = None) -> None:
-        self._stream.write(buffer, _left(timeout))
+        self._stream.write(buffer, _seconds_left(timeout))
 
     def close(self) -> None:
         self._stream.close()
@@ -185,13 +190,15 @@ class _Stream(httpcore.NetworkStream):
         server_hostname: str | None = None,
         timeout: float | None = None,
     ) -> httpcore.NetworkStream:
-        return _Stream(self._stream.start_tls(ssl_context, server_hostname, _left(timeout)))
+        return _Stream(self._stream.start_tls(ssl_context, server_hostname, _seconds_left(timeout)))
 
     def get_extra_info(self, info: str) -> Any:
         return self._stream.get_extra_info(info)
 
 
 class _Backend(httpcore.SyncBackend):
+    """A network backend whose streams are `_Stream` objects."""
+
     def connect_tcp(
         self,
         host: str,
@@ -200,12 +207,13 @@ class _Backend(httpcore.SyncBackend):
         local_address: str | None = None,
         socket_options: Iterable[httpcore.SOCKET_OPTION] | None = None,
     ) -> httpcore.NetworkStream:
-        left = _left(timeout)
+        left = _seconds_left(timeout)
         return _Stream(super().connect_tcp(host, port, left, local_address, socket_options))
 
 
 @contextmanager
 def _as_httpx() -> Iterator[None]:
+    """Convert the exceptions of httpcore to those of httpx."""
     try:
         yield
     except httpcore.TimeoutException as error:
@@ -242,7 +250,7 @@ class DeadlineTransport(httpx.BaseTransport):
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Send one request and return the response."""
         url = request.url
-        sent = httpcore.Request(
+        core_request = httpcore.Request(
             request.method,
             httpcore.URL(
                 scheme=url.raw_scheme, host=url.raw_host, port=url.port, target=url.raw_path
@@ -252,7 +260,7 @@ class DeadlineTransport(httpx.BaseTransport):
             extensions=request.extensions,
         )
         with _as_httpx():
-            response = self._pool.handle_request(sent)
+            response = self._pool.handle_request(core_request)
         return httpx.Response(response.status, headers=response.headers, stream=_Body(response))
 
     def close(self) -> None:

@@ -18,9 +18,9 @@ class ClientError(Exception):
     """Base class of the exceptions. A call of the client failed."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Process pools pickle exceptions. `_restored` restores the attributes of the exception
+        # Process pools pickle exceptions. `_restore` restores the attributes of the exception
         # without a call of the constructor.
-        return _restored, (type(self), self.args, self.__dict__)
+        return _restore, (type(self), self.args, self.__dict__)
 
 
 class InvalidRequestError(ClientError, ValueError):
@@ -31,7 +31,7 @@ class InvalidRequestError(ClientError, ValueError):
     """
 
     def __init__(self, errors: Sequence[FieldError]) -> None:
-        super().__init__("; ".join(_placed(error) for error in errors))
+        super().__init__("; ".join(_located_message(error) for error in errors))
         self.errors = list(errors)
 
     @classmethod
@@ -75,7 +75,7 @@ class ProblemError(ClientError):
         retry_after: float | None = None,
     ) -> None:
         lines = [f"{status} {title} ({type}): {detail}"]
-        lines += [f"{error.pointer}: {_worded(error)}" for error in errors[:MOST_SHOWN]]
+        lines += [f"{error.pointer}: {_message(error)}" for error in errors[:MOST_SHOWN]]
         if len(errors) > MOST_SHOWN:
             lines.append(f"and {len(errors) - MOST_SHOWN} more errors")
         super().__init__("\n  ".join(lines))
@@ -132,7 +132,10 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
             request_id=headers.get("x-request-id", ""),
         )
     return ProblemError(
-        *(problem.type, status, problem.title, problem.detail),
+        problem.type,
+        status,
+        problem.title,
+        problem.detail,
         errors=problem.errors or (),
         failures=problem.failures or (),
         request_id=problem.request_id,
@@ -152,19 +155,20 @@ def _seconds(retry_after: str) -> float | None:
     return None
 
 
-def _restored(kind: type[ClientError], args: tuple[Any, ...], state: dict[str, Any]) -> ClientError:
+def _restore(kind: type[ClientError], args: tuple[Any, ...], state: dict[str, Any]) -> ClientError:
+    """Return an exception with these attributes, for pickle. The constructor does not run."""
     error = kind.__new__(kind, *args)
     error.__dict__.update(state)
     return error
 
 
-def _placed(error: FieldError) -> str:
+def _located_message(error: FieldError) -> str:
     # The pointer "#" means the whole body, so the message needs no location.
-    where = "" if error.pointer == "#" else f"{error.pointer}: "
-    return where + _worded(error)
+    prefix = "" if error.pointer == "#" else f"{error.pointer}: "
+    return prefix + _message(error)
 
 
-def _worded(error: FieldError) -> str:
+def _message(error: FieldError) -> str:
     if not error.suggestions:
         return error.message
     return f"{error.message} (did you mean {', '.join(error.suggestions)}?)"

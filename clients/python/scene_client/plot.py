@@ -48,9 +48,10 @@ def draw(answer: GenerateAnswer, path: Path) -> None:
     layouts = [arrange(scene.objects, scene.relations) for scene in answer.scenes]
     columns = ceil(sqrt(len(layouts)))
     extents = [extent(layout) for layout in layouts]
-    widths = [max(w for w, _ in extents[n::columns]) + _MARGIN for n in range(columns)]
+    # The scenes fill a grid row by row. Each column is as wide as its widest scene.
+    widths = [max(width for width, _ in extents[n::columns]) + _MARGIN for n in range(columns)]
     heights = [
-        max(h for _, h in extents[start : start + columns]) + _MARGIN
+        max(height for _, height in extents[start : start + columns]) + _MARGIN
         for start in range(0, len(layouts), columns)
     ]
     size = (sum(widths) * _UNIT, sum(heights) * _UNIT)
@@ -83,17 +84,17 @@ def _draw(axes: Axes, scene: GeneratedScene, boxes: list[Box]) -> None:
         # In matplotlib, an unescaped dollar sign starts a formula.
         text = box.label.replace("$", r"\$")
         axes.text(*middle, text, ha="center", va="center", fontsize=_POINTS, zorder=3)
-    named = {box.label: box for box in boxes}
-    used = set()
+    box_of = {box.label: box for box in boxes}
+    drawn_relations = set()
     for relation in scene.relations:
-        subject, object = named.get(relation.subject), named.get(relation.object)
+        subject, object = box_of.get(relation.subject), box_of.get(relation.object)
         if subject is not None and object is not None and relation.relation in _STYLES:
-            used.add(relation.relation)
-            _join(axes, subject, object, relation.relation)
-    for name in sorted(used):
+            drawn_relations.add(relation.relation)
+            _draw_line(axes, subject, object, relation.relation)
+    for name in sorted(drawn_relations):
         color, dashes = _STYLES[name]
         axes.plot([], [], color=color, linestyle=dashes, label=name)
-    if used:
+    if drawn_relations:
         axes.legend(
             loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3, fontsize=_POINTS, frameon=False
         )
@@ -102,7 +103,7 @@ def _draw(axes: Axes, scene: GeneratedScene, boxes: list[Box]) -> None:
     axes.set_ylim(-GAP, height + GAP)
 
 
-def _join(axes: Axes, subject: Box, object: Box, relation: str) -> None:
+def _draw_line(axes: Axes, subject: Box, object: Box, relation: str) -> None:
     color, dashes = _STYLES[relation]
     axes.plot(
         [subject.x + subject.width / 2, object.x + object.width / 2],
@@ -169,15 +170,15 @@ def arrange(objects: Sequence[str], relations: Iterable[Relation]) -> list[Box]:
         objects: names of the objects, without duplicates.
         relations: relations between the objects.
     """
-    stated = [_drawn(relation) for relation in relations]
-    stated = [(a, name, b) for a, name, b in stated if a != b and a in objects and b in objects]
-    below = _supporters(stated)
+    triples = [_canonical(relation) for relation in relations]
+    triples = [(a, name, b) for a, name, b in triples if a != b and a in objects and b in objects]
+    below = _supporters(triples)
     roots = [name for name in objects if name not in below]
     root = {name: _root(name, below) for name in objects}
     piles = {name: _pile(name, below) for name in roots}
 
     columns, rows = _Order(roots), _Order(roots)
-    for subject, relation, object in stated:
+    for subject, relation, object in triples:
         order = {"left": columns, "front": rows}.get(relation)
         if order is not None and root[subject] != root[object]:
             order.add(root[subject], root[object])
@@ -186,38 +187,45 @@ def arrange(objects: Sequence[str], relations: Iterable[Relation]) -> list[Box]:
     cells: dict[tuple[int, int], list[list[Box]]] = {}
     for name in roots:
         cells.setdefault((column[name], row[name]), []).append(piles[name])
-    shelved = {cell: _shelved(members) for cell, members in cells.items()}
-    lefts = _offsets({cell[0]: extent(boxes)[0] for cell, boxes in _widest(shelved, 0)})
-    floors = _offsets({cell[1]: extent(boxes)[1] for cell, boxes in _widest(shelved, 1)})
+    boxes_of = {cell: _in_shelves(members) for cell, members in cells.items()}
+    widths: dict[int, float] = {}
+    heights: dict[int, float] = {}
+    for (column_rank, row_rank), boxes in boxes_of.items():
+        width, height = extent(boxes)
+        widths[column_rank] = max(width, widths.get(column_rank, 0.0))
+        heights[row_rank] = max(height, heights.get(row_rank, 0.0))
+    x_of, y_of = _starts(widths), _starts(heights)
     return [
         box
-        for (at_column, at_row), boxes in shelved.items()
-        for box in _moved(boxes, lefts[at_column], floors[at_row])
+        for (column_rank, row_rank), boxes in boxes_of.items()
+        for box in _shifted(boxes, x_of[column_rank], y_of[row_rank])
     ]
 
 
-def _drawn(relation: Relation) -> tuple[str, str, str]:
+def _canonical(relation: Relation) -> tuple[str, str, str]:
+    """Return a relation as (subject, relation, object), without the relations in `_OPPOSITES`."""
     opposite = _OPPOSITES.get(relation.relation)
     if opposite is not None:
         return relation.object, opposite, relation.subject
     return relation.subject, relation.relation, relation.object
 
 
-def _supporters(stated: Sequence[tuple[str, str, str]]) -> dict[str, tuple[str, str]]:
+def _supporters(triples: Sequence[tuple[str, str, str]]) -> dict[str, tuple[str, str]]:
     """Return the lower object and the relation of each object with a relation on-top or above.
 
     The keys of the dictionary are the upper objects. The function ignores a relation that would
     close a cycle.
     """
     below: dict[str, tuple[str, str]] = {}
-    for wanted in ("on-top", "above"):
-        for subject, relation, object in stated:
-            if relation == wanted and subject not in below and _root(object, below) != subject:
+    for vertical in ("on-top", "above"):
+        for subject, relation, object in triples:
+            if relation == vertical and subject not in below and _root(object, below) != subject:
                 below[subject] = (object, relation)
     return below
 
 
 def _root(name: str, below: dict[str, tuple[str, str]]) -> str:
+    """Return the lowest object of the pile that contains an object."""
     while name in below:
         name = below[name][0]
     return name
@@ -230,13 +238,13 @@ def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
     for other, (supporter, relation) in below.items():
         if supporter == name:
             pile = _pile(other, below)
-            boxes += _moved(pile, x, HEIGHT + (GAP if relation == "above" else 0.0))
+            boxes += _shifted(pile, x, HEIGHT + (GAP if relation == "above" else 0.0))
             x += extent(pile)[0] + GAP
     width = max(0.2 * len(name) + 0.6, x - GAP)
     return [Box(name, 0.0, 0.0, width, HEIGHT), *boxes]
 
 
-def _shelved(piles: Sequence[list[Box]]) -> list[Box]:
+def _in_shelves(piles: Sequence[list[Box]]) -> list[Box]:
     """Arrange unordered piles in rows. The number of rows is about the number of piles in a row."""
     boxes: list[Box] = []
     length = ceil(sqrt(len(piles)))
@@ -245,33 +253,22 @@ def _shelved(piles: Sequence[list[Box]]) -> list[Box]:
         x = 0.0
         shelf: list[Box] = []
         for pile in piles[start : start + length]:
-            shelf += _moved(pile, x, y)
+            shelf += _shifted(pile, x, y)
             x += extent(pile)[0] + GAP
         boxes += shelf
         y = extent(shelf)[1] + GAP
     return boxes
 
 
-def _widest(
-    cells: dict[tuple[int, int], list[Box]], axis: int
-) -> list[tuple[tuple[int, int], list[Box]]]:
-    """Return the cells sorted by width (axis 0) or height (axis 1), in ascending order.
-
-    A dictionary that the caller builds from this list by column (or by row) then keeps the widest
-    (or highest) cell of each column (or row).
-    """
-    return sorted(cells.items(), key=lambda cell: extent(cell[1])[axis])
-
-
-def _moved(boxes: Iterable[Box], x: float, y: float) -> list[Box]:
+def _shifted(boxes: Iterable[Box], x: float, y: float) -> list[Box]:
     return [Box(box.label, box.x + x, box.y + y, box.width, box.height) for box in boxes]
 
 
-def _offsets(extents: dict[int, float]) -> dict[int, float]:
+def _starts(extents: dict[int, float]) -> dict[int, float]:
     """Return the start of each column (x) or row (y) from the extents of the columns or rows."""
-    offsets: dict[int, float] = {}
-    at = 0.0
+    starts: dict[int, float] = {}
+    start = 0.0
     for rank in sorted(extents):
-        offsets[rank] = at
-        at += extents[rank] + 2 * GAP
-    return offsets
+        starts[rank] = start
+        start += extents[rank] + 2 * GAP
+    return starts

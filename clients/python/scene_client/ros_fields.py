@@ -111,13 +111,13 @@ def time_of(stamp: Any) -> dict[str, int] | None:
     """Convert a time of ROS 1 or ROS 2 to the field `stamp`. Return None for an invalid time."""
     seconds = integer(take(stamp, "sec"))
     seconds = integer(take(stamp, "secs")) if seconds is None else seconds
-    rest = integer(take(stamp, "nanosec"))
-    rest = integer(take(stamp, "nsecs")) if rest is None else rest
-    if seconds is None or rest is None:
+    nanoseconds = integer(take(stamp, "nanosec"))
+    nanoseconds = integer(take(stamp, "nsecs")) if nanoseconds is None else nanoseconds
+    if seconds is None or nanoseconds is None:
         return None
-    if not (-(2**31) <= seconds < 2**31 and 0 <= rest < 1_000_000_000):
+    if not (-(2**31) <= seconds < 2**31 and 0 <= nanoseconds < 1_000_000_000):
         return None
-    return {"sec": seconds, "nanosec": rest}
+    return {"sec": seconds, "nanosec": nanoseconds}
 
 
 # -------------------------------------------------------------------------------- class ids

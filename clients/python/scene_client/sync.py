@@ -236,15 +236,15 @@ class Client:
         """Return the answer of a call. Retry as long as the timeout allows."""
         retries = self.options.retries if retries is None else retries
         limit = self.options.limit(timeout)
-        late, ends = f"The answer did not arrive within {limit:g} s.", monotonic() + limit
-        attempt = 0
+        message = f"The answer did not arrive within {limit:g} s."
+        ends, attempt = monotonic() + limit, 0
         while (left := ends - monotonic()) > 0:
             try:
                 answer = self._attempt(call, left)
             except (TimeoutError, httpx.TimeoutException):
                 break
             except DeadlineError as error:
-                raise DeadlineError(f"{late} {error}", error.request_id) from None
+                raise DeadlineError(f"{message} {error}", error.request_id) from None
             except (ProblemError, UnreachableError) as error:
                 pause = call.retry_pause(error, attempt)
                 if pause is None or attempt == retries or pause >= ends - monotonic():
@@ -255,7 +255,7 @@ class Client:
                 # If the client has read the answer only after the deadline, the call fails.
                 if monotonic() < ends:
                     return answer
-        raise DeadlineError(late)
+        raise DeadlineError(message)
 
     def _attempt(self, call: Call[T], left: float) -> T:
         """Send a call once and return the answer. The attempt takes at most `left` seconds."""

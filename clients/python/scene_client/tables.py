@@ -31,21 +31,21 @@ A table of answers about one place contains all places.
 def relations(answer: schemas.RelationsAnswer) -> RenderableType:
     """Return a table of relations, most probable first, and a table of disagreements."""
     rows = [(*_relation(entry), "observed" if entry.observed else "") for entry in answer.relations]
-    stated = _table("subject", "relation", "object", "probability", "", rows=rows)
-    doubted = [
+    table = _table("subject", "relation", "object", "probability", "", rows=rows)
+    disagreements = [
         (
             entry.subject,
             ", ".join(entry.observed),
             entry.object,
-            _share(entry.observed_probability),
-            f"{entry.expected} {_share(entry.probability)}",
+            _probability_text(entry.observed_probability),
+            f"{entry.expected} {_probability_text(entry.probability)}",
         )
         for entry in answer.disagreements
     ]
-    if not doubted:
-        return stated
+    if not disagreements:
+        return table
     columns = ("subject", "observed", "object", "probability", "expected")
-    return Group(stated, _table(*columns, rows=doubted, title="disagreements"))
+    return Group(table, _table(*columns, rows=disagreements, title="disagreements"))
 
 
 def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> RenderableType:
@@ -58,9 +58,9 @@ def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> Rend
     rows = [
         (
             entry.label,
-            _share(entry.probability),
+            _probability_text(entry.probability),
             f"{entry.log_odds:+.2f}",
-            "\n".join(_placement(one) for one in entry.placements if one.probability >= least),
+            "\n".join(_placement(p) for p in entry.placements if p.probability >= least),
             _reasons(entry.because),
         )
         for entry in answer.missing
@@ -68,16 +68,16 @@ def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> Rend
     table = _table("missing", "probability", "log-odds", "where", "because", rows=rows)
     if not answer.more:
         return table if rows else "No object is missing."
-    further = [
+    count_rows = [
         (
             entry.label,
             str(entry.listed_count),
             f"{entry.expected_count:.1f} ({entry.low} to {entry.high})",
-            _share(entry.probability),
+            _probability_text(entry.probability),
         )
         for entry in answer.more
     ]
-    counts = _table("more of", "listed", "expected", "probability", rows=further)
+    counts = _table("more of", "listed", "expected", "probability", rows=count_rows)
     return Group(table, counts) if rows else counts
 
 
@@ -87,7 +87,7 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
         (
             entry.object,
             entry.label,
-            _share(entry.probability),
+            _probability_text(entry.probability),
             f"{entry.log_odds:+.2f}",
             "outlier" if entry.is_outlier else "",
             _reasons(entry.because),
@@ -99,15 +99,15 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
     table = _table(*heads, rows=rows)
     if not answer.misplaced:
         return table
-    wrong = [
+    misplaced_rows = [
         (*_relation(entry), "misplaced" if entry.is_misplaced else "")
         for entry in answer.misplaced[:MOST_MISPLACED]
     ]
     columns = ("subject", "relation", "object", "probability of being wrong", "")
     title = "relations as given"
-    if len(wrong) < len(answer.misplaced):
-        title += f": the {len(wrong)} likeliest to be wrong of {len(answer.misplaced)}"
-    return Group(table, _table(*columns, rows=wrong, title=title))
+    if len(misplaced_rows) < len(answer.misplaced):
+        title += f": the {len(misplaced_rows)} likeliest to be wrong of {len(answer.misplaced)}"
+    return Group(table, _table(*columns, rows=misplaced_rows, title=title))
 
 
 def notes(answer: BaseModel) -> list[str]:
@@ -137,8 +137,9 @@ def generate(answer: schemas.GenerateAnswer) -> RenderableType:
 
 
 def _relations(relations: Sequence[schemas.Relation]) -> str:
-    ranked = sorted(relations, key=lambda one: one.relation in {"left", "front"})
-    lines = [f"{one.subject} {one.relation} {one.object}" for one in ranked[:MOST_RELATIONS]]
+    """Return the first `MOST_RELATIONS` relations as lines of text, vertical relations first."""
+    ranked = sorted(relations, key=lambda entry: entry.relation in {"left", "front"})
+    lines = [f"{r.subject} {r.relation} {r.object}" for r in ranked[:MOST_RELATIONS]]
     if len(ranked) > MOST_RELATIONS:
         lines.append(f"… and {len(ranked) - MOST_RELATIONS} more")
     return "\n".join(lines)
@@ -184,14 +185,15 @@ def vocabulary(answer: schemas.VocabularyAnswer) -> RenderableType:
 
 
 def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = None) -> Table:
+    """Return a table without the columns that are empty in every row."""
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     # Answers with `detail: scores` have no places and no reasons.
     shown = [n for n in range(len(columns)) if not rows or any(row[n] for row in rows)]
     for column in [columns[n] for n in shown]:
-        numbers = column.startswith("probability") or column in {"log-odds", "log score"}
+        has_numbers = column.startswith("probability") or column in {"log-odds", "log score"}
         # Only cells with the objects of a scene can be long. Other cells have short lines.
         width = 60 if column == "objects" else None
-        side: Literal["left", "right"] = "right" if numbers else "left"
+        side: Literal["left", "right"] = "right" if has_numbers else "left"
         # A narrow terminal wraps an id, because two shortened ids may look the same.
         table.add_column(column, justify=side, max_width=width, overflow="fold")
     for row in rows:
@@ -200,15 +202,15 @@ def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = Non
 
 
 def _relation(entry: schemas.ScoredRelation) -> tuple[str, str, str, str]:
-    return entry.subject, entry.relation, entry.object, _share(entry.probability)
+    return entry.subject, entry.relation, entry.object, _probability_text(entry.probability)
 
 
-def _share(probability: float) -> str:
+def _probability_text(probability: float) -> str:
     return f"{probability:.3f}"
 
 
 def _placement(placement: schemas.Placement) -> str:
-    text = f"{placement.relation} {placement.object} {_share(placement.probability)}"
+    text = f"{placement.relation} {placement.object} {_probability_text(placement.probability)}"
     # A model has no offsets if its training scenes have no positions.
     offset = placement.offset
     if offset is None:

@@ -76,22 +76,23 @@ def field_errors(
         at: location of ``body`` in the request.
     """
     errors = []
-    for fault in _first_errors(error, body, form):
-        message, suggestions = _worded(fault, form)
-        where = pointer(at) + pointer(fault["loc"], body)[1:]
-        errors.append(FieldError(pointer=where, message=message, suggestions=suggestions))
+    for details in _first_errors(error, body, form):
+        message, suggestions = _message(details, form)
+        location = pointer(at) + pointer(details["loc"], body)[1:]
+        errors.append(FieldError(pointer=location, message=message, suggestions=suggestions))
     return errors
 
 
 def _first_errors(error: ValidationError, body: Any, form: type[Request]) -> list[ErrorDetails]:
-    errors = later = error.errors(include_url=False)
+    """Return pydantic's errors of a request, at most `MAX_ERRORS`; see `field_errors`."""
+    errors = newest_errors = error.errors(include_url=False)
     while len(errors) < MAX_ERRORS:
-        # Only errors of entries have a location of more than one step.
-        index: Any = next(
-            (one["loc"][1] for one in later if one["loc"][1:] and _is_object(one)), None
-        )
-        if index is None:
+        object_errors = filter(_is_of_objects, newest_errors)
+        # An error of the whole list has the location ("objects",), without an index.
+        indices: list[Any] = [details["loc"][1] for details in object_errors if details["loc"][1:]]
+        if not indices:
             break
+        index = indices[0]
         objects = [*body["objects"]]
         objects[index] = "valid"
         body = {**body, "objects": objects}
@@ -99,14 +100,14 @@ def _first_errors(error: ValidationError, body: Any, form: type[Request]) -> lis
             form.model_validate(body)
             break
         except ValidationError as next_error:
-            later = list(filter(_is_object, next_error.errors(include_url=False)))
-            errors += later
+            newest_errors = list(filter(_is_of_objects, next_error.errors(include_url=False)))
+            errors += newest_errors
     # Errors of objects come first, as in the schema.
-    return sorted(errors, key=_is_object, reverse=True)[:MAX_ERRORS]
+    return sorted(errors, key=_is_of_objects, reverse=True)[:MAX_ERRORS]
 
 
-def _is_object(fault: ErrorDetails) -> bool:
-    return fault["loc"][:1] == ("objects",)
+def _is_of_objects(details: ErrorDetails) -> bool:
+    return details["loc"][:1] == ("objects",)
 
 
 def pointer(location: tuple[str | int, ...], body: Any = None) -> str:
@@ -144,38 +145,40 @@ def listed(names: Iterable[str], last: str = "and") -> str:
     return f"{', '.join(others)} {last} {final}" if others else final
 
 
-def _worded(fault: ErrorDetails, form: type[Request]) -> tuple[str, list[str]]:
-    """Return the message for an error of pydantic, and similar known names."""
-    kind, value = fault["type"], fault["input"]
+def _message(details: ErrorDetails, form: type[Request]) -> tuple[str, list[str]]:
+    """Return the message for an error of pydantic, and known names similar to an unknown name."""
+    kind, value = details["type"], details["input"]
     if kind == "extra_forbidden":
-        return _unknown_field(fault["loc"], form)
+        return _unknown_field(details["loc"], form)
     if kind == "literal_error":
-        choices = re.findall(r"'([^']*)'", fault["ctx"]["expected"])
-        return f"must be {listed(choices, 'or')}", _like(value, choices)
-    if (wanted := _WRONG_TYPES.get(kind)) is not None:
+        choices = re.findall(r"'([^']*)'", details["ctx"]["expected"])
+        return f"must be {listed(choices, 'or')}", _similar_names(value, choices)
+    if kind in _WRONG_TYPES:
+        requirement = _WRONG_TYPES[kind]
         actual = _KINDS.get(type(value)) or f"a {type(value).__name__}"
         if kind == "model_type":
-            members = _members(fault["loc"], form)
-            if isinstance(value, list) and members.endswith("values"):
+            fields = _required_fields(details["loc"], form)
+            if isinstance(value, list) and fields.endswith("values"):
                 actual += f" of {len(value)}"
-            return f"{wanted}{members}, not {actual}", []
-        return f"{wanted}, not {actual}", []
-    if (template := _MESSAGES.get(kind)) is not None:
-        context = fault.get("ctx", {})
-        return template.format(**{name: _plainly(bound) for name, bound in context.items()}), []
-    return fault["msg"], []
+            requirement += fields
+        return f"{requirement}, not {actual}", []
+    if kind in _MESSAGES:
+        bounds = {name: _whole(bound) for name, bound in details.get("ctx", {}).items()}
+        return _MESSAGES[kind].format(**bounds), []
+    return details["msg"], []
 
 
 def _unknown_field(location: Sequence[str | int], form: type[Request]) -> tuple[str, list[str]]:
-    part, _ = _part(location[:-1], form)
-    names = list(part.model_fields) if part is not None else []
-    similar = _like(location[-1], names)
+    """Return the message for a field that the schema lacks, and the similar fields."""
+    schema, _ = _schema_at(location[:-1], form)
+    names = list(schema.model_fields) if schema is not None else []
+    similar = _similar_names(location[-1], names)
     if similar or not names:
         return "unknown field", similar
     return f"unknown field; this object has the fields {listed(names)}", []
 
 
-def _like(value: Any, choices: Sequence[str]) -> list[str]:
+def _similar_names(value: Any, choices: Sequence[str]) -> list[str]:
     """Return the choices that share a word with a text, or that have a similar spelling."""
     if not isinstance(value, str):
         return []
@@ -185,10 +188,10 @@ def _like(value: Any, choices: Sequence[str]) -> list[str]:
     return shared[:3] or get_close_matches(text, choices, cutoff=0.7)
 
 
-def _members(location: Sequence[str | int], form: type[Request]) -> str:
+def _required_fields(location: Sequence[str | int], form: type[Request]) -> str:
     """Return the required fields of the object at a location, as the end of a message."""
-    part, or_array = _part(location, form)
-    fields = {} if part is None else part.model_fields
+    schema, or_array = _schema_at(location, form)
+    fields = {} if schema is None else schema.model_fields
     required = [name for name, field in fields.items() if field.is_required()]
     if not required:
         return ""
@@ -196,30 +199,32 @@ def _members(location: Sequence[str | int], form: type[Request]) -> str:
     return f"{text} or an array of these {len(required)} values" if or_array else text
 
 
-def _part(location: Sequence[str | int], form: type[Request]) -> tuple[type[Request] | None, bool]:
+def _schema_at(
+    location: Sequence[str | int], form: type[Request]
+) -> tuple[type[Request] | None, bool]:
     """Return the schema of the object at a location, and whether an array may replace the object.
 
     The schema is None if the value at the location is not an object with a schema.
     """
-    part: type[Request] | None = form
+    schema: type[Request] | None = form
     or_array = False
     for step in location:
         # Other steps are indices, pydantic's marks and keys of dictionaries.
-        if part is not None and step in part.model_fields:
-            inner = list(_within(part.model_fields[str(step)].annotation))
-            or_array = any(isinstance(one, OrArray) for one in inner)
-            schemas = (one for one in inner if isinstance(one, type) and issubclass(one, Request))
-            part = next(schemas, None)
-    return part, or_array
+        if schema is not None and step in schema.model_fields:
+            parts = list(_annotations(schema.model_fields[str(step)].annotation))
+            or_array = any(isinstance(part, OrArray) for part in parts)
+            classes = [part for part in parts if isinstance(part, type)]
+            schema = next((kind for kind in classes if issubclass(kind, Request)), None)
+    return schema, or_array
 
 
-def _within(annotation: Any) -> Iterator[Any]:
+def _annotations(annotation: Any) -> Iterator[Any]:
     """Yield an annotation and all annotations that it contains."""
     yield annotation
     for inner in get_args(annotation):
-        yield from _within(inner)
+        yield from _annotations(inner)
 
 
-def _plainly(bound: Any) -> Any:
+def _whole(bound: Any) -> Any:
     """Return a bound without the decimal places of a whole number."""
     return int(bound) if isinstance(bound, float) and bound.is_integer() else bound

@@ -119,7 +119,7 @@ def from_detection3d_array(
         MessageError: the message does not contain a valid scene, or an argument is invalid.
     """
     reader = _Reader(message, label_map, min_score)
-    objects = [reader.object(seen) | reader.pose(seen, boxes) for seen in reader.sightings]
+    objects = [reader.object(entry) | reader.pose(entry, boxes) for entry in reader.sightings]
     fields: dict[str, Any] = {"objects": objects}
     if viewpoint is not None:
         fields["viewpoint"] = _viewpoint(viewpoint)
@@ -146,7 +146,7 @@ def from_detection2d_array(
         MessageError: the message does not contain a valid scene, or an argument is invalid.
     """
     reader = _Reader(message, label_map, min_score)
-    fields = {"objects": [reader.object(seen) for seen in reader.sightings]}
+    fields = {"objects": [reader.object(sighting) for sighting in reader.sightings]}
     fields["relations"] = reader.image_relations([entry["id"] for entry in fields["objects"]])
     return reader.finish(fields, unknown_labels)
 
@@ -207,9 +207,9 @@ class _Reader:
         if number(min_score) is None:
             raise MessageError("min_score must be a finite number")
         sightings = [
-            seen
+            sighting
             for index, detection in enumerate(self.detections)
-            if (seen := self._sight(index, detection, min_score)) is not None
+            if (sighting := self._sight(index, detection, min_score)) is not None
         ]
         if not sightings and label_map is None and self._only_numbers():
             raise MessageError(
@@ -217,7 +217,7 @@ class _Reader:
                 "'coco80', 'coco91' or their labels (a list in the order of the numbers, a "
                 "mapping, or a vision_msgs/LabelInfo)"
             )
-        self.sightings = self._surest(sightings)
+        self.sightings = self._most_confident(sightings)
         self.ids = self._ids()
         self.frame = self._frame()
 
@@ -225,14 +225,15 @@ class _Reader:
         self.notes.append(Note(index, reason, detail))
 
     def _sight(self, index: int, detection: Any, min_score: float) -> _Sighting | None:
-        best, class_id, score = None, "", -math.inf
+        """Return the sighting by the best hypothesis. On failure, add a note and return None."""
+        best_result, class_id, score = None, "", -math.inf
         for result in items(take(detection, "results"), "results"):
             hypothesis = take(result, "hypothesis") or result
-            rated = number(take(hypothesis, "score"))
-            if rated is not None and rated > score:
-                best, score = result, rated
+            result_score = number(take(hypothesis, "score"))
+            if result_score is not None and result_score > score:
+                best_result, score = result, result_score
                 class_id = text(take(hypothesis, "class_id")) or text(take(hypothesis, "id"))
-        if best is None:
+        if best_result is None:
             self.note(index, "no-hypothesis", "the detection has no hypothesis with a score")
             return None
         if not score > 0 or score < min_score:
@@ -249,89 +250,95 @@ class _Reader:
             return None
         if score > 1:
             self.note(index, "high-score", f"the score {score:g} is above 1 and counts as 1")
-        pose = take(best, "pose")
+        pose = take(best_result, "pose")
         return _Sighting(
             index, detection, label.strip(), min(score, 1.0), take(pose, "pose") or pose
         )
 
     def _only_numbers(self) -> bool:
+        """Return whether all class ids are numbers and at least one has no label."""
         return any(note.reason == "no-label" for note in self.notes) and all(
             _is_number(text(take(result, "hypothesis", "class_id")) or text(take(result, "id")))
             for detection in self.detections
             for result in items(take(detection, "results"), "results")
         )
 
-    def _surest(self, sightings: list[_Sighting]) -> list[_Sighting]:
+    def _most_confident(self, sightings: list[_Sighting]) -> list[_Sighting]:
         """Return at most `MAX_OBJECTS` sightings, those of highest confidence, in message order."""
         if len(sightings) <= MAX_OBJECTS:
             return sightings
-        ranked = sorted(sightings, key=lambda seen: -seen.confidence)
-        for seen in ranked[MAX_OBJECTS:]:
-            why = f"{MAX_OBJECTS} other detections have equal or higher scores"
-            self.note(seen.index, "too-many", why)
-        return sorted(ranked[:MAX_OBJECTS], key=lambda seen: seen.index)
+        ranked = sorted(sightings, key=lambda sighting: -sighting.confidence)
+        for sighting in ranked[MAX_OBJECTS:]:
+            detail = f"{MAX_OBJECTS} other detections have equal or higher scores"
+            self.note(sighting.index, "too-many", detail)
+        return sorted(ranked[:MAX_OBJECTS], key=lambda sighting: sighting.index)
 
     def _ids(self) -> dict[int, str]:
         """Return a dictionary from the index of each detection to an id.
 
         A unique id of the detector stays. Otherwise the id is the label with a number.
         """
-        own: dict[str, int] = {}
+        index_of_id: dict[str, int] = {}
         ids: dict[int, str] = {}
-        for seen in self.sightings:
-            name = text(take(seen.detection, "id")) or text(take(seen.detection, "tracking_id"))
+        for sighting in self.sightings:
+            detection = sighting.detection
+            name = text(take(detection, "id")) or text(take(detection, "tracking_id"))
             if not name:
                 continue
             if not is_plain(name, _MAX_ID):
-                self.note(seen.index, "renamed", "the id is not plain text")
-            elif name in own:
-                self.note(seen.index, "renamed", f"detection {own[name]} has the same id")
+                self.note(sighting.index, "renamed", "the id is not plain text")
+            elif name in index_of_id:
+                detail = f"detection {index_of_id[name]} has the same id"
+                self.note(sighting.index, "renamed", detail)
             else:
-                own[name] = seen.index
-                ids[seen.index] = name
-        last: dict[str, int] = {}
-        for seen in self.sightings:
-            while seen.index not in ids:
-                last[seen.label] = last.get(seen.label, 0) + 1
-                name = f"{seen.label}_{last[seen.label]}"
-                if name not in own:
-                    ids[seen.index] = name
+                index_of_id[name] = sighting.index
+                ids[sighting.index] = name
+        last_number: dict[str, int] = {}
+        for sighting in self.sightings:
+            while sighting.index not in ids:
+                last_number[sighting.label] = last_number.get(sighting.label, 0) + 1
+                name = f"{sighting.label}_{last_number[sighting.label]}"
+                if name not in index_of_id:
+                    ids[sighting.index] = name
         return ids
 
     def _frame(self) -> str | None:
         """Return the frame in the message's header, or else in the first detection's header."""
-        for header in (self.header, *(take(seen.detection, "header") for seen in self.sightings)):
+        headers = [take(sighting.detection, "header") for sighting in self.sightings]
+        for header in (self.header, *headers):
             if frame := frame_of(header):
                 if not is_plain(frame, _MAX_FRAME):
                     raise MessageError("frame_id is not plain text")
                 return frame
         return None
 
-    def _is_elsewhere(self, seen: _Sighting) -> bool:
-        return frame_of(take(seen.detection, "header")) not in ("", self.frame)
+    def _has_other_frame(self, sighting: _Sighting) -> bool:
+        return frame_of(take(sighting.detection, "header")) not in ("", self.frame)
 
-    def object(self, seen: _Sighting) -> dict[str, Any]:
-        return {"id": self.ids[seen.index], "label": seen.label, "confidence": seen.confidence}
+    def object(self, sighting: _Sighting) -> dict[str, Any]:
+        name, label = self.ids[sighting.index], sighting.label
+        return {"id": name, "label": label, "confidence": sighting.confidence}
 
-    def pose(self, seen: _Sighting, boxes: bool) -> dict[str, Any]:
+    def pose(self, sighting: _Sighting, boxes: bool) -> dict[str, Any]:
         """Return the fields position, size and orientation of a detection, as far as known."""
-        if self._is_elsewhere(seen):
-            self.note(seen.index, "no-position", "the detection has another frame than the message")
+        if self._has_other_frame(sighting):
+            detail = "the detection has another frame than the message"
+            self.note(sighting.index, "no-position", detail)
             return {}
-        box = take(seen.detection, "bbox") if boxes else None
+        box = take(sighting.detection, "bbox") if boxes else None
         pose, size = take(box, "center"), numbers(take(box, "size"), "xyz")
-        sized = size is not None and any(size) and all(0 <= side <= _MAX_EXTENT for side in size)
-        if not sized and _is_unset(pose):
-            pose = seen.pose
+        has_size = size is not None and any(size) and all(0 <= s <= _MAX_EXTENT for s in size)
+        if not has_size and _is_unset(pose):
+            pose = sighting.pose
             if _is_unset(pose):
-                self.note(seen.index, "no-position", "the box and the pose are unset")
+                self.note(sighting.index, "no-position", "the box and the pose are unset")
                 return {}
         position = numbers(take(pose, "position"), "xyz")
         if position is None or any(abs(value) > _MAX_METRES for value in position):
-            self.note(seen.index, "no-position", "the position is not finite or out of range")
+            self.note(sighting.index, "no-position", "the position is not finite or out of range")
             return {}
         pose_fields: dict[str, Any] = {"position": dict(zip("xyz", position, strict=True))}
-        if size is not None and sized:
+        if size is not None and has_size:
             pose_fields["size"] = dict(zip("xyz", size, strict=True))
         turn = numbers(take(pose, "orientation"), "xyzw")
         length = math.hypot(*turn) if turn else 0.0
@@ -343,7 +350,7 @@ class _Reader:
 
     def image_relations(self, ids: list[str]) -> list[dict[str, str]]:
         """Return the relations left between neighbouring boxes in the image."""
-        boxes = [self._image_box(seen) for seen in self.sightings]
+        boxes = [self._image_box(sighting) for sighting in self.sightings]
         # If there are too many relations, the request contains those of the most confident objects.
         order = sorted(range(len(ids)), key=lambda i: -self.sightings[i].confidence)
         pairs = left_pairs(boxes, order)
@@ -354,21 +361,21 @@ class _Reader:
             for i, j in sorted(pairs[:MAX_RELATIONS])
         ]
 
-    def _image_box(self, seen: _Sighting) -> Box | None:
+    def _image_box(self, sighting: _Sighting) -> Box | None:
         """Return the smallest upright box around the box of a detection, which may be rotated."""
-        if self._is_elsewhere(seen):
-            self.note(seen.index, "no-box", "the detection has another frame than the message")
+        if self._has_other_frame(sighting):
+            self.note(sighting.index, "no-box", "the detection has another frame than the message")
             return None
-        box = take(seen.detection, "bbox")
+        box = take(sighting.detection, "bbox")
         centre = take(box, "center")
         middle = numbers(take(centre, "position") or centre, "xy")
         theta = number(take(centre, "theta"))
         width, height = number(take(box, "size_x")), number(take(box, "size_y"))
         if middle is None or not (width is not None and height is not None):
-            self.note(seen.index, "no-box", "the box is not finite")
+            self.note(sighting.index, "no-box", "the box is not finite")
             return None
         if not (width > 0 and height > 0):
-            self.note(seen.index, "no-box", "the box must have a positive width and height")
+            self.note(sighting.index, "no-box", "the box must have a positive width and height")
             return None
         return upright_box((middle[0], middle[1]), (width, height), theta or 0.0)
 
@@ -401,7 +408,7 @@ def _unwrapped(message: Any) -> Any:
 def _is_flat(message: Any) -> bool:
     """Return whether the message is a Detection2DArray, with boxes in an image."""
     detections = take(_unwrapped(message), "detections")
-    return any(has(take(one, "bbox"), "size_x") for one in items(detections, "detections"))
+    return any(has(take(entry, "bbox"), "size_x") for entry in items(detections, "detections"))
 
 
 def _is_number(label: str) -> bool:
