@@ -90,31 +90,21 @@ def test_energy_is_the_formula(name, counted):
         )
 
 
-def check_free_energy(joint, free, groups):
-    """F is -log sum exp(-E) over the states that agree in the given units."""
-    _, group = torch.cat(groups, 1).unique(dim=0, return_inverse=True)
+@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("room", [None, 1])
+def test_free_energy_is_the_sum_over_states(name, room):
+    """F is -log sum exp(-E) over h1, in the local form also over the relations."""
+    machine = small_machine(name)
+    is_seed = name in SEED_FORM
+    joint = enumerate_joint(machine, room if machine.spec.C and not is_seed else None)
+    relations = (joint.r, joint.edges) if is_seed else (None, None)
+    h2 = joint.h2 if machine.spec.H2 else None
+    free = machine.free_energy(joint.v, *relations, h2, joint.room)
+    given = torch.cat((joint.v, joint.h2, *([joint.r] if is_seed else [])), 1)
+    _, group = given.unique(dim=0, return_inverse=True)
     for g in range(int(group.max()) + 1):
         rows = group == g
         assert float(free[rows][0]) == pytest.approx(-joint.log_sum(rows), rel=1e-10)
-
-
-@pytest.mark.parametrize("name", SEED_FORM)
-def test_free_energy_sums_h1_out(name):
-    machine = small_machine(name)
-    joint = enumerate_joint(machine)
-    h2 = joint.h2 if machine.spec.H2 else None
-    free = machine.free_energy(joint.v, joint.r, joint.edges, h2)
-    check_free_energy(joint, free, (joint.v, joint.r, joint.h2))
-
-
-@pytest.mark.parametrize("name", [n for n in SMALL if n not in SEED_FORM])
-@pytest.mark.parametrize("room", [None, 1])
-def test_local_free_energy_sums_relations_out(name, room):
-    machine = small_machine(name)
-    joint = enumerate_joint(machine, room if machine.spec.C else None)
-    h2 = joint.h2 if machine.spec.H2 else None
-    free = machine.free_energy(joint.v, h2=h2, room=joint.room)
-    check_free_energy(joint, free, (joint.v, joint.h2))
 
 
 @pytest.mark.parametrize("name", SMALL)
