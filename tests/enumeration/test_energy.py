@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import pytest
 import torch
 
 from tests.enumeration.small_machines import (
-    ONE_LAYER,
     SEED_FORM,
     SMALL,
-    binary,
     enumerate_joint,
     full_frame,
-    same,
     small_machine,
 )
 
@@ -94,31 +90,21 @@ def test_energy_is_the_formula(name, counted):
         )
 
 
-def check_free_energy(joint, free, groups):
-    """F is -log sum exp(-E) over the states that agree in the given units."""
-    _, group = torch.cat(groups, 1).unique(dim=0, return_inverse=True)
+@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("room", [None, 1])
+def test_free_energy_is_the_sum_over_states(name, room):
+    """F is -log sum exp(-E) over h1, in the local form also over the relations."""
+    machine = small_machine(name)
+    is_seed = name in SEED_FORM
+    joint = enumerate_joint(machine, room if machine.spec.C and not is_seed else None)
+    relations = (joint.r, joint.edges) if is_seed else (None, None)
+    h2 = joint.h2 if machine.spec.H2 else None
+    free = machine.free_energy(joint.v, *relations, h2, joint.room)
+    given = torch.cat((joint.v, joint.h2, *([joint.r] if is_seed else [])), 1)
+    _, group = given.unique(dim=0, return_inverse=True)
     for g in range(int(group.max()) + 1):
         rows = group == g
         assert float(free[rows][0]) == pytest.approx(-joint.log_sum(rows), rel=1e-10)
-
-
-@pytest.mark.parametrize("name", SEED_FORM)
-def test_free_energy_sums_h1_out(name):
-    machine = small_machine(name)
-    joint = enumerate_joint(machine)
-    h2 = joint.h2 if machine.spec.H2 else None
-    free = machine.free_energy(joint.v, joint.r, joint.edges, h2)
-    check_free_energy(joint, free, (joint.v, joint.r, joint.h2))
-
-
-@pytest.mark.parametrize("name", [n for n in SMALL if n not in SEED_FORM])
-@pytest.mark.parametrize("room", [None, 1])
-def test_local_free_energy_sums_relations_out(name, room):
-    machine = small_machine(name)
-    joint = enumerate_joint(machine, room if machine.spec.C else None)
-    h2 = joint.h2 if machine.spec.H2 else None
-    free = machine.free_energy(joint.v, h2=h2, room=joint.room)
-    check_free_energy(joint, free, (joint.v, joint.h2))
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -131,66 +117,3 @@ def test_free_energy_refuses_what_has_no_closed_form(name):
     given = (v, r, edges, h2) if machine.spec.form == "local" else (v, None, None, h2)
     with pytest.raises(ValueError, match="no closed form"):
         machine.free_energy(*given)
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_conditionals_of_every_block(name):
-    machine = small_machine(name)
-    joint = enumerate_joint(machine)
-    generator = torch.Generator().manual_seed(2)
-    logits = machine.relation_logits(joint.edges, joint.v, joint.h1)
-    second = machine.second_layer_logits(joint.h1)
-    gate = machine.gate(joint.edges, joint.v)
-    for n in torch.randint(len(joint.v), (40,), generator=generator).tolist():
-        v, r, h1, h2 = (joint.v == joint.v[n], joint.r == joint.r[n], joint.h1 == joint.h1[n],
-                        joint.h2 == joint.h2[n])  # fmt: skip
-        rest = v.all(1) & h1.all(1) & h2.all(1)
-        for e in range(r.shape[1]):
-            others = torch.ones(r.shape[1], dtype=torch.bool)
-            others[e] = False
-            if gate[n, e]:
-                exact = joint.log_odds(joint.r[:, e] > 0, rest & r[:, others].all(1))
-                assert float(logits[n, e]) == pytest.approx(exact, abs=1e-9)
-        for k in range(machine.spec.H2):
-            others = torch.arange(machine.spec.H2) != k
-            given = v.all(1) & r.all(1) & h1.all(1) & h2[:, others].all(1)
-            exact = joint.log_odds(joint.h2[:, k] > 0, given)
-            assert float(second[n, k]) == pytest.approx(exact, abs=1e-9)
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_linear_relations_are_sums_over_units_whatever_the_leading_dimensions(name):
-    """sum_e r_e ℓ_e(v, 0) and sum_e r_e U_e of 5 draws of 3 scenes, scene by scene."""
-    machine = small_machine(name)
-    edges = full_frame(machine)
-    generator = torch.Generator().manual_seed(4)
-    v, r = (
-        (torch.rand(5, 3, size, generator=generator) < 0.5).double()
-        for size in (machine.spec.V, edges.shape[-1])
-    )
-    bare, context = machine.linear_relations(edges, v, r)
-    torch.testing.assert_close(machine.hidden_input(edges, r), context)
-    assert (bare.shape, context.shape) == ((5, 3), (5, 3, machine.spec.H1))
-    none, rows = torch.zeros(1, machine.spec.H1).double(), machine.relation_context(edges)[0]
-    for draw, k in itertools.product(range(5), range(3)):
-        logits = machine.relation_logits(edges, v[draw, k][None], none)[0]
-        torch.testing.assert_close(bare[draw, k], r[draw, k] @ logits)
-        torch.testing.assert_close(context[draw, k], r[draw, k] @ rows)
-
-
-@pytest.mark.parametrize("name", ONE_LAYER)
-def test_attraction_is_what_summing_relations_adds(name):
-    """log sum_{R_i} exp(-E) at v_i = 1 minus at v_i = 0, given h1, is b_i + W_i·h1 + attraction."""
-    machine = small_machine(name)
-    joint = enumerate_joint(machine)
-    for h1 in binary(machine.spec.H1):
-        for v in binary(machine.spec.V):
-            for i in range(machine.spec.V):
-                others = torch.arange(machine.spec.V) != i
-                given = same(joint.h1, h1) & same(joint.v[:, others], v[others])
-                exact = joint.log_odds(joint.v[:, i] > 0, given)
-                absent = v.clone()
-                absent[i] = 0
-                gain = machine.attraction(absent[None], h1[None], joint.edges, torch.tensor([[i]]))
-                ours = machine.object_logits(h1[None])[0, i] + gain[0, 0]
-                assert float(ours) == pytest.approx(exact, abs=1e-9)

@@ -25,7 +25,6 @@ from tests.enumeration.small_machines import (
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
 from training.machines.chain_samples import ChainSamples, pack_scenes
-from training.machines.edges import present_classes
 from training.machines.gibbs import Clamp, run, sample_relations
 
 CHAINS = 10_000
@@ -246,16 +245,6 @@ def test_relations_that_imply_each_other_are_drawn_as_by_tensors(layers, tempera
         [np.prod(np.where(row >> np.arange(6) & 1, alone, 1 - alone)) for row in range(64)]
     )
     assert 0.5 * np.abs(found - independent).sum() > 3 * (mean + slack)
-
-
-def test_logits_are_those_of_the_machine(wide):
-    chains = SceneChains(weights_of(wide))
-    drawn = chains.under(conditions([3, 17, 30])).draw(3, random_stream(0, 0))
-    v, h1 = torch.zeros(1, 40), torch.zeros(1, 70)
-    v[0, drawn.classes], h1[0, drawn.h1] = 1, 1
-    edges = wide.edges(present_classes(v))
-    expected = edges.unflatten(wide.relation_logits(edges, v, h1))[0]
-    np.testing.assert_allclose(drawn.logits, expected, atol=1e-4)
 
 
 def test_other_machines_are_refused():

@@ -94,18 +94,6 @@ async def test_a_full_queue_gets_429(shared_store: Path, hold: Hold) -> None:
 
 
 @pytest.mark.anyio
-async def test_a_batch_frees_its_queue_rows(shared_store: Path) -> None:
-    async with serve(shared_store, queue_rows=256) as client:
-        scenes: list[Any] = [SCENE, {**SCENE, "model": "nobody"}, {"model": 7}, [], SCENE]
-        for _ in range(2):
-            answer = await client.post("/outliers/batch", json={"scenes": scenes})
-            statuses = [entry["status"] for entry in answer.json()["results"]]
-            assert statuses == [200, 404, 422, 422, 200]
-        full = {"scenes": [SCENE] * 256}
-        assert (await client.post("/missing/batch", json=full)).status_code == 200
-
-
-@pytest.mark.anyio
 async def test_pending_rows_are_zero_after_a_request(shared_store: Path, hold: Hold) -> None:
     """After a batch, and after work that was given up, the gauge is back at 0."""
     async with serve(shared_store) as client:
@@ -115,7 +103,8 @@ async def test_pending_rows_are_zero_after_a_request(shared_store: Path, hold: H
             return {float(line.split()[-1]) for line in text.splitlines()
                     if line.startswith("scene_pending_rows{")}  # fmt: skip
 
-        await client.post("/missing/batch", json={"scenes": [SCENE] * 5})
+        scenes: list[Any] = [SCENE, {**SCENE, "model": "nobody"}, {"model": 7}, [], SCENE]
+        await client.post("/missing/batch", json={"scenes": scenes})
         assert await pending() == {0.0}
         hold("generate")
         drawing = asyncio.ensure_future(

@@ -35,7 +35,6 @@ REQUEST: dict[str, Any] = {
 def store_of_poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("store")
     publish(root, "measured", "1.0.0", alias="default", offsets=offsets_of_every_pair(V))
-    publish(root, "plain", "1.0.0")
     return root
 
 
@@ -80,9 +79,3 @@ async def test_an_object_without_a_position_has_no_offset(client: httpx.AsyncCli
     places = [place for entry in answer["missing"] for place in entry["placements"]]
     assert {place["object"] for place in places if "offset" in place} == {"bed"}
     assert {place["object"] for place in places if "offset" not in place} == {"chair", "desk"}
-
-
-async def test_a_model_without_poses_names_none(client: httpx.AsyncClient) -> None:
-    response = await client.post("/missing", json={**REQUEST, "model": "plain"})
-    assert response.is_success
-    assert "offset" not in response.text

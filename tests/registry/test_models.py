@@ -146,16 +146,6 @@ def test_spoilt_aliases_leave_names_usable(store: Store) -> None:
     assert refused.value.code == "invalid_aliases"
 
 
-def test_an_alias_to_a_removed_version_does_not_fall_back(store: Store) -> None:
-    store.set_alias("default", AliasTarget(name="tiny", version="2.0.0"))
-    shutil.rmtree(store.root / "tiny" / "2.0.0")
-    models = load_model_set(store)
-    assert not is_ready(models)
-    with pytest.raises(StoreError) as refused:
-        models.resolve("default")
-    assert refused.value.code == "dangling_alias"
-
-
 def test_a_publication_between_two_looks_leaves_no_alias_dangling(store: Store) -> None:
     class OvertakenStore(Store):
         """Another process publishes right after the first look, whichever that is."""

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from contextlib import suppress
 from itertools import permutations
 
 import numpy as np
@@ -28,7 +28,8 @@ def rooms(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     positions = draw(hnp.arrays(float, (n, 3), elements=steps))
     sizes = draw(hnp.arrays(float, (n, 3), elements=st.integers(1, 12).map(lambda k: k / 10)))
     sizes[draw(hnp.arrays(bool, n, elements=st.sampled_from([False, False, True])))] = NAN
-    yaws = draw(hnp.arrays(float, n, elements=st.sampled_from([0.0, 0.4, math.pi / 2, -2.5])))
+    turns = st.sampled_from([0.0, 0.4, math.pi / 2, -2.5]) | st.floats(-7, 7, width=32)
+    yaws = draw(hnp.arrays(float, n, elements=turns))
     return positions, sizes, yaws
 
 
@@ -38,20 +39,6 @@ def names(found: PoseRelations, i: int = 0, j: int = 1) -> tuple[set[str], set[s
         {name for a, name in enumerate(CANONICAL) if found.holds[a, i, j]},
         {name for a, name in enumerate(CANONICAL) if found.observed[a, i, j]},
     )
-
-
-def compare(found: PoseRelations, boxes: list[Box], *, horizontal: bool = True) -> Counter[str]:
-    """Compare every pair with the plain rules; returns what held and how often none could tell."""
-    seen: Counter[str] = Counter()
-    for i, j in permutations(range(len(boxes)), 2):
-        try:
-            holds, observed = relate(boxes[i], boxes[j], horizontal=horizontal)
-        except UndecidedError:
-            seen["undecided"] += 1
-            continue
-        assert names(found, i, j) == (holds, observed)
-        seen.update(holds or ["none" if observed else "unobserved"])
-    return seen
 
 
 def boxes_of(positions: np.ndarray, sizes: np.ndarray, yaws: np.ndarray) -> list[Box]:
@@ -65,28 +52,11 @@ def boxes_of(positions: np.ndarray, sizes: np.ndarray, yaws: np.ndarray) -> list
 def test_every_pair_obeys_the_rules(
     room: tuple[np.ndarray, np.ndarray, np.ndarray], horizontal: bool
 ) -> None:
-    found = derive_relations(*room, horizontal=horizontal)
-    compare(found, boxes_of(*room), horizontal=horizontal)
-
-
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("n", [12, 30])
-def test_every_pair_of_a_drawn_room_obeys_the_rules(n: int, turned: bool) -> None:
-    rng = np.random.default_rng(n)
-    seen: Counter[str] = Counter()
-    for _ in range(360 // n):
-        positions = rng.uniform(-2, 2, (n, 3)) * [1, 1, 0.3]
-        sizes, yaws = rng.uniform(0.05, 1.5, (n, 3)), np.zeros(n)
-        if turned:
-            yaws = rng.uniform(-7, 7, n)
-        else:  # a grid of eighths: every sum is exact, equal offsets are common
-            positions, sizes = np.round(positions * 8) / 8, np.ceil(sizes * 8) / 8
-        positions[rng.random(n) < 0.1, rng.integers(3)] = NAN
-        sizes[rng.random(n) < 0.2, rng.integers(3)] = NAN
-        seen += compare(derive_relations(positions, sizes, yaws), boxes_of(positions, sizes, yaws))
-    assert set(CANONICAL) | {"none", "unobserved"} <= set(seen)
-    # On the grid a gap of exactly one metre is common.
-    assert seen["undecided"] < (0.001 if turned else 0.05) * seen.total()
+    """Pairs where rounding decides are left out."""
+    derived, boxes = derive_relations(*room, horizontal=horizontal), boxes_of(*room)
+    for i, j in permutations(range(len(boxes)), 2):
+        with suppress(UndecidedError):
+            assert names(derived, i, j) == relate(boxes[i], boxes[j], horizontal=horizontal)
 
 
 def test_a_quarter_turn_exchanges_left_and_front() -> None:

@@ -35,14 +35,11 @@ class HiddenDraws:
     Attributes:
         h1: binary samples, (draws, scenes, hidden units).
         log_weight: log importance weights, (draws, scenes). The weights of a scene sum to 1.
-        log_evidence: estimate of log sum_{h1, unobserved r} exp(-E), (scenes,). The energy E is
-            without the object biases.
         field: the mean-field fixed point, from which the draws are sampled.
     """
 
     h1: Tensor
     log_weight: Tensor
-    log_evidence: Tensor
     field: MeanField
 
     def implied(
@@ -104,6 +101,4 @@ def draw_hidden(
             term = torch.lerp(unseen, term, pull)
         target = target + term.sum(-1)
     log_weight = target - log_q
-    total = log_weight.logsumexp(0)
-    count = torch.tensor(float(len(h1)), dtype=y.dtype).log()
-    return HiddenDraws(h1, log_weight - total, total - count, field)
+    return HiddenDraws(h1, log_weight - log_weight.logsumexp(0), field)

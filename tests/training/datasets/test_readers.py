@@ -108,18 +108,15 @@ def test_jsonl_takes_a_scene_as_a_request_writes_it(tmp_path: Path) -> None:
     assert first.objects[1].position == (2.0, 0.0, 0.4)
 
 
-@pytest.mark.parametrize("source", ["3dssg", "vrd", "nr3d"])
-def test_jsonl_keeps_relations_that_a_reader_translated(tmp_path: Path, source: str) -> None:
-    """The readers translate the predicates of a source already."""
-    things = tuple(AnnotatedObject(str(k), label) for k, label in enumerate(("cup", "table")))
-    read = AnnotatedScene("s", source, "g", None, things, relations=((0, "on-top", 1),))
-    jsonl.write_jsonl([read], tmp_path / "scenes.jsonl")
-    assert read_scenes(tmp_path / "scenes.jsonl") == [read]
-
-
 @pytest.mark.parametrize("name", ["again.jsonl", "again.jsonl.gz"])
 def test_jsonl_is_read_as_it_was_written(tmp_path: Path, name: str) -> None:
-    scenes = [*read_scenes(write_jsonl(tmp_path)), *generate_rooms(10, 0)]
+    """Relations of a source whose predicates a reader has translated stay as they are."""
+    things = tuple(AnnotatedObject(str(k), label) for k, label in enumerate(("cup", "table")))
+    translated = [
+        AnnotatedScene("s", source, "g", None, things, relations=((0, "on-top", 1),))
+        for source in ("3dssg", "vrd", "nr3d")
+    ]
+    scenes = [*read_scenes(write_jsonl(tmp_path)), *generate_rooms(10, 0), *translated]
     jsonl.write_jsonl(scenes, tmp_path / name)
     assert read_scenes(tmp_path / name) == scenes
 
@@ -546,24 +543,16 @@ def test_readers_are_found_by_file_name(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", READERS)
-@pytest.mark.parametrize("content", [b"", b"\x00\xff\xfe nonsense", b"[1, 2"])
-def test_files_of_nonsense(name: str, content: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", [None, b"", b"\x00\xff\xfe nonsense", b"[1, 2"])
+def test_missing_and_malformed_files(name: str, content: bytes | None, tmp_path: Path) -> None:
     path = LAYOUTS[name](tmp_path)
-    path.write_bytes(content)
-    if name == "jsonl" and not content:
+    path.unlink() if content is None else path.write_bytes(content)
+    if name == "jsonl" and content == b"":
         assert read_scenes(path) == []
         return
     with pytest.raises(DatasetError, match="(?i)" + path.name) as caught:
         read_scenes(path)
     assert caught.value.problem
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_missing_files(name: str, tmp_path: Path) -> None:
-    path = LAYOUTS[name](tmp_path)
-    path.unlink()
-    with pytest.raises(DatasetError, match=path.name):
-        read_scenes(path)
 
 
 def test_a_number_of_400_digits_in_a_json_file_is_an_error(tmp_path: Path) -> None:

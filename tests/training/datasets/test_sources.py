@@ -16,7 +16,7 @@ from training.datasets import (
     encode,
 )
 from training.datasets.batches import scene_tensors
-from training.datasets.sources import BOXES, LISTS, SOURCES, meaning_of
+from training.datasets.sources import SOURCES, meaning_of
 
 VOCABULARY = Vocabulary([ObjectClass("desk"), ObjectClass("monitor"), ObjectClass("pencil")])
 LATERAL, VERTICAL = [LEFT, FRONT], [ON_TOP, ABOVE]
@@ -73,13 +73,6 @@ def test_3dssg_annotates_supports_throughout_and_sides_of_related_pairs() -> Non
     related = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=bool)
     assert (found.instance_observed[LATERAL] == related).all()
     assert np.argwhere(found.instance_observed[ABOVE]).tolist() == [[0, 1], [1, 0]]
-
-
-def test_lists_of_the_users_own_are_complete() -> None:
-    found = encoded("robot", relations=((1, "on-top", 0),))
-    assert (found.instance_observed == ~np.eye(3, dtype=bool)).all()
-    assert meaning_of("robot") is LISTS
-    assert meaning_of("robot", listed=False) is BOXES
 
 
 @pytest.mark.parametrize("source", ["procthor", "rooms", "robot"])

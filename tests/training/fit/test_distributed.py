@@ -16,7 +16,7 @@ from training.fit.checkpoint import Epoch
 from training.fit.configuration import Config
 from training.fit.trainer import Trainer
 from training.machines.bernoulli import categorical, integers, uniform
-from training.machines.distributed import mean_part, new_generator, on_first, share
+from training.machines.distributed import new_generator
 from training.runs.config_files import config_toml, load_config, with_settings
 from training.runs.pipeline import prepare
 
@@ -152,10 +152,3 @@ def test_one_process_draws_as_torch_does():
     assert torch.equal(integers(WIDTH, (ROWS,), first), drawn)
     drawn = torch.multinomial(weight, 1, generator=second).squeeze(1)
     assert torch.equal(categorical(weight, first), drawn)
-
-
-def test_one_process_keeps_its_rows():
-    rows = torch.rand(ROWS)
-    assert torch.equal(mean_part(rows), rows.mean())
-    assert share(rows) is rows
-    assert on_first(lambda: 3) == 3

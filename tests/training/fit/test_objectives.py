@@ -14,7 +14,6 @@ import torch
 from torch.nn.functional import logsigmoid
 
 from tests.enumeration.small_machines import (
-    SEED_FORM,
     SMALL,
     draw_states,
     enumerate_joint,
@@ -260,24 +259,3 @@ def test_unlisted_relations_can_count_as_off():
     even = 16 / 24 * math.log(2)
     assert losses[0] == pytest.approx(even, rel=0.1)
     assert losses[1] == pytest.approx(4 * even, rel=0.1)
-
-
-@pytest.mark.parametrize("name", SEED_FORM)
-def test_both_terms_of_the_seed_form_are_free_energies(name):
-    """One pass over data and model states together is the difference of two free energies."""
-    machine = small_machine(name)
-    if machine.spec.variant == "triway":
-        machine.kappa.zero_()
-    joint = enumerate_joint(machine)
-    some, others = slice(40, 60), slice(100, 120)
-    states = [
-        State(joint.v[k], joint.h1[k], joint.h2[k], joint.r[k], joint.edges) for k in (some, others)
-    ]
-    room = torch.full((20,), -1)
-    everything = torch.ones(20, joint.r.shape[1], dtype=torch.bool)
-    ours = energy_difference(machine, states[0], everything, states[1], room, room)
-    second = [s.h2 if machine.spec.H2 else None for s in states]
-    free = [
-        machine.free_energy(s.v, s.r, s.edges, h2) for s, h2 in zip(states, second, strict=True)
-    ]
-    torch.testing.assert_close(ours, free[0].mean() - free[1].mean())

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from tests.training.commands import invoke, small_config, write_config
-from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.evaluation.metrics import Figure, Ratio
-from training.evaluation.model import Model
 from training.evaluation.report import SourceReport
 from training.evaluation.results import Cell, Difference, Results, summarise
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.setting import Outcome
 from training.evaluation.tasks import TASKS
 from training.fit.configuration import ConfigError
 from training.fit.trainer import Trainer
@@ -27,8 +24,7 @@ from training.research.benchmark import (
     read_domains,
     shuffled_text,
 )
-from training.research.entries import Entry, baseline_entries
-from training.research.measure import BenchmarkError, Plan, measure_entries
+from training.research.entries import baseline_entries
 from training.research.plots import read_curve, recall_points
 from training.runs.folder import load_run
 
@@ -193,14 +189,6 @@ def test_finished_rows_are_never_trained_again(finished, monkeypatch):
     assert outcomes[0] == outcomes[1]
 
 
-def test_every_trial_is_kept(finished):
-    _, folder = finished
-    lines = (folder / "ease/seed-0/trials.jsonl").read_text().splitlines()
-    trials = [json.loads(line) for line in lines]
-    assert len([t for t in trials if t["model"] == "EASE"]) > 1
-    assert all(np.isfinite(t["validation"]) and t["seconds"] >= 0 for t in trials)
-
-
 @pytest.mark.parametrize(
     ("others", "message"),
     [
@@ -294,47 +282,6 @@ def test_recall_curves_follow_the_figures():
 def test_a_summary_needs_our_row():
     with pytest.raises(ValueError, match="no metric of the reference row ours"):
         summarise({}, "ours")
-
-
-def test_interrupting_keeps_what_is_finished(tmp_path):
-    """Ctrl-C in the second row: the first row's report is there and is not made again."""
-    made = []
-
-    def make(name):
-        def maker(*_):
-            made.append(name)
-            if name == "second" and made.count(name) == 1:
-                raise KeyboardInterrupt
-            return Model()
-
-        return maker
-
-    plan = _plan(tmp_path)
-    entries = [Entry(name, 0, name, make(name)) for name in ("first", "second")]
-    with pytest.raises(KeyboardInterrupt):
-        measure_entries(plan, entries, print)
-    assert set(measure_entries(plan, entries, print)[0]) == {("first", 0), ("second", 0)}
-    assert made == ["first", "second", "second"]
-
-
-def _plan(folder, material="these scenes"):
-    settings = {"none": Setting(tensors([scene([0], name="one")]), NO_STRUCTURE)}
-    return Plan(folder, SimpleNamespace(digest=material), settings, ["T2 missing"])
-
-
-def test_a_folder_of_another_row_or_other_scenes_is_refused(tmp_path):
-    def row(identity):
-        return Entry("row", 0, identity, lambda *_: Model())
-
-    measure_entries(_plan(tmp_path), [row("1")], print)
-    with pytest.raises(BenchmarkError, match="another configuration of row"):
-        measure_entries(_plan(tmp_path), [row("2")], print)
-    with pytest.raises(BenchmarkError, match="other training scenes"):
-        measure_entries(_plan(tmp_path, "other scenes"), [row("1")], print)
-    # Nor one that does not say what it learnt from.
-    (tmp_path / "row/seed-0/row.json").write_text(json.dumps({"identity": "1"}))
-    with pytest.raises(BenchmarkError, match="other training scenes"):
-        measure_entries(_plan(tmp_path), [row("1")], print)
 
 
 def test_rows_that_answered_in_other_sources_are_not_paired():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import pytest
@@ -10,7 +11,7 @@ from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.evaluation.model import Model
 from training.evaluation.setting import Setting
 from training.research.entries import Entry
-from training.research.measure import Plan, measure_entries
+from training.research.measure import BenchmarkError, Plan, measure_entries
 
 
 def answers(*_):
@@ -21,9 +22,9 @@ def diverges(*_):
     raise FloatingPointError("loss is nan")
 
 
-def plan(folder):
+def plan(folder, material="these scenes"):
     settings = {"none": Setting(tensors([scene([0], name="one")]), NO_STRUCTURE)}
-    return Plan(folder, SimpleNamespace(digest="these scenes"), settings, ["T2 missing"])
+    return Plan(folder, SimpleNamespace(digest=material), settings, ["T2 missing"])
 
 
 @pytest.mark.slow
@@ -49,3 +50,18 @@ def test_errors_other_than_failures_of_a_row_are_raised(tmp_path):
     entries = [Entry("first", 0, "first", diverges), Entry("second", 0, "second", answers)]
     with pytest.raises(FloatingPointError, match="loss is nan"):
         measure_entries(plan(tmp_path), entries, print, workers=2)
+
+
+def test_a_folder_of_another_row_or_other_scenes_is_refused(tmp_path):
+    def row(identity):
+        return Entry("row", 0, identity, answers)
+
+    measure_entries(plan(tmp_path), [row("1")], print)
+    with pytest.raises(BenchmarkError, match="another configuration of row"):
+        measure_entries(plan(tmp_path), [row("2")], print)
+    with pytest.raises(BenchmarkError, match="other training scenes"):
+        measure_entries(plan(tmp_path, "other scenes"), [row("1")], print)
+    # Nor one that does not say what it learnt from.
+    (tmp_path / "row/seed-0/row.json").write_text(json.dumps({"identity": "1"}))
+    with pytest.raises(BenchmarkError, match="other training scenes"):
+        measure_entries(plan(tmp_path), [row("1")], print)
