@@ -65,10 +65,10 @@ class Candidate:
         """
         if self.artifact is None:
             return _baselines(data, say)
-        own = artifact_model(self.artifact, data.train)
+        model = artifact_model(self.artifact, data.train)
         if same_classes(scenes, self.artifact.vocabulary):
-            return own
-        return Translation.between(scenes, self.artifact.vocabulary).model(own)
+            return model
+        return Translation.between(scenes, self.artifact.vocabulary).translate(model)
 
 
 def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
@@ -182,10 +182,10 @@ def held_out(a: Candidate, b: Candidate, sources: Sources, root: Path) -> HeldOu
         raise ConfigError(
             f"{a.title} does not record the split of its scenes, so its test scenes are unknown"
         )
-    everything = [scene for some in sources.values() for scene in some]
+    all_scenes = [scene for scenes in sources.values() for scene in scenes]
     data = a.config.data
-    candidates = split(everything, seed=data.split_seed, protocol=data.split)["test"]
-    if not candidates:
+    test_scenes = split(all_scenes, seed=data.split_seed, protocol=data.split)["test"]
+    if not test_scenes:
         if data.split == "final":
             raise ConfigError(
                 f"{a.title} learnt from all of its scenes, because it was trained with --final; "
@@ -194,25 +194,25 @@ def held_out(a: Candidate, b: Candidate, sources: Sources, root: Path) -> HeldOu
         raise ConfigError("the test part contains no scenes: provide more scenes or more groups")
     notes: list[str] = []
     certain = True
-    kept = candidates
+    unlearnt = test_scenes
     for candidate in (a, b):
-        kept, note, sure = _not_learnt(candidate, kept, sources, root)
+        unlearnt, note, is_certain = _drop_learnt(candidate, unlearnt, sources, root)
         notes += [note] if note else []
-        certain &= sure
-    if not kept:
+        certain &= is_certain
+    if not unlearnt:
         raise ConfigError(
             f"no scene is held out from both models: {b.title} has learnt from all test scenes of "
             f"{a.title}"
         )
-    if dropped := len(candidates) - len(kept):
+    if dropped := len(test_scenes) - len(unlearnt):
         notes.append(
-            f"{dropped} of {len(candidates)} test scenes of {a.title} are left out: {b.title} has "
+            f"{dropped} of {len(test_scenes)} test scenes of {a.title} are left out: {b.title} has "
             "learnt from these scenes or from near-duplicates (same group)"
         )
-    return HeldOut(kept, tuple(notes), certain)
+    return HeldOut(unlearnt, tuple(notes), certain)
 
 
-def _not_learnt(
+def _drop_learnt(
     candidate: Candidate, scenes: list[AnnotatedScene], sources: Sources, root: Path
 ) -> tuple[list[AnnotatedScene], str, bool]:
     """Leave out the scenes that a candidate learnt from.
@@ -222,7 +222,7 @@ def _not_learnt(
     """
     if candidate.artifact is None:
         return scenes, "", True  # baselines are fitted on the training scenes of the first model
-    digests = {name: digest_of(some) for name, some in sources.items()}
+    digests = {name: digest_of(source) for name, source in sources.items()}
     shared = {
         name
         for name, digest in digests.items()
@@ -237,19 +237,22 @@ def _not_learnt(
     data = candidate.config.data
     if data.split == "stable":
         seed = data.split_seed
-        held = [s for s in scenes if s.source not in shared or stable_part(s.group, seed) == "test"]
-        return held, "", True
-    if (own := _scenes_of(data, candidate.learnt, sources, digests, root)) is None:
+        unlearnt = [
+            s for s in scenes if s.source not in shared or stable_part(s.group, seed) == "test"
+        ]
+        return unlearnt, "", True
+    all_scenes = _scenes_of(data, candidate.learnt, sources, digests, root)
+    if all_scenes is None:
         note = (
             f"{candidate.title} may have learnt from these scenes: it learnt from other versions "
             f"of {', '.join(sorted(shared))}, so its split cannot be reproduced. Use the "
             "stable split to avoid this"
         )
         return scenes, note, False
-    parts = split(own, seed=data.split_seed, protocol=data.split)
+    parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     # Filter by group for all protocols: scenes of one group are near-duplicates.
-    learnt = {scene.group for part in ("train", "validation") for scene in parts[part]}
-    return [scene for scene in scenes if scene.group not in learnt], "", True
+    groups = {scene.group for part in ("train", "validation") for scene in parts[part]}
+    return [scene for scene in scenes if scene.group not in groups], "", True
 
 
 def _scenes_of(
@@ -267,11 +270,11 @@ def _scenes_of(
             scenes += sources[name]
             continue
         try:
-            one = data.model_copy(update={"sources": (source,), "words": ""})
-            (read,) = read_sources(one, root).values()
+            source_data = data.model_copy(update={"sources": (source,), "words": ""})
+            (source_scenes,) = read_sources(source_data, root).values()
         except (ConfigError, DatasetError):
             return None
-        if digest_of(read) != learnt.get(name):
+        if digest_of(source_scenes) != learnt.get(name):
             return None
-        scenes += read
+        scenes += source_scenes
     return scenes

@@ -118,9 +118,9 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-serialisable dictionary with the results and all other attributes."""
-        own = asdict(self)
-        own.pop("results")
-        return self.results.to_dict() | {"a": self.a} | own
+        attributes = asdict(self)
+        attributes.pop("results")
+        return self.results.to_dict() | {"a": self.a} | attributes
 
 
 def compare_command(
@@ -174,9 +174,9 @@ def show(comparison: Comparison, console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    heads = "task, metric", "A", "B", "A - B, 95 % interval", "A is"
+    headings = "task, metric", "A", "B", "A - B, 95 % interval", "A is"
     # Without edges and padding, the table fits into 80 columns.
-    table = Table(*heads, box=box.SIMPLE_HEAD, show_edge=False, padding=0)
+    table = Table(*headings, box=box.SIMPLE_HEAD, show_edge=False, padding=0)
     cells = comparison.results.cells
     values = {(cell.row, cell.task, cell.metric): cell.figure.value for cell in cells}
     task = ""
@@ -187,7 +187,10 @@ def show(comparison: Comparison, console: Console) -> None:
         colour, figure = _COLOURS.get(row.verdict, "dim"), row.figure
         table.add_row(
             f"  {row.metric}",
-            *(f"{values[x, row.task, row.metric]:.3f}" for x in (comparison.a, comparison.b)),
+            *(
+                f"{values[title, row.task, row.metric]:.3f}"
+                for title in (comparison.a, comparison.b)
+            ),
             f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]",
             f"[{colour}]{row.verdict}[/{colour}]",
         )
@@ -250,9 +253,9 @@ def compare(
     groups = len({scene.group for scene in scenes.scenes})
     say("looking for examples")
     first, second = (model.missing for model in models)
-    different: list[Example] = []
+    changed: list[Example] = []
     if first is not None and second is not None:
-        different = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
+        changed = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
     return Comparison(
         results=results,
         b=titles[1],
@@ -260,7 +263,7 @@ def compare(
         groups=groups,
         certain=held.certain,
         notes=tuple(_notes(a, b, held, limit)),
-        examples=tuple(different),
+        examples=tuple(changed),
         unmeasured=unmeasured(results.differences, b),
     )
 
@@ -281,8 +284,8 @@ def side_by_side(
     setting = Setting(scenes, structure, limit=None)
 
     def groups(task: str) -> list[str]:
-        asked = setting.complete if TASKS[task].of_objects else setting
-        return [scene.group for scene in asked.some(task in _RELATED).scenes]
+        task_setting = setting.complete if TASKS[task].of_objects else setting
+        return [scene.group for scene in task_setting.some(task in _RELATED).scenes]
 
     tasks = [task for task in COMPARED if len(set(groups(task))) > 1]
     if not tasks:
@@ -308,14 +311,14 @@ def _notes(a: Candidate, b: Candidate, held: HeldOut, limit: int | None) -> Iter
     yield from held.notes
     ours, theirs = a.vocabulary, b.vocabulary
     if ours is not None and theirs is not None and not same_classes(ours, theirs):
-        own = Translation.between(ours, theirs).own
+        model_class = Translation.between(ours, theirs).model_class
         labels = [thing.label for scene in held.scenes for thing in scene.objects]
         mentions = [index for label in labels if (index := ours.index(label)) is not None]
-        lost = sum(int(own[index]) < 0 for index in mentions)
-        if missing := int((own < 0).sum()):
+        unknown = sum(int(model_class[index]) < 0 for index in mentions)
+        if missing := int((model_class < 0).sum()):
             yield (
                 f"the questions use the {len(ours)} classes of {a.title}. {b.title} lacks "
-                f"{missing} of these classes ({lost / max(len(mentions), 1):.0%} of the "
+                f"{missing} of these classes ({unknown / max(len(mentions), 1):.0%} of the "
                 "objects in the scenes). Objects of these classes are not part of its input, and "
                 "it ranks these classes last"
             )
@@ -338,14 +341,14 @@ def changed_most(
     """
     first, second = (leave_one_out(scenes, structure, score) for score in (a, b))
     change = np.abs(first.reciprocal_rank() - second.reciprocal_rank())
-    chosen: dict[str, int] = {}
-    for place in np.argsort(-change, kind="stable").tolist():
-        if len(chosen) == count or not change[place]:
+    question_of: dict[str, int] = {}
+    for question in np.argsort(-change, kind="stable").tolist():
+        if len(question_of) == count or not change[question]:
             break
-        chosen.setdefault(scenes.scenes[int(first.scene[place])].group, place)
+        question_of.setdefault(scenes.scenes[int(first.scene[question])].group, question)
     questions = []
-    for place in chosen.values():
-        row, target = int(first.scene[place]), int(first.target[place])
+    for question in question_of.values():
+        row, target = int(first.scene[question]), int(first.target[question])
         scene, v = scenes.scenes[row], scenes.v[row].clone()
         v[target] = 0.0
         room = vocabulary.room_types[scene.room_type] if scene.room_type >= 0 else ""
@@ -355,7 +358,7 @@ def changed_most(
                 room_type=room,
                 shown=tuple(vocabulary.labels[k] for k in v.nonzero().squeeze(1).tolist()),
                 removed=vocabulary.labels[target],
-                ranks=(int(first.above[place]) + 1, int(second.above[place]) + 1),
+                ranks=(int(first.above[question]) + 1, int(second.above[question]) + 1),
                 answers=(
                     _answers(a, v, structure, vocabulary),
                     _answers(b, v, structure, vocabulary),

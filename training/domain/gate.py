@@ -13,7 +13,7 @@ refused if the served version was measured on relation tasks and the comparison 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from app.registry import Artifact, ArtifactError, Store, StoreError
 from app.registry.references import AliasTarget
@@ -61,17 +61,17 @@ class Usefulness:
         """Generate the results as lines of at most 80 characters."""
         if self.ours is None:
             return
-        yield f"mean reciprocal rank of a missing object, {self._place()}:"
+        yield f"mean reciprocal rank of a missing object, {self._sample_text()}:"
         yield f"  {NEW:16} {self.ours:.3f}"
         for name, value in self.theirs.items():
-            yield f"  {name:16} {value:.3f}  difference {_signed(self.differences[name])}"
+            yield f"  {name:16} {value:.3f}  difference {_figure_text(self.differences[name])}"
         yield f"  required over {POPULARITY.name}: {_REQUIRED}"
 
     def objections(self) -> list[str]:
         """Return the reasons against the new version; an empty list if it is useful."""
         if self.ours is None or self.groups < FEWEST_GROUPS:
             return [
-                f"{NEW} cannot be compared with {POPULARITY.name}: {self._place()}, and a "
+                f"{NEW} cannot be compared with {POPULARITY.name}: {self._sample_text()}, and a "
                 f"comparison needs test scenes of at least {FEWEST_GROUPS} groups with two or more "
                 "classes. Provide more scenes"
             ]
@@ -80,21 +80,21 @@ class Usefulness:
         if not (gain.value >= GAIN and gain.low > 0):
             reasons.append(
                 f"{NEW} is not clearly better than {POPULARITY.name}, which only knows how "
-                f"frequent each class is: difference {_signed(gain)} (required: {_REQUIRED}), "
-                f"{self._place()}. Check the labels, train longer or provide more scenes"
+                f"frequent each class is: difference {_figure_text(gain)} (required: {_REQUIRED}), "
+                f"{self._sample_text()}. Check the labels, train longer or provide more scenes"
             )
         if loss.high < 0:
             reasons.append(
                 f"{NEW} is worse than EASE, a plain model of co-occurrence: difference "
-                f"{_signed(loss)}, {self._place()}"
+                f"{_figure_text(loss)}, {self._sample_text()}"
             )
         return reasons
 
-    def _place(self) -> str:
+    def _sample_text(self) -> str:
         return f"{self.scenes} test scenes of {self.groups} groups"
 
 
-def _signed(figure: Figure) -> str:
+def _figure_text(figure: Figure) -> str:
     return f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]"
 
 
@@ -108,13 +108,13 @@ def measure_usefulness(
     """
     complete = data.test.complete.nonzero().squeeze(1)
     scenes = some_scenes(subset(data.test, complete) if len(complete) else data.test, limit)
-    # A question hides one class and lists at least one other class.
-    usable = ((scenes.v > 0) & ~data.structure).sum(1) > 1
-    scenes = subset(scenes, usable.nonzero().squeeze(1))
+    # A question hides one class and lists the others.
+    has_two_classes = ((scenes.v > 0) & ~data.structure).sum(1) > 1
+    scenes = subset(scenes, has_two_classes.nonzero().squeeze(1))
     groups = [scene.group for scene in scenes.scenes]
-    size = len(scenes), len(set(groups))
-    if len(set(groups)) < FEWEST_GROUPS:
-        return Usefulness(*size)
+    usefulness = Usefulness(scenes=len(scenes), groups=len(set(groups)))
+    if usefulness.groups < FEWEST_GROUPS:
+        return usefulness
 
     def mrr(score: ObjectScore | None) -> Ratio:
         if score is None:
@@ -127,10 +127,13 @@ def measure_usefulness(
         say(f"fitting {baseline.name}")
         model = baseline.fit(data.train, data.validation, data.structure)
         theirs[baseline.name] = mrr(model.missing)
-    return Usefulness(
-        *(*size, ours.value),
-        {name: other.value for name, other in theirs.items()},
-        {name: paired_difference(ours, other, groups=groups) for name, other in theirs.items()},
+    return replace(
+        usefulness,
+        ours=ours.value,
+        theirs={name: ratio.value for name, ratio in theirs.items()},
+        differences={
+            name: paired_difference(ours, ratio, groups=groups) for name, ratio in theirs.items()
+        },
     )
 
 

@@ -20,7 +20,7 @@ from training.datasets.rooms import DOMAINS
 from training.domain.proposal import Proposal, propose
 from training.domain.proposal_report import as_dict, show
 from training.evaluation.report import write_whole
-from training.fit.configuration import ConfigError, is_file, source_name
+from training.fit.configuration import Config, ConfigError, is_file, source_name
 from training.runs.config_files import shipped_configs
 from training.runs.example_scenes import examples_json
 
@@ -68,33 +68,32 @@ def init(
     folder = Path(name) if output is None else output
     try:
         _check_name(name)
-        names = (f"{name}.toml", "vocabulary.json", "examples.json")
-        targets = [folder / file for file in names]
+        targets = [folder / file for file in (f"{name}.toml", "vocabulary.json", "examples.json")]
         with console.status("reading scenes"):
             scenes_of = {file: _read(file, format_) for file in files}
         for file in files:
             if not scenes_of[file]:
                 raise DatasetError(file, "", "the file contains no scene")
-        sources, copies = _sources(folder, scenes_of)
+        sources, copies = _sources_and_copies(folder, scenes_of)
         _require_new([*targets, *copies], force=force)
-        scenes = [scene for some in scenes_of.values() for scene in some]
+        all_scenes = [scene for scenes in scenes_of.values() for scene in scenes]
         with console.status("analysing scenes"):
-            proposal = propose(name, scenes, sources, terms=terms)
-            proposal.config  # noqa: B018  # raises an error if the proposal is invalid
+            proposal = propose(name, all_scenes, sources, terms=terms)
+            Config.model_validate(proposal.values)
     except BadLinesError as error:
-        _fail_lines(error)
+        _fail_with_lines(error)
     except (ConfigError, DatasetError, ValueError) as error:
         fail(error)
     folder.mkdir(parents=True, exist_ok=True)
-    for path, some in copies.items():
-        write_jsonl(some, path)
-    write_whole(targets[0], proposal.toml())
-    write_whole(targets[1], vocabulary_json(proposal.vocabulary))
-    write_whole(targets[2], examples_json(proposal.examples))
+    for path, scenes in copies.items():
+        write_jsonl(scenes, path)
+    vocabulary, examples = vocabulary_json(proposal.vocabulary), examples_json(proposal.examples)
+    for path, text in zip(targets, (proposal.toml(), vocabulary, examples), strict=True):
+        write_whole(path, text)
     if report is not None:
         write_whole(report, json.dumps(as_dict(proposal), indent=1, ensure_ascii=False) + "\n")
     show(proposal, console)
-    _next(proposal, folder, targets, copies)
+    _print_files(proposal, folder, targets, copies)
 
 
 def _check_name(name: str) -> None:
@@ -108,7 +107,7 @@ def _check_name(name: str) -> None:
 
 
 def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
-    """Read the scenes of a file."""
+    """Read the scenes of a file. Report all invalid lines of a JSONL file in one error."""
     if format_ is not None and format_ not in READERS:
         raise ConfigError(f"unknown format {format_!r}: use one of {', '.join(READERS)}")
     if (format_ or guess_format(path)) != "jsonl":
@@ -125,8 +124,8 @@ def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
     return scenes
 
 
-def _sources(
-    folder: Path, found: dict[Path, list[AnnotatedScene]]
+def _sources_and_copies(
+    folder: Path, scenes_of: dict[Path, list[AnnotatedScene]]
 ) -> tuple[list[str], dict[Path, list[AnnotatedScene]]]:
     """Return the paths of the scene files relative to the folder, and the files to copy.
 
@@ -135,7 +134,7 @@ def _sources(
     """
     sources: list[str] = []
     copies: dict[Path, list[AnnotatedScene]] = {}
-    for file, scenes in found.items():
+    for file, scenes in scenes_of.items():
         try:
             guess_format(file)
             sources.append(Path(os.path.relpath(file, folder)).as_posix())
@@ -147,7 +146,6 @@ def _sources(
 
 
 def _require_new(paths: Sequence[Path], *, force: bool) -> None:
-    """Refuse to overwrite files, unless ``force`` is True."""
     existing = [str(path) for path in paths if path.exists()]
     if existing and not force:
         raise ConfigError(
@@ -156,7 +154,7 @@ def _require_new(paths: Sequence[Path], *, force: bool) -> None:
         )
 
 
-def _next(
+def _print_files(
     proposal: Proposal, folder: Path, targets: list[Path], copies: dict[Path, list[AnnotatedScene]]
 ) -> None:
     written = ", ".join(map(str, [*targets, *copies]))
@@ -170,7 +168,7 @@ def _next(
         console.print(f"      (the configuration is {targets[0]})", markup=False, soft_wrap=True)
 
 
-def _fail_lines(error: BadLinesError) -> NoReturn:
+def _fail_with_lines(error: BadLinesError) -> NoReturn:
     console.print(f"[red]error:[/red] {error}; no file was written", soft_wrap=True)
     for line in error.errors[:BAD_LINES]:
         console.print(f"  {line.path.name}, {line.where}: {line.problem}", markup=False)

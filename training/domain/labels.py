@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import combinations
 
 from rapidfuzz import process
 from rapidfuzz.distance import OSA
@@ -68,7 +69,10 @@ def outside_vocabulary(scenes: Iterable[EncodedScene], *, named: bool) -> str:
         spellings.setdefault(label_key(label), Counter())[label] += count
     if not spellings:
         return ""
-    counts = [(_first(found), found.total()) for found in spellings.values()]
+    counts = [
+        (_most_frequent(counts_of_label), counts_of_label.total())
+        for counts_of_label in spellings.values()
+    ]
     ordered = sorted(counts, key=lambda entry: (-entry[1], entry[0]))
     listed = [f'"{label}" ({_number(count, "scene")})' for label, count in ordered[:_SHOWN]]
     listed += [f"{len(ordered) - _SHOWN:,} more"] if len(ordered) > _SHOWN else []
@@ -86,23 +90,23 @@ def _number(count: int, noun: str) -> str:
 def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
     """Count all names, most frequent first. Spellings with the same key count as one name."""
     spellings: dict[str, Counter[str]] = {}
-    shown: dict[str, Counter[str]] = {}
-    seen: Counter[str] = Counter()
+    names_of: dict[str, Counter[str]] = {}
+    scenes_of: Counter[str] = Counter()
     canonical = cache(names.canonical)
     for scene in scenes:
-        here = set()
+        scene_keys = set()
         for thing in scene.objects:
             name = canonical(thing.label)
             key = label_key(name)
             spellings.setdefault(key, Counter())[thing.label] += 1
-            shown.setdefault(key, Counter())[name] += 1
-            here.add(key)
-        seen.update(here)
+            names_of.setdefault(key, Counter())[name] += 1
+            scene_keys.add(key)
+        scenes_of.update(scene_keys)
     labels = [
         Label(
-            name=_first(shown[key]),
+            name=_most_frequent(names_of[key]),
             mentions=counts.total(),
-            scenes=seen[key],
+            scenes=scenes_of[key],
             spellings=tuple(sorted(counts, key=lambda label: (-counts[label], label))),
         )
         for key, counts in spellings.items()
@@ -110,7 +114,7 @@ def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
     return sorted(labels, key=lambda label: (-label.mentions, label.name))
 
 
-def _first(counts: Counter[str]) -> str:
+def _most_frequent(counts: Counter[str]) -> str:
     return min(counts, key=lambda label: (-counts[label], label))
 
 
@@ -124,8 +128,9 @@ def lookalikes(
     """
     compared = [label for label in labels[:_COMPARED] if len(label_key(label.name)) >= _ONE_SLIP]
     curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}
-    pairs = list(_pairs([label_key(label.name) for label in compared]))
-    together = _together({compared[k].name for pair in pairs for k in pair}, scenes, names)
+    pairs = list(_similar_pairs([label_key(label.name) for label in compared]))
+    paired = {compared[k].name for pair in pairs for k in pair}
+    together = _pairs_in_one_scene(paired, scenes, names)
     similar = []
     for i, j in pairs:
         # Labels are sorted by frequency, so the second name of a pair is rarer.
@@ -143,46 +148,46 @@ def lookalikes(
             merged, why = True, "rare, one or two letters differ, never in one scene"
         mentions = (rare.mentions, like.mentions)
         similar.append(Lookalike(rare.name, like.name, mentions, merged, why))
-    return _once(similar)
+    return _merge_each_name_once(similar)
 
 
-def _pairs(keys: Sequence[str]) -> Iterator[tuple[int, int]]:
+def _similar_pairs(keys: Sequence[str]) -> Iterator[tuple[int, int]]:
+    """Generate the index pairs of keys that differ by one edit, or by two edits if long."""
     for i, key in enumerate(keys):
         slips = 2 if len(key) >= _TWO_SLIPS else 1
-        rest = process.extract(
-            key, keys[i + 1 :], scorer=OSA.distance, limit=None, score_cutoff=slips
-        )
-        yield from ((i, i + 1 + place) for _, _, place in rest)
+        later = keys[i + 1 :]
+        matches = process.extract(key, later, scorer=OSA.distance, limit=None, score_cutoff=slips)
+        yield from ((i, i + 1 + offset) for _, _, offset in matches)
 
 
 def _digits(key: str) -> str:
     return "".join(letter for letter in key if letter.isdigit())
 
 
-def _together(
-    wanted: set[str], scenes: Sequence[AnnotatedScene], names: Names
+def _pairs_in_one_scene(
+    compared: set[str], scenes: Sequence[AnnotatedScene], names: Names
 ) -> set[frozenset[str]]:
-    """Return the pairs of names in `wanted` that occur in the same scene."""
-    by_key = {label_key(name): name for name in wanted}
+    """Return the pairs of names in `compared` that occur in the same scene."""
+    by_key = {label_key(name): name for name in compared}
     name_of = cache(lambda label: by_key.get(label_key(names.canonical(label))))
     together: set[frozenset[str]] = set()
     for scene in scenes:
-        here = {name for thing in scene.objects if (name := name_of(thing.label)) is not None}
-        together |= {frozenset((a, b)) for a in here for b in here if a < b}
+        present = {name_of(thing.label) for thing in scene.objects} - {None}
+        together |= {frozenset(pair) for pair in combinations(present, 2)}
     return together
 
 
-def _once(found: list[Lookalike]) -> list[Lookalike]:
+def _merge_each_name_once(pairs: list[Lookalike]) -> list[Lookalike]:
     """Return the pairs such that each name is merged at most once.
 
     A name is never merged into another merged name.
     """
     merged: set[str] = set()
-    kept = []
-    for pair in found:
+    checked = []
+    for pair in pairs:
         if pair.merged and (pair.name in merged or pair.like in merged):
             pair = replace(pair, merged=False, why="similar to several names")
         if pair.merged:
             merged.add(pair.name)
-        kept.append(pair)
-    return kept
+        checked.append(pair)
+    return checked

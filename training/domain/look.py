@@ -113,10 +113,12 @@ def _findings(
     scenes: Sequence[AnnotatedScene], rooms: Counter[str], names: Names
 ) -> Iterator[Finding]:
     def finding(what: str, advice: str, cases: Iterable[str]) -> Finding:
-        every = list(cases)
-        return Finding(what, advice, len(every), every[:SHOWN])
+        examples = list(cases)
+        return Finding(what, advice, len(examples), examples[:SHOWN])
 
-    held = [{canonicalise(*triple) for triple in scene.relations or ()} for scene in scenes]
+    triples_of_scenes = [
+        {canonicalise(*triple) for triple in scene.relations or ()} for scene in scenes
+    ]
     yield finding(
         "Scenes have fewer than two different objects, so they do not show co-occurrence.",
         "Training reads them. Questions that need more objects skip them.",
@@ -126,8 +128,8 @@ def _findings(
         "A relation is annotated in both directions, such as left and right of each other.",
         "Such a relation counts as unobserved. Correct it, or check the point of view.",
         (
-            f"{_pair(scene, i, j)}, {CANONICAL[a]}"
-            for scene, triples in zip(scenes, held, strict=True)
+            f"{_describe_pair(scene, i, j)}, {CANONICAL[a]}"
+            for scene, triples in zip(scenes, triples_of_scenes, strict=True)
             for a, i, j in sorted(triples)
             if i < j and (a, j, i) in triples
         ),
@@ -136,8 +138,8 @@ def _findings(
         "An object is on-top of another object that is annotated as above it.",
         "Correct one of the two relations.",
         (
-            _pair(scene, i, j)
-            for scene, triples in zip(scenes, held, strict=True)
+            _describe_pair(scene, i, j)
+            for scene, triples in zip(scenes, triples_of_scenes, strict=True)
             for a, i, j in sorted(triples)
             if a == _ON_TOP and (_ABOVE, j, i) in triples
         ),
@@ -146,27 +148,27 @@ def _findings(
         "Objects support each other in a cycle (on-top or supported_by).",
         "Correct the cycle: an object cannot stand on an object that it supports.",
         (
-            f"{scene.scene_id}: {', '.join(circle)}"
-            for scene, triples in zip(scenes, held, strict=True)
-            if (circle := _circle(scene, triples)) is not None
+            f"{scene.scene_id}: {', '.join(cycle)}"
+            for scene, triples in zip(scenes, triples_of_scenes, strict=True)
+            if (cycle := _support_cycle(scene, triples)) is not None
         ),
     )
     yield finding(
         f"Labels are blank, longer than {LONGEST} characters or not printable.",
         "A request cannot contain such a label. Use other labels.",
-        _unaskable(scenes, names),
+        _invalid_labels(scenes, names),
     )
     yield finding(
         "Scenes of different groups have the same objects in the same places or relations.",
         "Remove copies or put them into one group. Otherwise test scenes occur in training.",
         _duplicates(scenes),
     )
-    alone = len({scene.group for scene in scenes}) == len(scenes)
+    one_scene_each = len({scene.group for scene in scenes}) == len(scenes)
     yield Finding(
         "Every scene has its own group.",
         "If several scenes are frames or scans of one place, put these scenes into one group. "
         "Near-duplicates in training and test scenes make the test results too good.",
-        len(scenes) if alone else 0,
+        len(scenes) if one_scene_each else 0,
     )
     yield finding(
         "Scenes have no room type.",
@@ -199,25 +201,26 @@ def _beyond_metres(scene: AnnotatedScene) -> bool:
     return far or max((max(thing.size or (0,)) for thing in scene.objects), default=0) > LARGEST
 
 
-def _unaskable(scenes: Sequence[AnnotatedScene], names: Names) -> Iterator[str]:
+def _invalid_labels(scenes: Sequence[AnnotatedScene], names: Names) -> Iterator[str]:
+    """Generate the labels that a request refuses, at most 100 characters of each."""
     for label in sorted({thing.label for scene in scenes for thing in scene.objects}):
         name = names.canonical(label)
         if not name.strip() or len(name) > LONGEST or not name.isprintable():
             yield repr(label) if len(label) <= LONGEST else f"{label[:40]!r} …"
 
 
-def _pair(scene: AnnotatedScene, i: int, j: int) -> str:
+def _describe_pair(scene: AnnotatedScene, i: int, j: int) -> str:
     a, b = scene.objects[i], scene.objects[j]
     return f"{scene.scene_id}: {a.label} ({a.id}) and {b.label} ({b.id})"
 
 
-def _circle(scene: AnnotatedScene, held: set[tuple[int, int, int]]) -> list[str] | None:
+def _support_cycle(scene: AnnotatedScene, triples: set[tuple[int, int, int]]) -> list[str] | None:
     """Return the labels of objects that support each other in a cycle, or None without a cycle."""
     index_of = {thing.id: index for index, thing in enumerate(scene.objects)}
     below: dict[int, set[int]] = {}
-    for a, i, j in held:
+    for a, i, j in triples:
         # Skip pairs of objects that are on top of each other. Another finding reports such pairs.
-        if a == _ON_TOP and (a, j, i) not in held:
+        if a == _ON_TOP and (a, j, i) not in triples:
             below.setdefault(i, set()).add(j)
     for index, thing in enumerate(scene.objects):
         if thing.supported_by is not None:
@@ -228,14 +231,15 @@ def _circle(scene: AnnotatedScene, held: set[tuple[int, int, int]]) -> list[str]
             del below[i]
     if not below:
         return None
-    walk = [min(below)]
-    while (following := min(below[walk[-1]] & set(below))) not in walk:
-        walk.append(following)
-    return [scene.objects[i].label for i in walk[walk.index(following) :]]
+    path = [min(below)]
+    while (following := min(below[path[-1]] & set(below))) not in path:
+        path.append(following)
+    return [scene.objects[i].label for i in path[path.index(following) :]]
 
 
 def _duplicates(scenes: Sequence[AnnotatedScene]) -> Iterator[str]:
-    first: dict[object, AnnotatedScene] = {}
+    """Generate pairs of scenes with the same objects and relations, but different groups."""
+    first_scene: dict[object, AnnotatedScene] = {}
     for scene in scenes:
         labels = {thing.id: label_key(thing.label) for thing in scene.objects}
         things = [
@@ -250,6 +254,6 @@ def _duplicates(scenes: Sequence[AnnotatedScene]) -> Iterator[str]:
         if not scene.relations and not any(any(placed) for _, *placed in things):
             continue  # two small scenes often have the same objects by chance
         content = (tuple(sorted(things, key=repr)), tuple(sorted(scene.relations or ())))
-        other = first.setdefault(content, scene)
-        if other.group != scene.group:
-            yield f"{other.scene_id} and {scene.scene_id}"
+        earlier = first_scene.setdefault(content, scene)
+        if earlier.group != scene.group:
+            yield f"{earlier.scene_id} and {scene.scene_id}"

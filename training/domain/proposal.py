@@ -121,8 +121,8 @@ def propose(
     facts = look(scenes, names)
     labels = count_labels(scenes, names)
     pairs = lookalikes(labels, scenes, names)
-    minimum, covered = _minimum(scenes, pairs)
-    vocabulary = _in_own_words(_vocabulary(scenes, pairs, minimum), scenes)
+    minimum, covered = _choose_minimum(scenes, pairs)
+    vocabulary = _use_frequent_names(_vocabulary(scenes, pairs, minimum), scenes)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
@@ -169,13 +169,17 @@ def propose(
     )
 
 
-def _minimum(
+def _choose_minimum(
     scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike]
 ) -> tuple[int, dict[int, tuple[int, float]]]:
-    """Return the largest minimum with enough coverage, and the coverage of each minimum.
+    """Choose the minimum number of objects of a class.
 
-    The minimum is the minimum number of objects of a class. The coverage is the number of classes,
-    and the share of all objects that these classes cover.
+    The choice is the largest minimum whose classes cover enough objects, or the smallest minimum.
+    A choice that gives too many classes is raised.
+
+    Returns:
+        The choice. Then the number of classes and the share of all objects that these classes
+        cover, for each possible minimum.
     """
     covered: dict[int, tuple[int, float]] = {}
     for minimum in sorted({*_TABLE, *MINIMA}):
@@ -186,55 +190,55 @@ def _minimum(
         covered[minimum] = (len(vocabulary), coverage(vocabulary, scenes))
     if not covered:
         raise ConfigError("every label occurs only once: training needs labels with more objects")
-    enough = [
-        minimum for minimum in covered if covered[minimum][1] >= COVERED and minimum <= MINIMA[0]
-    ]
-    small = [minimum for minimum in covered if covered[minimum][0] <= _MOST_CLASSES]
-    chosen = max(enough, default=min(covered))
-    return max(chosen, min(small, default=chosen)), covered
+    sufficient = [m for m, (_, share) in covered.items() if share >= COVERED and m <= MINIMA[0]]
+    chosen = max(sufficient, default=min(covered))
+    affordable = [m for m, (classes, _) in covered.items() if classes <= _MOST_CLASSES]
+    return max(chosen, min(affordable, default=chosen)), covered
 
 
 def _vocabulary(
     scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike], minimum: int
 ) -> Vocabulary:
     merged = {label_key(pair.name): pair.like for pair in pairs if pair.merged}
-    vocabulary = source_vocabulary([_renamed(scene, merged) for scene in scenes], minimum=minimum)
-    also: dict[str, list[str]] = {}
+    vocabulary = source_vocabulary(
+        [_merge_labels(scene, merged) for scene in scenes], minimum=minimum
+    )
+    aliases_of: dict[str, list[str]] = {}
     for pair in pairs:
         if pair.merged and vocabulary.index(pair.name) is None:
-            also.setdefault(label_key(pair.like), []).append(pair.name)
+            aliases_of.setdefault(label_key(pair.like), []).append(pair.name)
     objects = [
-        replace(entry, aliases=(*entry.aliases, *also.get(label_key(entry.label), ())))
+        replace(entry, aliases=(*entry.aliases, *aliases_of.get(label_key(entry.label), ())))
         for entry in vocabulary.objects
     ]
     return Vocabulary(objects, vocabulary.room_types)
 
 
-def _in_own_words(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]) -> Vocabulary:
-    """Return the vocabulary with the synonyms that most objects of a class have as its label.
+def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]) -> Vocabulary:
+    """Rename each class to the alias that more than half of its objects have as label.
 
     A class of "plastic bottle", "glass bottle" and "bottle" stays "bottle", unless one of these
     names has more than half of the objects.
     """
-    spelt: dict[int, Counter[str]] = {}
+    key_counts: dict[int, Counter[str]] = {}
     for thing in (thing for scene in scenes for thing in scene.objects):
         index = vocabulary.index(thing.label)
         if index is not None:
-            spelt.setdefault(index, Counter())[label_key(thing.label)] += 1
+            key_counts.setdefault(index, Counter())[label_key(thing.label)] += 1
     objects = list(vocabulary.objects)
-    for index, counts in spelt.items():
+    for index, counts in key_counts.items():
         entry = objects[index]
-        ((most, count),) = counts.most_common(1)
-        own = next((name for name in entry.aliases if label_key(name) == most), None)
-        if own is not None and 2 * count > counts.total():
-            others = [name for name in entry.aliases if name != own]
-            objects[index] = replace(entry, label=own, aliases=(entry.label, *others))
+        ((frequent_key, count),) = counts.most_common(1)
+        frequent = [name for name in entry.aliases if label_key(name) == frequent_key]
+        if frequent and 2 * count > counts.total():
+            label = frequent[0]
+            aliases = (entry.label, *(name for name in entry.aliases if name != label))
+            objects[index] = replace(entry, label=label, aliases=aliases)
     return Vocabulary(objects, vocabulary.room_types)
 
 
-def _renamed(scene: AnnotatedScene, merged: Mapping[str, str]) -> AnnotatedScene:
-    if not merged:
-        return scene
+def _merge_labels(scene: AnnotatedScene, merged: Mapping[str, str]) -> AnnotatedScene:
+    """Replace the labels of a scene. `merged` maps the key of a label to another label."""
     objects = tuple(
         replace(thing, label=merged.get(label_key(thing.label), thing.label))
         for thing in scene.objects
@@ -245,12 +249,12 @@ def _renamed(scene: AnnotatedScene, merged: Mapping[str, str]) -> AnnotatedScene
 def _dropped(
     labels: Sequence[Label], vocabulary: Vocabulary, names: Names, minimum: int
 ) -> list[tuple[str, int, str]]:
-    refused = {label_key(name) for name in names.not_objects}
+    excluded = {label_key(name) for name in names.not_objects}
     return [
         (
             label.name,
             label.mentions,
-            "not an object" if label_key(label.name) in refused else f"under {minimum} mentions",
+            "not an object" if label_key(label.name) in excluded else f"under {minimum} mentions",
         )
         for label in labels
         if vocabulary.index(label.name) is None
@@ -263,15 +267,17 @@ def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
     The function returns the first seed whose parts are near their target shares. If there is no
     such seed, it returns the best of the tested seeds.
     """
-    best: tuple[float, int, dict[str, int], int] | None = None
+    best: tuple[int, dict[str, int], int] | None = None
+    smallest = math.inf
+    shares = FRACTIONS["stable"]
     for seed in range(_SPLIT_SEEDS):
         scenes_of = split(scenes, seed=seed, protocol="stable")
-        parts: dict[str, int] = {part: len(some) for part, some in scenes_of.items()}
-        shares = FRACTIONS["stable"]
-        off = max(abs(parts[p] / (share * len(scenes)) - 1) for p, share in shares.items())
-        if min(_telling(some) for some in scenes_of.values()) and (best is None or off < best[0]):
-            best = (off, seed, parts, len({scene.group for scene in scenes_of["test"]}))
-        if best is not None and best[0] <= _TOLERANCE:
+        sizes: dict[str, int] = {name: len(part) for name, part in scenes_of.items()}
+        deviation = max(abs(sizes[p] / (share * len(scenes)) - 1) for p, share in shares.items())
+        if deviation < smallest and all(map(_is_informative, scenes_of.values())):
+            smallest = deviation
+            best = seed, sizes, len({scene.group for scene in scenes_of["test"]})
+        if smallest <= _TOLERANCE:
             break
     if best is None:
         raise ConfigError(
@@ -279,20 +285,20 @@ def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int], int]:
             "split: every part needs scenes with at least three different objects. Provide more "
             "scenes or smaller groups"
         )
-    return best[1:]
+    return best
 
 
-def _telling(scenes: Sequence[AnnotatedScene]) -> int:
-    return sum(len({label_key(thing.label) for thing in scene.objects}) >= 3 for scene in scenes)
+def _is_informative(scenes: Sequence[AnnotatedScene]) -> bool:
+    return any(len({label_key(thing.label) for thing in scene.objects}) >= 3 for scene in scenes)
 
 
 def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, str]]:
     n = parts["train"]
     related = facts.related
-    H1 = _between(n, (200, 50), (2000, 200))
+    H1 = _interpolate(n, (200, 50), (2000, 200))
     # About eight updates an epoch or more: validation after each epoch takes longer than an update.
     batch = max(4, min(32, n // 8)) if n < 1500 else 64
-    updates = _between(n, (200, 600), (2500, 1800))
+    updates = _interpolate(n, (200, 600), (2500, 1800))
     per_epoch = math.ceil(n / batch)
     epochs = max(15, math.ceil(updates / per_epoch))
     patience = max(10, epochs // 4)
@@ -346,11 +352,12 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
     return values, reasons
 
 
-def _between(n: int, low: tuple[int, int], high: tuple[int, int]) -> int:
-    """Interpolate linearly in log(n) between two points (n, value).
+def _interpolate(n: int, low: tuple[int, int], high: tuple[int, int]) -> int:
+    """Interpolate linearly in log(n) between two points (n, value); round to a multiple of ten.
 
     Outside the two points, the value is constant.
     """
     (n0, x0), (n1, x1) = low, high
     share = math.log(max(n, 1) / n0) / math.log(n1 / n0)
-    return round((x0 + min(max(share, 0.0), 1.0) * (x1 - x0)) / 10) * 10
+    value = x0 + min(max(share, 0.0), 1.0) * (x1 - x0)
+    return round(value / 10) * 10

@@ -96,8 +96,8 @@ def _lookalikes(proposal: Proposal, console: Console) -> None:
     ordered = sorted(proposal.lookalikes, key=lambda pair: not pair.merged)
     for pair in ordered[:ROWS]:
         a, b = pair.mentions
-        done = "alias" if pair.merged else "two objects: check"
-        table.add_row(pair.name, pair.like, f"{a}, {b}", done, pair.why)
+        action = "alias" if pair.merged else "two objects: check"
+        table.add_row(pair.name, pair.like, f"{a}, {b}", action, pair.why)
     console.print(table)
     if (more := len(ordered) - ROWS) > 0:
         console.print(f"and {more} more in the JSON report")
@@ -107,12 +107,12 @@ def _coverage(proposal: Proposal, console: Console) -> None:
     title = "Vocabulary: minimum mentions of a class, and the resulting coverage"
     table = Table("mentions", "classes", "covered", "", title=title, title_justify="left")
     for minimum, (classes, share) in proposal.covered.items():
-        chosen = "chosen" if minimum == proposal.minimum else ""
-        table.add_row(str(minimum), str(classes), f"{share:.1%}", chosen)
+        mark = "chosen" if minimum == proposal.minimum else ""
+        table.add_row(str(minimum), str(classes), f"{share:.1%}", mark)
     console.print(table)
     if proposal.dropped:
-        shown = ", ".join(f"{label} ({why})" for label, _, why in proposal.dropped[:ROWS])
-        console.print(f"labels without a class, {len(proposal.dropped)}: {shown}", markup=False)
+        labels = ", ".join(f"{label} ({why})" for label, _, why in proposal.dropped[:ROWS])
+        console.print(f"labels without a class, {len(proposal.dropped)}: {labels}", markup=False)
 
 
 def _findings(proposal: Proposal, console: Console) -> None:

@@ -33,30 +33,32 @@ class Translation:
     """Mapping from the classes of scenes to the classes of a model.
 
     Attributes:
-        own: (V,) int64, the model's class for each of the V scene classes; -1 for an unknown class.
+        model_class: (V,) int64, model class of each of the V scene classes; -1 for unknown classes.
+        size: number of model classes.
+        unknown: score of unknown classes.
     """
 
-    own: Tensor
+    model_class: Tensor
     size: int
     unknown: float = -BEYOND
 
     @classmethod
     def between(cls, scenes: Vocabulary, model: Vocabulary) -> Translation:
         """Match the classes of two vocabularies by name, and then by alias."""
-        own = []
+        model_class = []
         for entry in scenes.objects:
-            named = (model.index(name) for name in (entry.label, *entry.aliases))
-            own.append(next((index for index in named if index is not None), -1))
-        return cls(torch.tensor(own, dtype=torch.int64), len(model))
+            indices = [model.index(name) for name in (entry.label, *entry.aliases)]
+            model_class.append(next((index for index in indices if index is not None), -1))
+        return cls(torch.tensor(model_class, dtype=torch.int64), len(model))
 
-    def model(self, model: Model) -> Model:
+    def translate(self, model: Model) -> Model:
         """Return the model with scores that take scenes and return values in the scene classes.
 
         In T3 (outliers) and T3b (false relations), the lowest score ranks first. In other tasks,
         the highest score ranks first. Unknown classes rank last in every task.
         """
         reverse = replace(self, unknown=BEYOND)
-        translated: dict[str, Callable[[Any], Any]] = {
+        wrapper_of: dict[str, Callable[[Any], Any]] = {
             "missing": self._objects,
             "outliers": reverse._objects,
             "at_place": self._placed,
@@ -65,8 +67,8 @@ class Translation:
             "false_relations": reverse._relations,
         }
         scores = {
-            name: translate(score)
-            for name, translate in translated.items()
+            name: wrap(score)
+            for name, wrap in wrapper_of.items()
             if (score := getattr(model, name)) is not None
         }
         return Model(**scores, parameters=model.parameters)
@@ -77,64 +79,70 @@ class Translation:
         `v` has the shape (scenes, scene classes); the result has the shape (scenes, model classes).
         If several scene classes map to one model class, the result is their maximum.
         """
-        has_class = self.own >= 0
-        index = self.own[has_class].expand(len(v), -1)
-        return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, has_class], "amax")
+        is_known = self.model_class >= 0
+        index = self.model_class[is_known].expand(len(v), -1)
+        return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, is_known], "amax")
 
     def scores(self, values: Tensor) -> Tensor:
         """Map scores (scenes, model classes) to scene classes; unknown classes get `unknown`."""
-        scores = values[:, self.own.clamp(min=0)]
-        return scores.masked_fill(self.own < 0, self.unknown)
+        scores = values[:, self.model_class.clamp(min=0)]
+        return scores.masked_fill(self.model_class < 0, self.unknown)
 
     def _objects(self, score: ObjectScore) -> ObjectScore:
         return lambda v: self.scores(score(self.presence(v)))
 
     def _placed(self, score: PlacedScore) -> PlacedScore:
-        def translated(places: Places) -> Tensor:
-            anchor = self.own[places.anchor]
-            found = torch.full_like(places.v, self.unknown)
-            if (known := (anchor >= 0).nonzero().squeeze(1)).numel():
-                own = Places(
-                    v=self.presence(places.v[known]),
-                    counts=self.presence(places.counts[known]),
-                    relation=places.relation[known],
-                    anchor=anchor[known],
-                    outgoing=places.outgoing[known],
+        def score_scene_classes(places: Places) -> Tensor:
+            """Score the places whose anchor class the model has; the others get `unknown`."""
+            anchor = self.model_class[places.anchor]
+            scores = torch.full_like(places.v, self.unknown)
+            rows = (anchor >= 0).nonzero().squeeze(1)
+            if len(rows):
+                model_places = Places(
+                    v=self.presence(places.v[rows]),
+                    counts=self.presence(places.counts[rows]),
+                    relation=places.relation[rows],
+                    anchor=anchor[rows],
+                    outgoing=places.outgoing[rows],
                 )
                 # Other present classes may map to the anchor's model class; the score is then -inf.
-                values = score(own).clamp(min=-BEYOND)
-                found[known] = self.scores(values)
-            return found
+                scores[rows] = self.scores(score(model_places).clamp(min=-BEYOND))
+            return scores
 
-        return translated
+        return score_scene_classes
 
     def _relations(self, score: RelationScore) -> RelationScore:
-        def translated(batch: Batch) -> Tensor:
-            found = torch.full(batch.holds.shape, self.unknown)
+        def score_scene_classes(batch: Batch) -> Tensor:
+            scores = torch.full(batch.holds.shape, self.unknown)
             for row in range(len(batch)):
-                self._score_row(score, batch, row, found[row])
-            return found
+                self._score_row(score, batch, row, scores[row])
+            return scores
 
-        return translated
+        return score_scene_classes
 
-    def _score_row(self, score: RelationScore, batch: Batch, row: int, found: Tensor) -> None:
-        """Write the scores of one scene into `found`, with shape (relations, classes, classes)."""
+    def _score_row(self, score: RelationScore, batch: Batch, row: int, scores: Tensor) -> None:
+        """Write the scores of one scene into `scores`, with shape (relations, classes, classes).
+
+        The scores of classes that the model lacks stay unchanged.
+        """
         classes = batch.classes[row]
-        own = torch.where(classes >= 0, self.own[classes.clamp(min=0)], -1)
-        kept = (own >= 0).nonzero().squeeze(1)
-        if not len(kept):
+        mapped = torch.where(classes >= 0, self.model_class[classes.clamp(min=0)], -1)
+        columns = (mapped >= 0).nonzero().squeeze(1)
+        if not len(columns):
             return
-        model_classes, index_of = own[kept].unique(return_inverse=True)
+        model_classes, index_of = mapped[columns].unique(return_inverse=True)
         n, A = len(model_classes), batch.holds.shape[1]
-        counts = torch.zeros(n, dtype=torch.int64).index_add(0, index_of, batch.counts[row, kept])
+        counts = torch.zeros(n, dtype=torch.int64).index_add(
+            0, index_of, batch.counts[row, columns]
+        )
         holds, observed = torch.zeros(A, n, n), torch.zeros(A, n, n, dtype=torch.bool)
-        pair = (slice(None), index_of[:, None], index_of[None, :])
-        scene_pair = (slice(None), kept[:, None], kept[None, :])
+        model_pair = (slice(None), index_of[:, None], index_of[None, :])
+        scene_pair = (slice(None), columns[:, None], columns[None, :])
         # Scene classes that map to one model class share their observed relations.
         for a, i, j in batch.observed[row][scene_pair].nonzero().tolist():
             observed[a, index_of[i], index_of[j]] = True
             holds[a, index_of[i], index_of[j]] += batch.holds[row][scene_pair][a, i, j]
-        small = replace(
+        model_scene = replace(
             batch.rows(torch.tensor([row])),
             v=torch.zeros(1, self.size).index_fill(1, model_classes, 1.0),
             classes=model_classes.unsqueeze(0),
@@ -143,7 +151,7 @@ class Translation:
             observed=observed.unsqueeze(0),
             room=torch.tensor([-1]),
         )
-        values = score(small)[0].clamp(min=-BEYOND)[pair]
+        values = score(model_scene)[0].clamp(min=-BEYOND)[model_pair]
         # The model has no relations between two objects of the same class.
-        apart = index_of[:, None] != index_of[None, :]
-        found[scene_pair] = torch.where(apart, values, torch.tensor(self.unknown))
+        classes_differ = index_of[:, None] != index_of[None, :]
+        scores[scene_pair] = torch.where(classes_differ, values, torch.tensor(self.unknown))

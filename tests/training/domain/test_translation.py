@@ -51,7 +51,7 @@ def test_the_same_classes_in_another_order_get_the_same_answers(model) -> None:
     shuffled = vocabulary(*(MODEL.labels[k] for k in order))
     assert not same_classes(shuffled, MODEL)
     assert same_classes(MODEL, vocabulary(*MODEL.labels))
-    asked = Translation.between(shuffled, MODEL).model(model)
+    asked = Translation.between(shuffled, MODEL).translate(model)
     v = torch.tensor([[1.0, 0.0, 1.0, 0.0, 0.0], [0.0, 1.0, 1.0, 1.0, 0.0]])
     own = torch.zeros_like(v)
     own[:, order] = v
@@ -73,23 +73,23 @@ def test_the_same_classes_in_another_order_get_the_same_answers(model) -> None:
 def test_aliases_are_understood_and_the_unknown_comes_last(model) -> None:
     scenes = vocabulary("mug", "bed", "unicorn")
     translation = Translation.between(scenes, MODEL)
-    assert translation.own.tolist() == [1, 0, -1]
+    assert translation.model_class.tolist() == [1, 0, -1]
     v = torch.tensor([[0.0, 1.0, 1.0]])
-    proposed = translation.model(model).missing(v)
+    proposed = translation.translate(model).missing(v)
     shown = model.missing(torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0]]))
     assert proposed[0, 0] == shown[0, 1]
     assert proposed[0, 2] == -BEYOND
     # What it does not know it cannot suspect either.
-    assert translation.model(model).outliers(v)[0, 2] == BEYOND
+    assert translation.translate(model).outliers(v)[0, 2] == BEYOND
     assert (
-        translation.model(model).false_relations(batch([0, 1, 2], 3, (0, 0, 2)))[0, 0, 0, 2]
+        translation.translate(model).false_relations(batch([0, 1, 2], 3, (0, 0, 2)))[0, 0, 0, 2]
         == BEYOND
     )
 
 
 def test_an_unknown_anchor_says_nothing(model) -> None:
     scenes = vocabulary("cup", "unicorn", "bed")
-    asked = Translation.between(scenes, MODEL).model(model)
+    asked = Translation.between(scenes, MODEL).translate(model)
     v = torch.tensor([[0.0, 1.0, 0.0]])
     places = Places(v, v, torch.tensor([0]), torch.tensor([1]), torch.tensor([True]))
     assert bool((asked.at_place(places) == -BEYOND).all())
@@ -97,7 +97,7 @@ def test_an_unknown_anchor_says_nothing(model) -> None:
 
 def test_two_things_under_one_name_have_no_relation(model) -> None:
     scenes = vocabulary("cup", "mug", "bed")
-    asked = Translation.between(scenes, MODEL).model(model)
+    asked = Translation.between(scenes, MODEL).translate(model)
     values = asked.relations(batch([0, 1, 2], 3))
     assert bool((values[0, :, 0, 1] == -BEYOND).all())
     assert bool((values[0, :, 0, 2] > -BEYOND).all())
