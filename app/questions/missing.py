@@ -205,7 +205,8 @@ def _read(request: MissingRequest, artifact: Artifact, reading: Reading) -> Opti
         candidates = _candidates(request.candidates, reading, errors)
     if request.at is not None:
         at = _at(request.at, artifact, reading, errors)
-    errors.raise_any()
+    if errors.by_class:
+        errors.raise_any()
     return {
         "top_k": request.top_k,
         "candidates": candidates,

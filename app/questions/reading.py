@@ -150,7 +150,8 @@ def read_scene(
         errors.add(
             InvalidRequestError, ("objects",), "the model does not know any of these objects"
         )
-    errors.raise_any()
+    if errors.by_class:
+        errors.raise_any()
 
     reading.scene = Scene(tuple(objects), None, False, room)
     if reading.left_out:
@@ -159,7 +160,8 @@ def read_scene(
     stated = _stated(request, ids)
     if stated is not None:
         triples, reading.flipped = _triples(stated, reading, errors)
-        errors.raise_any()
+        if errors.by_class:
+            errors.raise_any()
         reading.scene = Scene(reading.scene.objects, triples, request.relations_complete, room)
     if has_detections:
         _derive(request, reading, vocabulary, has_poses=has_poses)
@@ -173,7 +175,8 @@ def _check_sizes(request: SceneRequest, limits: Limits, errors: ErrorList) -> No
     if request.relations is None and request.relations_complete:
         message = "`relations_complete` requires the field `relations`"
         errors.add(InvalidRequestError, ("relations_complete",), message)
-    errors.raise_any()
+    if errors.by_class:
+        errors.raise_any()
 
 
 def _derive(
