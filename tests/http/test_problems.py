@@ -20,8 +20,6 @@ from app.questions import QUESTIONS
 from scene_client.schemas import Problem, Request
 from tests.services import Replace, defect, serve
 
-pytestmark = pytest.mark.anyio
-
 NAMES = [question.name for question in QUESTIONS]
 MARKER = "Zq7-marker"
 BED = {"label": "bed"}

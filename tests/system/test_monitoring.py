@@ -52,12 +52,6 @@ def rules(folder: Path) -> list[dict[str, Any]]:
     return [rule for group in groups for rule in group["rules"]]
 
 
-@pytest.fixture(scope="module")
-def compose(repository: Path) -> dict[str, Any]:
-    found: dict[str, Any] = yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))
-    return found
-
-
 def selectors(query: str) -> Iterator[tuple[str, str]]:
     """Every metric that a query names, with what stands in its braces."""
     bare = re.sub(GROUPINGS, " ", query)
