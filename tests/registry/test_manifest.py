@@ -134,7 +134,7 @@ def test_refuses_another_format(value: object) -> None:
         (resign(b'{"format": 3}'), "invalid_manifest"),
     ],
 )
-def test_refuses_what_is_no_manifest(data: bytes, code: str) -> None:
+def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
     with refused(code):
         Manifest.from_bytes(data)
 
