@@ -53,7 +53,7 @@ def repository() -> Path:
 
 @pytest.fixture(scope="session")
 def anyio_backend() -> str:
-    """Coroutine tests (`@pytest.mark.anyio`) run on asyncio, like uvicorn."""
+    """Coroutine tests run on asyncio, like uvicorn."""
     return "asyncio"
 
 

@@ -16,8 +16,6 @@ from tests.http.stores import VOCABULARY
 from tests.http.test_problems import problem
 from tests.services import client_of_service, launch
 
-pytestmark = pytest.mark.anyio
-
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 LIMIT = 16 * 2**20
 SMALL = 2**16

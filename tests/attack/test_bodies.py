@@ -26,7 +26,6 @@ JSON = {"Content-Type": "application/json"}
 locked = live_service(SCENE_API_KEY=API_KEY)
 
 
-@pytest.mark.anyio
 @pytest.mark.parametrize(
     ("path", "field", "entry", "most"),
     [
@@ -48,7 +47,6 @@ async def test_entries_are_counted_before_they_are_validated(
     ]
 
 
-@pytest.mark.anyio
 async def test_the_body_of_one_scene_has_a_limit_of_its_own(client: httpx.AsyncClient) -> None:
     scene = b'{"objects":["bed"]}'
     for size, status in ((2**18, 200), (2**18 + 1, 413)):
@@ -86,7 +84,6 @@ UNKNOWN = {f"u{k}": 0 for k in range(30)}
 AT = {"x": 1, "y": 0, "z": 0}
 
 
-@pytest.mark.anyio
 @pytest.mark.parametrize(
     ("body", "first", "last"),
     [
@@ -111,7 +108,6 @@ async def test_a_request_has_at_most_32_errors(
     assert raised.value.error_count() == len(UNKNOWN)
 
 
-@pytest.mark.anyio
 @pytest.mark.parametrize(
     ("scene", "is_large"),
     [
@@ -135,7 +131,6 @@ async def test_large_scenes_are_read_off_the_event_loop(
     assert (threads[0] is not threading.main_thread()) == is_large
 
 
-@pytest.mark.anyio
 async def test_further_instances_are_counted_off_the_event_loop(
     shared_store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,7 +34,6 @@ def related(objects: int) -> dict[str, Any]:
     return {"objects": names, "relations": relations, "model": "deep"}
 
 
-@pytest.mark.anyio
 @pytest.mark.parametrize("cheap", [DEEP, {**DEEP, "objects": [LABELS[0]] * 14}])
 async def test_health_answers_beside_a_first_question(
     shared_store: Path, hold: Hold, cheap: dict[str, Any]
@@ -56,7 +55,6 @@ async def test_health_answers_beside_a_first_question(
         assert (await costly).is_success
 
 
-@pytest.mark.anyio
 async def test_no_model_waits_for_another(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store) as client:
         release = hold("outliers").release

@@ -17,8 +17,6 @@ from app.scene.vocabulary import Vocabulary
 from scene_client.validation import MAX_ERRORS
 from tests.http.stores import VOCABULARY
 
-pytestmark = pytest.mark.anyio
-
 # Labels of one request that are looked up: to suggest some like them, and to take them for others.
 MAX_SUGGESTED, MAX_MAPPED = 32, 256
 

@@ -120,7 +120,6 @@ def test_a_hostile_version_is_refused_in_little_memory(
     models.resolve("default")
 
 
-@pytest.mark.anyio
 async def test_a_version_that_turns_hostile_goes_on_answering(published: Path) -> None:
     async with serve(published, store_poll=0) as client:
         extreme_date(published)
@@ -187,7 +186,6 @@ def test_a_refresh_is_linear_in_the_number_of_junk_versions(
     assert 0 < totals[1] <= 2 * totals[0]
 
 
-@pytest.mark.anyio
 async def test_a_full_alias_table_refuses_another_alias_and_stays_readable(published: Path) -> None:
     table = {f"a{number:063}": {"name": "healthy", "version": None} for number in range(3000)}
     file = published / "aliases.json"

@@ -61,7 +61,6 @@ async def server(
         await asyncio.gather(*(task for task in serving if task))
 
 
-@pytest.mark.anyio
 @pytest.mark.parametrize("pieces", [1, 7])
 async def test_every_answer_is_counted_once(pieces: int) -> None:
     async with server(pieces=pieces) as port:
@@ -72,7 +71,6 @@ async def test_every_answer_is_counted_once(pieces: int) -> None:
     assert window.rate == window.statuses[200] / window.seconds
 
 
-@pytest.mark.anyio
 async def test_other_statuses_and_broken_connections_are_errors() -> None:
     async with server(status=429) as port:
         window = await at_concurrency(port, REQUESTS, 2, 0.1)
@@ -83,14 +81,12 @@ async def test_other_statuses_and_broken_connections_are_errors() -> None:
     assert window.statuses == {200: 6, 0: 2}
 
 
-@pytest.mark.anyio
 async def test_latency_is_what_the_server_takes() -> None:
     async with server(pause=0.05) as port:
         window = await at_concurrency(port, REQUESTS, 4, 0.3)
     assert window.latency.min() >= 0.05
 
 
-@pytest.mark.anyio
 async def test_a_server_that_stalls_is_charged_for_all_that_waited() -> None:
     """Four a pause can be answered where ten are due: the later ones are charged their wait."""
     async with server(pause=0.1) as port:
@@ -127,7 +123,6 @@ def test_scenes_fit_every_question_and_are_all_different(kind: str) -> None:
             assert len(question.model_validate(scene).objects) == 12
 
 
-@pytest.mark.anyio
 @pytest.mark.parametrize("kind", KINDS)
 async def test_the_yardstick_validates_and_sends_the_prepared_answer(kind: str) -> None:
     transport = httpx.ASGITransport(plain.app)

@@ -64,16 +64,6 @@ def scene(recorder: Recorder) -> Client:
     return Client("http://robot/api/", transport=httpx.MockTransport(recorder))
 
 
-def test_only_set_fields_are_sent(scene: Client, recorder: Recorder) -> None:
-    scene.missing(["bed", "nightstand"], at=("on-top", "nightstand"), top_k=5)
-    assert recorder.body == {
-        "objects": ["bed", "nightstand"],
-        "at": {"relation": "on-top", "object": "nightstand"},
-        "top_k": 5,
-    }
-    assert recorder.requests[-1].headers["content-type"] == "application/json"
-
-
 def test_short_and_long_forms_are_sent_alike(scene: Client, recorder: Recorder) -> None:
     lamp = Detection(label="lamp", id="l", position=Position(x=1.0, y=0.0, z=0.5))
     plain = {"label": "lamp", "id": "l", "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
@@ -98,6 +88,11 @@ LAMPS = {"objects": ["bed"], "candidates": ["lamp"]}
     [
         (lambda scene: scene.missing(MissingRequest(**LAMPS)), "missing", LAMPS),
         (lambda scene: scene.missing(LAMPS), "missing", LAMPS),
+        (
+            lambda scene: scene.missing(["bed"], at=("left", "bed"), top_k=5),
+            "missing",
+            {"objects": ["bed"], "at": {"relation": "left", "object": "bed"}, "top_k": 5},
+        ),
         (lambda scene: scene.generate(), "generate", {"objects": []}),
         (
             lambda scene: scene.relations(["bed", "lamp"], pairs=[("bed", "lamp")]),
@@ -114,9 +109,11 @@ LAMPS = {"objects": ["bed"], "candidates": ["lamp"]}
 def test_scenes_of_every_form_are_sent_as_in_the_contract(
     scene: Client, recorder: Recorder, ask: Callable[[Client], Any], path: str, body: Any
 ) -> None:
+    """A request has only the fields that are set."""
     ask(scene)
     assert recorder.body == body
     assert recorder.requests[-1].url.path == f"/api/{path}"
+    assert recorder.requests[-1].headers["content-type"] == "application/json"
 
 
 def test_the_client_s_model_is_asked_where_a_request_names_none(recorder: Recorder) -> None:

@@ -200,7 +200,6 @@ def test_over_tls_certificates_are_verified_and_deadlines_hold(
         call("models")
 
 
-@pytest.mark.anyio
 async def test_an_answer_without_end_is_not_kept(
     peer: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -293,7 +293,7 @@ def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("questions", [[], ["weather"], ["missing", "generate"]])
-def test_questions_that_there_are_none_are_refused(
+def test_unknown_questions_are_refused(
     monkeypatch: pytest.MonkeyPatch, questions: list[str]
 ) -> None:
     load_package(monkeypatch)

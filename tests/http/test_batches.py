@@ -11,8 +11,6 @@ import pytest
 from app.questions import QUESTIONS
 from tests.services import Replace, defect
 
-pytestmark = pytest.mark.anyio
-
 ENTRIES: list[Any] = [
     {"objects": ["bed", "lamp"]},
     {"objects": ["bed", "droid"]},

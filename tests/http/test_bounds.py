@@ -18,7 +18,6 @@ from tests.services import Hold, Replace, launch, serve, wait_until
 SCENE = {"objects": ["bed", "chair", "lamp"]}
 
 
-@pytest.mark.anyio
 async def test_a_deadline_is_a_whole_number_within_the_limit(shared_store: Path) -> None:
     async with serve(shared_store, max_request_timeout_ms=20_000) as client:
         for value in ("0", "-1", "1.5", "", "soon", "NaN", b"\xff", "9" * 400, "20001", "20000"):
@@ -37,7 +36,6 @@ async def test_a_deadline_is_a_whole_number_within_the_limit(shared_store: Path)
     assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [20_000]
 
 
-@pytest.mark.anyio
 async def test_generate_past_its_deadline_gets_504_and_delays_no_request(
     shared_store: Path, hold: Hold
 ) -> None:
@@ -56,7 +54,6 @@ async def test_generate_past_its_deadline_gets_504_and_delays_no_request(
         assert (await client.post("/generate", json=SCENE)).is_success
 
 
-@pytest.mark.anyio
 async def test_the_default_deadline_applies_without_a_header(
     shared_store: Path, hold: Hold
 ) -> None:
@@ -65,7 +62,6 @@ async def test_the_default_deadline_applies_without_a_header(
         problem(await client.post("/generate", json=SCENE), 504, "deadline-passed")
 
 
-@pytest.mark.anyio
 async def test_a_full_queue_gets_429(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store, queue_rows=256) as client:
         release = hold("generate").release
@@ -93,7 +89,6 @@ async def test_a_full_queue_gets_429(shared_store: Path, hold: Hold) -> None:
         assert (await client.post("/missing/batch", json={"scenes": [SCENE] * 256})).is_success
 
 
-@pytest.mark.anyio
 async def test_pending_rows_are_zero_after_a_request(shared_store: Path, hold: Hold) -> None:
     """After a batch, and after work that was given up, the gauge is back at 0."""
     async with serve(shared_store) as client:
@@ -116,7 +111,6 @@ async def test_pending_rows_are_zero_after_a_request(shared_store: Path, hold: H
         assert await pending() == {0.0}
 
 
-@pytest.mark.anyio
 async def test_a_batch_stops_where_its_deadline_passes(
     shared_store: Path, replace: Replace
 ) -> None:

@@ -20,8 +20,6 @@ from tests.http.stores import VOCABULARY, C, V, publish
 from tests.http.test_questions import ask
 from tests.services import serve
 
-pytestmark = pytest.mark.anyio
-
 LABELS = ("bed", "nightstand", "chair", "chair")
 CHAIR, NIGHTSTAND = VOCABULARY.index("chair"), VOCABULARY.index("nightstand")
 

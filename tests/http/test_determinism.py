@@ -12,7 +12,7 @@ import pytest
 from benchmarks.load.connections import Connection, connect, prepared
 from tests.services import LiveService, launch
 
-pytestmark = [pytest.mark.anyio, pytest.mark.system]
+pytestmark = pytest.mark.system
 
 OTHERS = 31
 SCENE: dict[str, Any] = {

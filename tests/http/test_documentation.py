@@ -21,8 +21,6 @@ from scene_client.schemas import Problem
 from tests.http.test_problems import problem
 from tests.services import serve
 
-pytestmark = pytest.mark.anyio
-
 PAGES = ["/", "/docs", "/redoc", "/problems", "/problems/not-json"]
 # Of app/static/vendor: whoever changes a file of a library changes this, and is seen.
 LIBRARIES = "72a2b522c7b27658feb43c3d5bb8c11eb1bebd51df2ee3e734934ae37c728e86"

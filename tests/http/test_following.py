@@ -10,13 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import pytest
 
 from tests.http.stores import corrupt, publish
 from tests.http.test_models import default
 from tests.services import serve
-
-pytestmark = pytest.mark.anyio
 
 POLL = 0.05
 

@@ -10,8 +10,6 @@ import pytest
 
 from tests.services import LiveService, Replace, defect
 
-pytestmark = pytest.mark.anyio
-
 NOTHING = "default-src 'none'; frame-ancestors 'none'"
 COMPUTED = [
     ("POST", "/relations", {"objects": ["bed"]}),

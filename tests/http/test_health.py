@@ -16,8 +16,6 @@ from tests.http.stores import corrupt
 from tests.http.test_problems import problem
 from tests.services import NAMED, LiveService, Replace, defect, serve
 
-pytestmark = pytest.mark.anyio
-
 READY = ["/health/ready", "/v2/health/ready", "/v2/models/default/ready"]
 
 

@@ -41,7 +41,6 @@ def test_names_are_those_of_this_machine_or_listed(
     assert Settings(store=tmp_path, **settings).accepted_hosts == expected
 
 
-@pytest.mark.anyio
 async def test_requests_for_another_host_are_refused(shared_store: Path) -> None:
     accepted = ("127.0.0.1", "127.0.0.1:8000", "LOCALHOST:1", "[::1]:8000")
     others = ("evil.example", "127.0.0.1.evil.example", "localhost@evil.example")
@@ -61,7 +60,6 @@ async def test_requests_for_another_host_are_refused(shared_store: Path) -> None
         problem(await client.get("/models", headers=twice), 421, "host-refused")
 
 
-@pytest.mark.anyio
 @pytest.mark.parametrize("names", [["service"], ["service", "*"]])
 async def test_the_document_says_which_routes_refuse_names(
     shared_store: Path, names: list[str]

@@ -13,8 +13,6 @@ from tests.http.test_documentation import operations
 from tests.http.test_problems import problem
 from tests.services import ADMIN_KEY, client_of_service, serve
 
-pytestmark = pytest.mark.anyio
-
 API_KEY = "incorrect-zebra-capacitor-nail"
 # Said once more, so that a route is opened on purpose or not at all.
 OPEN_OPERATIONS = {"/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready"}

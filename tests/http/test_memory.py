@@ -13,8 +13,6 @@ import anyio
 import httpx
 import pytest
 
-pytestmark = pytest.mark.anyio
-
 SCENE = {"objects": ["bed", "lamp", "desk"]}
 CYCLE = {
     "objects": ["bed", "lamp"],

@@ -23,8 +23,6 @@ from tests.http.stores import VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
 from tests.services import ADMIN_KEY, Hold, Replace, defect, serve
 
-pytestmark = pytest.mark.anyio
-
 
 async def default(client: httpx.AsyncClient) -> str:
     response = await client.post("/relations", json={"objects": ["bed", "lamp"]})

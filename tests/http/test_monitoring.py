@@ -20,8 +20,6 @@ from tests.http.stores import corrupt, publish
 from tests.http.test_problems import problem
 from tests.services import Hold, LiveService, Replace, defect, serve
 
-pytestmark = pytest.mark.anyio
-
 SCENE = {"objects": ["bed", "lamp"]}
 OPERATIONS = (REPOSITORY / "docs" / "operations.md").read_text("utf-8")
 

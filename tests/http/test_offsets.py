@@ -19,8 +19,6 @@ from tests.http.test_questions import ask
 from tests.questions.test_placements import offsets_of_every_pair
 from tests.services import serve
 
-pytestmark = pytest.mark.anyio
-
 LABELS = ("bed", "chair", "desk")
 # Nothing is derived or stated, so that every request asks the same question of the model.
 PLACE = {"x": 1.0, "y": 0.0, "z": 0.5}

@@ -10,8 +10,6 @@ import pytest
 from tests.http.test_problems import problem
 from tests.services import Replace, client_of_service, defect, serve
 
-pytestmark = pytest.mark.anyio
-
 LISTED, SECOND, OTHER = "https://panel.example", "http://10.0.0.7:8080", "https://other.example"
 API_KEY = "incorrect-zebra-capacitor-nail"
 SCENE = {"objects": ["bed", "lamp"]}

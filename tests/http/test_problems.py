@@ -20,8 +20,6 @@ from app.questions import QUESTIONS
 from scene_client.schemas import Problem, Request
 from tests.services import Replace, defect, serve
 
-pytestmark = pytest.mark.anyio
-
 NAMES = [question.name for question in QUESTIONS]
 MARKER = "Zq7-marker"
 BED = {"label": "bed"}
@@ -100,7 +98,7 @@ async def test_only_strict_json_is_accepted(client: httpx.AsyncClient, body: byt
         ({"Content-Type": "application/json", "Content-Encoding": "identity, br"}, "compressed"),
     ],
 )
-async def test_what_is_not_declared_as_plain_json_is_refused(
+async def test_other_content_types_and_encodings_are_refused(
     client: httpx.AsyncClient, headers: dict[str, str], named: str
 ) -> None:
     response = await client.post("/relations", content=b'{"objects": ["bed"]}', headers=headers)
@@ -228,7 +226,7 @@ async def test_a_body_is_an_object_with_objects(
 
 
 @pytest.mark.parametrize("question", NAMES)
-async def test_no_body_has_more_faults_than_it_is_long(
+async def test_validation_stops_at_the_first_invalid_relation(
     client: httpx.AsyncClient, question: str
 ) -> None:
     unknown = {f"u{k}": 0 for k in range(29)}
@@ -303,9 +301,7 @@ async def test_numbers_that_are_not_json_are_pointed_at(client: httpx.AsyncClien
 @pytest.mark.parametrize(
     "key", ["<script>" + MARKER, MARKER + " x", MARKER * 20, MARKER + "\u202e"]
 )
-async def test_pointers_do_not_repeat_what_is_no_plain_name(
-    client: httpx.AsyncClient, key: str
-) -> None:
+async def test_pointers_leave_out_unusual_field_names(client: httpx.AsyncClient, key: str) -> None:
     document = problem(
         await client.post("/relations", json={"objects": ["bed"], key: 1}), 422, "invalid-request"
     )

@@ -17,8 +17,6 @@ from app.scene.relations import CANONICAL, opposite
 from tests.http.stores import VOCABULARY, publish
 from tests.services import serve
 
-pytestmark = pytest.mark.anyio
-
 
 def at(x: float, y: float, z: float) -> dict[str, float]:
     return {"x": x, "y": y, "z": z}

@@ -17,8 +17,6 @@ from tests.http.test_questions import LAMP_ON_DESK, ask, at
 from tests.scene.turns import Turn, about, after
 from tests.services import serve
 
-pytestmark = pytest.mark.anyio
-
 Triples = set[tuple[str, str, str]]
 drawn = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 

@@ -43,7 +43,7 @@ def without(machine: Triway) -> Triway:
 
 
 @given(relations(), st.sampled_from([None, 0, 1]))
-def test_the_context_is_that_of_the_objects(grid, room):
+def test_implications_equal_the_formula_by_hand(grid, room):
     """x of a machine is that by hand, at E[h1 | v], however much the relations say of h1."""
     A, n, _ = grid.shape
     machine = machine_of(A=A)
@@ -59,7 +59,7 @@ def test_the_context_is_that_of_the_objects(grid, room):
     torch.testing.assert_close(ours, implied_by_hand(machine, v[0], padded, room))
 
 
-def test_without_relations_given_nothing_changes():
+def test_without_observed_relations_nothing_changes():
     """Nor does anything that is not of relations: objects are judged as without implications."""
     machine = machine_of(A=2)
     plain = without(machine)

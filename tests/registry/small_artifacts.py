@@ -9,13 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from app.registry import (
+    ArtifactError,
     Calibration,
     CountSlope,
     Description,
     Manifest,
     Slope,
+    StoreError,
     Thresholds,
     VocabularyEntry,
 )
@@ -116,3 +119,8 @@ def replace_file(directory: Path, name: str, data: bytes) -> None:
 def read_manifest(directory: Path) -> Manifest:
     """The manifest of a directory."""
     return Manifest.from_bytes((directory / MANIFEST).read_bytes())
+
+
+def refused(code: str) -> pytest.RaisesExc[ArtifactError | StoreError]:
+    """Expect an error of the registry with this code."""
+    return pytest.raises((ArtifactError, StoreError), check=lambda error: error.code == code)

@@ -121,7 +121,7 @@ def test_the_same_content_is_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_refuses_to_write_what_is_not_finite(value: float, tmp_path: Path) -> None:
+def test_refuses_to_write_values_that_are_not_finite(value: float, tmp_path: Path) -> None:
     weights = state()
     weights["W"][1, 2] = value
     with pytest.raises(ArtifactError, match="'W'") as refused:
@@ -200,7 +200,7 @@ def test_refuses_an_unexpected_file(name: str, written: Path) -> None:
     assert len(refusal(written).reason) < 2000
 
 
-def test_refuses_what_is_no_regular_file(written: Path, tmp_path: Path) -> None:
+def test_refuses_links_folders_and_pipes(written: Path, tmp_path: Path) -> None:
     (written / CARD).rename(tmp_path / "moved.md")
     for make in (
         lambda place: place.symlink_to(tmp_path / "moved.md"),
@@ -234,7 +234,7 @@ def test_refuses_a_link_to_an_artifact(written: Path, tmp_path: Path) -> None:
         save({"b": np.zeros(3, np.float32)}) + b"\0",
     ],
 )
-def test_refuses_what_is_not_safetensors(data: bytes, written: Path) -> None:
+def test_refuses_malformed_weights_files(data: bytes, written: Path) -> None:
     replace_file(written, WEIGHTS, data)
     assert refusal(written).code == "not_safetensors"
 

@@ -13,7 +13,7 @@ from app.registry import AliasTarget, ArtifactError, Store, StoreError
 from app.registry.__main__ import main
 from app.registry.durable import exclusive
 from app.settings import Settings
-from tests.registry.small_artifacts import description, state
+from tests.registry.small_artifacts import description, refused, state
 
 
 @pytest.fixture
@@ -31,10 +31,6 @@ def tree(root: Path) -> dict[str, bytes]:
         for path in sorted(root.rglob("*"))
         if path.is_file() and path.name != ".lock"
     }
-
-
-def refused(code: str) -> pytest.RaisesExc[StoreError]:
-    return pytest.raises(StoreError, check=lambda error: error.code == code)
 
 
 # -- publishing ---------------------------------------------------------------------------------

@@ -50,7 +50,7 @@ def test_plurals(plural: str, single: str) -> None:
         *("thermos", "chess", "as", "s", ""),
     ],
 )
-def test_what_is_no_plural_stays(word: str) -> None:
+def test_words_that_are_not_plural_stay(word: str) -> None:
     assert singular(word) == word
 
 

@@ -28,8 +28,6 @@ from app.serving.admission import (
     WorkQueue,
 )
 
-pytestmark = pytest.mark.anyio
-
 ENDLESS = Ticket(math.inf)
 
 

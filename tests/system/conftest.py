@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from tests.services import free_port, is_ready, wait_until
 
@@ -34,6 +36,12 @@ StartProxy = Callable[..., AbstractContextManager[Proxy]]
 def configuration(repository: Path) -> Path:
     """The shipped configuration of the proxy."""
     return repository / "deploy" / "haproxy" / "haproxy.cfg"
+
+
+@pytest.fixture(scope="session")
+def compose(repository: Path) -> dict[str, Any]:
+    """The compose file."""
+    return yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from app.settings import Settings
 from deploy.image import first_base, pip_settings
@@ -49,11 +48,6 @@ def split_stages(dockerfile: str) -> dict[str, list[Instruction]]:
 @pytest.fixture(scope="module")
 def stages(repository: Path) -> dict[str, list[Instruction]]:
     return split_stages((repository / "Dockerfile").read_text("utf-8"))
-
-
-@pytest.fixture(scope="module")
-def compose(repository: Path) -> dict[str, Any]:
-    return yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))
 
 
 def built(compose: dict[str, Any]) -> list[dict[str, Any]]:

@@ -15,7 +15,6 @@ from typing import Any
 
 import httpx
 import pytest
-import yaml
 
 from app.settings import Settings
 from scene_client import Client
@@ -313,9 +312,10 @@ def test_the_proxy_answers_503_without_a_ready_service(behind: StartProxy, tmp_p
 # ---------------------------------------------------------------------------- configuration
 
 
-def test_the_compose_file_puts_the_proxy_in_front(repository: Path, configuration: Path) -> None:
-    services = yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))["services"]
-    proxy, scene = services["proxy"], services["scene"]
+def test_the_compose_file_puts_the_proxy_in_front(
+    repository: Path, compose: dict[str, Any], configuration: Path
+) -> None:
+    proxy, scene = compose["services"]["proxy"], compose["services"]["scene"]
     (mounted,) = proxy["volumes"]
     source, _, target = mounted.removesuffix(":ro").partition(":")
     assert (repository / source).samefile(configuration.parent)

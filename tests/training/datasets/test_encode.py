@@ -40,74 +40,74 @@ def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
     return scene
 
 
-def triples(found: Any) -> set[tuple[int, int, int]]:
+def triples(scene: Any) -> set[tuple[int, int, int]]:
     """Relations between classes."""
-    names = found.evidence.classes
-    return {(int(a), int(names[x]), int(names[y])) for a, x, y in np.argwhere(found.evidence.holds)}
+    names = scene.evidence.classes
+    return {(int(a), int(names[x]), int(names[y])) for a, x, y in np.argwhere(scene.evidence.holds)}
 
 
 def test_classes_counts_and_unknown_labels() -> None:
-    found = encoded(
+    scene = encoded(
         things("Screens", "desk", "goblet", "Goblets", "monitor", "wall"), room_type="Toilet"
     )
-    assert found.instance_classes.tolist() == [MONITOR, DESK, MONITOR, WALL]
-    assert found.evidence.classes.tolist() == [DESK, MONITOR, WALL]
-    assert found.evidence.counts.tolist() == [1, 2, 1]
-    assert found.evidence.confidence.tolist() == [1.0, 1.0, 1.0]
-    assert found.unknown == ("Goblets",)
-    assert found.room_type == found.evidence.room_type == 0  # a toilet is a bathroom
-    assert not found.evidence.observed.any()
+    assert scene.instance_classes.tolist() == [MONITOR, DESK, MONITOR, WALL]
+    assert scene.evidence.classes.tolist() == [DESK, MONITOR, WALL]
+    assert scene.evidence.counts.tolist() == [1, 2, 1]
+    assert scene.evidence.confidence.tolist() == [1.0, 1.0, 1.0]
+    assert scene.unknown == ("Goblets",)
+    assert scene.room_type == scene.evidence.room_type == 0  # a toilet is a bathroom
+    assert not scene.evidence.observed.any()
 
 
 @pytest.mark.parametrize("room_type", [None, "unknown", "attic"])
 def test_rooms_without_a_type(room_type: str | None) -> None:
-    found = encoded(things("desk"), room_type=room_type)
-    assert found.room_type == -1
-    assert found.evidence.room_type is None
+    scene = encoded(things("desk"), room_type=room_type)
+    assert scene.room_type == -1
+    assert scene.evidence.room_type is None
 
 
 def test_stated_relations_are_complete() -> None:
-    found = encoded(
+    scene = encoded(
         things("desk", "monitor", "monitor", "pencil"),
         relations=((1, "on-top", 0), (0, "under", 1), (2, "behind", 1)),
     )
-    assert triples(found) == {(ON_TOP, MONITOR, DESK), (FRONT, MONITOR, MONITOR)}
-    assert found.instance_holds.sum() == 2
+    assert triples(scene) == {(ON_TOP, MONITOR, DESK), (FRONT, MONITOR, MONITOR)}
+    assert scene.instance_holds.sum() == 2
     off_diagonal = ~np.eye(4, dtype=bool)
-    assert (found.instance_observed == off_diagonal).all()
+    assert (scene.instance_observed == off_diagonal).all()
     # A class with one instance has no pair with itself.
-    single = found.evidence.counts == 1
-    assert (found.evidence.observed == ~np.diag(single)).all()
+    single = scene.evidence.counts == 1
+    assert (scene.evidence.observed == ~np.diag(single)).all()
 
 
 def test_contradictory_relations_are_unobserved() -> None:
-    found = encoded(
+    scene = encoded(
         things("desk", "monitor", "pencil"),
         relations=((0, "front", 1), (0, "behind", 1), (2, "on-top", 0), (1, "on-top", 0)),
     )
-    assert triples(found) == {(ON_TOP, PENCIL, DESK), (ON_TOP, MONITOR, DESK)}
-    unobserved = np.argwhere(~found.instance_observed & ~np.eye(3, dtype=bool))
+    assert triples(scene) == {(ON_TOP, PENCIL, DESK), (ON_TOP, MONITOR, DESK)}
+    unobserved = np.argwhere(~scene.instance_observed & ~np.eye(3, dtype=bool))
     assert unobserved.tolist() == [[FRONT, 0, 1], [FRONT, 1, 0]]
 
 
 def test_relations_of_structure_are_neither_on_nor_off() -> None:
-    found = encoded(
+    scene = encoded(
         things("desk", "floor", "monitor"), relations=((0, "on-top", 1), (2, "on-top", 0))
     )
-    assert triples(found) == {(ON_TOP, MONITOR, DESK)}
-    floor = list(found.evidence.classes).index(FLOOR)
-    assert not found.evidence.observed[:, floor].any()
-    assert not found.evidence.observed[:, :, floor].any()
-    assert not found.instance_observed[:, 1].any()
-    assert found.evidence.observed[:, 0, 1].all()
+    assert triples(scene) == {(ON_TOP, MONITOR, DESK)}
+    floor = list(scene.evidence.classes).index(FLOOR)
+    assert not scene.evidence.observed[:, floor].any()
+    assert not scene.evidence.observed[:, :, floor].any()
+    assert not scene.instance_observed[:, 1].any()
+    assert scene.evidence.observed[:, 0, 1].all()
 
 
 def test_labels_that_a_source_annotates_incompletely_are_left_out() -> None:
-    found = encoded(things("wall", "desk", "floor"), source="sunrgbd")
-    assert found.evidence.classes.tolist() == [DESK]
-    assert found.unknown == ()
+    scene = encoded(things("wall", "desk", "floor"), source="sunrgbd")
+    assert scene.evidence.classes.tolist() == [DESK]
+    assert scene.unknown == ()
     # Free words annotate every other class: what they never mention was not there.
-    annotated = annotated_classes([found], VOCABULARY)["sunrgbd"]
+    annotated = annotated_classes([scene], VOCABULARY)["sunrgbd"]
     assert annotated.tolist() == [True, True, True, False, False]
     assert encoded(things("wall", "desk")).evidence.classes.tolist() == [DESK, WALL]
 
@@ -119,14 +119,14 @@ def test_poses_in_viewer_axes() -> None:
         AnnotatedObject("p", "pencil", position=(1.4, 0.1, 0.8), size=(0.1, 0.1, 0.1)),
         AnnotatedObject("w", "wall"),
     )
-    found = encoded(objects, viewer_frame=True)
-    assert triples(found) == {
+    scene = encoded(objects, viewer_frame=True)
+    assert triples(scene) == {
         (ON_TOP, MONITOR, DESK),
         (FRONT, PENCIL, DESK),
         (FRONT, PENCIL, MONITOR),
     }
-    assert found.evidence.observed[:, :3, :3][:, ~np.eye(3, dtype=bool)].all()
-    assert not found.evidence.observed[:, 3].any()
+    assert scene.evidence.observed[:, :3, :3][:, ~np.eye(3, dtype=bool)].all()
+    assert not scene.evidence.observed[:, 3].any()
 
 
 def test_without_sizes_nothing_vertical_is_observed() -> None:
@@ -134,9 +134,9 @@ def test_without_sizes_nothing_vertical_is_observed() -> None:
         AnnotatedObject("d", "desk", position=(2.0, 0.0, 0.4)),
         AnnotatedObject("m", "monitor", position=(2.0, 0.3, 1.0)),
     )
-    found = encoded(objects, viewer_frame=True)
-    assert triples(found) == {(LEFT, MONITOR, DESK)}
-    assert not found.evidence.observed[[ON_TOP, ABOVE]].any()
+    scene = encoded(objects, viewer_frame=True)
+    assert triples(scene) == {(LEFT, MONITOR, DESK)}
+    assert not scene.evidence.observed[[ON_TOP, ABOVE]].any()
 
 
 def test_an_object_in_a_drawer_is_on_top_of_the_desk() -> None:
@@ -148,13 +148,13 @@ def test_an_object_in_a_drawer_is_on_top_of_the_desk() -> None:
     assert triples(encoded(objects, viewer_frame=True)) == {(LEFT, PENCIL, DESK)}
     linked = (objects[0], AnnotatedObject("p", "pencil", objects[1].position, objects[1].size,
                                           supported_by="d"))  # fmt: skip
-    found = encoded(linked, viewer_frame=True)
-    assert triples(found) == {(ON_TOP, PENCIL, DESK)}
-    assert found.evidence.observed[:, 0, 1].all()
-    assert found.evidence.observed[:, 1, 0].all()
+    scene = encoded(linked, viewer_frame=True)
+    assert triples(scene) == {(ON_TOP, PENCIL, DESK)}
+    assert scene.evidence.observed[:, 0, 1].all()
+    assert scene.evidence.observed[:, 1, 0].all()
 
 
-def test_every_side_is_taken() -> None:
+def test_viewpoints_are_on_all_four_sides_of_a_room() -> None:
     positions = np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 0.0]])
     sides = [room_viewpoint(f"scene-{k}", positions) for k in range(400)]
     # 100 expected a side; under 60 or over 140 has a probability below 1e-5.
@@ -180,18 +180,18 @@ def test_world_axes_are_left_for_the_viewpoint() -> None:
     }
 
 
-def test_scenes_of_nothing() -> None:
-    found = encoded(things("goblet"), relations=())
-    assert found.unknown == ("goblet",)
-    assert found.evidence.classes.shape == (0,)
-    assert found.evidence.holds.shape == (4, 0, 0)
+def test_scenes_without_known_objects_are_empty() -> None:
+    scene = encoded(things("goblet"), relations=())
+    assert scene.unknown == ("goblet",)
+    assert scene.evidence.classes.shape == (0,)
+    assert scene.evidence.holds.shape == (4, 0, 0)
     assert encode([], VOCABULARY) == []
 
 
 def test_annotated_classes() -> None:
     first, second = encoded(things("desk")), encoded(things("screen", "wall"))
-    found = annotated_classes([first, second], VOCABULARY)
-    assert found["t"].tolist() == [True, True, False, True, False]
+    annotated = annotated_classes([first, second], VOCABULARY)
+    assert annotated["t"].tolist() == [True, True, False, True, False]
     assert annotated_classes([], VOCABULARY) == {}
 
 
@@ -214,7 +214,7 @@ def test_positions_are_kept_in_the_axes_that_relations_were_derived_in() -> None
     assert chosen[[0, 2]] == pytest.approx(expected)
 
 
-def test_positions_say_nothing_where_people_stated_the_relations() -> None:
+def test_scenes_with_stated_relations_have_no_positions() -> None:
     objects = (DESK_THING, MONITOR_THING)
     assert encoded(objects, relations=((1, "left", 0),)).instance_positions is None
     assert encoded(things("desk", "monitor")).instance_positions is None
@@ -233,13 +233,13 @@ boxes = st.lists(
 
 @given(boxes)
 def test_no_pair_contradicts_itself(drawn: list[tuple[int, int, int, int]]) -> None:
-    found = derive_from_boxes(drawn)
+    relations = derive_from_boxes(drawn)
     n = len(drawn)
-    assert found.holds.shape == (len(CANONICAL), n, n)
-    assert not (found.holds & ~found.observed).any()
-    assert not (found.holds & found.holds.transpose(0, 2, 1)).any()
-    assert not (found.holds[LEFT] & (found.holds[ABOVE] | found.holds[ABOVE].T)).any()
-    assert not found.observed[[FRONT, ON_TOP]].any()
+    assert relations.holds.shape == (len(CANONICAL), n, n)
+    assert not (relations.holds & ~relations.observed).any()
+    assert not (relations.holds & relations.holds.transpose(0, 2, 1)).any()
+    assert not (relations.holds[LEFT] & (relations.holds[ABOVE] | relations.holds[ABOVE].T)).any()
+    assert not relations.observed[[FRONT, ON_TOP]].any()
 
 
 @given(boxes)
@@ -251,14 +251,14 @@ def test_mirrored_images_exchange_left_and_right(drawn: list[tuple[int, int, int
 
 
 def test_known_boxes() -> None:
-    found = derive_from_boxes(
+    relations = derive_from_boxes(
         [(0, 50, 10, 60), (14, 51, 24, 61), (1, 10, 11, 40), (500, 0, 510, 9), (math.nan,) * 4]
     )
-    assert np.argwhere(found.holds).tolist() == [[LEFT, 0, 1], [ABOVE, 2, 0], [ABOVE, 2, 1]]
+    assert np.argwhere(relations.holds).tolist() == [[LEFT, 0, 1], [ABOVE, 2, 0], [ABOVE, 2, 1]]
     # One box is far from all others, one is unknown.
-    assert not found.observed[:, 3:].any()
-    assert not found.observed[:, :, 3:].any()
-    assert found.observed[LEFT, 1, 0]
+    assert not relations.observed[:, 3:].any()
+    assert not relations.observed[:, :, 3:].any()
+    assert relations.observed[LEFT, 1, 0]
     # Offsets of less than a tenth of the box decide nothing.
     assert not derive_from_boxes([(0, 0, 100, 100), (5, 5, 105, 105)]).holds.any()
 

@@ -121,7 +121,7 @@ def test_jsonl_is_read_as_it_was_written(tmp_path: Path, name: str) -> None:
     assert read_scenes(tmp_path / name) == scenes
 
 
-def test_jsonl_tells_of_every_bad_line(tmp_path: Path) -> None:
+def test_every_bad_line_of_jsonl_is_reported(tmp_path: Path) -> None:
     path = write_jsonl(tmp_path)
     path.write_text(path.read_text() + "[]\n" + "[" * 100_000 + "\n" + path.read_text())
     *valid, first, second, third, fourth = jsonl.scan_jsonl(path)

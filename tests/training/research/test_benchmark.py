@@ -130,7 +130,7 @@ def test_the_shuffled_control_has_a_page_for_each_task(finished, task, rows):
     assert f"above {control['ours']} over the whole interval: " in text
 
 
-def test_the_control_learns_from_other_scenes_and_is_asked_about_the_same(finished, results):
+def test_the_control_learns_from_shuffled_scenes_and_is_tested_on_real_ones(finished, results):
     """Popularity finds what it always finds: no class is in more or fewer training scenes."""
     cells, control = (
         {
@@ -220,7 +220,7 @@ def test_some_tasks_are_measured_and_the_rest_later(tmp_path, monkeypatch):
     assert kept == first
 
 
-def test_workers_find_what_one_process_finds(finished, tmp_path):
+def test_workers_give_the_results_of_one_process(finished, tmp_path):
     (first, *_), folder = finished
     arguments = (first, "--folder", tmp_path, "--quick", *BASELINES, "--task", "T2 missing")
     invoke("benchmark", *arguments, "--workers", "2")
@@ -258,7 +258,7 @@ def test_baselines_that_no_seed_changes_are_trained_once():
     assert again < every
 
 
-def test_tasks_go_by_name_or_by_how_they_begin():
+def test_tasks_are_chosen_by_name_or_prefix():
     assert chosen_tasks(None, quick=False) == tuple(TASKS)
     assert "Density" not in chosen_tasks(None, quick=True)
     assert chosen_tasks(["T2 missing"], quick=True) == ("T2 missing",)

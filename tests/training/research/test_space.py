@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from training.fit.configuration import Config, ConfigError
+from tests.training.commands import small_config
+from training.fit.configuration import ConfigError
 from training.research.tune import load_space
 from training.runs.config_files import load_config, shipped_files, with_settings
 
-CONFIG = Config.model_validate(
-    {
-        "name": "rooms-triway",
-        "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 60},
-        "machine": {"variant": "triway", "form": "local", "H1": 8, "H2": 0, "K": 4},
-        "objective": {"name": "composite"},
-    }
-)
+CONFIG = small_config()
 
 
 def read(folder, text):
@@ -72,4 +66,4 @@ def test_a_missing_space_is_named(tmp_path):
 def test_changed_settings_leave_the_rest_alone():
     changed = with_settings(CONFIG, {"machine.H1": 5, "training.patience": 2})
     assert (changed.machine.H1, changed.training.patience) == (5, 2)
-    assert with_settings(changed, {"machine.H1": 8, "training.patience": None}) == CONFIG
+    assert with_settings(changed, {"machine.H1": 6, "training.patience": None}) == CONFIG

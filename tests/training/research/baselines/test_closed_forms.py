@@ -125,7 +125,7 @@ def test_the_rbms_log_odds_are_scikit_learns_free_energies(v):
         assert values == pytest.approx(expected, abs=1e-3)
 
 
-def test_a_class_must_say_nothing_of_itself():
+def test_weights_of_a_class_on_itself_are_refused():
     with pytest.raises(ValueError, match="diagonal"):
         LinearScore(torch.zeros(2), torch.eye(2))
     with pytest.raises(ValueError, match=r"must be \(2, 2\), not \(3, 3\)"):

@@ -135,7 +135,7 @@ def test_relations_beat_popularity(baseline):
 
 
 @named(OF_RELATIONS)
-def test_relations_are_judged_without_looking_at_them(baseline, validation):
+def test_relation_scores_ignore_the_true_relations(baseline, validation):
     """The truth in a batch changes nothing."""
     batch = validation.batch(torch.arange(10))
     blank = telling(batch)
@@ -165,7 +165,7 @@ def test_closure_completes_what_the_table_cannot():
     assert closure.parameters["bonus"] > 0
 
 
-def test_a_place_tells_what_is_missing(train, validation):
+def test_the_placed_table_finds_the_missing_class(train, validation):
     """On the second class lies the first of its room; the product with EASE is no worse."""
     assert best(PLACED).validation > 0.8
     ease, table = (fitted(b) for b in (BASELINES["EASE"], PLACED))
