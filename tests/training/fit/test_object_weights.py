@@ -94,8 +94,7 @@ def test_an_update_is_the_likelihood_s_gradient():
         chains = objects._Chains(v, h1.float(), torch.zeros(count, 0), room)
         data = EVERY.repeat_interleave((TARGET * count).round().long(), dim=0)
         step = {name: torch.zeros_like(machine.get_parameter(name)) for name in ("b", "c1", "W")}
-        empty = torch.full((len(data),), -1)
-        objects._update(machine, step, data, empty, chains, 1.0, generator)
+        objects._update(machine, step, data, chains, 1.0, generator)
     for name, found in step.items():
         torch.testing.assert_close(found, -machine.get_parameter(name).grad, atol=0.0135, rtol=0)
 
