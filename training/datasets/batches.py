@@ -85,13 +85,13 @@ class SceneTensors:
 
     def batch(self, index: Tensor, width: int = 0) -> Batch:
         """Return the scenes at the given indices as one batch, with at least `width` classes."""
-        chosen = [self.scenes[k].evidence for k in index.tolist()]
-        n = max([width, *(len(e.classes) for e in chosen)])
+        evidence = [self.scenes[k].evidence for k in index.tolist()]
+        n = max([width, *(len(e.classes) for e in evidence)])
         relations = self.scenes[0].evidence.holds.shape[0] if self.scenes else 0
-        shape = (len(chosen), relations, n, n)
+        shape = (len(evidence), relations, n, n)
         classes, counts = np.full(shape[::3], -1), np.ones(shape[::3], dtype=np.int64)
         holds, observed = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.bool_)
-        for row, e in enumerate(chosen):
+        for row, e in enumerate(evidence):
             m = len(e.classes)
             classes[row, :m], counts[row, :m] = e.classes, e.counts
             holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
@@ -149,8 +149,8 @@ def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) ->
         classes = scene.evidence.classes
         keys.append((relation * size + classes[subject]) * size + classes[object_])
     values, counts = np.unique(np.concatenate([*keys, np.zeros(0, np.int64)]), return_counts=True)
-    kept = values[counts >= minimum].astype(np.int64)
-    table = np.stack([kept // size // size, kept // size % size, kept % size], 1)
+    keys_kept = values[counts >= minimum].astype(np.int64)
+    table = np.stack([keys_kept // size // size, keys_kept // size % size, keys_kept % size], 1)
     return torch.from_numpy(table).to(torch.int32)
 
 

@@ -24,6 +24,9 @@ from training.datasets.sources import SOURCES, meaning_of
 
 Triple: TypeAlias = tuple[int, int, int]
 
+_MOST_TRIPLES: Final = 40
+_ATTEMPTS: Final = 50  # random changes of a triple that are tried
+
 MOST: Final = 12
 """Maximum distinguished number of instances. It also stands for larger numbers."""
 
@@ -73,11 +76,11 @@ def annotated_relations(encoded: EncodedScene) -> Flags:
     stacked = holds[_VERTICAL].any(0)
     stacked |= stacked.T
     for a in range(min(len(annotated), len(unlisted))):
-        off = annotated[a] & ~holds[a]
+        is_false = annotated[a] & ~holds[a]
         # Without poses, the "neighbours" are the pairs of objects that an annotator selected.
-        chosen = unlisted[a] == "off for neighbours" and encoded.instance_positions is None
-        if chosen or (unlisted[a] == "unobserved" and not (off & ~stacked).any()):
-            annotated[a] &= stacked & off.any()
+        is_selected = unlisted[a] == "off for neighbours" and encoded.instance_positions is None
+        if is_selected or (unlisted[a] == "unobserved" and not (is_false & ~stacked).any()):
+            annotated[a] &= stacked & is_false.any()
     return annotated
 
 
@@ -110,9 +113,9 @@ def observed_pairs(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[F
     size = len(encoded.instance_classes)
     half = np.triu(rng.random((size, size)) < 0.5, 1)
     observed = half | half.T
-    plain = ~structure[encoded.instance_classes]
-    triples = np.argwhere(encoded.instance_holds & observed & plain[:, None] & plain).tolist()
-    return ~observed, [(int(a), int(x), int(y)) for a, x, y in triples]
+    is_thing = ~structure[encoded.instance_classes]
+    triples = np.argwhere(encoded.instance_holds & observed & is_thing[:, None] & is_thing)
+    return ~observed, [(a, i, j) for a, i, j in triples.tolist()]
 
 
 class Part(NamedTuple):
@@ -138,14 +141,15 @@ def some_instances(encoded: EncodedScene, structure: Flags, rng: Rng) -> Part:
     each class. The other parts list any number of instances with equal probability, from one to all
     instances. Half of the parts state the room type.
     """
-    plain = np.flatnonzero(~structure[encoded.evidence.classes])
+    things = np.flatnonzero(~structure[encoded.evidence.classes])
     share = _LISTED[rng.integers(len(_LISTED))]
-    kept = np.sort(rng.permutation(plain)[: max(1, int(share * len(plain) + 0.5))])
-    number = np.minimum(encoded.evidence.counts[kept], MOST)
-    one = rng.random() < 0.5
-    listed = np.ones_like(number) if one else rng.integers(1, number + 1)
+    count = max(1, int(share * len(things) + 0.5))
+    index = np.sort(rng.permutation(things)[:count])
+    number = np.minimum(encoded.evidence.counts[index], MOST)
+    lists_one = rng.random() < 0.5
+    listed = np.ones_like(number) if lists_one else rng.integers(1, number + 1)
     room = encoded.room_type if rng.random() < 0.5 else -1
-    return Part(encoded.evidence.classes[kept], listed, number, room)
+    return Part(encoded.evidence.classes[index], listed, number, room)
 
 
 def occupied_place(
@@ -161,11 +165,9 @@ def occupied_place(
         The canonical relation of the place, and the index of the shown object, which is the object
         of the relation. None means that the scene has no such place.
     """
-    usable = ~structure[encoded.instance_classes]
-    stands = (
-        encoded.instance_holds & annotated_relations(encoded) & usable[:, None] & (usable & shown)
-    )
-    places = np.argwhere(stands.any(1))
+    is_thing = ~structure[encoded.instance_classes]
+    holds = encoded.instance_holds & annotated_relations(encoded)
+    places = np.argwhere((holds & is_thing[:, None] & (is_thing & shown)).any(1))
     if not len(places):
         return None
     relation, anchor = places[rng.integers(len(places))]
@@ -180,7 +182,7 @@ def altered_case(
     Half of the scenes have a false triple in place of a true triple. In the other half, all triples
     are true, and the false triple is None.
     """
-    triples = stated_relations(encoded, structure, rng)
+    triples = draw_true_relations(encoded, structure, rng)
     if triples is None:
         return None
     if rng.random() < 0.5:
@@ -188,34 +190,35 @@ def altered_case(
     return altered_scene(encoded, structure, triples, rng)
 
 
-def stated_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> list[Triple] | None:
-    """Return at most 40 true relations of a scene, or None if fewer than two are known."""
-    usable = ~structure[encoded.instance_classes]
-    holds = encoded.instance_holds & usable[:, None] & usable[None, :]
-    triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(holds)]
-    if len(triples) > 40:
-        chosen = sorted(rng.choice(len(triples), 40, replace=False).tolist())
-        triples = [triples[k] for k in chosen]
-    return triples if len(triples) > 1 else None
+def draw_true_relations(encoded: EncodedScene, structure: Flags, rng: Rng) -> list[Triple] | None:
+    """Draw at most 40 true triples (relation, subject, object) of instances without structure.
+
+    The result is None if the scene has fewer than two: an altered triple needs other evidence.
+    """
+    is_thing = ~structure[encoded.instance_classes]
+    triples = np.argwhere(encoded.instance_holds & is_thing[:, None] & is_thing)
+    if len(triples) > _MOST_TRIPLES:
+        triples = triples[np.sort(rng.choice(len(triples), _MOST_TRIPLES, replace=False))]
+    return [(a, i, j) for a, i, j in triples.tolist()] if len(triples) > 1 else None
 
 
 def altered_scene(
     encoded: EncodedScene, structure: Flags, triples: Sequence[Triple], rng: Rng
 ) -> tuple[Scene, Triple] | None:
     """Replace one of `triples` by a false triple. Return the scene and this triple, or None."""
-    usable = ~structure[encoded.instance_classes]
+    is_thing = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds
     index = int(rng.integers(len(triples)))
-    for _ in range(50):
+    for _ in range(_ATTEMPTS):
         a, i, j = triples[index]
         if rng.random() < 0.5:
             a = int(rng.integers(len(CANONICAL)))
         else:
-            j = int(rng.integers(len(usable)))
-        if i == j or not usable[j] or holds[a, i, j] or holds[a, j, i]:
+            j = int(rng.integers(len(is_thing)))
+        if i == j or not is_thing[j] or holds[a, i, j] or holds[a, j, i]:
             continue
         altered = [*triples[:index], (a, i, j), *triples[index + 1 :]]
-        return scene_of(encoded, range(len(usable)), altered), (a, i, j)
+        return scene_of(encoded, range(len(is_thing)), altered), (a, i, j)
     return None
 
 
@@ -241,19 +244,21 @@ def counted_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> d
     A source counts instances if its object lists are complete and if at least 5 % of the entries
     (scene, class) have several instances.
     """
-    plain = ~vocabulary.structure
+    things = ~vocabulary.structure
     entries, several = Counter[str](), Counter[str]()
     repeated: dict[str, Flags] = {}
     for scene in (scene for scene in scenes if scene.complete):
         evidence = scene.evidence
-        usable = plain[evidence.classes]
-        entries[scene.source] += int(usable.sum())
-        several[scene.source] += int((evidence.counts[usable] > 1).sum())
-        often = repeated.setdefault(scene.source, np.zeros(len(vocabulary), dtype=np.bool_))
-        often[evidence.classes[evidence.counts > 1]] = True
+        is_counted = things[evidence.classes]
+        entries[scene.source] += int(is_counted.sum())
+        several[scene.source] += int((evidence.counts[is_counted] > 1).sum())
+        is_repeated = repeated.setdefault(scene.source, np.zeros(len(vocabulary), dtype=np.bool_))
+        is_repeated[evidence.classes[evidence.counts > 1]] = True
     counting = [source for source in repeated if several[source] > _COUNTING * entries[source]]
     partly = {name for name, source in SOURCES.items() if source.counts_movables}
-    return {source: plain & repeated[source] if source in partly else plain for source in counting}
+    return {
+        source: things & repeated[source] if source in partly else things for source in counting
+    }
 
 
 def listed_cases(

@@ -90,9 +90,9 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
     Relations of structure classes are unobserved.
     """
     encoder = _Encoder(vocabulary, curated_names())
-    every = list(scenes)
-    groups = Counter((scene.source, scene.group) for scene in every)
-    return [encoder(scene, groups[scene.source, scene.group]) for scene in every]
+    scene_list = list(scenes)
+    groups = Counter((scene.source, scene.group) for scene in scene_list)
+    return [encoder(scene, groups[scene.source, scene.group]) for scene in scene_list]
 
 
 def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> dict[str, Flags]:
@@ -197,18 +197,18 @@ def _from_lists(
         for subject, relation, anchor in relations:
             array[canonicalise(subject, relation, anchor)] = True
     # Contradictory annotations are unobserved: both directions listed, or listed and denied.
-    contradicted = (holds & holds.swapaxes(1, 2)) | (holds & denied)
-    related = holds.any(0)
+    is_contradicted = (holds & holds.swapaxes(1, 2)) | (holds & denied)
+    is_related = holds.any(0)
     masks = {
         "off": np.ones((n, n), dtype=np.bool_),
-        "off for neighbours": related | related.T,
+        "off for neighbours": is_related | is_related.T,
         "unobserved": np.zeros((n, n), dtype=np.bool_),
     }
-    holds &= ~contradicted
+    holds &= ~is_contradicted
     observed = np.stack([masks[kind] for kind in meaning.unlisted]) | holds | denied
-    stacked = holds[_VERTICAL].any(0)
-    observed |= stacked | stacked.T
-    return PoseRelations(holds, observed & ~contradicted & ~np.eye(n, dtype=np.bool_))
+    is_vertical = holds[_VERTICAL].any(0)
+    observed |= is_vertical | is_vertical.T
+    return PoseRelations(holds, observed & ~is_contradicted & ~np.eye(n, dtype=np.bool_))
 
 
 def _apply_rules(

@@ -57,14 +57,14 @@ def read_jsonl(path: Path) -> list[AnnotatedScene]:
 
 def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
     """Yield a scene for each valid line and an error for each invalid line. Skip blank lines."""
-    seen: dict[tuple[str, str], int] = {}
+    line_of: dict[tuple[str, str], int] = {}
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         if not line.strip():
             continue
         where = f"line {number}"
         try:
             scene = _scene(json.loads(line, parse_int=bounded_int), f"{path.name}:{number}")
-            first = seen.setdefault((scene.source, scene.scene_id), number)
+            first = line_of.setdefault((scene.source, scene.scene_id), number)
             if first != number:
                 raise ValueError(f"scene {scene.scene_id!r} is on line {first} already")
         except json.JSONDecodeError as error:
@@ -109,7 +109,7 @@ def _scene(values: Any, default_id: str) -> AnnotatedScene:
     source = _text("source", values.get("source", "jsonl"))
     if not isinstance(values["objects"], list):
         raise ValueError("objects must be a list")
-    objects = _counted(_objects(values["objects"]), values.get("counts"))
+    objects = _with_counts(_objects(values["objects"]), values.get("counts"))
     viewer_frame = values.get("viewer_frame", source in _VIEWER_SOURCES)
     if not isinstance(viewer_frame, bool):
         raise ValueError(f"viewer_frame must be true or false, not {viewer_frame!r}")
@@ -130,7 +130,7 @@ def _scene(values: Any, default_id: str) -> AnnotatedScene:
     )
 
 
-def _counted(objects: tuple[AnnotatedObject, ...], counts: Any) -> tuple[AnnotatedObject, ...]:
+def _with_counts(objects: tuple[AnnotatedObject, ...], counts: Any) -> tuple[AnnotatedObject, ...]:
     if counts is None:
         return objects
     if not isinstance(counts, Mapping):

@@ -158,10 +158,11 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
 
 
 def rooms_vocabulary() -> Vocabulary:
-    """Return the vocabulary of the generator, with all classes in its tables of rooms."""
+    """Return the vocabulary of all labels and room types in the tables of `ROOMS`."""
     labels = sorted({label for pieces in ROOMS.values() for label in _labels(pieces)})
-    things = tuple(AnnotatedObject(str(i), label) for i, label in enumerate(labels))
-    scenes = [AnnotatedScene(room, SOURCE, room, room, things) for room in ROOMS]
+    # `source_vocabulary` reads scenes, so one scene per room type contains every label once.
+    objects = tuple(AnnotatedObject(str(i), label) for i, label in enumerate(labels))
+    scenes = [AnnotatedScene(room, SOURCE, room, room, objects) for room in ROOMS]
     return source_vocabulary(scenes, minimum=1)
 
 
@@ -196,12 +197,18 @@ class _Layout:
             if box.support is None or self.rng.random() >= _GONE
         ]
         positions, yaws = to_viewer_frame(
-            [(box.x, box.y, box.z) for _, box in kept], viewpoint, [box.yaw for _, box in kept]
+            [(box.x, box.y, box.z) for _, box in kept],
+            viewpoint,
+            [box.yaw for _, box in kept],
         )
         poses = zip(kept, positions.tolist(), yaws.tolist(), strict=True)
         objects = tuple(
             AnnotatedObject(
-                *(index, box.label, (x, y, z), box.size, yaw),
+                index,
+                box.label,
+                position=(x, y, z),
+                size=box.size,
+                yaw=yaw,
                 supported_by=None if box.support is None else str(box.support),
             )
             for (index, box), (x, y, z), yaw in poses
@@ -209,12 +216,12 @@ class _Layout:
         scene_id = f"{group}-{number}"
         return AnnotatedScene(scene_id, SOURCE, group, self.room_type, objects, viewer_frame=True)
 
-    def _size(self, mean: Size) -> Size:
+    def _random_size(self, mean: Size) -> Size:
         x, y, z = (np.array(mean) * self.rng.uniform(0.88, 1.12, 3)).tolist()
         return x, y, z
 
     def _furnish(self, piece: Piece) -> None:
-        size = self._size(piece.size)
+        size = self._random_size(piece.size)
         for _ in range(_ATTEMPTS):
             if (box := self._propose(piece, size)) is not None and self._free(box):
                 self._place(piece, box)
@@ -228,9 +235,9 @@ class _Layout:
                 return None
             x = self.rng.uniform(0.35, 0.65) * self.width
             y = self.rng.uniform(0.35, 0.65) * self.depth
-            turned = self.rng.choice([0.0, math.pi / 2]) + self.rng.normal(0.0, 0.05)
+            yaw = self.rng.choice([0.0, math.pi / 2]) + self.rng.normal(0.0, 0.05)
             z = size[2] / 2 if piece.where == "centre" else _HEIGHT - size[2] / 2
-            return _Box(piece.label, x, y, z, size, float(turned))
+            return _Box(piece.label, x, y, z, size, float(yaw))
         # The back of a piece is its -y side. The back touches the wall.
         side = int(self.rng.integers(4))
         length = self.width if side % 2 == 0 else self.depth
@@ -260,13 +267,13 @@ class _Layout:
 
     def _put_on(self, small: Small, support: int) -> None:
         base = self.boxes[support]
-        size = self._size(small.size)
+        size = self._random_size(small.size)
         if size[0] > base.size[0] or size[1] > base.size[1]:
             return
         for _ in range(_ATTEMPTS):
             u = self.rng.uniform(-1, 1) * (base.size[0] - size[0]) / 2
             v = self.rng.uniform(-1, 1) * (base.size[1] - size[1]) / 2
-            x, y = _offset(base, u, v)
+            x, y = _point_on(base, u, v)
             box = _Box(small.label, x, y, base.top + size[2] / 2, size, base.yaw, support=support)
             if self._free(box):
                 self.boxes.append(box)
@@ -278,16 +285,16 @@ class _Layout:
         for side in sides:
             if self.rng.random() >= piece.chance:
                 continue
-            size = self._size(piece.size)
-            away = self.rng.uniform(0.03, 0.15)
+            size = self._random_size(piece.size)
+            gap = self.rng.uniform(0.03, 0.15)
             if side in ("left", "right"):
-                u = (anchor.size[0] + size[0]) / 2 + away
+                u = (anchor.size[0] + size[0]) / 2 + gap
                 # Unless the side is "around", the backs of both pieces touch the same wall.
                 v = 0.0 if beside.side == "around" else (size[1] - anchor.size[1]) / 2
-                x, y = _offset(anchor, -u if side == "left" else u, v)
+                x, y = _point_on(anchor, -u if side == "left" else u, v)
             else:
-                v = (anchor.size[1] + size[1]) / 2 + away
-                x, y = _offset(anchor, 0.0, v if side == "front" else -v)
+                v = (anchor.size[1] + size[1]) / 2 + gap
+                x, y = _point_on(anchor, 0.0, v if side == "front" else -v)
             box = _Box(piece.label, x, y, size[2] / 2, size, anchor.yaw)
             if self._inside(box) and self._free(box):
                 self._place(piece, box)
@@ -301,25 +308,25 @@ class _Layout:
 
     def _free(self, box: _Box) -> bool:
         """Return True if a box overlaps no other box."""
-        rivals = [
+        others = [
             other
             for other in self.boxes
             if abs(other.z - box.z) < (other.size[2] + box.size[2]) / 2 - 1e-6
         ]
-        if not rivals:
+        if not others:
             return True
-        n = len(rivals)
+        n = len(others)
         _, gap = overlap_and_gap(
             np.tile([box.x, box.y], (n, 1)), np.tile(box.size[:2], (n, 1)), np.full(n, box.yaw),
-            np.array([[other.x, other.y] for other in rivals]),
-            np.array([other.size[:2] for other in rivals]),
-            np.array([other.yaw for other in rivals]),
+            np.array([[other.x, other.y] for other in others]),
+            np.array([other.size[:2] for other in others]),
+            np.array([other.yaw for other in others]),
         )  # fmt: skip
         clearance = 0.0 if box.support is not None else _CLEARANCE
         return bool((gap > clearance).all())
 
 
-def _offset(box: _Box, u: float, v: float) -> tuple[float, float]:
+def _point_on(box: _Box, u: float, v: float) -> tuple[float, float]:
     """Return the point u metres along the front of a box and v metres away from its back."""
     cos, sin = math.cos(box.yaw), math.sin(box.yaw)
     return box.x + cos * u - sin * v, box.y + sin * u + cos * v

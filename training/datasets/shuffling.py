@@ -48,16 +48,16 @@ def shuffle_objects(
     rng = np.random.default_rng(seed)
     sizes = [len(scene.evidence.classes) for scene in scenes]
     owner = np.repeat(np.arange(len(scenes)), sizes)
-    nothing = np.zeros(0, dtype=np.int64)
-    classes = np.concatenate([nothing, *(scene.evidence.classes for scene in scenes)])
+    empty = np.zeros(0, dtype=np.int64)
+    classes = np.concatenate([empty, *(scene.evidence.classes for scene in scenes)])
     for group in (structure[classes], ~structure[classes]):
         classes[group] = _exchange(owner[group], classes[group], rng)
     rooms = np.array([scene.room_type for scene in scenes], dtype=np.int64)
     rooms[rooms >= 0] = rng.permutation(rooms[rooms >= 0])
-    own = np.split(classes, np.cumsum(sizes)[:-1]) if sizes else []
+    labels_of = np.split(classes, np.cumsum(sizes)[:-1]) if sizes else []
     return [
-        _relabelled(scene, labels, int(room))
-        for scene, labels, room in zip(scenes, own, rooms, strict=True)
+        _relabel(scene, labels, int(room))
+        for scene, labels, room in zip(scenes, labels_of, rooms, strict=True)
     ]
 
 
@@ -69,9 +69,9 @@ def _exchange(owner: Ints, classes: Ints, rng: Rng) -> Ints:
     classes_of: defaultdict[int, set[int]] = defaultdict(set)
     for s, c in zip(scene, label, strict=True):
         classes_of[s].add(c)
-    drawn = rng.integers(len(label), size=(2, _STEPS_PER_MENTION * len(label)))
+    pairs = rng.integers(len(label), size=(2, _STEPS_PER_MENTION * len(label)))
     # Each exchange depends on the earlier exchanges, so lists and sets are faster than arrays.
-    for i, j in zip(*drawn.tolist(), strict=True):
+    for i, j in zip(*pairs.tolist(), strict=True):
         c, d = label[i], label[j]
         first, second = classes_of[scene[i]], classes_of[scene[j]]
         if first is not second:
@@ -83,7 +83,7 @@ def _exchange(owner: Ints, classes: Ints, rng: Rng) -> Ints:
     return np.array(label, dtype=np.int64)
 
 
-def _relabelled(scene: EncodedScene, labels: Ints, room: int) -> EncodedScene:
+def _relabel(scene: EncodedScene, labels: Ints, room: int) -> EncodedScene:
     """Return the scene with a new class in each slot, sorted by class."""
     before = scene.evidence
     order = np.argsort(labels)

@@ -93,7 +93,7 @@ def _families(
     for scene, unit in zip(scenes, units, strict=True):
         sources_of[unit].add(scene.source)
         sizes[scene.source] += 1
-    family_of = _connected(sizes, sources_of.values())
+    family_of = _component_of(sizes, sources_of.values())
     leading = {
         unit: max(sources, key=lambda source: (sizes[source], source))
         for unit, sources in sources_of.items()
@@ -108,7 +108,7 @@ def _families(
     return list(families.values())
 
 
-def _connected(sources: Iterable[str], shared: Iterable[set[str]]) -> dict[str, str]:
+def _component_of(sources: Iterable[str], shared: Iterable[set[str]]) -> dict[str, str]:
     """Map each data source to the alphabetically first source of its connected component."""
     family = {source: source for source in sources}
     for linked in shared:
@@ -136,17 +136,17 @@ def _assign(
     overall: Counter[Part] = Counter()
     part_of: dict[str, Part] = {}
     for room in sorted(strata, key=lambda room: (-sum(weight[u] for u in strata[room]), room)):
-        here: Counter[Part] = Counter()
+        in_stratum: Counter[Part] = Counter()
         for unit in sorted(strata[room], key=lambda unit: _rank(seed, unit)):
             part = max(
                 shares,
                 key=lambda p: (
-                    _lack(shares[p], here[p], here.total() + weight[unit])
+                    _lack(shares[p], in_stratum[p], in_stratum.total() + weight[unit])
                     + _lack(shares[p], overall[p], overall.total() + weight[unit])
                 ),
             )
             part_of[unit] = part
-            here[part] += weight[unit]
+            in_stratum[part] += weight[unit]
             overall[part] += weight[unit]
     return part_of
 

@@ -57,19 +57,19 @@ def build_vocabulary(
             for labels in spellings.values()
         }
     )
-    refused = {label_key(name) for name in names.not_objects}
+    excluded = {label_key(name) for name in names.not_objects}
     if not outdoor:
-        refused |= {label_key(name) for name in (*names.outdoor, *names.surroundings)}
+        excluded |= {label_key(name) for name in (*names.outdoor, *names.surroundings)}
     if minimum_rooms is None:
         minimum_rooms = minimum
-    kept = {*names.base, *names.household}
-    kept |= {label for label, count in mentions.items() if count >= minimum}
+    labels_kept = {*names.base, *names.household}
+    labels_kept |= {label for label, count in mentions.items() if count >= minimum}
     structure = {label_key(name) for name in (*names.structure, *names.surroundings)}
-    key = {label: label_key(label) for label in kept}
+    key_of = {label: label_key(label) for label in labels_kept}
     classes = [
-        ObjectClass(label, names.aliases.get(label, ()), structure=key[label] in structure)
-        for label in sorted(kept, key=lambda label: (-mentions[label], label))
-        if key[label] not in refused
+        ObjectClass(label, names.aliases.get(label, ()), structure=key_of[label] in structure)
+        for label in sorted(labels_kept, key=lambda label: (-mentions[label], label))
+        if key_of[label] not in excluded
     ]
     return Vocabulary(classes, sorted(r for r, count in rooms.items() if count >= minimum_rooms))
 
@@ -118,12 +118,12 @@ def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabula
 def with_room_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
     """Return the vocabulary with the curated synonyms of its room types."""
     names = names or curated_names()
-    own = {label_key(room) for room in vocabulary.room_types}
+    keys = {label_key(room) for room in vocabulary.room_types}
     aliases = {
-        room: [name for name in names.rooms.get(room, ()) if label_key(name) not in own]
+        room: [name for name in names.rooms.get(room, ()) if label_key(name) not in keys]
         for room in vocabulary.room_types
     }
-    aliases = {room: others for room, others in aliases.items() if others}
+    aliases = {room: synonyms for room, synonyms in aliases.items() if synonyms}
     return Vocabulary(vocabulary.objects, vocabulary.room_types, aliases)
 
 
@@ -163,8 +163,8 @@ def source_vocabulary(
 def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> ObjectClass:
     """Add more specific names of a class as aliases, if the vocabulary does not contain them."""
     unknown = [kind for kind in names.kinds.get(entry.label, ()) if vocabulary.index(kind) is None]
-    more = [name for kind in unknown for name in (kind, *names.aliases.get(kind, ()))]
-    return replace(entry, aliases=(*entry.aliases, *more))
+    synonyms = [name for kind in unknown for name in (kind, *names.aliases.get(kind, ()))]
+    return replace(entry, aliases=(*entry.aliases, *synonyms))
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
@@ -182,9 +182,9 @@ def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene])
             x, y, z = thing.size
             boxes.setdefault(index, []).append(((x * y) ** 0.5, z))
     classes = list(vocabulary.objects)
-    for index, of_class in boxes.items():
-        if len(of_class) >= MINIMUM_BOXES:
-            side, height = (round(x, 3) for x in np.median(of_class, axis=0).tolist())
+    for index, class_boxes in boxes.items():
+        if len(class_boxes) >= MINIMUM_BOXES:
+            side, height = (round(x, 3) for x in np.median(class_boxes, axis=0).tolist())
             classes[index] = replace(classes[index], size=(side, side, height))
     return Vocabulary(classes, vocabulary.room_types)
 

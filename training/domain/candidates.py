@@ -237,10 +237,8 @@ def _drop_learnt(
     data = candidate.config.data
     if data.split == "stable":
         seed = data.split_seed
-        unlearnt = [
-            s for s in scenes if s.source not in shared or stable_part(s.group, seed) == "test"
-        ]
-        return unlearnt, "", True
+        test = {scene.group for scene in scenes if stable_part(scene.group, seed) == "test"}
+        return [s for s in scenes if s.source not in shared or s.group in test], "", True
     all_scenes = _scenes_of(data, candidate.learnt, sources, digests, root)
     if all_scenes is None:
         note = (

@@ -187,10 +187,7 @@ def show(comparison: Comparison, console: Console) -> None:
         colour, figure = _COLOURS.get(row.verdict, "dim"), row.figure
         table.add_row(
             f"  {row.metric}",
-            *(
-                f"{values[title, row.task, row.metric]:.3f}"
-                for title in (comparison.a, comparison.b)
-            ),
+            *(f"{values[name, row.task, row.metric]:.3f}" for name in (comparison.a, comparison.b)),
             f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]",
             f"[{colour}]{row.verdict}[/{colour}]",
         )

@@ -127,14 +127,9 @@ def measure_usefulness(
         say(f"fitting {baseline.name}")
         model = baseline.fit(data.train, data.validation, data.structure)
         theirs[baseline.name] = mrr(model.missing)
-    return replace(
-        usefulness,
-        ours=ours.value,
-        theirs={name: ratio.value for name, ratio in theirs.items()},
-        differences={
-            name: paired_difference(ours, ratio, groups=groups) for name, ratio in theirs.items()
-        },
-    )
+    values = {name: ratio.value for name, ratio in theirs.items()}
+    gaps = {name: paired_difference(ours, ratio, groups=groups) for name, ratio in theirs.items()}
+    return replace(usefulness, ours=ours.value, theirs=values, differences=gaps)
 
 
 @dataclass(frozen=True)

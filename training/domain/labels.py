@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import combinations
 
 from rapidfuzz import process
 from rapidfuzz.distance import OSA
@@ -69,10 +68,7 @@ def outside_vocabulary(scenes: Iterable[EncodedScene], *, named: bool) -> str:
         spellings.setdefault(label_key(label), Counter())[label] += count
     if not spellings:
         return ""
-    counts = [
-        (_most_frequent(counts_of_label), counts_of_label.total())
-        for counts_of_label in spellings.values()
-    ]
+    counts = [(_most_frequent(spelt), spelt.total()) for spelt in spellings.values()]
     ordered = sorted(counts, key=lambda entry: (-entry[1], entry[0]))
     listed = [f'"{label}" ({_number(count, "scene")})' for label, count in ordered[:_SHOWN]]
     listed += [f"{len(ordered) - _SHOWN:,} more"] if len(ordered) > _SHOWN else []
@@ -172,8 +168,8 @@ def _pairs_in_one_scene(
     name_of = cache(lambda label: by_key.get(label_key(names.canonical(label))))
     together: set[frozenset[str]] = set()
     for scene in scenes:
-        present = {name_of(thing.label) for thing in scene.objects} - {None}
-        together |= {frozenset(pair) for pair in combinations(present, 2)}
+        present = {name for thing in scene.objects if (name := name_of(thing.label)) is not None}
+        together |= {frozenset((a, b)) for a in present for b in present if a < b}
     return together
 
 

@@ -116,9 +116,7 @@ def _findings(
         examples = list(cases)
         return Finding(what, advice, len(examples), examples[:SHOWN])
 
-    triples_of_scenes = [
-        {canonicalise(*triple) for triple in scene.relations or ()} for scene in scenes
-    ]
+    listed = [{canonicalise(*triple) for triple in scene.relations or ()} for scene in scenes]
     yield finding(
         "Scenes have fewer than two different objects, so they do not show co-occurrence.",
         "Training reads them. Questions that need more objects skip them.",
@@ -129,7 +127,7 @@ def _findings(
         "Such a relation counts as unobserved. Correct it, or check the point of view.",
         (
             f"{_describe_pair(scene, i, j)}, {CANONICAL[a]}"
-            for scene, triples in zip(scenes, triples_of_scenes, strict=True)
+            for scene, triples in zip(scenes, listed, strict=True)
             for a, i, j in sorted(triples)
             if i < j and (a, j, i) in triples
         ),
@@ -139,7 +137,7 @@ def _findings(
         "Correct one of the two relations.",
         (
             _describe_pair(scene, i, j)
-            for scene, triples in zip(scenes, triples_of_scenes, strict=True)
+            for scene, triples in zip(scenes, listed, strict=True)
             for a, i, j in sorted(triples)
             if a == _ON_TOP and (_ABOVE, j, i) in triples
         ),
@@ -149,7 +147,7 @@ def _findings(
         "Correct the cycle: an object cannot stand on an object that it supports.",
         (
             f"{scene.scene_id}: {', '.join(cycle)}"
-            for scene, triples in zip(scenes, triples_of_scenes, strict=True)
+            for scene, triples in zip(scenes, listed, strict=True)
             if (cycle := _support_cycle(scene, triples)) is not None
         ),
     )

@@ -200,9 +200,8 @@ def _vocabulary(
     scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike], minimum: int
 ) -> Vocabulary:
     merged = {label_key(pair.name): pair.like for pair in pairs if pair.merged}
-    vocabulary = source_vocabulary(
-        [_merge_labels(scene, merged) for scene in scenes], minimum=minimum
-    )
+    renamed = [_relabel(scene, merged) for scene in scenes]
+    vocabulary = source_vocabulary(renamed, minimum=minimum)
     aliases_of: dict[str, list[str]] = {}
     for pair in pairs:
         if pair.merged and vocabulary.index(pair.name) is None:
@@ -237,7 +236,7 @@ def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]
     return Vocabulary(objects, vocabulary.room_types)
 
 
-def _merge_labels(scene: AnnotatedScene, merged: Mapping[str, str]) -> AnnotatedScene:
+def _relabel(scene: AnnotatedScene, merged: Mapping[str, str]) -> AnnotatedScene:
     """Replace the labels of a scene. `merged` maps the key of a label to another label."""
     objects = tuple(
         replace(thing, label=merged.get(label_key(thing.label), thing.label))

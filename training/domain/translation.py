@@ -132,9 +132,8 @@ class Translation:
             return
         model_classes, index_of = mapped[columns].unique(return_inverse=True)
         n, A = len(model_classes), batch.holds.shape[1]
-        counts = torch.zeros(n, dtype=torch.int64).index_add(
-            0, index_of, batch.counts[row, columns]
-        )
+        counts = torch.zeros(n, dtype=torch.int64)
+        counts.index_add_(0, index_of, batch.counts[row, columns])
         holds, observed = torch.zeros(A, n, n), torch.zeros(A, n, n, dtype=torch.bool)
         model_pair = (slice(None), index_of[:, None], index_of[None, :])
         scene_pair = (slice(None), columns[:, None], columns[None, :])

@@ -23,7 +23,7 @@ from app.questions.outliers import Sensitivity
 from app.registry import Artifact
 from app.scene import Scene
 from training.datasets import EncodedScene
-from training.datasets.cases import scene_of, stated_relations
+from training.datasets.cases import draw_true_relations, scene_of
 
 ALARMS: dict[Sensitivity, float] = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Maximum shares of unaltered scenes with an alarm, on the large source with the most alarms."""
@@ -70,22 +70,22 @@ def untouched_alarms(artifact: Artifact, scenes: Sequence[EncodedScene]) -> Iter
     """
     rng = np.random.default_rng(0)
     sizes = Counter(scene.source for scene in scenes)
-    drawn: dict[tuple[str, str], EncodedScene] = {}
+    scene_of_group: dict[tuple[str, str], EncodedScene] = {}
     for k in rng.permutation(len(scenes)).tolist():
-        drawn.setdefault((scenes[k].source, scenes[k].group), scenes[k])
-    asked: dict[str, list[tuple[Scene, bool]]] = {}
-    for scene in drawn.values():
-        triples = stated_relations(scene, artifact.vocabulary.structure, rng) or ()
+        scene_of_group.setdefault((scenes[k].source, scenes[k].group), scenes[k])
+    cases: dict[str, list[tuple[Scene, bool]]] = {}
+    for scene in scene_of_group.values():
+        triples = draw_true_relations(scene, artifact.vocabulary.structure, rng) or ()
         whole = scene_of(scene, range(len(scene.instance_classes)), triples)
-        small = len(sizes) > 1 and sizes[scene.source] < SOURCE_SCENES
-        source = "the smaller sources" if small else scene.source
-        asked.setdefault(source, []).append((replace(whole, room_type=None), scene.complete))
-    for source, sensitivity in product(sorted(asked), ALARMS):
-        alarms = [_raises(artifact, *one, sensitivity) for one in asked[source]]
+        is_small = len(sizes) > 1 and sizes[scene.source] < SOURCE_SCENES
+        source = "the smaller sources" if is_small else scene.source
+        cases.setdefault(source, []).append((replace(whole, room_type=None), scene.complete))
+    for source, sensitivity in product(sorted(cases), ALARMS):
+        alarms = [_has_alarm(artifact, *case, sensitivity) for case in cases[source]]
         yield Alarms(source, sensitivity, len(alarms), sum(alarms))
 
 
-def _raises(artifact: Artifact, scene: Scene, complete: bool, sensitivity: Sensitivity) -> bool:
+def _has_alarm(artifact: Artifact, scene: Scene, complete: bool, sensitivity: Sensitivity) -> bool:
     answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
     return any(entry["is_misplaced"] for entry in answer["misplaced"]) or (
         complete and any(entry["is_outlier"] for entry in answer["outliers"])

@@ -72,11 +72,11 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
 
     def score(batch: Batch) -> Tensor:
         log_odds = torch.full(batch.holds.shape, -torch.inf)
-        stated = batch.holds * batch.observed * given
-        for row, padded in enumerate(batch.classes):
-            n = int((padded >= 0).sum())
-            scene, first = _instances(padded[:n], batch.counts[row, :n])
-            observed = set(map(tuple, stated[row].nonzero().tolist()))
+        evidence = batch.holds * batch.observed * given
+        for row, classes in enumerate(batch.classes):
+            n = int((classes >= 0).sum())
+            scene, first = _instances(classes[:n], batch.counts[row, :n])
+            observed = set(map(tuple, evidence[row].nonzero().tolist()))
             # a(x, y) and a(y, x) can both hold between classes, but for different instances.
             last = first + batch.counts[row, :n].clamp(min=1) - 1
             triples = [
@@ -116,8 +116,8 @@ def placed_score(artifact: Artifact) -> PlacedScore:
 
 def _instances(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
     """Return a scene with `counts` objects of each class, and the first object index per class."""
-    each = counts.clamp(min=1).long()
-    return of_classes(classes.repeat_interleave(each).tolist()), each.cumsum(0) - each
+    copies = counts.clamp(min=1).long()
+    return of_classes(classes.repeat_interleave(copies).tolist()), copies.cumsum(0) - copies
 
 
 def floor_model() -> Model:

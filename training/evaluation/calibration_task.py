@@ -48,7 +48,7 @@ from training.evaluation.asking import (
     labels_alone,
     with_intruder,
 )
-from training.evaluation.intruders import kinds_of_intruders
+from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.metrics import Items, Metric
 from training.evaluation.missing_tasks import SHARES, shown_classes
 from training.evaluation.model import Model
@@ -85,9 +85,9 @@ def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -
     answers: list[tuple[int, float, bool]] = []
     skipped = 0
     for k, scene in enumerate(scenes.scenes):
-        own = ask(artifact, scene, scene_rng(scene, seed))
-        skipped += own is None
-        answers += [(k, probability, truth) for probability, truth in own or ()]
+        scene_answers = ask(artifact, scene, scene_rng(scene, seed))
+        skipped += scene_answers is None
+        answers += [(k, probability, truth) for probability, truth in scene_answers or ()]
     index, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
     return Items(index.astype(np.int64), probability, truth > 0, len(scenes), skipped)
 
@@ -101,7 +101,7 @@ def ask_relations(
     is_known = annotated_relations(encoded)
     if not is_known.any():
         return None
-    return _judged(artifact, encoded, labels_alone(encoded), is_known) or None
+    return _answers_on(artifact, encoded, labels_alone(encoded), is_known) or None
 
 
 def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
@@ -110,39 +110,40 @@ def ask_given(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered |
     if not evidence:
         return None
     scene = replace(scene_of(encoded, range(len(is_asked)), evidence), room_type=None)
-    return _judged(artifact, encoded, scene, annotated_relations(encoded) & is_asked) or None
+    return _answers_on(artifact, encoded, scene, annotated_relations(encoded) & is_asked) or None
 
 
-def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Flags) -> Answered:
-    """Return the answers about the relations in `judged`, (relations, objects, objects) bool."""
+def _answers_on(artifact: Artifact, encoded: EncodedScene, scene: Scene, mask: Flags) -> Answered:
+    """Return the answers about the relations in `mask`, (relations, objects, objects) bool."""
     answers = [
         (entry["probability"], canonical_triple(scene, entry))
         for entry in relations(artifact, scene)["relations"]
     ]
-    return [(p, bool(encoded.instance_holds[triple])) for p, triple in answers if judged[triple]]
+    return [(p, bool(encoded.instance_holds[triple])) for p, triple in answers if mask[triple]]
 
 
 def ask_placements(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask where a removed object belongs. Up to `_REMOVALS` objects are removed one at a time."""
     if not annotated_relations(encoded).any():
         return None
-    each = (_places_of_one(artifact, encoded, rng) for _ in range(_REMOVALS))
-    return list(chain.from_iterable(each)) or None
+    answers = (_ask_one_placement(artifact, encoded, rng) for _ in range(_REMOVALS))
+    return list(chain.from_iterable(answers)) or None
 
 
-def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered:
-    taken = removed_class(encoded, artifact.vocabulary.structure, rng)
-    if taken is None:
+def _ask_one_placement(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered:
+    """Remove a class, and ask for the places of one of its instances in the remaining scene."""
+    removal = removed_class(encoded, artifact.vocabulary.structure, rng)
+    if removal is None:
         return []
-    target, kept = taken
-    gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
+    target, kept = removal
+    removed = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
     is_known = annotated_relations(encoded)
     answers: Answered = []
     scene = labels_alone(encoded, kept)
     index = index_of_ids(scene)
     for entry in missing(artifact, scene, candidates=[target])["missing"]:
         for place in entry["placements"]:
-            triple = canonicalise(gone, place["relation"], kept[index[place["object"]]])
+            triple = canonicalise(removed, place["relation"], kept[index[place["object"]]])
             if is_known[triple]:
                 answers.append((place["probability"], bool(encoded.instance_holds[triple])))
     return answers
@@ -150,7 +151,7 @@ def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answe
 
 def ask_missing(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for missing classes. A random share of the classes, or one class, is hidden."""
-    hidden = _hidden(artifact, encoded, rng)
+    hidden = _draw_hidden(artifact, encoded, rng)
     if hidden is None:
         return None
     labels = {artifact.vocabulary.labels[index] for index in hidden}
@@ -164,7 +165,7 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered 
 
     A class is left out if it is unknown whether the class has this relation to the object.
     """
-    hidden = _hidden(artifact, encoded, rng)
+    hidden = _draw_hidden(artifact, encoded, rng)
     if hidden is None:
         return None
     is_hidden = np.isin(encoded.instance_classes, hidden)
@@ -174,15 +175,16 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered 
     relation, anchor = place
     kept = np.flatnonzero(~is_hidden).tolist()
     labels = np.array(artifact.vocabulary.labels, dtype=object)[encoded.instance_classes]
-    there = set(labels[encoded.instance_holds[relation, :, anchor] & is_hidden])
-    unknown = set(labels[~annotated_relations(encoded)[relation, :, anchor] & is_hidden]) - there
+    placed = set(labels[encoded.instance_holds[relation, :, anchor] & is_hidden])
+    is_annotated = annotated_relations(encoded)[relation, :, anchor]
+    unannotated = set(labels[~is_annotated & is_hidden]) - placed
     at = CANONICAL[relation], kept.index(anchor)
     entries = missing(artifact, labels_alone(encoded, kept), at=at, details=False)["missing"]
-    judged = [entry for entry in entries if entry["label"] not in unknown]
-    return [(entry["probability"], entry["label"] in there) for entry in judged]
+    annotated = [entry for entry in entries if entry["label"] not in unannotated]
+    return [(entry["probability"], entry["label"] in placed) for entry in annotated]
 
 
-def _hidden(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Ints | None:
+def _draw_hidden(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Ints | None:
     """Draw the classes of a scene to hide. The share of hidden classes is drawn for each scene."""
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
@@ -204,27 +206,27 @@ def ask_outliers(
 
     Args:
         intruders: maps (source, scene id) to the classes from which the intruder is drawn, see
-            `kinds_of_intruders`. None means any absent class.
+            `draw_intruder_choices`. None means any absent class.
     """
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
     if not encoded.complete or (~structure[classes]).sum() < 3:
         return None
-    choice = np.setdiff1d(np.flatnonzero(~structure), classes)
+    candidates = np.setdiff1d(np.flatnonzero(~structure), classes)
     if intruders is not None:
-        choice = intruders[encoded.source, encoded.scene_id]
-    if not len(choice):
+        candidates = intruders[encoded.source, encoded.scene_id]
+    if not len(candidates):
         return None
     scene, intruder = labels_alone(encoded), -1
     if rng.random() < 0.5:
         intruder = len(scene.objects)
-        scene = with_intruder(artifact, scene, int(rng.choice(choice)))
+        scene = with_intruder(artifact, scene, int(rng.choice(candidates)))
     index = index_of_ids(scene)
-    usable = [not structure[thing.class_index] for thing in scene.objects]
+    is_thing = [not structure[thing.class_index] for thing in scene.objects]
     return [
         (entry["probability"], index[entry["object"]] == intruder)
         for entry in outliers(artifact, scene, details=False)["outliers"]
-        if usable[index[entry["object"]]]
+        if is_thing[index[entry["object"]]]
     ] or None
 
 
@@ -252,29 +254,31 @@ QUESTIONS: dict[str, Ask] = {
 
 
 def calibration_task(model: Model, setting: Setting) -> Outcome | None:
-    """Measure the calibration of each `QUESTIONS` entry, with and without the calibration maps."""
+    """Measure the calibration of the answers to all `QUESTIONS`, published and uncalibrated.
+
+    Questions about objects use scenes with complete object lists, the others scenes with relations.
+    """
     if model.artifact is None:
         return None
     related = setting.some(related=True, share=3)
     complete = setting.complete.some(share=3)
     at_place = setting.complete.some(related=True, share=3)
-    of_objects = {"missing": complete, "outliers": complete, "missing at a place": at_place}
+    scenes_of = {"missing": complete, "outliers": complete, "missing at a place": at_place}
     metrics: dict[str, Metric] = {}
     skipped = 0
-    published, plain = model.artifact, uncalibrated(model.artifact)
-    intruders = kinds_of_intruders(
-        complete, setting.structure, setting.complete.train, setting.seed
-    )
+    raw = uncalibrated(model.artifact)
+    train = setting.complete.train
+    intruders = draw_intruder_choices(complete, setting.structure, train, setting.seed)
     asks = QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
     for name, ask in asks.items():
-        scenes = of_objects.get(name, related)
-        answers = collect(published, scenes, ask, setting.seed)
+        scenes = scenes_of.get(name, related)
+        answers = collect(model.artifact, scenes, ask, setting.seed)
         skipped += answers.skipped
         if len(answers.scene):
-            before = collect(plain, scenes, ask, setting.seed)
+            raw_answers = collect(raw, scenes, ask, setting.seed)
             for figure in ("ECE", "Brier skill"):
                 metrics[f"{figure}, {name}"] = answers.metric(figure)
-                metrics[f"{figure}, {name}, uncalibrated"] = before.metric(figure)
+                metrics[f"{figure}, {name}, uncalibrated"] = raw_answers.metric(figure)
     # Brier skill is undefined if all answers are true or all answers are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None

@@ -53,35 +53,38 @@ def counts_task(model: Model, setting: Setting) -> Outcome | None:
     counting = counted_classes(train.scenes, artifact.vocabulary)
     scenes = [scene for scene in setting.scenes.scenes if scene.source in counting]
     answers = [
-        (place, *answer)
-        for place, scene in enumerate(scenes)
-        for answer in _asked(artifact, scene, counting[scene.source], setting.seed)
+        (scene_index, *answer)
+        for scene_index, scene in enumerate(scenes)
+        for answer in _ask_counts(artifact, scene, counting[scene.source], setting.seed)
     ]
     if not answers:
         return None
-    place, index, number, listed, expected, low, high, p = np.array(answers).T
+    scene_index, index, number, listed, expected, low, high, p = np.array(answers).T
     _, group = np.unique([scene.group for scene in scenes], return_inverse=True)
-    unit, units = group[place.astype(np.int64)], int(group.max()) + 1
+    unit, units = group[scene_index.astype(np.int64)], int(group.max()) + 1
     index, k = index.astype(np.int64), listed.astype(np.int64)
 
     def error(guess: Floats) -> Ratio:
         return Ratio.of_items(unit, np.abs(guess - number), units)
 
     row = np.searchsorted(artifact.counts.classes, index)
-    found, mean = error(expected), error(class_mean(artifact.counts, row, k))
-    of_source = error(np.maximum(_means(train.scenes, artifact)[index], listed))
-    inside = ((low <= number) & (number <= high)).astype(np.float64)
-    metrics: dict[str, Metric] = dict(
-        zip(METRICS, (found, mean, found - mean, found - of_source), strict=False)
-    )
-    metrics["count in the interval"] = Ratio.of_items(unit, inside, units)
-    if (likely := p >= LIKELY).any():
-        right = (number > listed)[likely].astype(np.float64)
-        metrics["proposals that are right"] = Ratio.of_items(unit[likely], right, units)
-    return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(place)))
+    ours, mean_error = error(expected), error(class_mean(artifact.counts, row, k))
+    of_source = error(np.maximum(_mean_counts(train.scenes, artifact)[index], listed))
+    is_inside = ((low <= number) & (number <= high)).astype(np.float64)
+    metrics: dict[str, Metric] = {
+        "error of the expected count": ours,
+        "error of the class mean": mean_error,
+        "change of error, class mean": ours - mean_error,
+        "change of error, mean of the source": ours - of_source,
+    }
+    metrics["count in the interval"] = Ratio.of_items(unit, is_inside, units)
+    if (is_likely := p >= LIKELY).any():
+        is_right = (number > listed)[is_likely].astype(np.float64)
+        metrics["proposals that are right"] = Ratio.of_items(unit[is_likely], is_right, units)
+    return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(scene_index)))
 
 
-def _asked(
+def _ask_counts(
     artifact: Artifact, scene: EncodedScene, counted: Flags, seed: int
 ) -> list[tuple[float, ...]]:
     """Return the answers about a partly listed scene.
@@ -92,15 +95,15 @@ def _asked(
     part, is_asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
     room = part.room if part.room >= 0 else None
     listed = replace(of_classes(np.repeat(part.classes, part.listed).tolist()), room_type=room)
-    wanted = part.classes[is_asked].tolist()
+    candidates = part.classes[is_asked].tolist()
     labels = artifact.vocabulary.labels
     pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
     number_of = {labels[index]: (index, number) for index, number in pairs}
-    entries = more(artifact, listed, top_k=len(wanted), candidates=wanted)
+    entries = more(artifact, listed, top_k=len(candidates), candidates=candidates)
     return [(*number_of[entry.pop("label")], *entry.values()) for entry in entries]
 
 
-def _means(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:
+def _mean_counts(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:
     """Return the mean number of instances of each class in the scenes with the class, (V,)."""
     times, total = np.zeros((2, len(artifact.vocabulary)))
     for scene in scenes:

@@ -117,7 +117,7 @@ def machine_density(
     below, above = log_partition(objects, train, settings, seed)
 
     def log_unnormalised(v: Tensor) -> Tensor:
-        return torch.cat([_log_sum(objects, some, settings.draws) for some in v.split(_BLOCK)])
+        return torch.cat([_log_unnormalised(objects, b, settings.draws) for b in v.split(_BLOCK)])
 
     return _density(log_unnormalised, below, above)
 
@@ -161,16 +161,21 @@ def log_partition(
 
 
 @torch.no_grad()
-def _log_sum(machine: BoltzmannMachine, v: Tensor, draws: int) -> Tensor:
-    """Return log p(v) + log Z for presence (B, V), estimated with samples of h1."""
+def _log_unnormalised(machine: BoltzmannMachine, v: Tensor, draws: int) -> Tensor:
+    """Return log p(v) + log Z, (B,), for presence (B, V).
+
+    The value is exact with one hidden layer. With two layers, it is the importance-sampling
+    estimate of the module, from `draws` samples of h1.
+    """
     if not machine.spec.H2:
         return -machine.free_energy(v)
     y = mean_field(machine, Evidence(v)).y
-    h1 = (fixed_uniforms(draws, machine.spec.H1).to(y.dtype).unsqueeze(1) < y.sigmoid()).to(y.dtype)
+    uniforms = fixed_uniforms(draws, machine.spec.H1).to(y.dtype).unsqueeze(1)
+    h1 = (uniforms < y.sigmoid()).to(y.dtype)  # (draws, B, H1)
     log_q = (h1 * logsigmoid(y) + (1 - h1) * logsigmoid(-y)).sum(-1)
-    second = softplus(machine.second_layer_logits(h1)).sum(-1)
-    target = v @ machine.b + (h1 * (machine.c1 + v @ machine.W)).sum(-1) + second
-    return (target - log_q).logsumexp(0) - float(np.log(draws))
+    log_h2 = softplus(machine.second_layer_logits(h1)).sum(-1)  # h2 summed out
+    log_joint = v @ machine.b + (h1 * (machine.c1 + v @ machine.W)).sum(-1) + log_h2
+    return (log_joint - log_q).logsumexp(0) - float(np.log(draws))
 
 
 def _log_odds(train: SceneTensors) -> Tensor:

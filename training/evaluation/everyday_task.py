@@ -78,11 +78,11 @@ def everyday_task(model: Model, setting: Setting) -> Outcome | None:
         return None
     metrics: dict[str, Metric] = {}
     count = 0
-    for line, found in ask_everyday(artifact, folder).items():
-        hits, asked = np.array(found, dtype=np.float64).reshape(-1, 2).T
-        count += len(found)
-        if asked.sum():
-            metrics[line] = Ratio(hits, asked)
+    for line, pairs in ask_everyday(artifact, folder).items():
+        hits, questions_asked = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+        count += len(pairs)
+        if questions_asked.sum():
+            metrics[line] = Ratio(hits, questions_asked)
     return Outcome(metrics, count, 0)
 
 
@@ -123,20 +123,22 @@ def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
 def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
     rows = []
     for fact in facts:
-        p = _of_eight(artifact, fact["subject"], fact["object"])
-        upright = {name: value for name, value in p.items() if name in _VERTICAL}
+        p = _relation_probabilities(artifact, fact["subject"], fact["object"])
+        vertical = {name: value for name, value in p.items() if name in _VERTICAL}
         relation = fact["relation"]
-        first = [max(some, key=some.__getitem__, default="") == relation for some in (p, upright)]
-        rows.append((*first, p.get(relation, 0.0) >= 0.5))
-    return _lines(LINES[:3], rows)
+        likeliest = max(p, key=p.__getitem__, default="")
+        likeliest_vertical = max(vertical, key=vertical.__getitem__, default="")
+        is_likely = p.get(relation, 0.0) >= 0.5
+        rows.append((likeliest == relation, likeliest_vertical == relation, is_likely))
+    return _count_hits(LINES[:3], rows)
 
 
-def _lines(names: Sequence[str], rows: Sequence[Sequence[bool]]) -> Lines:
+def _count_hits(names: Sequence[str], rows: Sequence[Sequence[bool]]) -> Lines:
     """Return the hits of each name, from one row of hits per fact."""
     return {name: [(int(row[k]), 1) for row in rows] for k, name in enumerate(names)}
 
 
-def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
+def _relation_probabilities(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
     """Return the probability of each of the eight relations of the subject to the other object."""
     scene = _scene(artifact, [subject, other])
     answer = questions.relations(artifact, scene, top_k=_RELATIONS, include_opposites=True)
@@ -149,17 +151,19 @@ def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
 
 
 def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Lines:
-    answers = [({entry["label"] for entry in _five(artifact, fact)}, fact) for fact in facts]
-    hits = [[bool(labels & set(fact["expected"]))] for labels, fact in answers]
-    return _lines([f"{name}: an expected object is among five"], hits)
+    hits = []
+    for fact in facts:
+        labels = {entry["label"] for entry in _first_missing(artifact, fact)}
+        hits.append([bool(labels & set(fact["expected"]))])
+    return _count_hits([f"{name}: an expected object is among five"], hits)
 
 
-def _five(artifact: Artifact, fact: dict[str, Any]) -> list[Fields]:
+def _first_missing(artifact: Artifact, fact: dict[str, Any]) -> list[Fields]:
     """Return the first five answers, or an empty list if the service would reject the request."""
     scene = _scene(artifact, fact["objects"])
     at = None
     if "at" in fact:
-        if (anchor := _place(artifact, scene, fact["at"]["object"])) is None:
+        if (anchor := _object_index(artifact, scene, fact["at"]["object"])) is None:
             return []
         at = fact["at"]["relation"], anchor
     if not scene.objects:
@@ -168,7 +172,7 @@ def _five(artifact: Artifact, fact: dict[str, Any]) -> list[Fields]:
     return entries
 
 
-def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
+def _object_index(artifact: Artifact, scene: Scene, name: str) -> int | None:
     """Return the index of the object with the id `name`, or of the only object of class `name`."""
     index = artifact.vocabulary.index(name)
     named = [k for k, thing in enumerate(scene.objects) if thing.id == name]
@@ -181,18 +185,18 @@ def _outliers(
 ) -> Lines:
     rows = []
     for fact in intruders:
-        answers = _judged(artifact, [*fact["objects"], fact["intruder"]])
-        own = [answer for answer in answers if answer["label"] == fact["intruder"]]
-        first = bool(answers) and answers[0]["label"] == fact["intruder"]
-        rows.append((first, any(answer["is_outlier"] for answer in own)))
+        answers = _outlier_entries(artifact, [*fact["objects"], fact["intruder"]])
+        is_first = bool(answers) and answers[0]["label"] == fact["intruder"]
+        flagged = {answer["label"] for answer in answers if answer["is_outlier"]}
+        rows.append((is_first, fact["intruder"] in flagged))
     alarms = [
-        [any(answer["is_outlier"] for answer in _judged(artifact, fact["objects"]))]
+        [any(answer["is_outlier"] for answer in _outlier_entries(artifact, fact["objects"]))]
         for fact in plain
     ]
-    return _lines(LINES[5:7], rows) | _lines(LINES[7:8], alarms)
+    return _count_hits(LINES[5:7], rows) | _count_hits(LINES[7:8], alarms)
 
 
-def _judged(artifact: Artifact, labels: Sequence[str]) -> list[Fields]:
+def _outlier_entries(artifact: Artifact, labels: Sequence[str]) -> list[Fields]:
     entries: list[Fields] = questions.outliers(artifact, _scene(artifact, labels))["outliers"]
     return entries
 
@@ -200,11 +204,11 @@ def _judged(artifact: Artifact, labels: Sequence[str]) -> list[Fields]:
 def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -> Lines:
     rows = []
     for room, seed in product(rooms, seeds):
-        given = Scene((), room_type=artifact.vocabulary.room_index(room["room"]))
-        answer = questions.generate(artifact, given, count=_DRAWN, seed=seed)
-        drawn = [set(scene["objects"]) for scene in answer["scenes"]]
-        typical = sum(bool(one & set(room["one_of"])) for one in drawn)
-        foreign = sum(bool(one & set(room["never"])) for one in drawn)
-        few = sum(len(one) < _FEW for one in drawn)
-        rows.append([(count, len(drawn)) for count in (typical, foreign, few)])
+        empty = Scene((), room_type=artifact.vocabulary.room_index(room["room"]))
+        answer = questions.generate(artifact, empty, count=_DRAWN, seed=seed)
+        scenes = [set(scene["objects"]) for scene in answer["scenes"]]
+        typical = sum(bool(labels & set(room["one_of"])) for labels in scenes)
+        foreign = sum(bool(labels & set(room["never"])) for labels in scenes)
+        few = sum(len(labels) < _FEW for labels in scenes)
+        rows.append([(count, len(scenes)) for count in (typical, foreign, few)])
     return {name: [row[k] for row in rows] for k, name in enumerate(LINES[8:])}

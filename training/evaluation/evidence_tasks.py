@@ -57,18 +57,19 @@ class Case:
     """One question about a scene, asked with labels only and with additional evidence.
 
     Attributes:
+        scene_index: index of the scene in its set.
         scenes: the scene with labels only, and the scene with evidence.
         target: index of the removed class in T2, or of the intruding object in T3.
         truth: (relations, objects, objects) bool, the relations that hold. Empty in T2 and T3.
-        asked: (relations, objects, objects) bool, the queried relations. Empty in T2 and T3.
+        queried: (relations, objects, objects) bool, the queried relations. Empty in T2 and T3.
         items: number of relations to find in T1; 1 in T2 and T3.
     """
 
-    place: int
+    scene_index: int
     scenes: tuple[Scene, Scene]
     target: int = -1
     truth: Flags = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.bool_))
-    asked: Flags = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.bool_))
+    queried: Flags = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.bool_))
     items: int = 1
 
 
@@ -103,8 +104,8 @@ def removals(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -
             continue
         for target in scene_rng(encoded, seed).permutation(removable)[:_REMOVALS]:
             kept = np.flatnonzero(encoded.instance_classes != target).tolist()
-            if (both := with_evidence(encoded, kept, kind)) is not None:
-                yield Case(index, both, int(target))
+            if (pair := with_evidence(encoded, kept, kind)) is not None:
+                yield Case(index, pair, int(target))
 
 
 def intrusions(
@@ -115,39 +116,39 @@ def intrusions(
 ) -> Iterator[Case]:
     """Generate the T3 questions: each scene with its intruder, (scenes,); -1 skips the scene."""
     for index, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
-        both = with_evidence(encoded, list(range(len(encoded.instance_classes))), kind)
-        if intruder < 0 or both is None:
+        pair = with_evidence(encoded, list(range(len(encoded.instance_classes))), kind)
+        if intruder < 0 or pair is None:
             continue
-        bare, more = (_intruded(artifact, scene, int(intruder)) for scene in both)
-        yield Case(index, (bare, more), len(bare.objects) - 1)
+        bare, informed = (_add_intruder(artifact, scene, int(intruder)) for scene in pair)
+        yield Case(index, (bare, informed), len(bare.objects) - 1)
 
 
-def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
-    """Return the scene with an intruder, of which only the label is known."""
-    if scene.poses is not None:
-        pad = ((0, 0), (0, 1), (0, 1))
-        poses = PoseRelations(np.pad(scene.poses.holds, pad), np.pad(scene.poses.observed, pad))
-        larger = with_intruder(artifact, replace(scene, poses=None), intruder)
-        return replace(larger, poses=poses)
-    return with_intruder(artifact, scene, intruder)
+def _add_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
+    """Return the scene with an intruder. All relations of the intruder are unobserved."""
+    larger = with_intruder(artifact, replace(scene, poses=None), intruder)
+    if scene.poses is None:
+        return larger
+    pad = ((0, 0), (0, 1), (0, 1))  # one row and one column of False for the intruder
+    poses = PoseRelations(np.pad(scene.poses.holds, pad), np.pad(scene.poses.observed, pad))
+    return replace(larger, poses=poses)
 
 
 def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
     """Generate the T1 questions: evidence about half of the classes, all other pairs queried."""
     for index, encoded in enumerate(scenes.scenes):
-        own, classes = encoded.instance_classes, encoded.evidence.classes
-        usable = classes[~structure[classes]]
-        if len(usable) < 3:
+        instances, classes = encoded.instance_classes, encoded.evidence.classes
+        things = classes[~structure[classes]]
+        if len(things) < 3:
             continue
-        half = scene_rng(encoded, seed).permutation(usable)[: max(2, len(usable) // 2)]
-        in_half, plain = np.isin(own, half), ~structure[own]
+        half = scene_rng(encoded, seed).permutation(things)[: max(2, len(things) // 2)]
+        in_half, is_thing = np.isin(instances, half), ~structure[instances]
         between = in_half[:, None] & in_half
-        both = with_evidence(encoded, list(range(len(own))), kind, between)
-        pair = plain[:, None] & plain & ~between & ~np.eye(len(own), dtype=np.bool_)
+        scene_pair = with_evidence(encoded, list(range(len(instances))), kind, between)
+        pair = is_thing[:, None] & is_thing & ~between & ~np.eye(len(instances), dtype=np.bool_)
         queried = np.broadcast_to(pair, encoded.instance_holds.shape)
         truth = encoded.instance_holds & queried
-        if both is not None and truth.any():
-            yield Case(index, both, truth=truth, asked=queried, items=int(truth.sum()))
+        if scene_pair is not None and truth.any():
+            yield Case(index, scene_pair, truth=truth, queried=queried, items=int(truth.sum()))
 
 
 def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
@@ -159,7 +160,6 @@ def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
 
 def missing_evidence_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T2 (missing objects) with labels only and with additional evidence."""
-
     structure = setting.structure.numpy()
     return _changes(
         "MRR",
@@ -189,7 +189,7 @@ def relations_evidence_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T1 (relations) with labels only and with additional evidence."""
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
-        p, truth = relation_probabilities(artifact, scene)[case.asked], case.truth[case.asked]
+        p, truth = relation_probabilities(artifact, scene)[case.queried], case.truth[case.queried]
         return expected_hits(p, truth, case.items)
 
     return _changes(
@@ -230,15 +230,15 @@ def _changes(
         values = np.array(
             ask_every(lambda case: np.array([value(artifact, s, case) for s in case.scenes]), cases)
         )
-        index = [case.place for case in cases]
-        without, informed, below = (
+        index = [case.scene_index for case in cases]
+        without, informed, items = (
             np.bincount(index, weights=column, minlength=len(scenes)).astype(np.float64)
             for column in (*values.T, [case.items for case in cases])
         )
         metrics |= {
-            f"change of {metric}, {kind}": Ratio(informed - without, below),
-            f"{metric}, {kind}": Ratio(informed, below),
-            f"{metric}, {kind} withheld": Ratio(without, below),
+            f"change of {metric}, {kind}": Ratio(informed - without, items),
+            f"{metric}, {kind}": Ratio(informed, items),
+            f"{metric}, {kind} withheld": Ratio(without, items),
         }
-        skipped.append(int((below == 0).sum()))
+        skipped.append(int((items == 0).sum()))
     return Outcome(metrics, len(scenes), skipped[0]) if metrics else None

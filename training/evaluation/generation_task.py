@@ -81,20 +81,19 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
 
     def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
         rng = np.random.default_rng(seed)
-        free = not bool(given.any())
-        chosen = []
+        is_free = not bool(given.any())
+        rows = []
         for row in range(len(given)):
             fits = (scenes.v >= given[row].to(scenes.v.dtype)).all(1)
             if room[row] >= 0:
                 fits &= scenes.room == room[row]
-            places = fits.nonzero().squeeze(1).numpy()
-            if not len(places):
+            fitting = fits.nonzero().squeeze(1).numpy()
+            if not len(fitting):
                 raise ValueError(
                     f"no real scene has the observed classes and the room type of test scene {row}"
                 )
-            own = free and row in places
-            chosen.append(row if own else int(rng.choice(places)))
-        index = torch.tensor(chosen)
+            rows.append(row if is_free and row in fitting else int(rng.choice(fitting)))
+        index = torch.tensor(rows)
         return Drawn(scenes.v[index], None if counts is None else counts[index])
 
     return sample
@@ -144,8 +143,8 @@ def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
     half.
     """
     scenes = setting.scenes
-    odd = torch.tensor([crc32(scene.group.encode()) % 2 for scene in scenes.scenes]).bool()
-    first, second = (subset(scenes, some.nonzero().squeeze(1)) for some in (~odd, odd))
+    is_odd = torch.tensor([crc32(scene.group.encode()) % 2 for scene in scenes.scenes]).bool()
+    first, second = (subset(scenes, mask.nonzero().squeeze(1)) for mask in (~is_odd, is_odd))
     return (
         some_scenes(first, setting.limit, setting.seed),
         some_scenes(second, setting.limit, setting.seed),
@@ -241,7 +240,7 @@ def generation_metrics(
     drawn: Drawn,
     held_out: Tensor,
     train: Tensor,
-    asked: Tensor,
+    used: Tensor,
     bandwidth: float,
     emphasis: Tensor | None = None,
 ) -> dict[str, Metric]:
@@ -249,16 +248,16 @@ def generation_metrics(
 
     Args:
         drawn: at least two generated scenes.
-        asked: (classes,) bool, the classes that the metrics use.
+        used: (classes,) bool, the classes that the metrics use.
         bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
         emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
     """
-    x, y, training = drawn.v[:, asked], held_out[:, asked], train[:, asked]
+    x, y, training = drawn.v[:, used], held_out[:, used], train[:, used]
     ours, theirs = x.double().numpy(), y.double().numpy()
-    each = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
+    base = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
 
     def resampled(statistic: Callable[[Floats], float]) -> Resampled:
-        return Resampled.of(lambda weight: statistic(weight * each), len(y), len(x), _RESAMPLES)
+        return Resampled.of(lambda weight: statistic(weight * base), len(y), len(x), _RESAMPLES)
 
     metrics: dict[str, Metric] = {
         "MMD²": resampled(discrepancy(y, x, bandwidth)),
@@ -288,26 +287,26 @@ def generation_task(model: Model, setting: Setting) -> Outcome | None:
     if sampler is None or setting.train is None:
         return None
     first, second = held_out_halves(setting)
-    asked = first.annotated_classes[first.source].any(0) & ~setting.structure
-    mentions = ((second.v > 0) & asked).nonzero()
-    if min(len(first), len(second), len(mentions)) < 2 or not first.v[:, asked].any():
+    used = first.annotated_classes[first.source].any(0) & ~setting.structure
+    mentions = ((second.v > 0) & used).nonzero()
+    if min(len(first), len(second), len(mentions)) < 2 or not first.v[:, used].any():
         return None
-    bandwidth = median_distance(first.v[:, asked])
-    nothing = torch.zeros_like(second.v, dtype=torch.bool)
-    nowhere = torch.full_like(second.room, -1)
+    bandwidth = median_distance(first.v[:, used])
+    no_classes = torch.zeros_like(second.v, dtype=torch.bool)
+    no_rooms = torch.full_like(second.room, -1)
     order = np.random.default_rng(setting.seed).permutation(len(mentions))[: len(second)]
     classes = mentions[torch.from_numpy(order), 1]
-    one = nothing[: len(classes)].scatter(1, classes.unsqueeze(1), True)
-    size = first.v[:, asked].sum(1)
+    one_class = no_classes[: len(classes)].scatter(1, classes.unsqueeze(1), True)
+    class_counts = first.v[:, used].sum(1)
     conditions = {
-        "free": (nothing, nowhere, None),
-        "given room types": (nothing, second.room, None),
-        "given one class": (one, nowhere[: len(one)], size),
+        "free": (no_classes, no_rooms, None),
+        "given room types": (no_classes, second.room, None),
+        "given one class": (one_class, no_rooms[: len(one_class)], class_counts),
     }
     metrics: dict[str, Metric] = {}
     for name, (given, room, emphasis) in conditions.items():
         drawn = sampler(given, room, setting.seed)
-        own = generation_metrics(drawn, first.v, setting.train.v, asked, bandwidth, emphasis)
-        metrics |= {f"{metric}, {name}": value for metric, value in own.items()}
+        values = generation_metrics(drawn, first.v, setting.train.v, used, bandwidth, emphasis)
+        metrics |= {f"{metric}, {name}": value for metric, value in values.items()}
     notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
     return Outcome(metrics, len(first), 0, notes)

@@ -57,8 +57,8 @@ def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
     weights = torch.zeros_like(scenes.v)
     for room in scenes.room.unique().tolist():
         if room >= 0:
-            seen = (train.v[train.room == room] > 0).any(0)
-            weights[scenes.room == room] = seen.to(weights.dtype)
+            is_in_room = (train.v[train.room == room] > 0).any(0)
+            weights[scenes.room == room] = is_in_room.to(weights.dtype)
     return weights
 
 
@@ -74,9 +74,9 @@ def draw_intruders(
     absent = (~present & ~structure).double()
     if weights is not None:
         absent = absent * weights
-    enough = ((present & ~structure).sum(1) >= 3) & (absent.sum(1) > 0)
+    is_usable = ((present & ~structure).sum(1) >= 3) & (absent.sum(1) > 0)
     intruders = torch.full((len(scenes),), -1, dtype=torch.int64)
-    for k in enough.nonzero().squeeze(1).tolist():
+    for k in is_usable.nonzero().squeeze(1).tolist():
         p = absent[k].numpy()
         rng = scene_rng(scenes.scenes[k], seed)
         intruders[k] = int(rng.choice(len(p), p=p / p.sum()))
@@ -97,14 +97,14 @@ def signatures(train: SceneTensors) -> tuple[Flags, Floats]:
     typical = np.zeros(share.shape, dtype=np.bool_)
     popularity = v.mean(0) if len(v) else np.zeros(v.shape[1])
     for r in range(rooms):
-        own = v[room == r]
-        if len(own) < _SCENES:
+        room_scenes = v[room == r]
+        if len(room_scenes) < _SCENES:
             continue
-        share[r] = own.mean(0)
-        often = share[r] >= _OFTEN
-        lift = np.divide(share[r], popularity, where=often, out=np.zeros(v.shape[1]))
-        best = np.argsort(-lift, kind="stable")[:SIGNATURE]
-        typical[r, best[lift[best] >= _LIFT]] = True
+        share[r] = room_scenes.mean(0)
+        is_frequent = share[r] >= _OFTEN
+        lift = np.divide(share[r], popularity, where=is_frequent, out=np.zeros(v.shape[1]))
+        ranked = np.argsort(-lift, kind="stable")[:SIGNATURE]
+        typical[r, ranked[lift[ranked] >= _LIFT]] = True
     return typical, share
 
 
@@ -118,25 +118,27 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
             continue
         suitable = typical & absent[k] & (share[room] < _FOREIGN)
         suitable[room] = False
-        sizes = suitable.sum(1)
-        some = sizes > 0
-        if some.any():
-            weights[k] = (suitable[some] / sizes[some, None]).mean(0)
+        suitable = suitable[suitable.any(1)]
+        if len(suitable):
+            weights[k] = (suitable / suitable.sum(1, keepdims=True)).mean(0)
     return torch.from_numpy(weights)
 
 
-def kinds_of_intruders(
+def draw_intruder_choices(
     scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Ints]:
-    """Draw uniform, popular and signature intruders of each scene, by (source, scene id)."""
-    laws: list[Tensor | None] = [None]
+    """Draw up to three classes for each scene, by (source, scene id), for `ask_outliers`.
+
+    They are a uniform, a popular and a signature intruder; without `train`, only a uniform one.
+    """
+    weights: list[Tensor | None] = [None]
     if train is not None:
-        laws += [by_popularity(scenes, train), by_signature(scenes, train)]
-    # `answers.ask_outliers` uses `seed` itself. Another seed keeps the draws independent.
-    drawn = [draw_intruders(scenes, structure, weights, seed + 1) for weights in laws]
-    each = torch.stack(drawn, 1).numpy()
+        weights += [by_popularity(scenes, train), by_signature(scenes, train)]
+    # `ask_outliers` uses `seed` itself. Another seed keeps the draws independent.
+    columns = [draw_intruders(scenes, structure, weight, seed + 1) for weight in weights]
+    rows = torch.stack(columns, 1).numpy()
     names = [(scene.source, scene.scene_id) for scene in scenes.scenes]
-    return {name: own[own >= 0] for name, own in zip(names, each, strict=True)}
+    return {name: row[row >= 0] for name, row in zip(names, rows, strict=True)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,18 +189,18 @@ class IntruderScores:
         """Return the share of scenes whose intruder has the lowest log-odds; expected over ties."""
         return self.dirty.hit_at_1()
 
-    def false_alarms(self, loud: Flags) -> Ratio:
-        """Return the share of clean scenes with an alarm, for the alarms `loud` (objects,)."""
-        return self._alarms(loud, self.clean)
+    def false_alarms(self, alarms: Flags) -> Ratio:
+        """Return the share of clean scenes with an alarm, for the alarms `alarms` (objects,)."""
+        return self._alarms(alarms, self.clean)
 
-    def caught(self, loud: Flags) -> Ratio:
-        """Return the share of intruders with an alarm, for the alarms `loud` (objects,)."""
-        return self._alarms(loud, self.intruder)
+    def caught(self, alarms: Flags) -> Ratio:
+        """Return the share of intruders with an alarm, for the alarms `alarms` (objects,)."""
+        return self._alarms(alarms, self.intruder)
 
-    def _alarms(self, loud: Flags, judged: Flags) -> Ratio:
-        there = np.bincount(self.scene[judged], minlength=self.scenes) > 0
-        alarm = np.bincount(self.scene[judged & loud], minlength=self.scenes) > 0
-        return Ratio.of_scenes(alarm, there)
+    def _alarms(self, alarms: Flags, judged: Flags) -> Ratio:
+        has_object = np.bincount(self.scene[judged], minlength=self.scenes) > 0
+        has_alarm = np.bincount(self.scene[judged & alarms], minlength=self.scenes) > 0
+        return Ratio.of_scenes(has_alarm, has_object)
 
 
 Score = Callable[[Tensor], Tensor]
@@ -251,12 +253,17 @@ def _scores(
         row, things = ((v > 0) & ~structure).nonzero(as_tuple=True)
         log_odds = torch.zeros(0)
         if len(row):
-            rest = v[row].scatter(1, things.unsqueeze(1), 0.0)
-            log_odds = score(rest).gather(1, things.unsqueeze(1)).squeeze(1)
-        sizes = (v > 0).sum(1)[row]
-        flags = things == added[row], added[row] < 0
-        parts.append((index[row], things, log_odds.double(), flags[0], sizes, flags[1]))
-    scene, thing, odds, is_intruder, size, is_clean = (
-        torch.cat(column).numpy() for column in zip(*parts, strict=True)
-    )
-    return IntruderScores(scene, thing, odds, is_intruder, size, is_clean, scenes, skipped)
+            other_objects = v[row].scatter(1, things.unsqueeze(1), 0.0)
+            log_odds = score(other_objects).gather(1, things.unsqueeze(1)).squeeze(1)
+        parts.append(
+            {
+                "scene": index[row],
+                "thing": things,
+                "log_odds": log_odds.double(),
+                "intruder": things == added[row],
+                "size": (v > 0).sum(1)[row],
+                "clean": added[row] < 0,
+            }
+        )
+    columns = {name: torch.cat([part[name] for part in parts]).numpy() for name in parts[0]}
+    return IntruderScores(**columns, scenes=scenes, skipped=skipped)

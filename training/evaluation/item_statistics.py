@@ -31,9 +31,9 @@ def _by_score(
     scores, level = np.unique(score, return_inverse=True)
 
     def count(weight: Floats) -> tuple[Floats, Floats]:
-        every = np.bincount(level, weights=weight, minlength=len(scores)).astype(np.float64)
+        total = np.bincount(level, weights=weight, minlength=len(scores)).astype(np.float64)
         true = np.bincount(level, weights=weight * truth, minlength=len(scores))
-        return every, true.astype(np.float64)
+        return total, true.astype(np.float64)
 
     return scores, count
 
@@ -62,16 +62,16 @@ def average_precision(score: Floats, truth: Flags) -> Prepared:
     _, count = _by_score(score, truth)
 
     def at(weight: Floats) -> float:
-        every, true = (part[::-1] for part in count(weight))
-        some = every > 0
-        n, p = every[some], true[some]
+        totals, true = (part[::-1] for part in count(weight))
+        is_nonempty = totals > 0
+        n, p = totals[is_nonempty], true[is_nonempty]
         if not p.sum():
             return float("nan")
         N, P = np.cumsum(n) - n, np.cumsum(p) - p
         harmonic = np.concatenate([[0.0], np.cumsum(1.0 / np.arange(1, int(n.sum()) + 1))])
         inverse = harmonic[(N + n).astype(np.int64)] - harmonic[N.astype(np.int64)]
-        more = (p - 1) / np.maximum(n - 1, 1) * (n - (N + 1) * inverse)
-        return float((p / n * ((P + 1) * inverse + more)).sum() / p.sum())
+        tied_hits = (p - 1) / np.maximum(n - 1, 1) * (n - (N + 1) * inverse)
+        return float((p / n * ((P + 1) * inverse + tied_hits)).sum() / p.sum())
 
     return at
 

@@ -114,8 +114,8 @@ def paired_difference(
         of = "" if groups is None else f" and {len(groups)} group labels"
         raise ValueError(f"cannot pair {a.scenes} scenes with {b.scenes} scenes{of}")
     if groups is None:
-        both = min(len(a.draws), len(b.draws))
-        draws = a.draws[:both] - b.draws[:both]
+        count = min(len(a.draws), len(b.draws))
+        draws = a.draws[:count] - b.draws[:count]
     else:
         names, group_of = np.unique(np.array(groups), return_inverse=True)
         if len(names) < 2:
@@ -188,9 +188,9 @@ class Ratio(Metric):
         return cls(top, np.bincount(scene, minlength=scenes).astype(np.float64))
 
     @classmethod
-    def of_scenes(cls, values: NDArray[Any], asked: NDArray[Any] | None = None) -> Ratio:
-        """Return the mean of values (scenes,) over the scenes in ``asked``, by default all."""
-        below = np.ones(len(values)) if asked is None else asked.astype(np.float64)
+    def of_scenes(cls, values: NDArray[Any], mask: NDArray[Any] | None = None) -> Ratio:
+        """Return the mean of values (scenes,) over the scenes in ``mask``, by default all."""
+        below = np.ones(len(values)) if mask is None else mask.astype(np.float64)
         return cls(values.astype(np.float64), below)
 
     @property
@@ -214,9 +214,10 @@ class Ratio(Metric):
 
     def mean_over_scenes(self) -> Ratio:
         """Return the metric with equal weight for every scored scene."""
-        some = self.denominators > 0
-        share = np.divide(self.numerators, self.denominators, where=some, out=np.zeros(len(some)))
-        return Ratio.of_scenes(share, some)
+        is_scored = self.denominators > 0
+        share = np.zeros(self.scenes)
+        np.divide(self.numerators, self.denominators, where=is_scored, out=share)
+        return Ratio.of_scenes(share, is_scored)
 
     def __sub__(self, other: Ratio) -> Ratio:
         """Return the difference on the same items, as a metric with a paired interval.
@@ -261,8 +262,9 @@ class _OfItems(Metric):
     def join(cls, parts: Sequence[Self]) -> Self:
         values: dict[str, Any] = {}
         for field in fields(cls):  # type: ignore[arg-type]
-            own = [getattr(part, field.name) for part in parts]
-            values[field.name] = np.concatenate(own) if isinstance(own[0], np.ndarray) else own[0]
+            items = [getattr(part, field.name) for part in parts]
+            is_column = isinstance(items[0], np.ndarray)
+            values[field.name] = np.concatenate(items) if is_column else items[0]
         # The scene indices of a part are shifted by the number of scenes in earlier parts.
         starts = np.cumsum([0, *(part.count for part in parts)]).tolist()
         shifted = [part.scene + start for part, start in zip(parts, starts[:-1], strict=True)]
@@ -292,11 +294,13 @@ class Macro(_OfItems):
         return len(np.unique(self.group))
 
     def at(self, weight: Floats) -> float:
-        item = weight[self.scene]
-        below = np.bincount(self.group, weights=item)
-        top = np.bincount(self.group, weights=item * self.value_of)
-        some = below > 0
-        return float((top[some] / below[some]).mean()) if some.any() else float("nan")
+        item_weight = weight[self.scene]
+        weights = np.bincount(self.group, weights=item_weight)
+        sums = np.bincount(self.group, weights=item_weight * self.value_of)
+        has_items = weights > 0
+        if not has_items.any():
+            return float("nan")
+        return float((sums[has_items] / weights[has_items]).mean())
 
     @cached_property
     def draws(self) -> Floats:
@@ -341,9 +345,9 @@ class Scored(_OfItems):
 
     @cached_property
     def draws(self) -> Floats:
-        drawn = resample(self.at, self.scenes)
+        values = resample(self.at, self.scenes)
         # Resampling inflates calibration errors, so these resamples are centred on the value.
-        return _centred(drawn, self.value) if self.statistic == "ECE" else drawn
+        return _centred(values, self.value) if self.statistic == "ECE" else values
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,9 +371,9 @@ class Items:
         """Return the share of scenes whose highest-scored item is true; expected over ties."""
         highest = np.full(self.scenes, -np.inf)
         np.maximum.at(highest, self.scene, self.score)
-        best = self.score == highest[self.scene]
-        ties = np.bincount(self.scene[best], minlength=self.scenes)
-        hits = np.bincount(self.scene[best & self.truth], minlength=self.scenes)
+        is_highest = self.score == highest[self.scene]
+        ties = np.bincount(self.scene[is_highest], minlength=self.scenes)
+        hits = np.bincount(self.scene[is_highest & self.truth], minlength=self.scenes)
         return Ratio.of_scenes(hits / np.maximum(ties, 1), ties > 0)
 
     def metric(self, statistic: str) -> Scored:

@@ -103,8 +103,8 @@ class Ranking:
         """
         if bool(values.isnan().any()):
             raise FloatingPointError("the score of a class is NaN")
-        chosen = values.gather(1, target.unsqueeze(1))
-        above, ties = (values > chosen).sum(1), (values == chosen).sum(1) - 1
+        target_score = values.gather(1, target.unsqueeze(1))
+        above, ties = (values > target_score).sum(1), (values == target_score).sum(1) - 1
         return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes, skipped)
 
     def reciprocal_rank(self) -> Floats:
@@ -120,9 +120,9 @@ class Ranking:
         """Return the probability that the target is among the first k, (N,)."""
         return np.clip((k - self.above) / (self.ties + 1), 0.0, 1.0)
 
-    def mrr(self, some: Flags | slice = slice(None)) -> Ratio:
+    def mrr(self, selection: Flags | slice = slice(None)) -> Ratio:
         """Return the mean reciprocal rank of the selected targets."""
-        return Ratio.of_items(self.scene[some], self.reciprocal_rank()[some], self.scenes)
+        return Ratio.of_items(self.scene[selection], self.reciprocal_rank()[selection], self.scenes)
 
     def metrics(self) -> dict[str, Metric]:
         """Return MRR and top-k, micro-averaged over hidden classes, and the macro MRR by class."""
@@ -148,12 +148,12 @@ def leave_one_out(
 ) -> Ranking:
     """Rank each class of each scene when it is removed; `with_room` passes the room types."""
     removable = (scenes.v > 0) & ~structure
-    enough = removable.sum(1) >= 2
-    row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
+    is_usable = removable.sum(1) >= 2
+    row, target = (removable & is_usable.unsqueeze(1)).nonzero(as_tuple=True)
     v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
     values = ask_rows(score, v, scenes.room[row]) if with_room else ask_rows(score, v)
     values = values.masked_fill((v > 0) | structure, -torch.inf)
-    return Ranking.of(row, target, values, len(scenes), int((~enough).sum()))
+    return Ranking.of(row, target, values, len(scenes), int((~is_usable).sum()))
 
 
 # ------------------------------------------------------------------------------------- T2 partial
@@ -208,11 +208,11 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
     values = values.masked_fill((partial.v > 0) | structure, -torch.inf)
     row, target = partial.hidden.nonzero(as_tuple=True)
     others = partial.hidden[row].scatter(1, target.unsqueeze(1), False)
-    alone = values[row].masked_fill(others, -torch.inf)
-    ranking = Ranking.of(partial.scene[row], target, alone, partial.scenes, 0)
+    competing = values[row].masked_fill(others, -torch.inf)
+    ranking = Ranking.of(partial.scene[row], target, competing, partial.scenes, 0)
     hits = [
-        expected_hits(own[own > -np.inf], right[own > -np.inf], _FIRST)
-        for own, right in zip(values.double().numpy(), partial.hidden.numpy(), strict=True)
+        expected_hits(scores[scores > -np.inf], is_hidden[scores > -np.inf], _FIRST)
+        for scores, is_hidden in zip(values.double().numpy(), partial.hidden.numpy(), strict=True)
     ]
     precision = Ratio.of_items(partial.scene.numpy(), np.array(hits), partial.scenes)
     return ranking.mrr(), Ratio(precision.numerators, _FIRST * precision.denominators)
@@ -240,25 +240,25 @@ def removed_places(
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
         evidence = scene.evidence
-        usable = plain[evidence.classes]
-        if usable.sum() < 2:
+        is_thing = plain[evidence.classes]
+        if is_thing.sum() < 2:
             continue
-        pair = usable[:, None] & usable & ~np.eye(len(usable), dtype=np.bool_)
+        pair = is_thing[:, None] & is_thing & ~np.eye(len(is_thing), dtype=np.bool_)
         triples = np.argwhere(evidence.holds & pair)
         rng = scene_rng(scene, seed)
         for x in np.unique(triples[:, 1:]):
-            touching = triples[(triples[:, 1:] == x).any(1)]
-            a, i, j = touching[rng.integers(len(touching))].tolist()
+            triples_of_x = triples[(triples[:, 1:] == x).any(1)]
+            a, i, j = triples_of_x[rng.integers(len(triples_of_x))].tolist()
             anchor = j if i == x else i
-            target, other = evidence.classes[[x, anchor]].tolist()
-            removals.append((k, target, a, other, bool(i == x)))
+            target, anchor_class = evidence.classes[[x, anchor]].tolist()
+            removals.append((k, target, a, anchor_class, bool(i == x)))
     table = torch.tensor(removals, dtype=torch.int64).reshape(-1, 5)
     row, target, relation, anchor, outgoing = table.unbind(1)
     v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
     counts = torch.zeros_like(v)
-    for case, k in enumerate(row.tolist()):
+    for question, k in enumerate(row.tolist()):
         evidence = scenes.scenes[k].evidence
-        counts[case, torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
+        counts[question, torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
     return row, target, Places(v, counts * v, relation, anchor, outgoing.bool())
 
 
@@ -269,8 +269,8 @@ def leave_one_out_at(
     row, target, places = removed_places(scenes, structure, seed)
     values = places.v
     if len(row):
-        every = torch.arange(len(row))
-        values = ask_rows(lambda index: score(places.rows(index)), every, block=16)
+        index = torch.arange(len(row))
+        values = ask_rows(lambda index: score(places.rows(index)), index, block=16)
     values = values.masked_fill((places.v > 0) | structure, -torch.inf)
     skipped = len(scenes) - len(row.unique())
     return Ranking.of(row, target, values, len(scenes), skipped), places.relation.numpy()
@@ -321,12 +321,12 @@ def partial_task(model: Model, setting: Setting) -> Outcome | None:
         mrr, precision = rank_hidden(cases, setting.structure, score)
         metrics |= {f"MRR, {name}": mrr, f"precision@5, {name}": precision}
         if artifact is not None:
-            closed = partial_score(artifact, _CLOSED)
-            other, other_precision = rank_hidden(cases, setting.structure, closed)
+            closed_score = partial_score(artifact, _CLOSED)
+            closed_mrr, closed_precision = rank_hidden(cases, setting.structure, closed_score)
             metrics |= {
-                f"MRR, {name}, unlisted absent": other,
-                f"change of MRR, {name}": mrr - other,
-                f"change of precision@5, {name}": precision - other_precision,
+                f"MRR, {name}, unlisted absent": closed_mrr,
+                f"change of MRR, {name}": mrr - closed_mrr,
+                f"change of precision@5, {name}": precision - closed_precision,
             }
     return Outcome(metrics, len(scenes), skipped)
 
@@ -344,8 +344,8 @@ def placed_task(model: Model, setting: Setting) -> Outcome | None:
         if (relation == a).any():
             metrics[f"MRR, {name}"] = ranking.mrr(relation == a)
     if (objects := model.missing) is not None:
-        blind, _ = leave_one_out_at(
+        without_place, _ = leave_one_out_at(
             scenes, structure, lambda places: objects(places.v), seed=setting.seed
         )
-        metrics["MRR, place unknown"] = blind.mrr()
+        metrics["MRR, place unknown"] = without_place.mrr()
     return Outcome(metrics, len(scenes), ranking.skipped)

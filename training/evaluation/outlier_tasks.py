@@ -81,7 +81,7 @@ def fitted_alarm(
     scenes = some_scenes(complete, _SCENES, seed)
     scores = intruder_scores(scenes, structure, score, seed=seed)
     threshold = alarm_threshold(-scores.log_odds, scores, scenes, np.random.default_rng(seed))
-    return Alarm(lambda asked: -asked.log_odds, threshold)
+    return Alarm(lambda scored: -scored.log_odds, threshold)
 
 
 def alarm_threshold(
@@ -104,13 +104,13 @@ def alarm_threshold(
     """
     worst = np.full(len(scenes), -np.inf)
     np.maximum.at(worst, scores.scene[scores.clean], suspicion[scores.clean])
-    judged = np.bincount(scores.scene[scores.clean], minlength=len(scenes)) > 0
-    if not judged.any():
+    is_clean = np.bincount(scores.scene[scores.clean], minlength=len(scenes)) > 0
+    if not is_clean.any():
         raise ValueError("the scores contain no clean scene, which the alarm threshold needs")
-    if not np.isfinite(worst[judged]).all():
+    if not np.isfinite(worst[is_clean]).all():
         raise FloatingPointError("the suspicion of a clean scene is not finite")
-    group = np.array([scene.group for scene in scenes.scenes])[judged]
-    return kept_in_each_source(worst[judged], group, scenes.source.numpy()[judged], rng, share)
+    group = np.array([scene.group for scene in scenes.scenes])[is_clean]
+    return kept_in_each_source(worst[is_clean], group, scenes.source.numpy()[is_clean], rng, share)
 
 
 def kept_in_each_source(
@@ -133,16 +133,16 @@ def kept_in_each_source(
     """
     kinds, sizes = np.unique(source, return_counts=True)
     large = [source == kind for kind in kinds[sizes >= SOURCE_SCENES]]
-    small = np.isin(source, kinds[sizes < SOURCE_SCENES])
-    bounds = [_bound(worst[some], group[some], rng, share) for some in large]
-    if small.sum() >= _SMALL_SCENES or not large:
-        bounds.append(float(np.quantile(worst[small], 1 - share)))
+    is_small = np.isin(source, kinds[sizes < SOURCE_SCENES])
+    limits = [_cautious_threshold(worst[scenes], group[scenes], rng, share) for scenes in large]
+    if is_small.sum() >= _SMALL_SCENES or not large:
+        limits.append(float(np.quantile(worst[is_small], 1 - share)))
     # A suspicion equal to the threshold raises the alarm. Many scenes may share one value, such as
     # the popularity of a class, so the threshold moves just above it.
-    return float(np.nextafter(max(bounds), np.inf))
+    return float(np.nextafter(max(limits), np.inf))
 
 
-def _bound(worst: Floats, group: NDArray[np.str_], rng: Rng, share: float) -> float:
+def _cautious_threshold(worst: Floats, group: NDArray[np.str_], rng: Rng, share: float) -> float:
     """Return a threshold that a share of scenes exceeds, with a safety margin.
 
     Scenes of one place raise alarms together, so the share in new places is uncertain. The margin
@@ -151,8 +151,8 @@ def _bound(worst: Floats, group: NDArray[np.str_], rng: Rng, share: float) -> fl
     members = [worst[group == name] for name in np.unique(group)]
     thresholds = []
     for _ in range(_RESAMPLES):
-        drawn = rng.integers(len(members), size=len(members))
-        thresholds.append(np.quantile(np.concatenate([members[k] for k in drawn]), 1 - share))
+        sample = rng.integers(len(members), size=len(members))
+        thresholds.append(np.quantile(np.concatenate([members[k] for k in sample]), 1 - share))
     return float(np.quantile(thresholds, _CONFIDENCE))
 
 
@@ -177,9 +177,9 @@ def outliers_task(model: Model, setting: Setting, law: Law | None = None) -> Out
         "average precision": scores.dirty.metric("average precision"),
     }
     if model.alarm is not None:
-        loud = model.alarm.raised(scores)
-        metrics["alarms in untouched scenes"] = scores.false_alarms(loud)
-        metrics["intruders caught"] = scores.caught(loud)
+        alarms_raised = model.alarm.raised(scores)
+        metrics["alarms in untouched scenes"] = scores.false_alarms(alarms_raised)
+        metrics["intruders caught"] = scores.caught(alarms_raised)
     return Outcome(metrics, len(scenes), scores.skipped)
 
 
@@ -188,18 +188,18 @@ def signature_task(model: Model, setting: Setting) -> Outcome | None:
     if setting.train is None:
         return None
     structure, seed = setting.structure, setting.seed
-    every = by_signature(setting.scenes, setting.train)
-    drawn = draw_intruders(setting.scenes, structure, every, seed)
-    index = (drawn >= 0).nonzero().squeeze(1)
+    all_weights = by_signature(setting.scenes, setting.train)
+    all_intruders = draw_intruders(setting.scenes, structure, all_weights, seed)
+    index = (all_intruders >= 0).nonzero().squeeze(1)
     if not len(index):
         return None
     scenes = setting.at(index).some()
-    own = by_signature(scenes, setting.train)
+    weights = by_signature(scenes, setting.train)
     if model.artifact is not None:
-        intruders = draw_intruders(scenes, structure, own, seed)
+        intruders = draw_intruders(scenes, structure, weights, seed)
         metrics = judge_intruders(model.artifact, scenes, structure, intruders)
     elif model.outliers is not None:
-        scores = intruder_scores(scenes, structure, model.outliers, weights=own, seed=seed)
+        scores = intruder_scores(scenes, structure, model.outliers, weights=weights, seed=seed)
         metrics = dict.fromkeys(("hit@1", "hit@1, log-odds alone"), scores.hit_at_1())
     else:
         return None
@@ -227,15 +227,15 @@ def sensitivity_task(model: Model, setting: Setting) -> Outcome | None:
     cases = [labels_alone(scene) for scene in scenes.scenes]
     for sensitivity in SENSITIVITIES:
         metrics[f"alarms, {sensitivity}"] = alarms(artifact, cases, structure, sensitivity, judged)
-    plain = ((scenes.v > 0) & ~structure).sum(1).numpy()
+    sizes = ((scenes.v > 0) & ~structure).sum(1).numpy()
     for listed in _SHORT_LISTS:
-        large = judged & (plain > listed)
-        if large.any():
+        is_longer = judged & (sizes > listed)
+        if is_longer.any():
             cases = [
                 first_classes(scene, structure, listed, scene_rng(scene, setting.seed))
                 for scene in scenes.scenes
             ]
-            share = alarms(artifact, cases, structure, "medium", large)
+            share = alarms(artifact, cases, structure, "medium", is_longer)
             metrics[f"alarms, medium, {listed} listed"] = share
     return Outcome(metrics, len(scenes), int((~judged).sum()))
 
@@ -255,29 +255,29 @@ def judge_intruders(
     answers = {
         name: ask_every(partial(judge, artifact, sensitivity=name), cases) for name in SENSITIVITIES
     }
-    plain = [things(case, structure.numpy()) for case in cases]
+    is_thing = [things(case, structure.numpy()) for case in cases]
 
     def hits(column: int, sign: int) -> Ratio:
-        first = [
-            share_of_first(np.where(own, sign * judged[:, column], -np.inf), -1)
-            for own, judged in zip(plain, answers["medium"], strict=True)
+        shares = [
+            share_of_first(np.where(mask, sign * columns[:, column], -np.inf), -1)
+            for mask, columns in zip(is_thing, answers["medium"], strict=True)
         ]
-        return Ratio.of_items(index, np.array(first), len(scenes))
+        return Ratio.of_items(index, np.array(shares), len(scenes))
 
     metrics: dict[str, Metric] = {
         f"hit@1{law}": hits(0, 1),
         f"hit@1{law}, log-odds alone": hits(1, -1),
     }
-    for name, each in answers.items():
-        caught = np.array([judged[-1, 2] for judged in each])
+    for name, all_columns in answers.items():
+        caught = np.array([columns[-1, 2] for columns in all_columns])
         metrics[f"caught{law}, {name}"] = Ratio.of_items(index, caught, len(scenes))
     return metrics
 
 
 def share_of_first(values: Floats, target: int) -> float:
     """Return 1 if the value at `target` is the highest, else 0; 1/m for m equal highest values."""
-    best = values == values.max()
-    return float(best[target] / best.sum())
+    is_highest = values == values.max()
+    return float(is_highest[target] / is_highest.sum())
 
 
 def alarms(
@@ -289,16 +289,16 @@ def alarms(
 ) -> Ratio:
     """Return the share of judged clean scenes with an object flagged as an outlier."""
     answers = ask_every(partial(judge, artifact, sensitivity=sensitivity), cases)
-    loud = [
+    has_alarm = [
         bool(((columns[:, 2] > 0) & things(case, structure.numpy())).any())
         for case, columns in zip(cases, answers, strict=True)
     ]
-    return Ratio.of_scenes(np.array(loud) & judged, judged)
+    return Ratio.of_scenes(np.array(has_alarm) & judged, judged)
 
 
 def first_classes(encoded: EncodedScene, structure: Tensor, listed: int, rng: Rng) -> Scene:
     """Return a scene of structure and all instances of ``listed`` random classes."""
-    every = np.unique(encoded.instance_classes)
-    hidden = rng.permutation(every[~structure.numpy()[every]])[listed:]
-    kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden))
-    return labels_alone(encoded, kept.tolist())
+    classes = np.unique(encoded.instance_classes)
+    hidden = rng.permutation(classes[~structure.numpy()[classes]])[listed:]
+    shown = np.flatnonzero(~np.isin(encoded.instance_classes, hidden))
+    return labels_alone(encoded, shown.tolist())

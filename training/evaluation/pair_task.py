@@ -68,8 +68,8 @@ def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
     for index, scene in enumerate(scenes.scenes):
         holds = scene.evidence.holds
         vertical = holds[[a for a in VERTICAL if a < len(holds)]].any(0)
-        usable = plain[scene.evidence.classes]
-        pair = np.triu(vertical | vertical.T, 1) & usable[:, None] & usable
+        is_thing = plain[scene.evidence.classes]
+        pair = np.triu(vertical | vertical.T, 1) & is_thing[:, None] & is_thing
         ends = np.argwhere(pair)
         if len(ends):
             x, y = ends.T
@@ -82,11 +82,11 @@ def service_score(artifact: Artifact) -> PairScore:
     """Return a score: probabilities of `/relations` between the first instances of both classes."""
 
     def score(asked: ScenePairs) -> Floats:
-        scene, own = asked.scene, asked.scene.evidence.classes
-        first = [int(np.flatnonzero(scene.instance_classes == c)[0]) for c in own]
+        scene, classes = asked.scene, asked.scene.evidence.classes
+        first = [int(np.flatnonzero(scene.instance_classes == c)[0]) for c in classes]
         ends = [(first[x], first[y]) for x, y in asked.ends.tolist()]
-        both = ends + [(y, x) for x, y in ends]
-        p = relation_probabilities(artifact, labels_alone(scene), both)
+        pairs = ends + [(y, x) for x, y in ends]
+        p = relation_probabilities(artifact, labels_alone(scene), pairs)
         x, y = np.array(ends).T
         return np.concatenate([p[:, x, y], p[:, y, x]]).T
 
@@ -111,8 +111,8 @@ def accuracy(p: Floats, listed: Flags) -> Floats:
 
     The arguments are the probabilities of k relations and whether the scene lists them, (N, k).
     """
-    best = p == p.max(1, keepdims=True)
-    return np.asarray((best & listed).sum(1) / best.sum(1))
+    is_best = p == p.max(1, keepdims=True)
+    return np.asarray((is_best & listed).sum(1) / is_best.sum(1))
 
 
 def log_loss(p: Floats, listed: Flags) -> Floats:
@@ -124,7 +124,7 @@ def log_loss(p: Floats, listed: Flags) -> Floats:
 
 def pairs_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T1 pairs; the primary metric is the accuracy over all pairs."""
-    related = {one.place for one in vertical_pairs(setting.scenes, setting.structure)}
+    related = {q.place for q in vertical_pairs(setting.scenes, setting.structure)}
     if not related:
         return None
     index = torch.tensor(sorted(related), dtype=torch.int64)
@@ -137,26 +137,26 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
     else:
         return None
     p = np.concatenate(ask_every(score, questions))
-    listed = np.concatenate([one.listed for one in questions])
-    scene = np.repeat([one.place for one in questions], [len(one.ends) for one in questions])
-    upright = [a + back for back in (0, p.shape[1] // 2) for a in VERTICAL]
-    right, loss = accuracy(p, listed), log_loss(p, listed)
+    listed = np.concatenate([q.listed for q in questions])
+    scene = np.repeat([q.place for q in questions], [len(q.ends) for q in questions])
+    vertical = [a + back for back in (0, p.shape[1] // 2) for a in VERTICAL]
+    hits, loss = accuracy(p, listed), log_loss(p, listed)
     metrics: dict[str, Metric] = {
-        "accuracy": Ratio.of_items(scene, right, len(scenes)),
+        "accuracy": Ratio.of_items(scene, hits, len(scenes)),
         "accuracy, vertical": Ratio.of_items(
-            scene, accuracy(p[:, upright], listed[:, upright]), len(scenes)
+            scene, accuracy(p[:, vertical], listed[:, vertical]), len(scenes)
         ),
         "log-loss": Ratio.of_items(scene, loss, len(scenes)),
     }
-    classes = np.concatenate([one.scene.evidence.classes[one.ends] for one in questions])
-    for name, some in _little_known(classes, setting).items():
-        if some.any():
-            metrics[f"accuracy, {name}"] = Ratio.of_items(scene[some], right[some], len(scenes))
-            metrics[f"log-loss, {name}"] = Ratio.of_items(scene[some], loss[some], len(scenes))
+    classes = np.concatenate([q.scene.evidence.classes[q.ends] for q in questions])
+    for name, mask in _hard_pairs(classes, setting).items():
+        if mask.any():
+            metrics[f"accuracy, {name}"] = Ratio.of_items(scene[mask], hits[mask], len(scenes))
+            metrics[f"log-loss, {name}"] = Ratio.of_items(scene[mask], loss[mask], len(scenes))
     return Outcome(metrics, len(scenes), 0)
 
 
-def _little_known(classes: Ints, setting: Setting) -> dict[str, Flags]:
+def _hard_pairs(classes: Ints, setting: Setting) -> dict[str, Flags]:
     """Return masks (N,) of unseen pairs and of rare classes; empty without training scenes.
 
     "unseen pairs": training lists no relation of the two classes. "rare classes": training relates
@@ -171,6 +171,6 @@ def _little_known(classes: Ints, setting: Setting) -> dict[str, Flags]:
         triples = seen_triples(setting.train.scenes, V)
     related = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
     partners = np.bincount(related.ravel(), minlength=V)
-    rare: Flags = np.any(partners[classes] <= RARE, axis=1)
-    unseen = ~np.isin(classes @ np.array([V, 1]), related @ np.array([V, 1]))
-    return {"unseen pairs": unseen, "rare classes": rare}
+    is_rare: Flags = np.any(partners[classes] <= RARE, axis=1)
+    is_unseen = ~np.isin(classes @ np.array([V, 1]), related @ np.array([V, 1]))
+    return {"unseen pairs": is_unseen, "rare classes": is_rare}

@@ -85,8 +85,8 @@ class Candidates:
 def scorable(batch: Batch, structure: Tensor) -> Tensor:
     """Return a mask (B, A, n, n) of triples between two different classes without structure."""
     n = batch.classes.shape[1]
-    usable = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
-    pair = usable[:, :, None] & usable[:, None, :] & ~torch.eye(n, dtype=torch.bool)
+    is_thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
+    pair = is_thing[:, :, None] & is_thing[:, None, :] & ~torch.eye(n, dtype=torch.bool)
     return pair[:, None].expand_as(batch.holds)
 
 
@@ -111,12 +111,12 @@ def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candida
     """Return the candidates of every scene, numbered in order."""
     candidates: list[Candidates] = []
     for batch, values, mask in batches:
-        for row, own in enumerate(batch.classes):
+        for row, classes in enumerate(batch.classes):
             relation, x, y = mask[row].nonzero(as_tuple=True)
             score = values[row, relation, x, y].double().numpy()
             if np.isnan(score).any():
                 raise FloatingPointError(f"the score of a triple in scene {row} of a batch is NaN")
-            key = triple_keys(relation, own[x], own[y], batch.v.shape[1]).numpy()
+            key = triple_keys(relation, classes[x], classes[y], batch.v.shape[1]).numpy()
             truth = (batch.holds[row, relation, x, y] > 0).numpy()
             candidates.append(Candidates(len(candidates), relation.numpy(), key, score, truth))
     return candidates
@@ -149,21 +149,21 @@ def complete_scenes(
             mask = scorable(batch, structure)
             given = random_half((batch.holds > 0) & mask, scenes, index, seed)
             # With a single triple the observed half is empty: the scene is left out.
-            divided = given.flatten(1).any(1)[:, None, None, None]
-            yield batch, score(telling(batch, given)), mask & ~given & ~given.mT & divided
+            has_evidence = given.flatten(1).any(1)[:, None, None, None]
+            yield batch, score(telling(batch, given)), mask & ~given & ~given.mT & has_evidence
 
     return _candidates(scored())
 
 
 def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed: int) -> Tensor:
     """Return half of each scene's triples (rounded down), (B, A, n, n) bool."""
-    given = torch.zeros_like(truth)
+    half = torch.zeros_like(truth)
     for row, k in enumerate(index):
         triples = truth[row].nonzero()
         order = scene_rng(scenes.scenes[k], seed).permutation(len(triples))
         chosen = triples[torch.from_numpy(order[: len(triples) // 2])]
-        given[row][tuple(chosen.T)] = True
-    return given
+        half[row][tuple(chosen.T)] = True
+    return half
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,10 +187,10 @@ class RelationRanking:
         return self.pooled().mean_over_scenes()
 
 
-def rank(scored: Iterable[Candidates], scenes: int, *, first: int | None = None) -> RelationRanking:
+def rank(ranked: Iterable[Candidates], scenes: int, *, first: int | None = None) -> RelationRanking:
     """Count annotated triples among the first candidates, by default as many as are annotated."""
     annotated, hits = np.zeros(scenes, dtype=np.int64), np.zeros(scenes)
-    for scene in scored:
+    for scene in ranked:
         if count := int(scene.truth.sum()):
             annotated[scene.scene] = count
             hits[scene.scene] = expected_hits(scene.score, scene.truth, first or count)
@@ -216,9 +216,9 @@ def expected_hits(score: Floats, truth: Flags, count: int) -> float:
     if count >= len(score):
         return float(truth.sum())
     threshold = np.partition(score, -count)[-count]
-    above, level = score > threshold, score == threshold
-    share = (count - above.sum()) / level.sum()
-    return float(truth[above].sum() + share * truth[level].sum())
+    is_above, is_tied = score > threshold, score == threshold
+    share = (count - is_above.sum()) / is_tied.sum()
+    return float(truth[is_above].sum() + share * truth[is_tied].sum())
 
 
 # -------------------------------------------------------------------------------------------- T3b
@@ -258,19 +258,18 @@ def placement_scores(
     for index, batch in _batches(scenes, 2):
         usable = scorable(batch, structure)
         truth = (batch.holds > 0) & usable
-        stated, wrong = torch.zeros_like(truth), torch.zeros_like(truth)
+        observed, is_false = torch.zeros_like(truth), torch.zeros_like(truth)
         for row, k in enumerate(index):
             rng = scene_rng(scenes.scenes[k], seed)
             case = alter(batch.holds[row].numpy() > 0, usable[row].numpy(), rng)
             if case is not None:
-                before, after = case
-                stated[row] = truth[row]
-                stated[row][before] = False
-                stated[row][after] = wrong[row][after] = True
-        likely = score(telling(batch, stated))[stated].double()
-        parts.append(
-            torch.stack([torch.tensor(index)[stated.nonzero()[:, 0]], -likely, wrong[stated]], 1)
-        )
+                true_triple, false_triple = case
+                observed[row] = truth[row]
+                observed[row][true_triple] = False
+                observed[row][false_triple] = is_false[row][false_triple] = True
+        log_odds = score(telling(batch, observed))[observed].double()
+        scene_index = torch.tensor(index)[observed.nonzero()[:, 0]]
+        parts.append(torch.stack([scene_index, -log_odds, is_false[observed]], 1))
     scene, suspicion, false = torch.cat(parts).numpy().T
     skipped = len(scenes) - len(np.unique(scene))
     return Items(scene.astype(np.int64), suspicion, false > 0, len(scenes), skipped)
@@ -292,7 +291,7 @@ def relations_task(model: Model, setting: Setting) -> Outcome | None:
         "R-precision, distinct classes, mean over scenes": ranking.per_scene(),
         "R-precision, mean over scenes": counted.per_scene(),
     }
-    metrics |= _parts(with_counts, setting, FIRST)
+    metrics |= _details(with_counts, setting, FIRST)
     return Outcome(metrics, len(scenes), ranking.skipped)
 
 
@@ -309,10 +308,10 @@ def completion_task(model: Model, setting: Setting) -> Outcome | None:
         "R-precision": ranking.pooled(),
         "R-precision, mean over scenes": ranking.per_scene(),
     }
-    metrics |= _parts(candidates, setting, _RECALLS)
+    metrics |= _details(candidates, setting, _RECALLS)
     if model.relations is not None:
-        blind = complete_scenes(scenes, structure, model.relations, seed=seed)
-        metrics["R-precision, nothing given"] = rank(blind, len(scenes)).pooled()
+        unaided = complete_scenes(scenes, structure, model.relations, seed=seed)
+        metrics["R-precision, nothing given"] = rank(unaided, len(scenes)).pooled()
     return Outcome(metrics, len(scenes), ranking.skipped)
 
 
@@ -320,14 +319,14 @@ def _any_true(scored: list[Candidates]) -> bool:
     return any(scene.truth.any() for scene in scored)
 
 
-def _parts(scored: list[Candidates], setting: Setting, first: Sequence[int]) -> dict[str, Metric]:
+def _details(scored: list[Candidates], setting: Setting, first: Sequence[int]) -> dict[str, Metric]:
     """Return R-precision by relation, recall at k, and R-precision of unseen triples."""
     count = len(setting.scenes)
     metrics: dict[str, Metric] = {}
     for a, name in enumerate(CANONICAL):
-        some = [scene.where(scene.relation == a) for scene in scored]
-        if _any_true(some):
-            metrics[f"R-precision, {name}"] = rank(some, count).pooled()
+        candidates = [scene.where(scene.relation == a) for scene in scored]
+        if _any_true(candidates):
+            metrics[f"R-precision, {name}"] = rank(candidates, count).pooled()
     for k in first:
         metrics[f"R@{k}"] = rank(scored, count, first=k).per_scene()
     if setting.seen is not None:

@@ -116,8 +116,8 @@ def settings_by_source(
 ) -> Iterator[tuple[str, Setting]]:
     """Iterate over the data sources and the settings of their scenes and training scenes."""
     training = dict(by_source(train))
-    for source, some in by_source(scenes):
-        yield source, Setting(some, structure, training.get(source), seen, limit)
+    for source, source_scenes in by_source(scenes):
+        yield source, Setting(source_scenes, structure, training.get(source), seen, limit)
 
 
 def digest(setting: Setting) -> str:
@@ -214,7 +214,7 @@ def evaluate(
         limit = _LIMIT if artifact.oracle is None else _LIMIT_OF_DRAWS
     model = artifact_model(artifact, train)
     wanted = [
-        task for task, one in EVERY_TASK.items() if one.card and (tasks is None or task in tasks)
+        name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)
     ]
     rows: list[CardMetric] = []
 
@@ -300,11 +300,11 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
     Raises:
         ValueError: the kind of metric is unknown.
     """
-    rest = dict(values)
-    kind = rest.pop("kind", None)
+    entries = dict(values)
+    kind = entries.pop("kind", None)
     if kind not in _KINDS:
         raise ValueError(f"metric kind must be one of {sorted(_KINDS)}, not {kind!r}")
-    metric: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in rest.items()})
+    metric: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in entries.items()})
     return metric
 
 

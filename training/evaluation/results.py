@@ -137,8 +137,7 @@ class Results:
         for task, metrics in shown.items():
             tables = [table for name in metrics if (table := self._table(task, name, changes))]
             if tables:
-                asked = [asked for asked in self.asked if asked.task == task]
-                parts += [*tables, *remarks(asked)]
+                parts += [*tables, *remarks([entry for entry in self.asked if entry.task == task])]
         return "\n\n".join(parts) + "\n"
 
     def tables(
@@ -149,43 +148,43 @@ class Results:
         A star has the meaning of `markdown`. `words` returns the title of the table of a task.
         """
         sources = list(dict.fromkeys(cell.source for cell in self.cells))
-        chosen = [source for source in sources if "pooled" in source] or sources
+        columns = [source for source in sources if "pooled" in source] or sources
         for task, metrics in shown.items():
-            table = Table("metric, model", *chosen, title=words(task), box=box.SIMPLE_HEAD)
+            table = Table("metric, model", *columns, title=words(task), box=box.SIMPLE_HEAD)
             for metric in metrics:
                 texts = self._texts(task, metric)
-                rows = {row: found for row, found in texts.items() if found.keys() & set(chosen)}
+                rows = {row: cells for row, cells in texts.items() if cells.keys() & set(columns)}
                 if rows:
                     table.add_row(f"[bold]{metric}[/bold]")
-                for row, found in rows.items():
-                    table.add_row(f"  {row}", *(found.get(source, "") for source in chosen))
+                for row, cells in rows.items():
+                    table.add_row(f"  {row}", *(cells.get(source, "") for source in columns))
             if table.row_count:
                 yield table
 
     def _texts(self, task: str, metric: str, changes: bool = False) -> dict[str, dict[str, str]]:
         """Return the cells of a metric as texts, by row and data source."""
-        gaps = {
-            (gap.row, gap.source): gap
-            for gap in self.differences
-            if (gap.task, gap.metric) == (task, metric)
+        differences = {
+            (difference.row, difference.source): difference
+            for difference in self.differences
+            if (difference.task, difference.metric) == (task, metric)
         }
         texts: dict[str, dict[str, str]] = {}
         for cell in self.cells:
             if (cell.task, cell.metric) == (task, metric):
-                gap = gaps.get((cell.row, cell.source))
-                texts.setdefault(cell.row, {})[cell.source] = _text(cell, gap, changes)
+                difference = differences.get((cell.row, cell.source))
+                texts.setdefault(cell.row, {})[cell.source] = _text(cell, difference, changes)
         return texts
 
     def _table(self, task: str, metric: str, changes: bool) -> str:
         texts = self._texts(task, metric, changes)
         if not texts:
             return ""
-        sources = list(dict.fromkeys(source for found in texts.values() for source in found))
+        sources = list(dict.fromkeys(source for cells in texts.values() for source in cells))
         lines = []
-        for row, found in texts.items():
+        for row, cells in texts.items():
             name = f"**{row}**" if row == self.ours else row
             weights = f"{self.parameters[row]:,}" if row in self.parameters else ""
-            lines.append([name, weights, *(found.get(source, "") for source in sources)])
+            lines.append([name, weights, *(cells.get(source, "") for source in sources)])
         parts = [f"### {task}: {metric}"]
         if task.startswith(_RELATION_TASKS):
             parts.append(f"{UNLISTED}.")
@@ -194,13 +193,15 @@ class Results:
         return "\n\n".join([*parts, grid(["", "weights", *sources], lines)])
 
 
-def _text(cell: Cell, gap: Difference | None, changes: bool) -> str:
-    if changes and gap is not None:
-        low, high = (0.0 - round(bound, 3) for bound in (gap.figure.high, gap.figure.low))
+def _text(cell: Cell, difference: Difference | None, changes: bool) -> str:
+    if changes and difference is not None:
+        # 0.0 - x avoids the text "-0.000".
+        low, high = (0.0 - round(x, 3) for x in (difference.figure.high, difference.figure.low))
         return f"{cell.figure.value:.3f} ({low:+.3f}, {high:+.3f})"
     if changes:
         return f"{cell.figure.value:.3f}"
-    return f"{cell.figure}{' *' if gap is not None and gap.verdict == 'better' else ''}"
+    is_worse = difference is not None and difference.verdict == "better"
+    return f"{cell.figure} *" if is_worse else str(cell.figure)
 
 
 def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -262,7 +263,7 @@ def summarise(
         # A row may lack a pooled metric on some data sources. Its scenes then cannot be paired.
         and mine.scenes == mean.scenes
     )
-    return Results(ours, cells, differences, parameters or {}, tuple(_asked(reports)))
+    return Results(ours, cells, differences, parameters or {}, tuple(_scene_counts(reports)))
 
 
 def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:
@@ -280,7 +281,7 @@ def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceRep
     return replace(report, outcomes=outcomes)
 
 
-def _asked(reports: Reports) -> Iterator[Asked]:
+def _scene_counts(reports: Reports) -> Iterator[Asked]:
     for (row, seed), by_source in reports.items():
         for source, report in by_source.items():
             for task, outcome in report.outcomes.items():
@@ -292,14 +293,15 @@ def _asked(reports: Reports) -> Iterator[Asked]:
 def remarks(asked: Sequence[Asked]) -> list[str]:
     """Return remarks on one task: the number of skipped scenes, and a table of the notes."""
     skipped = []
-    for source in dict.fromkeys(one.source for one in asked):
-        here = [one for one in asked if one.source == source]
-        count, scenes = _range(one.skipped for one in here), _range(one.scenes for one in here)
+    for source in dict.fromkeys(entry.source for entry in asked):
+        entries = [entry for entry in asked if entry.source == source]
+        count = _range(entry.skipped for entry in entries)
+        scenes = _range(entry.scenes for entry in entries)
         if count != "0":
             skipped.append(f"{source} {count} of {scenes}")
     parts = [f"Scenes that could not be scored: {', '.join(skipped)}."] if skipped else []
-    noted = [one for one in asked if one.notes]
-    return [*parts, _notes(noted)] if noted else parts
+    with_notes = [entry for entry in asked if entry.notes]
+    return [*parts, _notes(with_notes)] if with_notes else parts
 
 
 def _range(counts: Iterable[int]) -> str:
@@ -316,8 +318,8 @@ def _notes(asked: Sequence[Asked]) -> str:
         "{0.row}, seed {0.seed}",
         "{0.row}, seed {0.seed}, {0.source}",
     ):
-        notes = {key_format.format(one): one.notes for one in asked}
-        if all(notes[key_format.format(one)] == one.notes for one in asked):
+        notes = {key_format.format(entry): entry.notes for entry in asked}
+        if all(notes[key_format.format(entry)] == entry.notes for entry in asked):
             break
     names = list(dict.fromkeys(name for values in notes.values() for name in values))
     rows = (

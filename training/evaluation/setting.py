@@ -41,10 +41,10 @@ class Setting:
         """Return at most `limit` / `share` scenes; with `related`, only scenes with relations."""
         scenes = self.scenes
         if related:
-            kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
-            scenes = subset(scenes, torch.tensor(kept, dtype=torch.int64))
-        most = None if self.limit is None else max(1, self.limit // share)
-        return some_scenes(scenes, most, self.seed)
+            has_relation = [bool(scene.evidence.holds.any()) for scene in scenes.scenes]
+            scenes = subset(scenes, torch.tensor(has_relation).nonzero().squeeze(1))
+        limit = None if self.limit is None else max(1, self.limit // share)
+        return some_scenes(scenes, limit, self.seed)
 
     def at(self, index: Tensor) -> Setting:
         """Return the setting with only the scenes at the given indices."""

@@ -38,11 +38,11 @@ from training.datasets.cases import (
     Triple,
     altered_scene,
     annotated_relations,
+    draw_true_relations,
     logistic,
     observed_pairs,
     removed_class,
     scene_of,
-    stated_relations,
 )
 from training.datasets.sources import meaning_of
 from training.evaluation.outlier_tasks import kept_in_each_source
@@ -108,7 +108,7 @@ def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[P
     The input is the log-odds of the relation between the two classes. The fit uses scenes without
     observed relations.
     """
-    return _fit_listed(_examples(_pair_examples(artifact, scenes)), artifact.spec.A, _LISTED)
+    return _fit_listed(_examples(_examples_of_pairs(artifact, scenes)), artifact.spec.A, _LISTED)
 
 
 def fit_with_observed(
@@ -121,11 +121,11 @@ def fit_with_observed(
     would depend on the few data sources that list many relations, and made answers for other
     sources worse.
     """
-    blocks = _pair_examples(artifact, scenes, np.random.default_rng(seed))
+    blocks = _examples_of_pairs(artifact, scenes, np.random.default_rng(seed))
     return _fit_curve(_examples(blocks), alone, _LISTED)
 
 
-def _pair_examples(
+def _examples_of_pairs(
     artifact: Artifact, scenes: Sequence[EncodedScene], rng: Rng | None = None
 ) -> list[Floats]:
     """Return the examples of each scene; with `rng`, of half its pairs, given the other half."""
@@ -168,11 +168,11 @@ def fit_placements(
         posterior = posterior_of(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
         present = posterior.present
         anchors = np.flatnonzero(~structure[present.classes])
-        both = posterior.placement_log_odds(np.array([target]), anchors)
-        other = np.array(kept)[present.first[anchors]]
-        own = np.full_like(other, instance)
+        tables = posterior.placement_log_odds(np.array([target]), anchors)
+        others = np.array(kept)[present.first[anchors]]
+        own = np.full_like(others, instance)
         holds, annotated = encoded.instance_holds, annotated_relations(encoded)
-        for values, ends in zip(both, ((own, other), (other, own)), strict=True):
+        for values, ends in zip(tables, ((own, others), (others, own)), strict=True):
             truth = np.where(annotated[:, *ends], holds[:, *ends], _UNKNOWN)
             a, anchor = map(np.ravel, np.indices(truth.shape))
             count, size = np.log(present.counts[anchors])[anchor], np.log(len(present.classes) + 1)
@@ -182,7 +182,7 @@ def fit_placements(
     examples, relations = _examples(blocks), artifact.spec.A
     return {
         "placement": _fit_listed(examples, relations, PLACES),
-        "asked_place": _fit_listed(_with_negatives(examples, sources), relations, len(examples)),
+        "asked_place": _fit_listed(_from_complete(examples, sources), relations, len(examples)),
     }
 
 
@@ -192,15 +192,16 @@ def _examples(blocks: list[Floats]) -> Floats:
     return every[every[:, _LOGIT] > NO_UNIT]
 
 
-def _with_negatives(examples: Floats, sources: Sequence[str]) -> Floats:
+def _from_complete(examples: Floats, sources: Sequence[str]) -> Floats:
     """Return the examples from data sources that also annotate false relations.
 
     If no source annotates a relation as false, return all examples of that relation.
     """
-    complete = np.array([[how != "unobserved" for how in meaning_of(s).unlisted] for s in sources])
+    rules = np.array([meaning_of(source).unlisted for source in sources])
+    complete = rules != "unobserved"
     relation, source = examples[:, [_RELATION, _SOURCE]].astype(int).T
-    chosen = complete[source, relation]
-    return examples[chosen | ~np.isin(relation, relation[chosen])]
+    is_complete = complete[source, relation]
+    return examples[is_complete | ~np.isin(relation, relation[is_complete])]
 
 
 def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[PairSlope, ...]:
@@ -211,11 +212,12 @@ def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[PairSlop
     list have a small weight. Examples without annotation take part only in the ranking.
     """
     annotated = examples[:, _TRUTH] != _UNKNOWN
-    slopes = _fit_each(examples[annotated], relations, np.ones(annotated.sum()))
+    slopes = _fit_by_relation(examples[annotated], relations, np.ones(annotated.sum()))
     for _ in range(_ROUNDS):
-        best = _among_best(examples, slopes, listed)[annotated]
-        weight = _source_weights(examples[annotated], best) * np.where(best, 1.0, _OF_THE_REST)
-        slopes = _fit_each(examples[annotated], relations, weight)
+        is_listed = _is_listed(examples, slopes, listed)[annotated]
+        weight = np.where(is_listed, 1.0, _OF_THE_REST)
+        weight *= _source_weights(examples[annotated], is_listed)
+        slopes = _fit_by_relation(examples[annotated], relations, weight)
     return _fit_curve(examples, slopes, listed)
 
 
@@ -227,15 +229,15 @@ def _fit_curve(
     The curve makes the mean probability equal to the share of true relations over all data sources.
     It keeps the ranking by `slopes`, a fit in which sources have similar weights.
     """
-    best = _among_best(examples, slopes, listed) & (examples[:, _TRUTH] != _UNKNOWN)
-    examples = examples[best]
+    is_used = _is_listed(examples, slopes, listed) & (examples[:, _TRUTH] != _UNKNOWN)
+    examples = examples[is_used]
     truth = examples[:, _TRUTH] > 0
     if len(np.unique(truth)) < 2:
         return slopes
     intercept, slope, bends = rising_curve(_logits(examples, slopes), truth)
     scaled = (
-        (intercept + slope * one.intercept, slope * one.slope, slope * one.log_count)
-        for one in slopes
+        (intercept + slope * entry.intercept, slope * entry.slope, slope * entry.log_count)
+        for entry in slopes
     )
     return tuple(PairSlope(intercept=a, slope=b, log_count=c, bends=bends) for a, b, c in scaled)
 
@@ -281,34 +283,34 @@ def _logits(examples: Floats, slopes: tuple[PairSlope, ...]) -> Floats:
     return (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1) + weights[:, 3]
 
 
-def _source_weights(examples: Floats, best: Flags) -> Floats:
+def _source_weights(examples: Floats, is_listed: Flags) -> Floats:
     """Return the weight of each example, (examples,), see `_POWER`."""
     relation, source = examples[:, [_RELATION, _SOURCE]].astype(int).T
     key = relation * (source.max(initial=0) + 1) + source
-    counts = np.bincount(key[best], minlength=int(key.max(initial=-1)) + 1)
+    counts = np.bincount(key[is_listed], minlength=int(key.max(initial=-1)) + 1)
     return (np.maximum(counts, 1.0) ** -_POWER)[key]
 
 
-def _among_best(examples: Floats, slopes: tuple[PairSlope, ...], listed: int) -> Flags:
+def _is_listed(examples: Floats, slopes: tuple[PairSlope, ...], listed: int) -> Flags:
     """Mark the `listed` examples of each scene with the highest log-odds, (examples,) bool."""
     logits = _logits(examples, slopes)
     order = np.lexsort((-logits, examples[:, 0]))
     scene = examples[order, 0]
     rank = np.arange(len(order)) - np.searchsorted(scene, scene)
-    best = np.zeros(len(order), dtype=np.bool_)
-    best[order] = rank < listed
-    return best
+    is_listed = np.zeros(len(order), dtype=np.bool_)
+    is_listed[order] = rank < listed
+    return is_listed
 
 
-def _fit_each(examples: Floats, relations: int, weight: Floats) -> tuple[PairSlope, ...]:
+def _fit_by_relation(examples: Floats, relations: int, weight: Floats) -> tuple[PairSlope, ...]:
     fitted = []
     for a in range(relations):
-        own = examples[:, _RELATION] == a
-        truth = examples[own, _TRUTH] > 0
+        rows = examples[:, _RELATION] == a
+        truth = examples[rows, _TRUTH] > 0
         entry = PairSlope()
         if len(np.unique(truth)) == 2:
-            features = examples[own, _LOGIT : _LOGIT + 2]
-            slope, count, intercept = logistic(features, truth, weight[own])
+            features = examples[rows, _LOGIT : _LOGIT + 2]
+            slope, count, intercept = logistic(features, truth, weight[rows])
             entry = PairSlope(intercept=intercept, slope=slope, log_count=count)
         fitted.append(entry)
     return tuple(fitted)
@@ -331,12 +333,12 @@ def _instance_pairs(
     evidence = scene.evidence
     index = np.searchsorted(evidence.classes, scene.instance_classes)
     logs = np.log(evidence.counts[index])
-    usable = ~structure[scene.instance_classes]
-    pairs = pairs & usable[:, None] & usable[None, :] & ~np.eye(len(index), dtype=np.bool_)
+    is_thing = ~structure[scene.instance_classes]
+    pairs = pairs & is_thing[:, None] & is_thing[None, :] & ~np.eye(len(index), dtype=np.bool_)
     annotated, every = annotated_relations(scene)[: len(values)], values[:, index[:, None], index]
     # The smallest of the `_LISTED` largest values of each relation.
     few = pairs.sum() <= _LISTED
-    least = [-np.inf if few else np.partition(own[pairs], -_LISTED)[-_LISTED] for own in every]
+    least = [-np.inf if few else np.partition(v[pairs], -_LISTED)[-_LISTED] for v in every]
     examples = pairs & (annotated | (every >= np.array(least)[:, None, None]))
     relation, i, j = np.nonzero(examples)
     truth = np.where(annotated, scene.instance_holds[: len(values)], _UNKNOWN)[examples]
@@ -359,14 +361,14 @@ def fit_misplaced(
     rows: list[tuple[float, bool]] = []
     untouched: list[tuple[EncodedScene, float]] = []
     for encoded in scenes:
-        triples = stated_relations(encoded, structure, rng)
+        triples = draw_true_relations(encoded, structure, rng)
         altered = triples and altered_scene(encoded, structure, triples, rng)
         if not triples or not altered:
             continue
         scene, false = altered
-        own = _log_odds(artifact, replace(scene, relations=tuple(triples)))
-        untouched.append((encoded, min(own.values())))
-        rows += [(z, False) for z in own.values()]
+        log_odds_of = _log_odds(artifact, replace(scene, relations=tuple(triples)))
+        untouched.append((encoded, min(log_odds_of.values())))
+        rows += [(z, False) for z in log_odds_of.values()]
         rows += [(z, triple == false) for triple, z in _log_odds(artifact, scene).items()]
     unfitted: dict[str, Any] = {"misplaced": None, "misplaced_thresholds": None}
     if len(untouched) < _JUDGED_SCENES:

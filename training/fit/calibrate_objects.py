@@ -116,12 +116,12 @@ def calibrate_objects(
     scenes = complete_scenes(validation, seed)
     if not len(scenes):
         return artifact.calibration
-    every = validation.complete if bool(validation.complete.any()) else ~validation.complete
-    every_scene = subset(validation, every.nonzero().squeeze(1))
+    is_used = validation.complete if bool(validation.complete.any()) else ~validation.complete
+    used_scenes = subset(validation, is_used.nonzero().squeeze(1))
     learnt = complete_scenes(train, seed)
     popular = tuple(np.round(popularity(train), 4).tolist())
     artifact = recalibrated(artifact, popularity=popular)
-    coverage = fit_coverage(artifact, every_scene, structure, seed, chosen)
+    coverage = fit_coverage(artifact, used_scenes, structure, seed, chosen)
     artifact = recalibrated(artifact, **coverage)
     weights = chosen.evidence if chosen else fit_evidence(artifact, validation, structure, seed)
     artifact = recalibrated(artifact, evidence=weights)
@@ -166,10 +166,10 @@ def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
     """
     limits = []
     for t in range(artifact.spec.C):
-        own = train.v[train.room == t].numpy()
+        room_scenes = train.v[train.room == t].numpy()
         limit = -1e9
-        if len(own) >= _ROOM_SCENES:
-            limit = float(np.quantile(room_fit(artifact.weights, own, t), _UNSUITED))
+        if len(room_scenes) >= _ROOM_SCENES:
+            limit = float(np.quantile(room_fit(artifact.weights, room_scenes, t), _UNSUITED))
         limits.append(round(limit, 4))
     return tuple(limits)
 
@@ -207,7 +207,7 @@ def fit_coverage(
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
     """Fit the entries `coverage`, `coverage_weight` and `missing` of the calibration."""
-    cases = list(_partial_lists(artifact, scenes, structure, seed))
+    cases = list(_draw_partial_lists(artifact, scenes, structure, seed))
     if not cases:
         return {}
     if artifact.completions is None:
@@ -216,9 +216,9 @@ def fit_coverage(
         coverage, weight = (
             (chosen.coverage, chosen.coverage_weight) if chosen else _choose_coverage(cases)
         )
-    rows = [_rows(case, coverage, weight) for case in cases]
+    rows = [_example_rows(case, coverage, weight) for case in cases]
     examples = np.concatenate(rows)
-    weights = np.repeat([case.weight for case in cases], [len(own) for own in rows])
+    weights = np.repeat([case.weight for case in cases], [len(case_rows) for case_rows in rows])
     entry = CountSlope()
     if len(np.unique(examples[:, 2])) == 2:
         slope, count, intercept = logistic(examples[:, :2], examples[:, 2] > 0, weights)
@@ -231,31 +231,33 @@ def _choose_coverage(cases: Sequence[_PartialList]) -> tuple[float, float]:
 
     On nearly complete lists, their MRR must be at most `_COMPLETE_LOSS` below the MRR of weight 0.
     """
-    nearly = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
-    least = [_mrr(some, 0.5, 0.0) - _COMPLETE_LOSS for some in nearly]
-    allowed = [(0.5, 0.0)] + [
+    parts = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
+    limits = [_mrr(part, 0.5, 0.0) - _COMPLETE_LOSS for part in parts]
+    candidates = [(0.5, 0.0)] + [
         pair
         for pair in itertools.product(COVERAGES, WEIGHTS)
-        if all(_mrr(some, *pair) >= limit for some, limit in zip(nearly, least, strict=True))
+        if all(_mrr(part, *pair) >= limit for part, limit in zip(parts, limits, strict=True))
     ]
-    return max(allowed, key=lambda pair: _mrr(cases, *pair))
+    return max(candidates, key=lambda pair: _mrr(cases, *pair))
 
 
-def _partial_lists(
+def _draw_partial_lists(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, seed: int
 ) -> Iterable[_PartialList]:
+    """Hide classes of up to `_PARTIAL_SCENES` scenes of each data source, by each of `SHARES`."""
     order = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(seed))
     source = scenes.source[order]
     rank = torch.zeros(len(order), dtype=torch.int64)
     stands_for = torch.zeros(len(order))
-    for one in source.unique():
-        own = source == one
-        count = int(own.sum())
-        rank[own] = torch.arange(count)
-        stands_for[own] = scenes.weight[order][own].sum() / min(count, _PARTIAL_SCENES)
-    chosen = rank < _PARTIAL_SCENES
-    some, weight = subset(scenes, order[chosen]), stands_for[chosen].tolist()
-    source_of = source[chosen].tolist()
+    for index in source.unique():
+        in_source = source == index
+        count = int(in_source.sum())
+        rank[in_source] = torch.arange(count)
+        total = scenes.weight[order][in_source].sum()
+        stands_for[in_source] = total / min(count, _PARTIAL_SCENES)
+    is_drawn = rank < _PARTIAL_SCENES
+    sample, weight = subset(scenes, order[is_drawn]), stands_for[is_drawn].tolist()
+    source_of = source[is_drawn].tolist()
     whole = recalibrated(artifact, coverage_weight=1.0)
     # If only one class is hidden, several hidden classes are tried to reduce the effect of chance.
     draws = [
@@ -264,7 +266,7 @@ def _partial_lists(
         for draw in range(1 if share else _DRAWS_OF_ONE)
     ]
     for name, share, draw in draws:
-        cases = hide(some, structure, share, draw)
+        cases = hide(sample, structure, share, draw)
         for k, v, hidden in zip(cases.scene, cases.v.numpy(), cases.hidden.numpy(), strict=True):
             classes = np.flatnonzero(v)
             absent = np.flatnonzero((v == 0) & ~structure.numpy())
@@ -277,12 +279,18 @@ def _partial_lists(
                 }
             closed = posterior.absent_log_odds(absent).astype(np.float64)
             listed = max(1, int((~structure.numpy()[classes]).sum()))
-            own = weight[int(k)] / (1 if share else _DRAWS_OF_ONE)
-            own = (name, source_of[int(k)], own)
-            yield _PartialList(closed, partial, hidden[absent], listed, *own)
+            yield _PartialList(
+                closed=closed,
+                partial=partial,
+                hidden=hidden[absent],
+                listed=listed,
+                share=name,
+                source=source_of[int(k)],
+                weight=weight[int(k)] / (1 if share else _DRAWS_OF_ONE),
+            )
 
 
-def _mixed(case: _PartialList, coverage: float, weight: float) -> Floats:
+def _mixed_log_odds(case: _PartialList, coverage: float, weight: float) -> Floats:
     closed = case.closed + np.log1p(-coverage)
     return (1 - weight) * closed + weight * case.partial[coverage] if weight else closed
 
@@ -291,19 +299,19 @@ def _mrr(cases: Sequence[_PartialList], coverage: float, weight: float) -> float
     """Return the mean reciprocal rank of hidden classes. All data sources have the same weight."""
     reciprocal: dict[int, list[Floats]] = {}
     for case in cases:
-        z = _mixed(case, coverage, weight)
+        z = _mixed_log_odds(case, coverage, weight)
         others = np.sort(z[~case.hidden])
         above = len(others) - np.searchsorted(others, z[case.hidden], side="right")
         reciprocal.setdefault(case.source, []).append(1.0 / (1.0 + above.astype(np.float64)))
-    return float(np.mean([np.concatenate(own).mean() for own in reciprocal.values()]))
+    return float(np.mean([np.concatenate(ranks).mean() for ranks in reciprocal.values()]))
 
 
-def _rows(case: _PartialList, coverage: float, weight: float) -> Floats:
+def _example_rows(case: _PartialList, coverage: float, weight: float) -> Floats:
     """Return the data for the fit, one row for each of the best classes, (classes, 3).
 
     The columns are the log-odds, the log of the number of listed classes, and 1 for a hidden class.
     """
-    z = _mixed(case, coverage, weight)
+    z = _mixed_log_odds(case, coverage, weight)
     first = np.argsort(-z, kind="stable")[:_LISTED]
     size = np.full(len(first), np.log(case.listed))
     return np.stack([z[first], size, case.hidden[first]], 1)
@@ -342,10 +350,10 @@ def fit_outliers(
     if not kinds:
         return {}
     alpha = chosen.popularity_weight if chosen else choose_alpha(kinds, prior)
-    judged = [scores.with_prior(alpha * prior) for scores in kinds.values()]
+    all_scores = [scores.with_prior(alpha * prior) for scores in kinds.values()]
     rng = np.random.default_rng(seed)
     parts = []
-    for scores in judged:
+    for scores in all_scores:
         clean_scene = rng.random(scores.scenes) < 0.5
         used = scores.clean == clean_scene[scores.scene]
         columns = scores.log_odds, np.log(scores.size), scores.intruder
@@ -355,7 +363,7 @@ def fit_outliers(
     if slope >= 0:
         return {}
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
-    whole = [(judged[0], scenes)]
+    whole = [(all_scores[0], scenes)]
     limits = thresholds(partial(limit_of, whole, entry, rng))
     short: list[Thresholds] = []
     for listed in range(1, _SHORT_LISTS + 1):
@@ -365,14 +373,14 @@ def fit_outliers(
         while len(lists) * len(lists[0][0]) < _SHORTENED:
             lists.append(listing(scenes, structure, listed, rng))
         shortened = [
-            (clean_scores(parts_of, structure, score).with_prior(alpha * prior), some)
-            for some, parts_of in lists
+            (clean_scores(lists_of, structure, score).with_prior(alpha * prior), sample)
+            for sample, lists_of in lists
         ]
         share = _ENOUGH * ALARMS["medium"]
         if limit_of(shortened, entry, np.random.default_rng(seed), share) <= limits.medium:
             break
-        own = thresholds(partial(limit_of, shortened, entry, rng))
-        short.append(_between(limits, own, short[-1] if short else NEVER))
+        length_limits = thresholds(partial(limit_of, shortened, entry, rng))
+        short.append(_clamp_thresholds(limits, length_limits, short[-1] if short else NEVER))
     return {
         "popularity_weight": alpha,
         "outlier": entry,
@@ -389,12 +397,12 @@ def listing(
     A shortened list contains `listed` random classes and all structure classes of the scene. The
     lists have the shape (scenes, classes).
     """
-    plain = (scenes.v > 0) & ~structure
-    large = (plain.sum(1) > listed).nonzero().squeeze(1)
-    order = torch.from_numpy(rng.random(plain[large].shape)).masked_fill(~plain[large], 2.0)
-    kept = order.argsort(1)[:, :listed]
-    shown = scenes.v[large] * structure
-    return subset(scenes, large), shown.scatter(1, kept, 1.0)
+    is_thing = (scenes.v > 0) & ~structure
+    large = (is_thing.sum(1) > listed).nonzero().squeeze(1)
+    order = torch.from_numpy(rng.random(is_thing[large].shape)).masked_fill(~is_thing[large], 2.0)
+    drawn = order.argsort(1)[:, :listed]
+    structure_lists = scenes.v[large] * structure
+    return subset(scenes, large), structure_lists.scatter(1, drawn, 1.0)
 
 
 Scored = Sequence[tuple[IntruderScores, SceneTensors]]
@@ -422,9 +430,10 @@ def limit_of(untouched: Scored, entry: CountSlope, rng: Rng, share: float) -> fl
     return float(1 / (1 + np.exp(-np.mean(logits))))
 
 
-def _between(low: Thresholds, middle: Thresholds, high: Thresholds) -> Thresholds:
-    values = {n: min(max(getattr(middle, n), getattr(low, n)), getattr(high, n)) for n in ALARMS}
-    return Thresholds(**values)
+def _clamp_thresholds(low: Thresholds, middle: Thresholds, high: Thresholds) -> Thresholds:
+    """Raise each threshold of `middle` to that of `low`, then lower it to that of `high`."""
+    raised = {name: max(getattr(middle, name), getattr(low, name)) for name in ALARMS}
+    return Thresholds(**{name: min(raised[name], getattr(high, name)) for name in ALARMS})
 
 
 def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
@@ -434,7 +443,7 @@ def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
     detected share at most .06 lower.
     """
     rates = {
-        alpha: {name: _detection(one.with_prior(alpha * prior)) for name, one in kinds.items()}
+        alpha: {name: _detection(s.with_prior(alpha * prior)) for name, s in kinds.items()}
         for alpha in ALPHAS
     }
     floor = rates[0.0].get("uniform", np.zeros(2)) - _UNIFORM_LOSS
@@ -462,25 +471,25 @@ def fit_evidence(
     The criterion is the mean reciprocal rank (MRR) of removed objects. Evidence without validation
     scenes has no effect on answers about objects.
     """
-    plain = structure.numpy()
-    chosen = EvidenceWeights(relations_on_objects=0.0, poses_on_objects=0.0)
+    mask = structure.numpy()
+    weights = EvidenceWeights(relations_on_objects=0.0, poses_on_objects=0.0)
     scenes = complete_scenes(validation, seed)
     related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
     rng = np.random.default_rng(seed)
     count = _EVIDENCE_SCENES if artifact.oracle is None else _EVIDENCE_SCENES_OF_DRAWS
-    picked = rng.permutation(related)[:count].astype(np.int64)
-    some = subset(scenes, torch.from_numpy(picked))
+    index = rng.permutation(related)[:count].astype(np.int64)
+    sample = subset(scenes, torch.from_numpy(index))
     for kind, name in (("relations", "relations_on_objects"), ("poses", "poses_on_objects")):
-        cases = list(removals(some, plain, kind, seed)) if len(some) else []
+        cases = list(removals(sample, mask, kind, seed)) if len(sample) else []
         if not cases:
             continue
         scores = {}
         for weight in EVIDENCE_WEIGHTS:
-            candidate = recalibrated(artifact, evidence=chosen.model_copy(update={name: weight}))
-            ranks = [_rank(candidate, case.scenes[1], case.target, plain) for case in cases]
+            tested = recalibrated(artifact, evidence=weights.model_copy(update={name: weight}))
+            ranks = [_rank(tested, case.scenes[1], case.target, mask) for case in cases]
             scores[weight] = float(np.mean([1 / rank for rank in ranks]))
-        chosen = chosen.model_copy(update={name: smallest_good_weight(scores)})
-    return chosen
+        weights = weights.model_copy(update={name: smallest_good_weight(scores)})
+    return weights
 
 
 def smallest_good_weight(scores: dict[float, float]) -> float:

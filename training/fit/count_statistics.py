@@ -53,10 +53,10 @@ def fit_counts(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Counts
     counting = counted_classes(scenes, vocabulary)
     counting = {source: counted for source, counted in counting.items() if source not in views}
     counted = [scene for scene in scenes if scene.source in counting]
-    most = _most(counted, counting, vocabulary)
+    most = _most_listed(counted, counting, vocabulary)
     if (most > 1).any():
         counted = _limit_groups(counted)
-        most *= _better_than_mean(counted, most, counting, vocabulary)
+        most *= _is_better_than_mean(counted, most, counting, vocabulary)
     return _fit(counted, most, counting, vocabulary) if (most > 1).any() else None
 
 
@@ -92,15 +92,15 @@ def _fit(
 
 def _limit_groups(scenes: Sequence[EncodedScene]) -> list[EncodedScene]:
     """Return at most `_OF_GROUP` scenes of each group."""
-    kept, number = [], Counter[tuple[str, str]]()
+    scenes_kept, count_of = [], Counter[tuple[str, str]]()
     for scene in scenes:
-        number[scene.source, scene.group] += 1
-        if number[scene.source, scene.group] <= _OF_GROUP:
-            kept.append(scene)
-    return kept
+        count_of[scene.source, scene.group] += 1
+        if count_of[scene.source, scene.group] <= _OF_GROUP:
+            scenes_kept.append(scene)
+    return scenes_kept
 
 
-def _most(
+def _most_listed(
     scenes: Sequence[EncodedScene], counting: dict[str, Flags], vocabulary: Vocabulary
 ) -> Ints:
     """Return the maximum listed number of each class that the data can tell about, (V,).
@@ -108,20 +108,20 @@ def _most(
     It is at least 2 for a class with enough scenes and enough groups with several instances, and 0
     for the other classes.
     """
-    times = np.zeros(len(vocabulary), dtype=np.int64)
-    of_group: dict[tuple[int, str, str], int] = {}
+    scene_counts = np.zeros(len(vocabulary), dtype=np.int64)
+    largest: dict[tuple[int, str, str], int] = {}
     for scene in scenes:
-        usable = counting[scene.source][scene.evidence.classes]
-        classes, counts = scene.evidence.classes[usable], scene.evidence.counts[usable]
-        times[classes] += 1
+        is_counted = counting[scene.source][scene.evidence.classes]
+        classes, counts = scene.evidence.classes[is_counted], scene.evidence.counts[is_counted]
+        scene_counts[classes] += 1
         for index, count in zip(classes.tolist(), counts.tolist(), strict=True):
             key = index, scene.source, scene.group
-            of_group[key] = max(count, of_group.get(key, 0))
-    numbers = np.array([(index, count) for (index, _, _), count in of_group.items()]).reshape(-1, 2)
-    most = np.zeros_like(times)
-    for index in np.flatnonzero(times >= _SCENES).tolist():
-        of_class = numbers[numbers[:, 0] == index, 1]
-        groups = np.array([(of_class >= number).sum() for number in range(2, MOST)])
+            largest[key] = max(count, largest.get(key, 0))
+    numbers = np.array([(key[0], count) for key, count in largest.items()]).reshape(-1, 2)
+    most = np.zeros_like(scene_counts)
+    for index in np.flatnonzero(scene_counts >= _SCENES).tolist():
+        largest_counts = numbers[numbers[:, 0] == index, 1]
+        groups = np.array([(largest_counts >= number).sum() for number in range(2, MOST)])
         if groups[0] >= _GROUPS:
             most[index] = max(2, 1 + (groups >= _GROUPS_OF_MANY).sum())
     return most
@@ -194,13 +194,13 @@ def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
     features, (N, width) = cases.features, cases.features.shape
     # The terms of a class act only on cases of this class.
     entries = features.tocoo()
-    own = sparse.csr_matrix(
+    class_terms = sparse.csr_matrix(
         (entries.data, (entries.row, cases.index[entries.row] * width + entries.col)),
         shape=(N, V * width),
     )
-    used = np.unique(own.indices)
-    both = sparse.hstack([own[:, used], features]).tocsr()
-    penalty = np.repeat([_OWN, _SHARED], [len(used), width])[:, None]
+    used_columns = np.unique(class_terms.indices)
+    all_terms = sparse.hstack([class_terms[:, used_columns], features]).tocsr()
+    penalty = np.repeat([_OWN, _SHARED], [len(used_columns), width])[:, None]
     numbers, of_number = np.arange(1, MOST + 1), functions(MOST)
     observed, case = cases.number - 1, np.arange(N)
     base = share.T[:, cases.index] - np.log(numbers)[:, None]
@@ -208,26 +208,26 @@ def _weights(cases: _Cases, share: Floats, V: int) -> Floats:
 
     def loss(flat: Floats) -> tuple[float, Floats]:
         terms = flat.reshape(-1, EXPONENTS)
-        logits = of_number.T @ (both @ terms).T
+        logits = of_number.T @ (all_terms @ terms).T
         logits += base
         logits -= logits.max(axis=0)
         p = np.exp(logits)
         total = p.sum(axis=0)
         fit = cases.weight @ (logits[observed, case] - np.log(total))
         error = cases.weight * (of_number @ p / total - of_number[:, observed])
-        slope = both.T @ error.T + penalty * terms
+        slope = all_terms.T @ error.T + penalty * terms
         return 0.5 * (penalty * terms**2).sum() - fit, slope.ravel()
 
-    start, options = np.zeros(both.shape[1] * EXPONENTS), {"ftol": _PRECISION}
+    start, options = np.zeros(all_terms.shape[1] * EXPONENTS), {"ftol": _PRECISION}
     optimum = minimize(loss, start, jac=True, method="L-BFGS-B", options=options)
     terms = optimum.x.reshape(-1, EXPONENTS)
     weights = np.zeros((V * width, EXPONENTS))
-    weights[used] = terms[: len(used)]
-    of_class = weights.reshape(V, width, EXPONENTS) + terms[len(used) :]
+    weights[used_columns] = terms[: len(used_columns)]
+    of_class = weights.reshape(V, width, EXPONENTS) + terms[len(used_columns) :]
     return of_class.swapaxes(1, 2)
 
 
-def _better_than_mean(
+def _is_better_than_mean(
     scenes: Sequence[EncodedScene], most: Ints, counting: dict[str, Flags], vocabulary: Vocabulary
 ) -> Flags:
     """Return the classes, (V,), whose expected number is closer than the class mean."""
@@ -246,9 +246,9 @@ def _better_than_mean(
 def _changes(counts: Counts, part: Part, indices: NDArray[np.intp], V: int) -> tuple[Ints, Floats]:
     """Return classes (k,), and error of the expected number minus error of the mean."""
     room = part.room if part.room >= 0 else None
-    which, p = distribution(counts, V, part.classes, part.listed, room)
-    usable = np.isin(which, indices)
-    which, expected = which[usable], p[usable] @ np.arange(1, MOST + 1)
-    classes, number = part.classes[which], part.number[which]
-    mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[which])
+    rows, p = distribution(counts, V, part.classes, part.listed, room)
+    is_asked = np.isin(rows, indices)
+    rows, expected = rows[is_asked], p[is_asked] @ np.arange(1, MOST + 1)
+    classes, number = part.classes[rows], part.number[rows]
+    mean = class_mean(counts, np.searchsorted(counts.classes, classes), part.listed[rows])
     return classes, np.abs(expected - number) - np.abs(mean - number)

@@ -79,7 +79,8 @@ def fit_objects(
 ) -> None:
     """Train b, c1, c2, W, J and Q of a machine of the local form, in place; not with 0 epochs.
 
-    Scenes with incomplete object lists are left out.
+    Each update compares the next scenes, without room types, with the Gibbs chains. Scenes with
+    incomplete object lists are left out.
 
     Raises:
         FloatingPointError: a weight became infinite or NaN.
@@ -92,14 +93,14 @@ def fit_objects(
     updates = config.epochs * max(1, round(scenes.size / config.batch_size))
     with torch.no_grad():
         v, room = scenes.draw(config.chains)
-        chains = _begin(machine, v, torch.full_like(room, -1))
+        chains = _start_chains(machine, v, torch.full_like(room, -1))
         average = {name: weight.clone() for name, weight in weights.items()}
         for update in range(updates):
-            v, room = scenes.draw(config.batch_size)
+            v, _ = scenes.draw(config.batch_size)
             rate = config.learning_rate * (1 - update / updates)
-            _update(machine, weights, v, torch.full_like(room, -1), chains, rate, generator)
-            late = update - (1 - _AVERAGED) * updates
-            share = 1.0 if late <= 0 else max(_FORGETTING, 1 / (late + 1))
+            _update(machine, weights, v, chains, rate, generator)
+            averaged = update - (1 - _AVERAGED) * updates  # updates in the average so far
+            share = 1.0 if averaged <= 0 else max(_FORGETTING, 1 / (averaged + 1))
             for name, weight in weights.items():
                 average[name].lerp_(weight, share)
             if (update + 1) % _REPORTED == 0 or update + 1 == updates:
@@ -121,23 +122,23 @@ def _fit_rooms(machine: BoltzmannMachine, scenes: _Scenes, generator: torch.Gene
     rooms = counts.nonzero().squeeze(1)
     if not len(rooms):
         return
-    chance = torch.stack([scenes.weight * (scenes.room == t) for t in rooms.tolist()])
-    room = rooms.repeat_interleave(_PER_ROOM)
+    weights = torch.stack([scenes.weight * (scenes.room == t) for t in rooms.tolist()])
+    chain_rooms = rooms.repeat_interleave(_PER_ROOM)
 
     def draw() -> Tensor:
-        picks = torch.multinomial(chance, _PER_ROOM, replacement=True, generator=generator)
+        picks = torch.multinomial(weights, _PER_ROOM, replacement=True, generator=generator)
         return scenes.v[picks.flatten()]
 
-    chains = _begin(machine, draw(), room)
+    chains = _start_chains(machine, draw(), chain_rooms)
     decay = (_ROOM_PRIOR / counts[rooms]).unsqueeze(1)
     average = machine.Q.clone()
     for update in range(_ROOM_UPDATES):
         rate = _ROOM_RATE * (1 - update / _ROOM_UPDATES)
-        data = mean_field(machine, Evidence(draw(), room=room)).y.sigmoid()
+        data = mean_field(machine, Evidence(draw(), room=chain_rooms)).y.sigmoid()
         step = (data - _sweep(machine, chains, generator)).unflatten(0, (len(rooms), -1)).mean(1)
         machine.Q[rooms] += rate * (step - decay * machine.Q[rooms])
-        late = update - (1 - _AVERAGED) * _ROOM_UPDATES
-        average.lerp_(machine.Q, 1.0 if late <= 0 else 1 / (late + 1))
+        averaged = update - (1 - _AVERAGED) * _ROOM_UPDATES
+        average.lerp_(machine.Q, 1.0 if averaged <= 0 else 1 / (averaged + 1))
     machine.Q.copy_(average)
 
 
@@ -156,7 +157,7 @@ def store_samples(
     scenes = _Scenes(train, generator)
     v, room = scenes.draw(machine.spec.N)
     hidden = torch.rand(len(v), generator=generator) < room_dropout
-    chains = _begin(machine, v, torch.where(hidden, -1, room))
+    chains = _start_chains(machine, v, torch.where(hidden, -1, room))
     for _ in range(_SWEEPS):
         _sweep(machine, chains, generator)
     machine.fantasies.copy_(pack_scenes(chains.v))
@@ -195,7 +196,7 @@ class _Scenes:
         return index[torch.randperm(len(index), generator=self._generator)]
 
 
-def _begin(machine: BoltzmannMachine, v: Tensor, room: Tensor) -> _Chains:
+def _start_chains(machine: BoltzmannMachine, v: Tensor, room: Tensor) -> _Chains:
     field = mean_field(machine, Evidence(v, room=room))
     return _Chains(v.clone(), field.y.sigmoid().round(), field.h2.round(), room)
 
@@ -204,15 +205,15 @@ def _update(
     machine: BoltzmannMachine,
     weights: Mapping[str, Tensor],
     v: Tensor,
-    room: Tensor,
     chains: _Chains,
     rate: float,
     generator: torch.Generator,
 ) -> None:
-    field = mean_field(machine, Evidence(v, room=room))
-    _add(weights, v, field.y.sigmoid(), field.h2, rate / len(v))
+    """Add the gradient at the scenes v, and subtract the gradient at the advanced chains."""
+    field = mean_field(machine, Evidence(v, room=torch.full((len(v),), -1)))
+    _accumulate(weights, v, field.y.sigmoid(), field.h2, rate / len(v))
     mean = _sweep(machine, chains, generator)
-    _add(weights, chains.v, mean, chains.h2, -rate / len(chains.v))
+    _accumulate(weights, chains.v, mean, chains.h2, -rate / len(chains.v))
 
 
 def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generator) -> Tensor:
@@ -229,7 +230,9 @@ def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generato
     return mean
 
 
-def _add(weights: Mapping[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, rate: float) -> None:
+def _accumulate(
+    weights: Mapping[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, rate: float
+) -> None:
     """Add the gradient of -E to the weights, summed over scenes and multiplied by the rate."""
     weights["b"].add_(v.sum(0), alpha=rate)
     weights["c1"].add_(h1.sum(0), alpha=rate)
@@ -265,13 +268,13 @@ def fine_tune(
         rooms = train.room[index]
         return train.v[index], torch.where(hidden, -1, rooms), rooms
 
-    v, room, every_room = scenes(max(config.chains, machine.spec.N))
-    state = _settled(machine, v, room, generator)
-    before = {name: machine.get_parameter(name).detach().clone() for name in _FINE_TUNED}
-    average = {name: value.clone() for name, value in before.items()}
+    v, room, all_rooms = scenes(max(config.chains, machine.spec.N))
+    state = _start_state(machine, v, room, generator)
+    initial = {name: machine.get_parameter(name).detach().clone() for name in _FINE_TUNED}
+    average = {name: value.clone() for name, value in initial.items()}
     weights = [machine.get_parameter(name) for name in _FINE_TUNED]
     optimiser = torch.optim.Adam(weights, lr=config.learning_rate)
-    cycle = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(config.updates, 1))
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(config.updates, 1))
     for _ in range(config.updates):
         state = run(machine, state, generator, config.k, Clamp(room=room), relations=False)
         data_v, data_room, _ = scenes(len(v))
@@ -281,25 +284,25 @@ def fine_tune(
         loss = machine.free_energy(data_v, h2=h2, room=data_room).mean()
         loss = loss - machine.free_energy(state.v, h2=state.h2, room=room).mean()
         for name, weight in zip(_FINE_TUNED, weights, strict=True):
-            loss = loss + config.anchor * ((weight - before[name]) ** 2).sum()
+            loss = loss + config.anchor * ((weight - initial[name]) ** 2).sum()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        cycle.step()
+        schedule.step()
         for name, weight in zip(_FINE_TUNED, weights, strict=True):
             average[name].lerp_(weight.detach(), 1 - _FINE_TUNED_AVERAGING)
     with torch.no_grad():
         for name, weight in zip(_FINE_TUNED, weights, strict=True):
             weight.copy_(average[name])
     if machine.spec.N:
-        clamp = Clamp(room=every_room)
+        clamp = Clamp(room=all_rooms)
         state = run(machine, state, generator, _FINE_TUNED_SWEEPS, clamp, relations=False)
         machine.fantasies.copy_(pack_scenes(state.v[: machine.spec.N]))
-        machine.fantasy_rooms.copy_(every_room[: machine.spec.N])
+        machine.fantasy_rooms.copy_(all_rooms[: machine.spec.N])
 
 
 @torch.no_grad()
-def _settled(
+def _start_state(
     machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
 ) -> State:
     """Return chains that start at the scenes v, with hidden units sampled given v."""

@@ -59,14 +59,14 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     pair = [np.zeros(0, dtype=np.int64)]
     moments, counts = [np.zeros((0, 6))], [np.zeros(0, dtype=np.int32)]
     for a in range(A):
-        some = observed.rows(observed.relation == a)
-        if not len(some.offset):
+        offsets = observed.rows(observed.relation == a)
+        if not len(offsets.offset):
             continue
-        pairs = _pairs(some)
+        pairs = _pool_pairs(offsets)
         fit = _fit(pairs, V)
         relation[a], subject[a], other[a] = fit.tables()
         mean, variance = fit.predict(pairs)
-        scenes_of[a] = len(np.unique(some.scene))
+        scenes_of[a] = len(np.unique(offsets.scene))
         pair.append((a * V + pairs.subject) * V + pairs.other)
         moments.append(np.concatenate([mean, np.sqrt(variance)], axis=1))
         counts.append(pairs.scenes.astype(np.int32))
@@ -95,7 +95,7 @@ class Pairs(NamedTuple):
     scatter: Floats
 
 
-def _pairs(observed: ObservedOffsets) -> Pairs:
+def _pool_pairs(observed: ObservedOffsets) -> Pairs:
     classes = np.stack([observed.subject, observed.other], axis=1)
     distinct, pair = np.unique(classes, axis=0, return_inverse=True)
     pair = pair.reshape(-1)
@@ -212,19 +212,19 @@ def _updated(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> tuple[An
 
 def _fit(pairs: Pairs, V: int) -> _Fit:
     """Fit the parameters of one relation, by alternation between the prior and class effects."""
-    nothing = np.zeros((V, 3))
+    no_effect = np.zeros((V, 3))
     start = (pairs.n * pairs.mean).sum(axis=0) / pairs.n.sum()
     prior = np.ones(3), np.full(3, 2.0), np.full(3, 0.1)
-    fit = _Fit(*prior, start, *[nothing] * 4)
+    fit = _Fit(*prior, start, *[no_effect] * 4)
     for _ in range(_ROUNDS):
         expected = fit.expected(pairs)
-        priors = [_hyperparameters(pairs, axis, expected[:, axis]) for axis in range(3)]
+        priors = [_fit_prior(pairs, axis, expected[:, axis]) for axis in range(3)]
         fit.kappa, fit.alpha, fit.beta = np.array(priors).T
-        _effects(fit, pairs, V)
+        _fit_effects(fit, pairs, V)
     return fit
 
 
-def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
+def _fit_prior(pairs: Pairs, axis: int, expected: Floats) -> Floats:
     """Return kappa, alpha and beta of one axis, fitted by maximum likelihood."""
 
     def loss(logs: Floats) -> float:
@@ -235,7 +235,7 @@ def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
     return np.exp(minimize(loss, np.log([1.0, 2.0, 0.1]), bounds=bounds).x)
 
 
-def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
+def _fit_effects(fit: _Fit, pairs: Pairs, V: int) -> None:
     """Fit mu and the effects u and v, shrunk towards 0, by alternation, in place."""
     # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)
@@ -243,11 +243,11 @@ def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
     below_u = _sums(pairs.subject, weight, V) + LAMBDA
     below_v = _sums(pairs.other, weight, V) + LAMBDA
     for _ in range(_SWEEPS):
-        rest = pairs.mean - fit.u[pairs.subject] - fit.v[pairs.other]
-        fit.mu = (weight * rest).sum(axis=0) / weight.sum(axis=0)
-        rest = pairs.mean - fit.mu
-        fit.u = _sums(pairs.subject, weight * (rest - fit.v[pairs.other]), V) / below_u
-        fit.v = _sums(pairs.other, weight * (rest - fit.u[pairs.subject]), V) / below_v
+        residual = pairs.mean - fit.u[pairs.subject] - fit.v[pairs.other]
+        fit.mu = (weight * residual).sum(axis=0) / weight.sum(axis=0)
+        residual = pairs.mean - fit.mu
+        fit.u = _sums(pairs.subject, weight * (residual - fit.v[pairs.other]), V) / below_u
+        fit.v = _sums(pairs.other, weight * (residual - fit.u[pairs.subject]), V) / below_v
     fit.doubt_u, fit.doubt_v = 1 / below_u, 1 / below_v
 
 

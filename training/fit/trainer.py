@@ -82,24 +82,24 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
 def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
     """Set the relation biases to the log-odds of relations in scenes with annotated relations."""
     A, V, T = machine.spec.A, machine.spec.V, machine.spec.T
-    held, seen, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
+    true, known, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
     logs, times, annotated = torch.zeros(V), torch.zeros(V), 0
     for scene in scenes.scenes:
-        e = scene.evidence
-        if not e.observed.any():
+        evidence = scene.evidence
+        if not evidence.observed.any():
             continue
         annotated += 1
-        held += torch.from_numpy(e.holds.sum((1, 2)))
-        seen += torch.from_numpy(e.observed.sum((1, 2)))
-        classes = torch.from_numpy(e.classes)
-        relation, subject, object_ = torch.from_numpy(e.holds).nonzero(as_tuple=True)
+        true += torch.from_numpy(evidence.holds.sum((1, 2)))
+        known += torch.from_numpy(evidence.observed.sum((1, 2)))
+        classes = torch.from_numpy(evidence.classes)
+        relation, subject, object_ = torch.from_numpy(evidence.holds).nonzero(as_tuple=True)
         keys = triple_keys(relation, classes[subject], classes[object_], V)
         index, exists = find_triples(machine.triple_keys, keys)
         per_unit[index[exists]] += 1
-        logs[classes] += torch.from_numpy(e.counts).log()
+        logs[classes] += torch.from_numpy(evidence.counts).log()
         times[classes] += 1
     machine.start_relations(
-        log_odds_of(held, seen),
+        log_odds_of(true, known),
         log_odds_of(per_unit, torch.full_like(per_unit, annotated)),
         logs / times.clamp(min=1),
     )
@@ -111,7 +111,7 @@ class _Loss(nn.Module):
     def __init__(self, objective: Objective, machine: BoltzmannMachine) -> None:
         super().__init__()
         self.objective, self.machine = objective, machine
-        self.more = nn.ParameterList(objective.parameters())
+        self.objective_parameters = nn.ParameterList(objective.parameters())
 
     def forward(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the loss, times the number of processes."""
@@ -132,30 +132,30 @@ class Trainer:
         self.machine = new_machine(config, data, self.generator).to(self.device)
         self.machine.index_triples()
         kind = OBJECTIVES[config.objective.name]
-        with self._placed():
+        with self._on_device():
             self.objective: Objective = kind.of(config.objective, self.machine, data)
         self.train = data.train
         if config.objects.epochs:
-            self.train = _with_relations(data.train)
+            self.train = _select_annotated(data.train)
             for name in OBJECT_WEIGHTS:
                 self.machine.get_parameter(name).requires_grad_(False)
         self.loss = distributed.parallel(_Loss(self.objective, self.machine))
-        self.optimiser = self._optimiser()
+        self.optimiser = self._new_optimiser()
         self.steps_per_epoch = math.ceil(len(self.train) / config.training.batch_size)
-        self.scheduler = self._scheduler()
-        self.average = self._copies()
+        self.scheduler = self._new_scheduler()
+        self.average = self._copy_weights()
         self.updates = 0
         self.epochs: list[Epoch] = []
         self.best: dict[str, Tensor] = {}
         self.best_epoch, self.best_score = -1, -math.inf
         self.seconds = 0.0
         self.objects_trained = not config.objects.epochs
-        self._drawn = -math.inf
+        self._plotted_at = -math.inf
 
-    def _copies(self) -> dict[str, Tensor]:
+    def _copy_weights(self) -> dict[str, Tensor]:
         return {name: p.detach().clone() for name, p in self.machine.named_parameters()}
 
-    def _placed(self) -> torch.device | nullcontext[None]:
+    def _on_device(self) -> torch.device | nullcontext[None]:
         """Return a context in which new tensors are on the device."""
         return nullcontext() if self.device.type == "cpu" else self.device
 
@@ -167,7 +167,7 @@ class Trainer:
         machine.index_triples()
         return machine
 
-    def _optimiser(self) -> torch.optim.Optimizer:
+    def _new_optimiser(self) -> torch.optim.Optimizer:
         t = self.config.training
         groups: tuple[list[Tensor], list[Tensor], list[Tensor]] = ([], [], [])
         matrices, biases, relations = groups
@@ -186,7 +186,7 @@ class Trainer:
         kind = torch.optim.SGD if t.optimiser == "sgd" else torch.optim.AdamW
         return kind(settings, lr=t.learning_rate, fused=True)
 
-    def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
+    def _new_scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
         """Return the schedule of the learning rate.
 
         In the one-cycle schedule, it rises over the first tenth of the updates, and then falls to 0
@@ -248,7 +248,7 @@ class Trainer:
             state = distributed.on_first(partial(self._fit_objects, objects))
             self.machine.load_state_dict(state)
             self.objects_trained = True
-            self.average = self._copies()
+            self.average = self._copy_weights()
             self.seconds += time.perf_counter() - began
             self._save()
         while len(self.epochs) < self.config.training.epochs and not self._out_of_patience():
@@ -256,7 +256,7 @@ class Trainer:
             self._save()
             if ended is not None:
                 ended(self.epochs[-1])
-        self._draw()
+        self._plot()
         with torch.no_grad():
             for name, value in self.best.items():
                 self.machine.get_parameter(name).copy_(value)
@@ -291,10 +291,10 @@ class Trainer:
             total, steps = total + self._update(index), steps + 1
             if progress is not None:
                 progress(number, steps / self.steps_per_epoch, total / steps)
-        everyone = distributed.total(torch.tensor(total, dtype=torch.float64))
-        loss = float(everyone) / distributed.size() / steps
-        finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
-        if not math.isfinite(loss) or not finite:
+        global_total = distributed.total(torch.tensor(total, dtype=torch.float64))
+        loss = float(global_total) / distributed.size() / steps
+        is_finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
+        if not math.isfinite(loss) or not is_finite:
             raise FloatingPointError(
                 f"the training diverged in epoch {number}, with a loss of {loss}: lower the "
                 "learning rate (training.learning_rate)"
@@ -304,7 +304,7 @@ class Trainer:
     def _update(self, index: Tensor) -> float:
         width = max(len(self.train.scenes[k].evidence.classes) for k in index.tolist())
         batch = self.train.batch(distributed.share(index), width).to(self.device)
-        with self._placed():
+        with self._on_device():
             loss = self.loss(batch, self.generator)
             self.optimiser.zero_grad()
             loss.backward()
@@ -324,7 +324,7 @@ class Trainer:
     @torch.no_grad()
     def _close_epoch(self, number: int, loss: float, began: float) -> None:
         """Evaluate the weights, or their average, on validation scenes. Keep the best weights."""
-        parameters, current = dict(self.machine.named_parameters()), self._copies()
+        parameters, current = dict(self.machine.named_parameters()), self._copy_weights()
         if self.config.training.averaging:
             for name, p in parameters.items():
                 p.copy_(self.average[name])
@@ -339,7 +339,7 @@ class Trainer:
         score = mrr + (0.0 if math.isnan(precision) else precision)
         if score > self.best_score or self.objective.keeps_last:
             self.best_score, self.best_epoch = score, number
-            self.best = self._copies()
+            self.best = self._copy_weights()
         for name, p in parameters.items():
             p.copy_(current[name])
         seconds = time.perf_counter() - began
@@ -392,16 +392,16 @@ class Trainer:
         write_csv(self.folder / "curve.csv", self.epochs)
         # Plot at most once in _DRAWN_EVERY seconds. With few scenes, a plot takes longer than an
         # epoch.
-        if time.perf_counter() - self._drawn > _DRAWN_EVERY:
-            self._draw()
+        if time.perf_counter() - self._plotted_at > _DRAWN_EVERY:
+            self._plot()
 
-    def _draw(self) -> None:
+    def _plot(self) -> None:
         if self.folder is not None and distributed.is_first():
             write_plot(self.folder / "curve.png", self.epochs, self.config.name)
-            self._drawn = time.perf_counter()
+            self._plotted_at = time.perf_counter()
 
 
-def _with_relations(scenes: SceneTensors) -> SceneTensors:
+def _select_annotated(scenes: SceneTensors) -> SceneTensors:
     """Return the scenes with an annotated relation, or all scenes if no scene has one."""
-    kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
-    return subset(scenes, torch.tensor(kept, dtype=torch.int64)) if kept else scenes
+    annotated = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
+    return subset(scenes, torch.tensor(annotated, dtype=torch.int64)) if annotated else scenes

@@ -15,7 +15,7 @@ from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, roo
 from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
 from training.datasets.cases import scene_of
 from training.evaluation.calibration_task import QUESTIONS, ask_outliers, collect, uncalibrated
-from training.evaluation.intruders import kinds_of_intruders
+from training.evaluation.intruders import draw_intruder_choices
 
 ARTIFACT = artifact_of(larger_machine("triway-local"))
 V = LARGER["triway-local"].V
@@ -111,14 +111,14 @@ def test_half_of_the_scenes_have_an_intruder():
 def test_intruders_are_of_every_kind():
     """Uniform, popular, and typical of another room type; each absent and no structure."""
     data, train = rooms(40, 1), rooms(400, 2)
-    found = kinds_of_intruders(data, STRUCTURE, train)
+    found = draw_intruder_choices(data, STRUCTURE, train)
     assert set(found) == {(entry.source, entry.scene_id) for entry in data.scenes}
     for entry in data.scenes:
         drawn = found[entry.source, entry.scene_id]
         assert not np.isin(drawn, entry.evidence.classes).any()
         assert not STRUCTURE.numpy()[drawn].any()
     assert max(map(len, found.values())) == 3
-    alone = kinds_of_intruders(data, STRUCTURE, None)
+    alone = draw_intruder_choices(data, STRUCTURE, None)
     assert {len(drawn) for drawn in alone.values()} <= {0, 1}
     ask = partial(ask_outliers, intruders=found)
     answers = collect(room_model(), data, ask)

@@ -68,12 +68,12 @@ def test_no_asked_pair_is_told(kind):
     for case in cases:
         _, more = case.scenes
         for a, i, j in more.relations:
-            assert not case.asked[a, i, j]
+            assert not case.queried[a, i, j]
         if more.poses is not None:
-            assert not (more.poses.observed & case.asked).any()
-        assert not (case.truth & ~case.asked).any()
-        own = DATA.scenes[case.place].instance_classes
-        assert not case.asked[:, PLAIN[own]].any()
+            assert not (more.poses.observed & case.queried).any()
+        assert not (case.truth & ~case.queried).any()
+        own = DATA.scenes[case.scene_index].instance_classes
+        assert not case.queried[:, PLAIN[own]].any()
 
 
 @pytest.mark.parametrize("kind", ["relations", "poses"])
@@ -83,11 +83,11 @@ def test_nothing_is_known_of_an_intruder_but_its_label(kind):
     )
     intruders[0] = -1
     cases = list(intrusions(room_model(), DATA, intruders, kind))
-    assert 0 not in {case.place for case in cases}
+    assert 0 not in {case.scene_index for case in cases}
     for case in cases:
         _, more = case.scenes
         assert case.target == len(more.objects) - 1
-        assert more.objects[-1].class_index == intruders[case.place]
+        assert more.objects[-1].class_index == intruders[case.scene_index]
         assert not any(case.target in (i, j) for _, i, j in more.relations)
         if kind == "poses":
             assert not more.poses.observed[:, case.target].any()

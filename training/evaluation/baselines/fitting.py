@@ -116,26 +116,26 @@ class Baseline:
                 f"the {len(train)} training scenes contain no objects; a baseline needs objects"
             )
         trials: list[Trial] = []
-        chosen: list[Any] = []
+        best_scores: list[Any] = []
         highest = -math.inf
         start = time.perf_counter()
         for parameters, score in self.propose(train, structure, seed):
-            figure = self.judge(validation, structure, score)
-            if math.isnan(figure):
+            metric = self.judge(validation, structure, score)
+            if math.isnan(metric):
                 raise FloatingPointError(
                     f"{self.name}: the validation metric with {dict(parameters)} is NaN; leave "
                     "this grid point out"
                 )
-            if figure > highest:
-                highest, chosen = figure, [score]
+            if metric > highest:
+                highest, best_scores = metric, [score]
             now = time.perf_counter()
-            trials.append(Trial(dict(parameters), figure, now - start))
-            shown = ", ".join(f"{key} {value}" for key, value in parameters.items())
-            progress(f"{self.name} {shown}: {figure:.4f}")
+            trials.append(Trial(dict(parameters), metric, now - start))
+            text = ", ".join(f"{key} {value}" for key, value in parameters.items())
+            progress(f"{self.name} {text}: {metric:.4f}")
             start = now
-        best = chosen[0]
-        answers = dict.fromkeys(self.scores, best)
+        best_score = best_scores[0]
+        answers = dict.fromkeys(self.scores, best_score)
         if "density" in answers:
-            answers["density"] = lambda _: best
-        count = getattr(best, "parameter_count", None) if "missing" in answers else None
+            answers["density"] = lambda _: best_score
+        count = getattr(best_score, "parameter_count", None) if "missing" in answers else None
         return Model(**answers, parameters=count, trials=tuple(trials))

@@ -54,14 +54,14 @@ def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
             "annotated relations"
         )
     A = related[0].holds.shape[0]
-    held = np.zeros((A, V, V), dtype=np.float32)
+    holds = np.zeros((A, V, V), dtype=np.float32)
     together = np.zeros((V, V), dtype=np.float32)
-    for e in related:
-        held[np.ix_(np.arange(A), e.classes, e.classes)] += e.holds
-        together[np.ix_(e.classes, e.classes)] += 1.0
+    for evidence in related:
+        holds[np.ix_(np.arange(A), evidence.classes, evidence.classes)] += evidence.holds
+        together[np.ix_(evidence.classes, evidence.classes)] += 1.0
     skip = structure.numpy()
     pair = ~(skip[:, None] | skip | np.eye(V, dtype=np.bool_))
-    return TripleCounts(torch.from_numpy(held * pair), torch.from_numpy(together * pair))
+    return TripleCounts(torch.from_numpy(holds * pair), torch.from_numpy(together * pair))
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,10 +70,10 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
     (classes,) bool, are never removed or ranked.
     """
     removable = batch.v * ~structure
-    enough = removable.sum(1) >= 2
-    if not anywhere(enough):
+    is_maskable = removable.sum(1) >= 2
+    if not anywhere(is_maskable):
         return None
-    batch, removable = batch.rows(enough), removable[enough]
+    batch, removable = batch.rows(is_maskable), removable[is_maskable]
     target = categorical(removable, generator)
     v = batch.v.scatter(1, target.unsqueeze(1), 0.0)
     absent = (v == 0) & ~structure
@@ -156,11 +156,12 @@ class CompositeLikelihood(Objective):
         if masked is None:
             return total
         log_odds = self._log_odds(machine, masked, generator)
-        chosen = log_odds.gather(1, masked.target.unsqueeze(1)).squeeze(1)
+        target_log_odds = log_odds.gather(1, masked.target.unsqueeze(1)).squeeze(1)
         others = log_odds.masked_fill(~masked.absent, -torch.inf)
-        ranking = others.logsumexp(1) - chosen
-        off = softplus(log_odds) * masked.absent.scatter(1, masked.target.unsqueeze(1), False)
-        presence = masked.removable * softplus(-chosen) + off.sum(1)
+        ranking = others.logsumexp(1) - target_log_odds
+        is_off = masked.absent.scatter(1, masked.target.unsqueeze(1), False)
+        off = (softplus(log_odds) * is_off).sum(1)
+        presence = masked.removable * softplus(-target_log_odds) + off
         return total + mean_part(ranking + self.config.presence_weight * presence)
 
     def _log_odds(
@@ -187,16 +188,16 @@ class CompositeLikelihood(Objective):
         annotated = batch.observed.flatten(1).any(1)
         if not anywhere(annotated):
             return machine.b.sum() * 0.0
-        some = batch.rows(annotated)
+        scenes = batch.rows(annotated)
         if self.config.unlisted == "off":
-            some = unlisted_off(some, self.structure)
-        room = withhold_rooms(some, self.config.room_dropout, generator)
-        some = withhold_counts(some, self.config.count_dropout, generator)
-        edges, r, observed = relation_units(machine, some)
-        evidence = Evidence(some.v, machine.context_units(edges), room=room)
+            scenes = unlisted_off(scenes, self.structure)
+        room = withhold_rooms(scenes, self.config.room_dropout, generator)
+        scenes = withhold_counts(scenes, self.config.count_dropout, generator)
+        edges, r, observed = relation_units(machine, scenes)
+        evidence = Evidence(scenes.v, machine.context_units(edges), room=room)
         h1 = mean_field(machine, evidence).y.sigmoid()
-        logits = machine.relation_logits(edges, some.v, h1)
-        counted = observed * machine.gate(edges, some.v)
+        logits = machine.relation_logits(edges, scenes.v, h1)
+        counted = observed * machine.gate(edges, scenes.v)
         nll = relation_nll(machine, edges, logits, r, observed, counted, h1, generator)
         return nll / int(total(torch.tensor(len(batch))))
 

@@ -145,8 +145,8 @@ class RelationLikelihood(Objective):
         batch = withhold_counts(batch, self.config.count_dropout, generator)
         edges, r, observed = relation_units(machine, batch)
         with torch.no_grad():
-            shown = hide_objects(batch.v, generator)
-            h1 = mean_field(machine, Evidence(shown, room=room)).y.sigmoid()
+            visible = hide_objects(batch.v, generator)
+            h1 = mean_field(machine, Evidence(visible, room=room)).y.sigmoid()
         offsets = self.offsets[batch.source]
         weight = self.source_weights[batch.source].unsqueeze(1)
         logits = machine.relation_logits(edges, batch.v, h1)
