@@ -151,8 +151,6 @@ def _baselines(data: TrainingData, say: Progress) -> Model:
     )
 
 
-# --------------------------------------------------------------------------------- held-out scenes
-
 Sources = Mapping[str, Sequence[AnnotatedScene]]
 
 

@@ -105,11 +105,7 @@ class Proposal:
 
 
 def propose(
-    name: str,
-    scenes: Sequence[AnnotatedScene],
-    sources: Sequence[str],
-    *,
-    terms: str = "",
+    name: str, scenes: Sequence[AnnotatedScene], sources: Sequence[str], *, terms: str = ""
 ) -> Proposal:
     """Analyse the scenes, and propose a vocabulary and a configuration.
 

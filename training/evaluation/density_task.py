@@ -202,9 +202,6 @@ def density_task(model: Model, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(scenes), 0, notes)
 
 
-# ------------------------------------------------------------------------------ the pairwise model
-
-
 @dataclass(frozen=True, eq=False)
 class Ising:
     """A fully visible Boltzmann machine with biases b (V,) and pairwise weights W (V, V).

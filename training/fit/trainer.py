@@ -205,8 +205,6 @@ class Trainer:
 
         return torch.optim.lr_scheduler.LambdaLR(self.optimiser, factor)
 
-    # -- the run --------------------------------------------------------------------------------
-
     def resume(self) -> bool:
         """Load the checkpoint in the folder of the run. Return False if there is no checkpoint.
 
