@@ -291,8 +291,8 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
     file_sources = {source_name(source) for source in config.data.sources if is_file(source)}
     for is_named in (True, False):
-        every = (scene for part in scenes.parts.values() for scene in part)
-        selected = (scene for scene in every if (scene.source in file_sources) == is_named)
+        all_scenes = (scene for part in scenes.parts.values() for scene in part)
+        selected = (scene for scene in all_scenes if (scene.source in file_sources) == is_named)
         if line := outside_vocabulary(selected, named=is_named):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
     for reason in reasons:

@@ -80,10 +80,10 @@ def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
     opener = gzip.open if path.suffix == ".gz" else open
     with opener(path, "wt", encoding="utf-8") as file:
         for scene in scenes:
-            file.write(json.dumps(_values(scene), ensure_ascii=False) + "\n")
+            file.write(json.dumps(_fields_of(scene), ensure_ascii=False) + "\n")
 
 
-def _values(scene: AnnotatedScene) -> dict[str, Any]:
+def _fields_of(scene: AnnotatedScene) -> dict[str, Any]:
     ids = [thing.id for thing in scene.objects]
 
     def with_ids(relations: Iterable[tuple[int, str, int]]) -> list[list[str]]:

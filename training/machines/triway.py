@@ -294,6 +294,7 @@ class Triway(BoltzmannMachine):
     def _collapsed_sweep(
         self, v: Tensor, h1: Tensor, held: Tensor | None, generator: torch.Generator
     ) -> Tensor:
+        """Sample each class in turn given the others, with the relations summed out."""
         logits = self.object_logits(h1)
         for i in range(self.spec.V):
             gain = self.attraction_to_all(v, h1, torch.tensor([[i]]))[:, 0]

@@ -229,10 +229,10 @@ def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
     chosen: set[str] = set()
     for part in wanted:
         # A full name selects only that task, even if it is a prefix of other names.
-        named = {part} & set(TASKS) or {name for name in TASKS if name.startswith(part)}
-        if not named:
+        matches = {part} & set(TASKS) or {name for name in TASKS if name.startswith(part)}
+        if not matches:
             raise ValueError(f"unknown task {part!r}: use a name, or the start, of {list(TASKS)}")
-        chosen |= named
+        chosen |= matches
     return tuple(name for name in TASKS if name in chosen)
 
 
@@ -311,7 +311,9 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
         plan = replace(plan, tasks=tasks)
     entries = [machine_entry(config, calibrated=False) for config in options.configs(domain, 0)]
     # A baseline that supports several of the tasks is fitted once.
-    names = [name for name, one in BASELINES.items() if one.scores in (("missing",), RELATIONS)]
+    names = [
+        name for name, baseline in BASELINES.items() if baseline.scores in (("missing",), RELATIONS)
+    ]
     if options.baselines is not None:
         yardsticks = {YARDSTICKS[task][0] for task in tasks}
         names = [name for name in names if name in yardsticks | set(options.baselines)]
@@ -320,13 +322,13 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
     weights = plan.parameters(entries)
     for task in tasks:
         yardstick, metric = YARDSTICKS[task]
-        some: Reports = {
+        task_reports: Reports = {
             row: {source: only(report, {task: (metric,)}) for source, report in by_source.items()}
             for row, by_source in reports.items()
         }
         # A task without metrics needs data that these scenes lack, for example room types.
-        if any(report.outcomes[task] for report in some[yardstick, 0].values()):
-            results = summarise(some, yardstick, weights)
+        if any(report.outcomes[task] for report in task_reports[yardstick, 0].values()):
+            results = summarise(task_reports, yardstick, weights)
             text = shuffled_text(task, results)
             _write(folder / slug(task), scenes, results.to_dict(), text)
             console.print("trained on shuffled scenes:", *results.tables({task: (metric,)}))
@@ -396,10 +398,10 @@ Results of the paper on its own data:
 def shuffled_text(task: str, results: Results) -> str:
     """Return the Markdown page of one task of the control experiment."""
     _, metric = YARDSTICKS[task]
-    above = [
-        f"{gap.row} by {-gap.figure.value:.3f}"
-        for gap in results.differences
-        if gap.source == POOLED and gap.verdict == "worse"
+    better_models = [
+        f"{difference.row} by {-gap.figure.value:.3f}"
+        for difference in results.differences
+        if difference.source == POOLED and difference.verdict == "worse"
     ]
     return f"""# Shuffled scenes, {task}
 
@@ -410,5 +412,5 @@ outside the training scenes. A star marks a model that is worse than the bold mo
 interval of the paired difference is on one side of zero.
 
 {results.markdown({task: (metric,)})}
-Models above {results.ours} over the whole interval: {", ".join(above) or "none"}.
+Models above {results.ours} over the whole interval: {", ".join(better_models) or "none"}.
 """

@@ -63,14 +63,14 @@ def known_examples(
     examples: Sequence[Example], vocabulary: Vocabulary
 ) -> tuple[tuple[Example, ...], list[str]]:
     """Return the examples that a vocabulary covers, and the reasons against the others."""
-    known, reasons = [], []
+    covered_examples, reasons = [], []
     for example in examples:
         try:
             example.require_known(vocabulary)
-            known.append(example)
+            covered_examples.append(example)
         except ValueError as error:
             reasons.append(str(error))
-    return tuple(known), reasons
+    return tuple(covered_examples), reasons
 
 
 def examples_json(examples: Sequence[Example]) -> str:

@@ -302,9 +302,9 @@ def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
 def terms(scenes: SplitScenes) -> str:
     """Return a sentence about the permitted use of the trained weights."""
     entries = {source: terms_of(source, scenes.data) for source in scenes.counts}
-    restricted = [source for source, (_, research_only) in entries.items() if research_only]
-    if restricted:
-        return f"Research use only: trained on {', '.join(restricted)}. Not for commercial robots."
+    sources = [source for source, (_, research_only) in entries.items() if research_only]
+    if sources:
+        return f"Research use only: trained on {', '.join(sources)}. Not for commercial robots."
     sentences = [
         f"Trained on {source}: {words.rstrip('.')}."
         for source, (words, _) in entries.items()
