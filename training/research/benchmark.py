@@ -399,7 +399,7 @@ def shuffled_text(task: str, results: Results) -> str:
     """Return the Markdown page of one task of the control experiment."""
     _, metric = YARDSTICKS[task]
     better_models = [
-        f"{difference.row} by {-gap.figure.value:.3f}"
+        f"{difference.row} by {-difference.figure.value:.3f}"
         for difference in results.differences
         if difference.source == POOLED and difference.verdict == "worse"
     ]

@@ -79,8 +79,8 @@ class SplitScenes:
             ConfigError: a source has no scene in the training part.
         """
         annotated = annotated_classes(self.parts["train"], self.vocabulary)
-        every = {scene.source for scenes in self.parts.values() for scene in scenes}
-        for source in every - set(annotated):
+        sources = {scene.source for scenes in self.parts.values() for scene in scenes}
+        for source in sources - set(annotated):
             raise ConfigError(
                 f"the training part contains no scene of the source {source!r}; add scenes, or "
                 "remove the source from data.sources"
