@@ -26,7 +26,7 @@ from training.datasets.batches import subset
 from training.datasets.files import DATA
 from training.domain.candidates import Candidate
 from training.domain.compare import compare, compare_command, show
-from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, seat
+from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
 from training.domain.init_command import example, fail, init
 from training.domain.labels import outside_vocabulary
 from training.evaluation.everyday_task import EVERYDAY
@@ -389,7 +389,7 @@ def _promote(
     even_if_worse: bool,
 ) -> None:
     """Publish the version and point the alias at it, unless the gate refuses the version."""
-    earlier = seat(store, alias)
+    served = served_model(store, alias)
     with console.status("publishing") as status:
 
         def judged(artifact: Artifact) -> list[str]:
@@ -398,11 +398,11 @@ def _promote(
             for line in useful.lines():
                 console.print(line, highlight=False)
             reasons = useful.objections()
-            if earlier.holder is not None and (even_if_worse or not reasons):
+            if served.candidate is not None and (even_if_worse or not reasons):
                 try:
                     new = Candidate(NEW, run.config, scenes.digests, artifact, root)
                     comparison = compare(
-                        *(new, earlier.holder, root), limit=limit, examples=3, say=say
+                        *(new, served.candidate, root), limit=limit, examples=3, say=say
                     )
                     show(comparison, console)
                     reasons += losses(comparison, margin)
@@ -418,13 +418,13 @@ def _promote(
             accept=_print_accepted if even_if_worse else None,
             progress=status.update,
         )
-    if earlier.note:
-        console.print(earlier.note, soft_wrap=True)
+    if served.note:
+        console.print(served.note, soft_wrap=True)
     _print_published(artifact)
     # `expected` makes the change fail if another process changed the alias during the comparison.
     target = AliasTarget(name=artifact.manifest.name, version=version)
-    store.set_alias(alias, target, expected=earlier.target)
-    change = f", before {earlier.target}" if earlier.target is not None else ""
+    store.set_alias(alias, target, expected=served.target)
+    change = f", before {served.target}" if served.target is not None else ""
     console.print(f"promoted: {alias} → {target}{change}", soft_wrap=True)
 
 

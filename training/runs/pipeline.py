@@ -223,16 +223,16 @@ def split_and_encode(
     Raises:
         ConfigError: the vocabulary is invalid; see `build_vocabulary`.
     """
-    everything = [scene for source in scenes.values() for scene in source]
-    parts = split(everything, seed=data.split_seed, protocol=data.split)
+    all_scenes = [scene for source in scenes.values() for scene in source]
+    parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
         vocabulary = build_vocabulary(data, list(parts["train"]), root)
     return SplitScenes(
         data=data,
         vocabulary=vocabulary,
-        parts={part: encode(some, vocabulary) for part, some in parts.items()},
-        counts={source: len(some) for source, some in scenes.items()},
-        digests={source: digest_of(some) for source, some in scenes.items()},
+        parts={name: encode(part, vocabulary) for name, part in parts.items()},
+        counts={name: len(source) for name, source in scenes.items()},
+        digests={name: digest_of(source) for name, source in scenes.items()},
         words=_word_vectors(data, vocabulary, root),
     )
 
