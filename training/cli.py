@@ -26,7 +26,7 @@ from training.datasets.batches import subset
 from training.datasets.files import DATA
 from training.domain.candidates import Candidate
 from training.domain.compare import compare, compare_command, show
-from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, seat
+from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
 from training.domain.init_command import example, fail, init
 from training.domain.labels import outside_vocabulary
 from training.evaluation.everyday_task import EVERYDAY
@@ -125,11 +125,8 @@ def train(
         if publish is not None and first:
             _publish(load_run(folder), scenes, store, publish, measured)
     except RefusedError as error:
-        _refused(error)
-    except (
-        *(ConfigError, DatasetError, RegistryError, RunError),
-        FloatingPointError,
-    ) as error:
+        _exit_refused(error)
+    except (*(ConfigError, DatasetError, RegistryError, RunError), FloatingPointError) as error:
         fail(error)
 
 
@@ -210,9 +207,10 @@ def publish(
             command = f"SCENE_STORE={shlex.quote(store)} SCENE_PORT=8055 python -m app"
             console.print(f"next: {command}", soft_wrap=True, markup=False, highlight=False)
         else:
-            _publish(run, scenes, store, version, accept=_accept if even_if_worse else None)
+            accept = _print_accepted if even_if_worse else None
+            _publish(run, scenes, store, version, accept=accept)
     except RefusedError as error:
-        _refused(error, "; --even-if-worse publishes the version all the same")
+        _exit_refused(error, "; --even-if-worse publishes the version all the same")
     except (RunError, ConfigError, DatasetError, RegistryError) as error:
         fail(error)
 
@@ -289,12 +287,13 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     with console.status("reading and encoding scenes"):
         scenes = prepare(config, data)
     examples, reasons = known_examples(read_examples(config.examples, data), scenes.vocabulary)
-    sizes = ", ".join(f"{len(some)} {part}" for part, some in scenes.parts.items())
+    sizes = ", ".join(f"{len(part)} {name}" for name, part in scenes.parts.items())
     console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
-    own = {source_name(source) for source in config.data.sources if is_file(source)}
-    for named in (True, False):
-        some = (s for part in scenes.parts.values() for s in part if (s.source in own) == named)
-        if line := outside_vocabulary(some, named=named):
+    file_sources = {source_name(source) for source in config.data.sources if is_file(source)}
+    for is_named in (True, False):
+        all_scenes = (scene for part in scenes.parts.values() for scene in part)
+        selected = (scene for scene in all_scenes if (scene.source in file_sources) == is_named)
+        if line := outside_vocabulary(selected, named=is_named):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
     for reason in reasons:
         console.print(f"[yellow]note:[/yellow] an example is left out: {reason}", soft_wrap=True)
@@ -321,8 +320,8 @@ def _train(
             result = trainer.run(display.progress, display.ended, display.objects)
     except KeyboardInterrupt:
         # Count the epochs in the checkpoint, because the last epoch may be finished but not saved.
-        kept = len(trainer.epochs) if trainer.resume() else 0
-        console.print(f"stopped after epoch {kept}; run the same command to continue")
+        finished = len(trainer.epochs) if trainer.resume() else 0
+        console.print(f"stopped after epoch {finished}; run the same command to continue")
         raise typer.Exit(130) from None
     if not is_first():
         return
@@ -345,14 +344,14 @@ def _publish(
             accept=accept,
             progress=status.update,
         )
-    _published(artifact, store)
+    _print_published(artifact, store)
 
 
-def _accept(reason: str) -> None:
+def _print_accepted(reason: str) -> None:
     console.print(f"accepted by --even-if-worse: {reason}", soft_wrap=True)
 
 
-def _refused(error: RefusedError, remedy: str = "") -> NoReturn:
+def _exit_refused(error: RefusedError, remedy: str = "") -> NoReturn:
     console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
     console.print(f"nothing was published{remedy}")
     raise typer.Exit(3) from None
@@ -365,10 +364,10 @@ def _refit(reference: str, root: Path, store: str, version: str) -> None:
     artifact = models.load(name, old)
     with console.status("publishing") as status:
         artifact = refit(artifact, root, models, version, progress=status.update)
-    _published(artifact, store)
+    _print_published(artifact, store)
 
 
-def _published(artifact: Artifact, unmoved: str | None = None) -> None:
+def _print_published(artifact: Artifact, unmoved: str | None = None) -> None:
     """Print the new version. If no alias moved in the store `unmoved`, print the next step."""
     reference = f"{artifact.manifest.name}@{artifact.manifest.version}"
     console.print(f"published {reference}, digest {artifact.digest[:12]}")
@@ -390,7 +389,7 @@ def _promote(
     even_if_worse: bool,
 ) -> None:
     """Publish the version and point the alias at it, unless the gate refuses the version."""
-    before = seat(store, alias)
+    served = served_model(store, alias)
     with console.status("publishing") as status:
 
         def judged(artifact: Artifact) -> list[str]:
@@ -399,11 +398,11 @@ def _promote(
             for line in useful.lines():
                 console.print(line, highlight=False)
             reasons = useful.objections()
-            if before.holder is not None and (even_if_worse or not reasons):
+            if served.candidate is not None and (even_if_worse or not reasons):
                 try:
                     new = Candidate(NEW, run.config, scenes.digests, artifact, root)
                     comparison = compare(
-                        *(new, before.holder, root), limit=limit, examples=3, say=say
+                        *(new, served.candidate, root), limit=limit, examples=3, say=say
                     )
                     show(comparison, console)
                     reasons += losses(comparison, margin)
@@ -416,17 +415,17 @@ def _promote(
         artifact = publish_run(
             *(run, scenes, store, version),
             judge=judged,
-            accept=_accept if even_if_worse else None,
+            accept=_print_accepted if even_if_worse else None,
             progress=status.update,
         )
-    if before.note:
-        console.print(before.note, soft_wrap=True)
-    _published(artifact)
+    if served.note:
+        console.print(served.note, soft_wrap=True)
+    _print_published(artifact)
     # `expected` makes the change fail if another process changed the alias during the comparison.
     target = AliasTarget(name=artifact.manifest.name, version=version)
-    store.set_alias(alias, target, expected=before.target)
-    was = f", before {before.target}" if before.target is not None else ""
-    console.print(f"promoted: {alias} → {target}{was}", soft_wrap=True)
+    store.set_alias(alias, target, expected=served.target)
+    change = f", before {served.target}" if served.target is not None else ""
+    console.print(f"promoted: {alias} → {target}{change}", soft_wrap=True)
 
 
 def _show(tables: dict[str, list[Metric]]) -> None:

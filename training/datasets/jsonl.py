@@ -63,7 +63,7 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
             continue
         where = f"line {number}"
         try:
-            scene = _scene(json.loads(line, parse_int=bounded_int), f"{path.name}:{number}")
+            scene = _parse_scene(json.loads(line, parse_int=bounded_int), f"{path.name}:{number}")
             first = line_of.setdefault((scene.source, scene.scene_id), number)
             if first != number:
                 raise ValueError(f"scene {scene.scene_id!r} is on line {first} already")
@@ -80,17 +80,17 @@ def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
     opener = gzip.open if path.suffix == ".gz" else open
     with opener(path, "wt", encoding="utf-8") as file:
         for scene in scenes:
-            file.write(json.dumps(_values(scene), ensure_ascii=False) + "\n")
+            file.write(json.dumps(_fields_of(scene), ensure_ascii=False) + "\n")
 
 
-def _values(scene: AnnotatedScene) -> dict[str, Any]:
+def _fields_of(scene: AnnotatedScene) -> dict[str, Any]:
+    """Return the fields of a scene as JSON values. Fields with an unknown value are left out."""
     ids = [thing.id for thing in scene.objects]
 
     def with_ids(relations: Iterable[tuple[int, str, int]]) -> list[list[str]]:
         return [[ids[s], r, ids[o]] for s, r, o in relations]
 
     values = {name: getattr(scene, name) for name in ("scene_id", "source", "group", "room_type")}
-    # Fields with an unknown value are left out.
     values["objects"] = [
         {name: x for name, x in asdict(thing).items() if x is not None and name != "count"}
         for thing in scene.objects
@@ -103,26 +103,26 @@ def _values(scene: AnnotatedScene) -> dict[str, Any]:
     return values | ({"viewer_frame": True} if scene.viewer_frame else {})
 
 
-def _scene(values: Any, default_id: str) -> AnnotatedScene:
+def _parse_scene(values: Any, default_id: str) -> AnnotatedScene:
     _check_fields("a scene", values, {"objects"}, _SCENE_FIELDS)
-    scene_id = _text("scene_id", values.get("scene_id", default_id))
-    source = _text("source", values.get("source", "jsonl"))
+    scene_id = _require_text("scene_id", values.get("scene_id", default_id))
+    source = _require_text("source", values.get("source", "jsonl"))
     if not isinstance(values["objects"], list):
         raise ValueError("objects must be a list")
-    objects = _with_counts(_objects(values["objects"]), values.get("counts"))
+    objects = _with_counts(_parse_objects(values["objects"]), values.get("counts"))
     viewer_frame = values.get("viewer_frame", source in _VIEWER_SOURCES)
     if not isinstance(viewer_frame, bool):
         raise ValueError(f"viewer_frame must be true or false, not {viewer_frame!r}")
     room_type = values.get("room_type")
     relations, false_relations = (
-        _relations(name, values.get(name), source, objects)
+        _parse_relations(name, values.get(name), source, objects)
         for name in ("relations", "false_relations")
     )
     return AnnotatedScene(
         scene_id=scene_id,
         source=source,
-        group=_text("group", values.get("group", scene_id)),
-        room_type=None if room_type is None else _text("room_type", room_type),
+        group=_require_text("group", values.get("group", scene_id)),
+        room_type=None if room_type is None else _require_text("room_type", room_type),
         objects=objects,
         relations=relations,
         viewer_frame=viewer_frame,
@@ -147,12 +147,12 @@ def _with_counts(objects: tuple[AnnotatedObject, ...], counts: Any) -> tuple[Ann
     return tuple(replace(thing, count=counts.get(thing.label, 1)) for thing in objects)
 
 
-def _objects(entries: list[Any]) -> tuple[AnnotatedObject, ...]:
+def _parse_objects(entries: list[Any]) -> tuple[AnnotatedObject, ...]:
     things = [{"label": entry} if isinstance(entry, str) else entry for entry in entries]
     for thing in things:
         _check_fields("an object", thing, {"label"}, _OBJECT_FIELDS)
-    nameless = Counter(_text("label", t["label"]) for t in things if t.get("id") is None)
-    taken = {_id(thing["id"]) for thing in things if thing.get("id") is not None}
+    nameless = Counter(_require_text("label", t["label"]) for t in things if t.get("id") is None)
+    taken = {_require_id(thing["id"]) for thing in things if thing.get("id") is not None}
     objects = []
     for thing in things:
         name, number = thing.get("id"), 0
@@ -162,29 +162,29 @@ def _objects(entries: list[Any]) -> tuple[AnnotatedObject, ...]:
                 number += 1
                 name = f"{label}_{number}"
             taken.add(name)
-        objects.append(_object(thing, _id(name)))
+        objects.append(_parse_object(thing, _require_id(name)))
     return tuple(objects)
 
 
-def _object(values: Mapping[str, Any], name: str) -> AnnotatedObject:
+def _parse_object(values: Mapping[str, Any], name: str) -> AnnotatedObject:
     supported_by = values.get("supported_by")
     yaw = values.get("yaw", 0.0)
     if not _is_number(yaw):
         raise ValueError(f"yaw must be a number, not {yaw!r}")
-    size = _vector("size", values.get("size"))
+    size = _parse_vector("size", values.get("size"))
     return AnnotatedObject(
         id=name,
-        label=_text("label", values["label"]),
-        position=_vector("position", values.get("position")),
+        label=_require_text("label", values["label"]),
+        position=_parse_vector("position", values.get("position")),
         # Sides that are all below 1 mm mean an unknown size, as in a request.
         size=None if size and all(abs(side) < SMALLEST for side in size) else size,
         yaw=float(yaw),
-        supported_by=None if supported_by is None else _id(supported_by),
-        box2d=_numbers("box2d", values.get("box2d"), 4),
+        supported_by=None if supported_by is None else _require_id(supported_by),
+        box2d=_parse_numbers("box2d", values.get("box2d"), 4),
     )
 
 
-def _relations(
+def _parse_relations(
     name: str, values: Any, source: str, objects: tuple[AnnotatedObject, ...]
 ) -> tuple[tuple[int, str, int], ...] | None:
     if values is None:
@@ -203,10 +203,10 @@ def _relations(
                 "a relation is a list [subject, relation, object] or an object with these fields, "
                 f"not {entry!r}"
             )
-        subject, anchor = index_of.get(_id(entry[0])), index_of.get(_id(entry[2]))
+        subject, anchor = index_of.get(_require_id(entry[0])), index_of.get(_require_id(entry[2]))
         if subject is None or anchor is None:
             raise ValueError(f"relation {entry!r} names an object that is not in the scene")
-        relation = relation_of(source, _text("predicate", entry[1]))
+        relation = relation_of(source, _require_text("predicate", entry[1]))
         # Some image annotators relate an object to itself. Such relations are skipped.
         if relation is not None and subject != anchor:
             relations[subject, relation, anchor] = None
@@ -222,13 +222,13 @@ def _check_fields(what: str, values: Any, needed: set[str], allowed: set[str]) -
         raise ValueError(f"{what} has unknown fields: {', '.join(unknown)}")
 
 
-def _text(name: str, value: Any) -> str:
+def _require_text(name: str, value: Any) -> str:
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"{name} must be a non-empty string, not {value!r}")
     return value
 
 
-def _id(value: Any) -> str:
+def _require_id(value: Any) -> str:
     if isinstance(value, bool) or not isinstance(value, (str, int)):
         raise ValueError(f"an id must be a string or an integer, not {value!r}")
     return str(value)
@@ -238,13 +238,13 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _vector(name: str, values: Any) -> Any:
+def _parse_vector(name: str, values: Any) -> Any:
     if isinstance(values, dict) and set(values) == {"x", "y", "z"}:
         values = [values[axis] for axis in "xyz"]
-    return _numbers(name, values, 3)
+    return _parse_numbers(name, values, 3)
 
 
-def _numbers(name: str, values: Any, length: int) -> Any:
+def _parse_numbers(name: str, values: Any, length: int) -> Any:
     if values is None:
         return None
     if not isinstance(values, list) or len(values) != length or not all(map(_is_number, values)):

@@ -69,14 +69,14 @@ def _relations(
 ) -> tuple[tuple[int, str, int], ...]:
     index_of = {key: index for index, key in enumerate(ids)}
     relations: dict[tuple[int, str, int], None] = {}
-    for here, entry in _entries(path, where, scan, "relationships"):
+    for place, entry in _entries(path, where, scan, "relationships"):
         if not isinstance(entry, list) or len(entry) != 4 or not isinstance(entry[3], str):
             raise DatasetError(
-                path, here, f"must be [subject, object, predicate id, predicate], not {entry!r}"
+                path, place, f"must be [subject, object, predicate id, predicate], not {entry!r}"
             )
         subject, anchor = index_of.get(str(entry[0])), index_of.get(str(entry[1]))
         if subject is None or anchor is None:
-            raise DatasetError(path, here, f"{entry!r} names an object that is not in the scan")
+            raise DatasetError(path, place, f"{entry!r} names an object that is not in the scan")
         relation = relation_of("3dssg", entry[3])
         if relation is not None and subject != anchor:
             relations[subject, relation, anchor] = None
@@ -87,10 +87,10 @@ def _labels(path: Path) -> dict[str, dict[str, str]]:
     """Read ``objects.json``. Return a mapping from scan id to object id to label."""
     labels: dict[str, dict[str, str]] = {}
     for where, scan in _entries(path, "", load_json(path), "scans"):
-        of_scan = labels.setdefault(take(path, where, scan, "scan", str), {})
-        for here, thing in _entries(path, where, scan, "objects"):
-            key = str(take(path, here, thing, "id", (str, int)))
-            of_scan[key] = take(path, here, thing, "label", str)
+        scan_labels = labels.setdefault(take(path, where, scan, "scan", str), {})
+        for place, thing in _entries(path, where, scan, "objects"):
+            key = str(take(path, place, thing, "id", (str, int)))
+            scan_labels[key] = take(path, place, thing, "label", str)
     return labels
 
 
@@ -104,8 +104,8 @@ def _rooms(path: Path) -> dict[str, str]:
         where = f"[{number}]"
         reference = take(path, where, entry, "reference", str)
         rooms[reference] = reference
-        for here, rescan in _entries(path, where, entry, "scans"):
-            rooms[take(path, here, rescan, "reference", str)] = reference
+        for place, rescan in _entries(path, where, entry, "scans"):
+            rooms[take(path, place, rescan, "reference", str)] = reference
     return rooms
 
 

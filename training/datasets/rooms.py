@@ -197,9 +197,7 @@ class _Layout:
             if box.support is None or self.rng.random() >= _GONE
         ]
         positions, yaws = to_viewer_frame(
-            [(box.x, box.y, box.z) for _, box in kept],
-            viewpoint,
-            [box.yaw for _, box in kept],
+            [(box.x, box.y, box.z) for _, box in kept], viewpoint, [box.yaw for _, box in kept]
         )
         poses = zip(kept, positions.tolist(), yaws.tolist(), strict=True)
         objects = tuple(

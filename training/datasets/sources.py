@@ -54,8 +54,8 @@ class Meaning:
     @property
     def unlisted(self) -> tuple[Unlisted, ...]:
         """Meaning of an unlisted relation, for each canonical relation in order."""
-        own = {"on-top": self.on_top, "above": self.above}
-        return tuple(own.get(name, self.lateral) for name in CANONICAL)
+        vertical = {"on-top": self.on_top, "above": self.above}
+        return tuple(vertical.get(name, self.lateral) for name in CANONICAL)
 
 
 LISTS: Final = Meaning()

@@ -115,15 +115,15 @@ def _check_sizes(path: Path) -> None:
 
 def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
     """Yield type and contents of each element."""
-    at = 0
-    while at + 8 <= len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, at)
+    offset = 0
+    while offset + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, offset)
         if kind >> 16:  # the contents are in the tag
-            yield kind & 0xFFFF, data[at + 4 : at + 4 + (kind >> 16)]
-            at += 8
+            yield kind & 0xFFFF, data[offset + 4 : offset + 4 + (kind >> 16)]
+            offset += 8
         else:
-            yield kind, data[at + 8 : at + 8 + size]
-            at += 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
+            yield kind, data[offset + 8 : offset + 8 + size]
+            offset += 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
 
 
 def _entries(body: memoryview, order: str) -> int:
@@ -166,6 +166,7 @@ def _array(path: Path, where: str, struct: Any, name: str, shape: tuple[int, ...
 
 
 def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
+    """Convert a box of the file. Its upright axis is the one with the largest z component."""
     basis = _array(path, where, struct, "basis", (3, 3))
     # Some boxes in the file have negative half extents, so use the absolute values.
     half = np.abs(_array(path, where, struct, "coeffs", (3,)))

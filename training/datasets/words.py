@@ -71,7 +71,7 @@ class WordVectors:
 
     def _row(self, word: str) -> int | None:
         forms = (word, word.removesuffix("s"), word.removesuffix("es"))
-        return next((row for form in forms if (row := self._rows.get(form)) is not None), None)
+        return next((self._rows[form] for form in forms if form in self._rows), None)
 
     @cached_property
     def _rows(self) -> dict[str, int]:
@@ -87,8 +87,9 @@ def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, 
     vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
     has_vector = np.zeros(len(vocabulary), dtype=np.bool_)
     for index, entry in enumerate(vocabulary.objects):
-        named = map(words.of, (entry.label, *entry.aliases))
-        if (vector := next((one for one in named if one is not None), None)) is not None:
+        candidates = map(words.of, (entry.label, *entry.aliases))
+        vector = next((vector for vector in candidates if vector is not None), None)
+        if vector is not None:
             vectors[index], has_vector[index] = vector, True
     return vectors, has_vector
 

@@ -133,6 +133,8 @@ def find(reference: str, store: Store, data: Path | None, say: Progress) -> Cand
 
 
 def _baselines(data: TrainingData, say: Progress) -> Model:
+    """Fit the baselines; without annotated relations, only the baseline for objects."""
+
     def fit(baseline: Baseline) -> Model:
         say(f"fitting {baseline.name}")
         return baseline.fit(data.train, data.validation, data.structure, progress=say)
@@ -150,8 +152,6 @@ def _baselines(data: TrainingData, say: Progress) -> Model:
         false_relations=relations,
     )
 
-
-# --------------------------------------------------------------------------------- held-out scenes
 
 Sources = Mapping[str, Sequence[AnnotatedScene]]
 

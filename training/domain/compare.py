@@ -231,9 +231,9 @@ def compare(
         )
     say("reading scenes")
     sources = read_sources(a.config.data, root)
-    held = held_out(a, b, sources, root)
+    test = held_out(a, b, sources, root)
     data = split_and_encode(a.config.data, sources, a.vocabulary).training_data()
-    encoded = encode(held.scenes, a.vocabulary)
+    encoded = encode(test.scenes, a.vocabulary)
     annotated = annotated_classes(encoded, a.vocabulary)
     scenes = some_scenes(scene_tensors(encoded, annotated, len(a.vocabulary)), limit)
     models = (a.model(a.vocabulary, data, say), b.model(a.vocabulary, data, say))
@@ -258,8 +258,8 @@ def compare(
         b=titles[1],
         scenes=len(scenes),
         groups=groups,
-        certain=held.certain,
-        notes=tuple(_notes(a, b, held, limit)),
+        certain=test.certain,
+        notes=tuple(_notes(a, b, test, limit)),
         examples=tuple(changed),
         unmeasured=unmeasured(results.differences, b),
     )
@@ -303,13 +303,13 @@ def unmeasured(rows: Sequence[Difference], other: Candidate) -> tuple[str, ...]:
     return tuple(task for task in RELATIONAL if task in measured)
 
 
-def _notes(a: Candidate, b: Candidate, held: HeldOut, limit: int | None) -> Iterator[str]:
+def _notes(a: Candidate, b: Candidate, test: HeldOut, limit: int | None) -> Iterator[str]:
     """Generate remarks on the results: held-out scenes, unknown classes of the second model."""
-    yield from held.notes
+    yield from test.notes
     ours, theirs = a.vocabulary, b.vocabulary
     if ours is not None and theirs is not None and not same_classes(ours, theirs):
         model_class = Translation.between(ours, theirs).model_class
-        labels = [thing.label for scene in held.scenes for thing in scene.objects]
+        labels = [thing.label for scene in test.scenes for thing in scene.objects]
         mentions = [index for label in labels if (index := ours.index(label)) is not None]
         unknown = sum(int(model_class[index]) < 0 for index in mentions)
         if missing := int((model_class < 0).sum()):
@@ -319,8 +319,8 @@ def _notes(a: Candidate, b: Candidate, held: HeldOut, limit: int | None) -> Iter
                 "objects in the scenes). Objects of these classes are not part of its input, and "
                 "it ranks these classes last"
             )
-    if limit is not None and len(held.scenes) > limit:
-        yield f"only {limit} of {len(held.scenes)} held-out scenes are compared, because of --limit"
+    if limit is not None and len(test.scenes) > limit:
+        yield f"only {limit} of {len(test.scenes)} held-out scenes are compared, because of --limit"
 
 
 def changed_most(

@@ -133,21 +133,21 @@ def measure_usefulness(
 
 
 @dataclass(frozen=True)
-class Seat:
+class ServedModel:
     """An alias of the model store, and the model that it serves now.
 
     Attributes:
         target: model version that the alias names. None if the alias is new.
-        holder: the served model. None if the alias is new or the model cannot be read.
+        candidate: the served model. None if the alias is new or the model cannot be read.
         note: reason why a comparison with the served model is impossible, or "".
     """
 
     target: AliasTarget | None
-    holder: Candidate | None
+    candidate: Candidate | None
     note: str
 
 
-def seat(store: Store, alias: str) -> Seat:
+def served_model(store: Store, alias: str) -> ServedModel:
     """Look up an alias in the store and load the model that it serves.
 
     Raises:
@@ -155,12 +155,12 @@ def seat(store: Store, alias: str) -> Seat:
     """
     target = store.aliases().get(alias)
     if target is None:
-        return Seat(None, None, f"{alias} is a new alias, so there is no older version")
+        return ServedModel(None, None, f"{alias} is a new alias, so there is no older version")
     try:
-        return Seat(target, stored_candidate(alias, store), "")
+        return ServedModel(target, stored_candidate(alias, store), "")
     except (ArtifactError, StoreError) as error:
         note = f"no comparison: the model served as {alias} cannot be read ({error})"
-        return Seat(target, None, note)
+        return ServedModel(target, None, note)
 
 
 def losses(comparison: Comparison, margin: float) -> list[str]:

@@ -105,11 +105,7 @@ class Proposal:
 
 
 def propose(
-    name: str,
-    scenes: Sequence[AnnotatedScene],
-    sources: Sequence[str],
-    *,
-    terms: str = "",
+    name: str, scenes: Sequence[AnnotatedScene], sources: Sequence[str], *, terms: str = ""
 ) -> Proposal:
     """Analyse the scenes, and propose a vocabulary and a configuration.
 
@@ -120,9 +116,9 @@ def propose(
     names = curated_names()
     facts = look(scenes, names)
     labels = count_labels(scenes, names)
-    pairs = lookalikes(labels, scenes, names)
-    minimum, covered = _choose_minimum(scenes, pairs)
-    vocabulary = _use_frequent_names(_vocabulary(scenes, pairs, minimum), scenes)
+    similar = lookalikes(labels, scenes, names)
+    minimum, covered = _choose_minimum(scenes, similar)
+    vocabulary = _use_frequent_names(_vocabulary(scenes, similar, minimum), scenes)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
@@ -156,7 +152,7 @@ def propose(
         name=name,
         facts=facts,
         labels=tuple(labels),
-        lookalikes=tuple(pairs),
+        lookalikes=tuple(similar),
         minimum=minimum,
         covered=covered,
         vocabulary=vocabulary,
@@ -292,6 +288,7 @@ def _is_informative(scenes: Sequence[AnnotatedScene]) -> bool:
 
 
 def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the sections of the configuration, and the reasons for some of their entries."""
     n = parts["train"]
     related = facts.related
     H1 = _interpolate(n, (200, 50), (2000, 200))

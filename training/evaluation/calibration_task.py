@@ -42,12 +42,7 @@ from training.datasets.cases import (
     scene_of,
     scene_rng,
 )
-from training.evaluation.asking import (
-    canonical_triple,
-    index_of_ids,
-    labels_alone,
-    with_intruder,
-)
+from training.evaluation.asking import canonical_triple, index_of_ids, labels_alone, with_intruder
 from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.metrics import Items, Metric
 from training.evaluation.missing_tasks import SHARES, shown_classes

@@ -22,14 +22,15 @@ def count_contradictions(holds: Tensor) -> Tensor:
         holds: (scenes, relations, classes, classes), above 0 for relations that hold.
     """
     n = holds.shape[-1]
-    on = (holds > 0) & ~torch.eye(n, dtype=torch.bool)
+    edges = (holds > 0) & ~torch.eye(n, dtype=torch.bool)
     upper = torch.ones(n, n, dtype=torch.bool).triu(1)
-    both, either = on & on.mT & upper, (on | on.mT) & upper
-    stacks = torch.zeros(len(holds), 1, 1, dtype=torch.bool)
+    mirrored, related = edges & edges.mT & upper, (edges | edges.mT) & upper
+    on_top = torch.zeros(len(holds), 1, 1, dtype=torch.bool)
     if holds.shape[1] > _ON_TOP and n:
-        stacks = on[:, _ON_TOP]
-    cyclic = transitive_closure(stacks).diagonal(dim1=-2, dim2=-1).any(1)
-    counts = both.flatten(1).sum(1), either.flatten(1).sum(1), cyclic, stacks.flatten(1).any(1)
+        on_top = edges[:, _ON_TOP]
+    is_cyclic = transitive_closure(on_top).diagonal(dim1=-2, dim2=-1).any(1)
+    has_on_top = on_top.flatten(1).any(1)
+    counts = mirrored.flatten(1).sum(1), related.flatten(1).sum(1), is_cyclic, has_on_top
     return torch.stack([count.long() for count in counts], 1)
 
 
@@ -43,11 +44,11 @@ def contradiction_metrics(counts: Tensor) -> dict[str, Metric]:
     return {name: Ratio(part, whole) for name, (part, whole) in shares.items() if whole.any()}
 
 
-def transitive_closure(given: Tensor) -> Tensor:
+def transitive_closure(pairs: Tensor) -> Tensor:
     """Return all pairs that a chain of given pairs connects, (..., n, n) bool."""
-    reach = given.float()
+    reach = pairs.float()
     while True:
-        further = ((reach + reach @ reach) > 0).float()
-        if torch.equal(further, reach):
+        longer = ((reach + reach @ reach) > 0).float()
+        if torch.equal(longer, reach):
             return reach > 0
-        reach = further
+        reach = longer

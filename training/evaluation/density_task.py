@@ -71,7 +71,7 @@ class DensitySettings:
 
 def independent_density(train: SceneTensors) -> ObjectDensity:
     """Return the density of independent classes at their smoothed training frequencies."""
-    logits = _log_odds(train)
+    logits = _class_log_odds(train)
 
     def log_p(v: Tensor) -> Tensor:
         return torch.where(v > 0, logsigmoid(logits), logsigmoid(-logits)).sum(1)
@@ -90,7 +90,7 @@ def ising_density(
     model = Ising(b.double().numpy(), W.double().numpy())
     generator = torch.Generator().manual_seed(seed)
     start = torch.randint(len(train), (settings.chains,), generator=generator)
-    base = _log_odds(train).double().numpy()
+    base = _class_log_odds(train).double().numpy()
     below, above = model.log_partition(
         base, train.v[start], settings.betas(), settings.burn_in, seed
     )
@@ -152,7 +152,7 @@ def log_partition(
     """Run forward and reverse AIS for a machine without relation units."""
     generator = torch.Generator().manual_seed(seed)
     betas = settings.betas()
-    base = independent_base(machine, _log_odds(train))
+    base = independent_base(machine, _class_log_odds(train))
     below = ais(machine, betas, settings.chains, generator, base)
     start = torch.randint(len(train), (settings.chains,), generator=generator)
     state = initial_state(machine, train.v[start], generator)
@@ -178,7 +178,7 @@ def _log_unnormalised(machine: BoltzmannMachine, v: Tensor, draws: int) -> Tenso
     return (log_joint - log_q).logsumexp(0) - float(np.log(draws))
 
 
-def _log_odds(train: SceneTensors) -> Tensor:
+def _class_log_odds(train: SceneTensors) -> Tensor:
     return log_odds_of(train.v.sum(0), torch.tensor(float(len(train))))
 
 
@@ -200,9 +200,6 @@ def density_task(model: Model, setting: Setting) -> Outcome | None:
     }
     notes = {"log Z, upper": density.upper, "log Z, lower": density.lower} | density.notes
     return Outcome(metrics, len(scenes), 0, notes)
-
-
-# ------------------------------------------------------------------------------ the pairwise model
 
 
 @dataclass(frozen=True, eq=False)

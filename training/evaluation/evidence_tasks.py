@@ -109,10 +109,7 @@ def removals(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -
 
 
 def intrusions(
-    artifact: Artifact,
-    scenes: SceneTensors,
-    intruders: Ints,
-    kind: str,
+    artifact: Artifact, scenes: SceneTensors, intruders: Ints, kind: str
 ) -> Iterator[Case]:
     """Generate the T3 questions: each scene with its intruder, (scenes,); -1 skips the scene."""
     for index, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):

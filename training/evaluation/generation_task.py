@@ -240,7 +240,7 @@ def generation_metrics(
     drawn: Drawn,
     held_out: Tensor,
     train: Tensor,
-    used: Tensor,
+    mask: Tensor,
     bandwidth: float,
     emphasis: Tensor | None = None,
 ) -> dict[str, Metric]:
@@ -248,11 +248,11 @@ def generation_metrics(
 
     Args:
         drawn: at least two generated scenes.
-        used: (classes,) bool, the classes that the metrics use.
+        mask: (classes,) bool, the classes that the metrics use.
         bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
         emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
     """
-    x, y, training = drawn.v[:, used], held_out[:, used], train[:, used]
+    x, y, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
     ours, theirs = x.double().numpy(), y.double().numpy()
     base = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
 
@@ -287,17 +287,17 @@ def generation_task(model: Model, setting: Setting) -> Outcome | None:
     if sampler is None or setting.train is None:
         return None
     first, second = held_out_halves(setting)
-    used = first.annotated_classes[first.source].any(0) & ~setting.structure
-    mentions = ((second.v > 0) & used).nonzero()
-    if min(len(first), len(second), len(mentions)) < 2 or not first.v[:, used].any():
+    mask = first.annotated_classes[first.source].any(0) & ~setting.structure
+    mentions = ((second.v > 0) & mask).nonzero()
+    if min(len(first), len(second), len(mentions)) < 2 or not first.v[:, mask].any():
         return None
-    bandwidth = median_distance(first.v[:, used])
+    bandwidth = median_distance(first.v[:, mask])
     no_classes = torch.zeros_like(second.v, dtype=torch.bool)
     no_rooms = torch.full_like(second.room, -1)
     order = np.random.default_rng(setting.seed).permutation(len(mentions))[: len(second)]
     classes = mentions[torch.from_numpy(order), 1]
     one_class = no_classes[: len(classes)].scatter(1, classes.unsqueeze(1), True)
-    class_counts = first.v[:, used].sum(1)
+    class_counts = first.v[:, mask].sum(1)
     conditions = {
         "free": (no_classes, no_rooms, None),
         "given room types": (no_classes, second.room, None),
@@ -306,7 +306,7 @@ def generation_task(model: Model, setting: Setting) -> Outcome | None:
     metrics: dict[str, Metric] = {}
     for name, (given, room, emphasis) in conditions.items():
         drawn = sampler(given, room, setting.seed)
-        values = generation_metrics(drawn, first.v, setting.train.v, used, bandwidth, emphasis)
+        values = generation_metrics(drawn, first.v, setting.train.v, mask, bandwidth, emphasis)
         metrics |= {f"{metric}, {name}": value for metric, value in values.items()}
     notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
     return Outcome(metrics, len(first), 0, notes)

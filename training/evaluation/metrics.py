@@ -93,11 +93,7 @@ class Metric(ABC):
 
 
 def paired_difference(
-    a: Metric,
-    b: Metric,
-    *,
-    groups: Sequence[str] | None = None,
-    resamples: int = RESAMPLES,
+    a: Metric, b: Metric, *, groups: Sequence[str] | None = None, resamples: int = RESAMPLES
 ) -> Figure:
     """Return a minus b on the same scenes, with the interval of the difference.
 

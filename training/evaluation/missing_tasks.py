@@ -156,9 +156,6 @@ def leave_one_out(
     return Ranking.of(row, target, values, len(scenes), int((~is_usable).sum()))
 
 
-# ------------------------------------------------------------------------------------- T2 partial
-
-
 @dataclass(frozen=True, eq=False)
 class Partial:
     """N scenes with their index in the set (N,), shown and hidden classes (N, V)."""
@@ -227,9 +224,6 @@ def partial_score(artifact: Artifact, coverage: float | None = None) -> ObjectSc
         return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
 
     return score
-
-
-# ------------------------------------------------------------------------------------------ T2-at
 
 
 def removed_places(

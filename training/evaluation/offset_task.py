@@ -42,25 +42,25 @@ def offsets_task(model: Model, setting: Setting) -> Outcome | None:
     if model.artifact is None or (offsets := model.artifact.offsets) is None:
         return None
     scenes = setting.scenes.scenes
-    every = observed_offsets(scenes)
-    has_statistics = offsets.relation_scenes[every.relation] > 0
+    all_offsets = observed_offsets(scenes)
+    has_statistics = offsets.relation_scenes[all_offsets.relation] > 0
     if not has_statistics.any():
         return None
-    seen = every.rows(has_statistics)
-    values, _ = offsets.find(seen.relation, seen.subject, seen.other)
-    away = seen.offset - values[:, :3]
-    squares = np.square(away / values[:, 3:])
+    observed = all_offsets.rows(has_statistics)
+    values, _ = offsets.find(observed.relation, observed.subject, observed.other)
+    deviation = observed.offset - values[:, :3]
+    squares = np.square(deviation / values[:, 3:])
     metrics: dict[str, Metric] = {}
     for a, name in enumerate(CANONICAL):
-        related = seen.relation == a
+        in_relation = observed.relation == a
         for region, axes in _REGIONS.items():
-            inside = squares[related, :axes].sum(axis=1) <= chi2.ppf(SHARE, axes)
-            if related.any():
+            is_inside = squares[in_relation, :axes].sum(axis=1) <= chi2.ppf(SHARE, axes)
+            if in_relation.any():
                 metrics[f"in {region}, {name}"] = Ratio.of_items(
-                    seen.scene[related], inside.astype(np.float64), len(scenes)
+                    observed.scene[in_relation], is_inside.astype(np.float64), len(scenes)
                 )
-    alone = seen.offset - offsets.relation[seen.relation, :3]
-    for name, vectors in (("distance (m)", away), ("distance (m), relation alone", alone)):
+    residual = observed.offset - offsets.relation[observed.relation, :3]
+    for name, vectors in (("distance (m)", deviation), ("distance (m), relation alone", residual)):
         distance = np.linalg.norm(vectors, axis=1)
-        metrics[name] = Ratio.of_items(seen.scene, distance, len(scenes))
-    return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(seen.scene)))
+        metrics[name] = Ratio.of_items(observed.scene, distance, len(scenes))
+    return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(observed.scene)))

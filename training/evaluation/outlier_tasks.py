@@ -114,11 +114,7 @@ def alarm_threshold(
 
 
 def kept_in_each_source(
-    worst: Floats,
-    group: NDArray[np.str_],
-    source: Ints,
-    rng: Rng,
-    share: float,
+    worst: Floats, group: NDArray[np.str_], source: Ints, rng: Rng, share: float
 ) -> float:
     """Return the threshold that keeps the share of alarms within every source.
 

@@ -221,9 +221,6 @@ def expected_hits(score: Floats, truth: Flags, count: int) -> float:
     return float(truth[is_above].sum() + share * truth[is_tied].sum())
 
 
-# -------------------------------------------------------------------------------------------- T3b
-
-
 def alter(holds: Flags, usable: Flags, rng: Rng) -> tuple[Triple, Triple] | None:
     """Draw a triple of a scene and a false replacement; return (true, false) or None."""
     triples = np.argwhere(holds & usable)

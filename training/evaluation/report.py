@@ -266,9 +266,6 @@ def _from_dict(values: dict[str, Any] | None) -> Outcome | None:
     )
 
 
-# ------------------------------------------------------------------------------ metrics as JSON
-
-
 def pool(parts: Sequence[Metric]) -> Metric | None:
     """Pool a metric over the scenes of all parts. Return None for a metric of a whole set.
 

@@ -147,9 +147,7 @@ TASKS: dict[str, Task] = {
     ),
     "T3 sensitivity": _carded("intruder, by sensitivity", sensitivity_task, _BY_SENSITIVITY),
     "T3 with evidence": _carded(
-        "intruder, with more evidence",
-        outliers_evidence_task,
-        _each(("change of hit@1",), KINDS),
+        "intruder, with more evidence", outliers_evidence_task, _each(("change of hit@1",), KINDS)
     ),
     "T3b placement": _carded("false relation", placement_task, ("hit@1",), of_objects=False),
     "T4 generate": _objects(

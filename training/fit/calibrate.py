@@ -160,19 +160,20 @@ def fit_placements(
     sources = sorted({encoded.source for encoded in scenes})
     blocks: list[Floats] = []
     for number, encoded in enumerate([*scenes] * _PLACEMENT_CASES):
-        removed = removed_class(encoded, structure, rng)
-        if removed is None:
+        removal = removed_class(encoded, structure, rng)
+        if removal is None:
             continue
-        target, kept = removed
+        target, kept = removal
         instance = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
         posterior = posterior_of(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
         present = posterior.present
         anchors = np.flatnonzero(~structure[present.classes])
         tables = posterior.placement_log_odds(np.array([target]), anchors)
-        others = np.array(kept)[present.first[anchors]]
-        own = np.full_like(others, instance)
+        anchor_index = np.array(kept)[present.first[anchors]]
+        removed_index = np.full_like(anchor_index, instance)
         holds, annotated = encoded.instance_holds, annotated_relations(encoded)
-        for values, ends in zip(tables, ((own, others), (others, own)), strict=True):
+        directions = (removed_index, anchor_index), (anchor_index, removed_index)
+        for values, ends in zip(tables, directions, strict=True):
             truth = np.where(annotated[:, *ends], holds[:, *ends], _UNKNOWN)
             a, anchor = map(np.ravel, np.indices(truth.shape))
             count, size = np.log(present.counts[anchors])[anchor], np.log(len(present.classes) + 1)
@@ -303,6 +304,7 @@ def _is_listed(examples: Floats, slopes: tuple[PairSlope, ...], listed: int) -> 
 
 
 def _fit_by_relation(examples: Floats, relations: int, weight: Floats) -> tuple[PairSlope, ...]:
+    """Fit one slope for each relation; a relation with one truth value keeps its log-odds."""
     fitted = []
     for a in range(relations):
         rows = examples[:, _RELATION] == a

@@ -174,9 +174,6 @@ def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
     return tuple(limits)
 
 
-# ------------------------------------------------------------------------------ unlisted classes
-
-
 @dataclass(frozen=True, eq=False)
 class _PartialList:
     """A scene that lists only some of its classes. The remaining classes are hidden.
@@ -317,9 +314,6 @@ def _example_rows(case: _PartialList, coverage: float, weight: float) -> Floats:
     return np.stack([z[first], size, case.hidden[first]], 1)
 
 
-# ------------------------------------------------------------------------------------- intruders
-
-
 def fit_outliers(
     artifact: Artifact,
     scenes: SceneTensors,
@@ -458,9 +452,6 @@ def _detection(scores: IntruderScores) -> Floats:
     limit = np.quantile(worst[np.isfinite(worst)], ALARMS["medium"])
     detected = (scores.log_odds[scores.intruder] <= limit).mean()
     return np.array([scores.hit_at_1().figure().value, detected])
-
-
-# -------------------------------------------------------------------------------------- evidence
 
 
 def fit_evidence(

@@ -96,6 +96,7 @@ class Pairs(NamedTuple):
 
 
 def _pool_pairs(observed: ObservedOffsets) -> Pairs:
+    """Compute the moments of each pair of classes. Its offsets in a scene share the weight 1."""
     classes = np.stack([observed.subject, observed.other], axis=1)
     distinct, pair = np.unique(classes, axis=0, return_inverse=True)
     pair = pair.reshape(-1)

@@ -82,15 +82,15 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
 def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
     """Set the relation biases to the log-odds of relations in scenes with annotated relations."""
     A, V, T = machine.spec.A, machine.spec.V, machine.spec.T
-    true, known, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
+    holding, observed, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
     logs, times, annotated = torch.zeros(V), torch.zeros(V), 0
     for scene in scenes.scenes:
         evidence = scene.evidence
         if not evidence.observed.any():
             continue
         annotated += 1
-        true += torch.from_numpy(evidence.holds.sum((1, 2)))
-        known += torch.from_numpy(evidence.observed.sum((1, 2)))
+        holding += torch.from_numpy(evidence.holds.sum((1, 2)))
+        observed += torch.from_numpy(evidence.observed.sum((1, 2)))
         classes = torch.from_numpy(evidence.classes)
         relation, subject, object_ = torch.from_numpy(evidence.holds).nonzero(as_tuple=True)
         keys = triple_keys(relation, classes[subject], classes[object_], V)
@@ -99,7 +99,7 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
         logs[classes] += torch.from_numpy(evidence.counts).log()
         times[classes] += 1
     machine.start_relations(
-        log_odds_of(true, known),
+        log_odds_of(holding, observed),
         log_odds_of(per_unit, torch.full_like(per_unit, annotated)),
         logs / times.clamp(min=1),
     )
@@ -168,6 +168,7 @@ class Trainer:
         return machine
 
     def _new_optimiser(self) -> torch.optim.Optimizer:
+        """Return an optimiser; biases have no decay, and weights of relations their own rate."""
         t = self.config.training
         groups: tuple[list[Tensor], list[Tensor], list[Tensor]] = ([], [], [])
         matrices, biases, relations = groups
@@ -204,8 +205,6 @@ class Trainer:
             return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(total - rise, 1))))
 
         return torch.optim.lr_scheduler.LambdaLR(self.optimiser, factor)
-
-    # -- the run --------------------------------------------------------------------------------
 
     def resume(self) -> bool:
         """Load the checkpoint in the folder of the run. Return False if there is no checkpoint.
@@ -302,6 +301,7 @@ class Trainer:
         self._close_epoch(number, loss, began)
 
     def _update(self, index: Tensor) -> float:
+        """Update the weights and their average on a batch. Return the loss of this process."""
         width = max(len(self.train.scenes[k].evidence.classes) for k in index.tolist())
         batch = self.train.batch(distributed.share(index), width).to(self.device)
         with self._on_device():
@@ -367,6 +367,7 @@ class Trainer:
         return (float(ranking.hits.sum() / max(ranking.annotated.sum(), 1)),)
 
     def _save(self) -> None:
+        """Write the checkpoint and the curve; all processes must call, as chains are gathered."""
         if self.folder is None:
             return
         objective = self.objective.state()

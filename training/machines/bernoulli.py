@@ -47,24 +47,24 @@ def uniform(
 ) -> Tensor:
     """Return uniform draws from [0, 1) for the rows of this process."""
     first, rows = own_rows(shape[0], generator)
-    drawn = torch.rand((rows, *shape[1:]), generator=generator, dtype=dtype, device="cpu")
-    return drawn[first : first + shape[0]].to(torch.get_default_device())
+    values = torch.rand((rows, *shape[1:]), generator=generator, dtype=dtype, device="cpu")
+    return values[first : first + shape[0]].to(torch.get_default_device())
 
 
 def integers(limit: int, shape: Sequence[int], generator: torch.Generator | None) -> Tensor:
     """Return uniform draws from 0 .. limit - 1 for the rows of this process."""
     first, rows = own_rows(shape[0], generator)
-    drawn = torch.randint(limit, (rows, *shape[1:]), generator=generator, device="cpu")
-    return drawn[first : first + shape[0]].to(torch.get_default_device())
+    values = torch.randint(limit, (rows, *shape[1:]), generator=generator, device="cpu")
+    return values[first : first + shape[0]].to(torch.get_default_device())
 
 
 def categorical(weight: Tensor, generator: torch.Generator | None) -> Tensor:
     """Return a column for each row (B,), drawn in proportion to the weights (B, n)."""
     first, rows = own_rows(len(weight), generator)
-    every = torch.ones(rows, weight.shape[1], dtype=weight.dtype, device="cpu")
-    every[first : first + len(weight)] = weight.cpu()
-    drawn = torch.multinomial(every, 1, generator=generator).squeeze(1)
-    return drawn[first : first + len(weight)].to(weight.device)
+    weights = torch.ones(rows, weight.shape[1], dtype=weight.dtype, device="cpu")
+    weights[first : first + len(weight)] = weight.cpu()
+    columns = torch.multinomial(weights, 1, generator=generator).squeeze(1)
+    return columns[first : first + len(weight)].to(weight.device)
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:

@@ -88,27 +88,27 @@ class ChainSamples:
         """
         machine = self.machine
         if not machine.spec.N:
-            return _held(initial_state(machine, observed, generator, clamp), clamp)
+            return _apply_clamp(initial_state(machine, observed, generator, clamp), clamp)
         weight = self.log_weight(observed, clamp)
-        chosen = torch.multinomial(weight.softmax(1), 1, generator=generator).squeeze(1)
-        h1, h2 = bernoulli(self.h1[chosen], generator), bernoulli(self.h2[chosen], generator)
-        return _held(bare_state(machine, self.v[chosen].maximum(observed), h1, h2), clamp)
+        index = torch.multinomial(weight.softmax(1), 1, generator=generator).squeeze(1)
+        h1, h2 = bernoulli(self.h1[index], generator), bernoulli(self.h2[index], generator)
+        return _apply_clamp(bare_state(machine, self.v[index].maximum(observed), h1, h2), clamp)
 
     def log_weight(self, observed: Tensor, clamp: Clamp = FREE) -> Tensor:
         """Return the log weight log w of each stored sample for each chain, (chains, samples)."""
         weight = observed @ self._present.T
         if clamp.room is not None and self.machine.spec.C:
             has_room = (clamp.room >= 0).to(observed.dtype).unsqueeze(1)
-            own = self.machine.fantasy_rooms == clamp.room.unsqueeze(1)
+            in_room = self.machine.fantasy_rooms == clamp.room.unsqueeze(1)
             hint = self._room.T[clamp.room.clamp(min=0)]
-            hint = torch.where(own.any(1, keepdim=True), -float(OTHER_ROOM) * ~own, hint)
+            hint = torch.where(in_room.any(1, keepdim=True), -float(OTHER_ROOM) * ~in_room, hint)
             weight = weight + has_room * hint
         if clamp.h1 is not None:
             weight = weight + clamp.h1.to(observed.dtype) @ self._unit.T
         return weight
 
 
-def _held(state: State, clamp: Clamp) -> State:
+def _apply_clamp(state: State, clamp: Clamp) -> State:
     """Return the state with the clamped hidden units set to 1."""
     h1 = state.h1 if clamp.h1 is None else torch.where(clamp.h1, 1.0, state.h1)
     h2 = state.h2 if clamp.h2 is None else torch.where(clamp.h2, 1.0, state.h2)

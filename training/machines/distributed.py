@@ -73,9 +73,6 @@ def parallel(module: nn.Module) -> nn.Module:
     return DistributedDataParallel(module, forward_sync_buffers=False, find_unused_parameters=True)
 
 
-# -- rows ----------------------------------------------------------------------------------------
-
-
 class SharedGenerator(torch.Generator):
     """A generator with the same state in all processes; each process uses the draws of its rows."""
 
@@ -139,9 +136,6 @@ def mean_part(values: Tensor) -> Tensor:
     if size() == 1:
         return values.mean(0)
     return values.sum(0) / total(torch.tensor(len(values))).clamp(min=1)
-
-
-# -- work ----------------------------------------------------------------------------------------
 
 
 def spread(works: Sequence[Callable[[], T]]) -> list[T]:

@@ -134,8 +134,8 @@ def reconstruct(
     """Run the second half of a `gibbs_step`: given h1, sample h2, v and r."""
     h1, h2 = state.h1, state.h2
     if machine.spec.H2:
-        drawn = bernoulli(machine.second_layer_logits(h1).sigmoid(), generator)
-        h2 = _keep(clamp.h2, h2, drawn)
+        sample = bernoulli(machine.second_layer_logits(h1).sigmoid(), generator)
+        h2 = _keep(clamp.h2, h2, sample)
     v = machine.sample_objects(state, generator, held=clamp.v, collapsed=collapsed)
     v = _keep(clamp.v, state.v, v)
     if not relations:
@@ -233,9 +233,9 @@ def _drawing_order(like: Tensor, generator: torch.Generator) -> Tensor:
     The units of relation a from i to j and from j to i are always in different groups.
     """
     group = integers(_RELATION_GROUPS, like.shape, generator)
-    later = integers(2, like.shape, generator).triu(1)
-    later = later + (1 - later.mT).tril(-1)
-    return group + _RELATION_GROUPS * later
+    is_second = integers(2, like.shape, generator).triu(1)
+    is_second = is_second + (1 - is_second.mT).tril(-1)
+    return group + _RELATION_GROUPS * is_second
 
 
 def _observed_weight(

@@ -86,8 +86,6 @@ class BoltzmannMachine(nn.Module, ABC):
         )
         self.triple_keys = torch.zeros(spec.T, dtype=torch.int64)
 
-    # -- construction ---------------------------------------------------------------------------
-
     def index_triples(self) -> None:
         """Check the table of triples and build its search keys."""
         table = self.triples.long()
@@ -136,8 +134,6 @@ class BoltzmannMachine(nn.Module, ABC):
     def parameter_count(self) -> int:
         """Number of trained weights."""
         return sum(parameter.numel() for parameter in self.parameters())
-
-    # -- what a variant defines -----------------------------------------------------------------
 
     @abstractmethod
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
@@ -284,8 +280,6 @@ class BoltzmannMachine(nn.Module, ABC):
         result is this machine at temperature 1 / beta.
         """
 
-    # -- the relation part ----------------------------------------------------------------------
-
     def relation_term(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
         """Return the term of each unit in log sum_{unobserved r} exp(-E), (..., scenes, units).
 
@@ -304,8 +298,6 @@ class BoltzmannMachine(nn.Module, ABC):
         if not self.relations_act:
             return torch.where(observed, r - mean, 0.0) * gate
         return torch.where(observed, r, mean) * gate
-
-    # -- energies -------------------------------------------------------------------------------
 
     def context_bias(self, room: Tensor | None) -> Tensor:
         """Return the bias c1 + Q[t] of the hidden units, (scenes or 1, hidden units).
@@ -386,8 +378,6 @@ class BoltzmannMachine(nn.Module, ABC):
         if h2 is not None:
             x, free = x + h2 @ self.J.T, free - h2 @ self.c2
         return free - softplus(x).sum(-1)
-
-    # -- conditionals of the other blocks -------------------------------------------------------
 
     def second_layer_logits(self, h1: Tensor) -> Tensor:
         """Return the logits c2 + h1'J of p(h2 = 1 | h1), (..., scenes, units of h2)."""

@@ -87,13 +87,13 @@ def mean_field(
             point without relations.
     """
     if pull < 1 and evidence.observed is not None and evidence.relations(machine) is not None:
-        nothing = torch.zeros_like(evidence.observed)
+        unobserved = torch.zeros_like(evidence.observed)
         without, with_all = (
-            mean_field(machine, one, iterations=iterations, damping=damping)
-            for one in (replace(evidence, observed=nothing), evidence)
+            mean_field(machine, e, iterations=iterations, damping=damping)
+            for e in (replace(evidence, observed=unobserved), evidence)
         )
         pairs = zip(vars(without).values(), vars(with_all).values(), strict=True)
-        return MeanField(*(torch.lerp(one, other, pull) for one, other in pairs))
+        return MeanField(*(torch.lerp(value, full_value, pull) for value, full_value in pairs))
     base = x = machine.context_bias(evidence.room) + evidence.v @ machine.W
     relations = evidence.relations(machine)
     two_layers = machine.spec.H2 > 0

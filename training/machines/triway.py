@@ -181,10 +181,10 @@ class Triway(BoltzmannMachine):
         """Return 1 for each class with a relation r = 1, else 0, (scenes, classes)."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(r).amax(-3)
-        held = r.new_zeros(len(r), self.spec.V)
-        held.scatter_reduce_(1, pairs.subjects.expand(len(r), -1), grid.amax(-1), "amax")
-        held.scatter_reduce_(1, pairs.objects.expand(len(r), -1), grid.amax(-2), "amax")
-        return held
+        is_held = r.new_zeros(len(r), self.spec.V)
+        is_held.scatter_reduce_(1, pairs.subjects.expand(len(r), -1), grid.amax(-1), "amax")
+        is_held.scatter_reduce_(1, pairs.objects.expand(len(r), -1), grid.amax(-2), "amax")
+        return is_held
 
     def relation_context(self, edges: Edges) -> Tensor:
         pairs = _pairs(edges)
@@ -220,15 +220,15 @@ class Triway(BoltzmannMachine):
         present = v.gather(-1, anchors.expand(*v.shape[:-1], -1)) * valid
         candidates = candidates.expand(len(anchors), -1)
         # Leave out relations of a candidate to its own class. Their units (a,i,i) are added below.
-        other = (anchors.unsqueeze(-2) != candidates.unsqueeze(-1)) * present.unsqueeze(-2)
+        is_other = (anchors.unsqueeze(-2) != candidates.unsqueeze(-1)) * present.unsqueeze(-2)
         A = self.spec.A
         outgoing = pair_edges(candidates, A, objects=anchors, log_objects=logs)
         incoming = pair_edges(anchors, A, objects=candidates, log_subjects=logs)
         forward = outgoing.unflatten(self.relation_logits(outgoing, v, h1))
         backward = incoming.unflatten(self.relation_logits(incoming, v, h1)).mT
         kappa = self.kappa[:, None, None]
-        both = softplus(forward) + softplus(backward) + 2 * kappa
-        total = (both * other.unsqueeze(-3)).sum((-1, -3))
+        terms = softplus(forward) + softplus(backward) + 2 * kappa
+        total = (terms * is_other.unsqueeze(-3)).sum((-1, -3))
         loop = self._loop_logits(candidates, h1)
         return total + (softplus(loop) + self.kappa).sum(-1)
 
@@ -294,13 +294,14 @@ class Triway(BoltzmannMachine):
     def _collapsed_sweep(
         self, v: Tensor, h1: Tensor, held: Tensor | None, generator: torch.Generator
     ) -> Tensor:
+        """Sample each class in turn given the others, with the relations summed out."""
         logits = self.object_logits(h1)
         for i in range(self.spec.V):
             gain = self.attraction_to_all(v, h1, torch.tensor([[i]]))[:, 0]
-            drawn = bernoulli((logits[:, i] + gain).sigmoid(), generator)
+            sample = bernoulli((logits[:, i] + gain).sigmoid(), generator)
             if held is not None:
-                drawn = torch.where(held.expand_as(v)[:, i], v[:, i], drawn)
-            v[:, i] = drawn
+                sample = torch.where(held.expand_as(v)[:, i], v[:, i], sample)
+            v[:, i] = sample
         return v
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
@@ -356,17 +357,17 @@ def implication_features(observed: Tensor) -> Tensor:
     """
     n = observed.shape[-1]
     between = observed * ~torch.eye(n, dtype=torch.bool, device=observed.device)
-    both = torch.cat([between, between.mT], 1)
-    steps = both.shape[1]
+    directed = torch.cat([between, between.mT], 1)
+    kinds = directed.shape[1]
     # One batched product counts the paths of all relation pairs: (B, 2A·n, n) by (B, n, 2A·n).
-    paths = both.flatten(1, 2) @ both.transpose(1, 2).flatten(2)
+    paths = directed.flatten(1, 2) @ directed.transpose(1, 2).flatten(2)
     paths = (
-        paths.view(len(observed), steps, n, steps, n).transpose(2, 3).flatten(1, 2).clamp(max=1.0)
+        paths.view(len(observed), kinds, n, kinds, n).transpose(2, 3).flatten(1, 2).clamp(max=1.0)
     )
-    outgoing = both.sum(-1, keepdim=True) - both
-    incoming = both.sum(-2, keepdim=True) - both
+    outgoing = directed.sum(-1, keepdim=True) - directed
+    incoming = directed.sum(-2, keepdim=True) - directed
     degrees = torch.cat([outgoing, incoming], 1).clamp(max=_MOST)
-    return torch.cat([both, paths, degrees], 1)
+    return torch.cat([directed, paths, degrees], 1)
 
 
 def implied(

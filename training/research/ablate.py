@@ -92,7 +92,7 @@ def ablate(
         console.print(f"[red]error:[/red] {configs[0].name}: {failures[configs[0].name]}")
         raise typer.Exit(1)
     with console.status("resampling scenes"):
-        reports: Reports = {row: _with_pools(own) for row, own in measured.items()}
+        reports: Reports = {row: _with_pools(by_source) for row, by_source in measured.items()}
         weights, seconds = _costs(plan, entries)
         results = summarise(reports, configs[0].name, weights)
     parts = [
@@ -130,8 +130,8 @@ def _configs(
     }
     if unknown := sorted(set(names or ()) - set(rows)):
         raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(rows)}")
-    chosen = [full, *(row for name, row in rows.items() if not names or name in names)]
-    return chosen if epochs is None else [at_most(config, epochs) for config in chosen]
+    configs = [full, *(row for name, row in rows.items() if not names or name in names)]
+    return configs if epochs is None else [at_most(config, epochs) for config in configs]
 
 
 def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
@@ -140,9 +140,9 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
     parts = {"validation": scenes.validation, "test": scenes.test}
     return {
         f"{part} {source}": setting
-        for part, some in parts.items()
+        for part, part_scenes in parts.items()
         for source, setting in settings_by_source(
-            some, scenes.structure, scenes.train, seen, limit=limit
+            part_scenes, scenes.structure, scenes.train, seen, limit=limit
         )
     }
 
@@ -161,14 +161,14 @@ def _with_pools(reports: Mapping[str, SourceReport]) -> dict[str, SourceReport]:
 def _costs(plan: Plan, entries: Sequence[Entry]) -> tuple[dict[str, int], dict[str, float]]:
     """Return the number of weights not held at zero, and the mean seconds, by model name."""
     weights, seconds = {}, {}
-    for name in dict.fromkeys(entry.name for entry in entries):
+    for name in dict.fromkeys(e.name for e in entries):
         try:
-            runs = [load_run(plan.folder_of(one) / "run") for one in entries if one.name == name]
+            runs = [load_run(plan.folder_of(e) / "run") for e in entries if e.name == name]
         except RunError:
             continue
-        held = {"kappa", *runs[0].config.machine.without}
+        zero_weights = {"kappa", *runs[0].config.machine.without}
         parameters = runs[0].machine.named_parameters()
-        weights[name] = sum(p.numel() for key, p in parameters if key not in held)
+        weights[name] = sum(p.numel() for key, p in parameters if key not in zero_weights)
         seconds[name] = sum(run.seconds for run in runs) / len(runs)
     return weights, seconds
 

@@ -28,14 +28,7 @@ from training.evaluation.tasks import TASKS
 from training.fit.configuration import Config, ConfigError, DataConfig
 from training.research.baselines import BASELINES
 from training.research.entries import Entry, baseline_entries, machine_entry, reference_entries
-from training.research.measure import (
-    POOLED,
-    Plan,
-    measure_entries,
-    resumable,
-    shown,
-    slug,
-)
+from training.research.measure import POOLED, Plan, measure_entries, resumable, shown, slug
 from training.research.plots import write_plots
 from training.runs.config_files import at_most, data_folder, load_config, with_settings
 from training.runs.pipeline import SplitScenes, prepare
@@ -160,14 +153,14 @@ def benchmark(
     it continues and skips finished tasks.
     """
     with resumable(console, ValueError, FloatingPointError):
-        wanted = None if baseline is None else tuple(b for b in baseline if b != "none")
+        baseline_names = None if baseline is None else tuple(b for b in baseline if b != "none")
         names = machines or DEFAULT
         domains = read_domains(names)
         options = Options(
             root=data_folder(names[0], domains[0].configs[0], data),
             tasks=chosen_tasks(task, quick),
             seeds=1 if quick else seeds,
-            baselines=QUICK_BASELINES if quick and wanted is None else wanted,
+            baselines=QUICK_BASELINES if quick and baseline_names is None else baseline_names,
             limit=_QUICK_LIMIT if quick else limit,
             workers=workers,
             quick=quick,
@@ -236,10 +229,10 @@ def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
     chosen: set[str] = set()
     for part in wanted:
         # A full name selects only that task, even if it is a prefix of other names.
-        named = {part} & set(TASKS) or {name for name in TASKS if name.startswith(part)}
-        if not named:
+        matches = {part} & set(TASKS) or {name for name in TASKS if name.startswith(part)}
+        if not matches:
             raise ValueError(f"unknown task {part!r}: use a name, or the start, of {list(TASKS)}")
-        chosen |= named
+        chosen |= matches
     return tuple(name for name in TASKS if name in chosen)
 
 
@@ -269,7 +262,7 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
         entries += [machine_entry(config) for config in options.configs(domain, seed)]
         entries += baseline_entries(seed, options.baselines, related=plan.data.related)
     entries += reference_entries()
-    reports = _measured(plan, entries, options, domain.name)
+    reports = _measure_all(plan, entries, options, domain.name)
     results = summarise(reports, domain.configs[0].name, plan.parameters(entries))
     _write(folder, scenes, results.to_dict(), f"# {domain.name}\n\n{results.markdown()}")
     console.print(*results.tables())
@@ -285,7 +278,7 @@ def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> 
         machine_entry(with_settings(config, {"data.split": "random"}), calibrated=False)
         for config in options.configs(domain, 0)
     ]
-    reports = _measured(plan, entries, options, f"{domain.name}, seed protocol")
+    reports = _measure_all(plan, entries, options, f"{domain.name}, seed protocol")
     results = summarise(reports, domain.configs[0].name, plan.parameters(entries))
     # The seed protocol does not rank the machines, so the results contain no paired differences.
     results = replace(results, differences=())
@@ -318,22 +311,24 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
         plan = replace(plan, tasks=tasks)
     entries = [machine_entry(config, calibrated=False) for config in options.configs(domain, 0)]
     # A baseline that supports several of the tasks is fitted once.
-    names = [name for name, one in BASELINES.items() if one.scores in (("missing",), RELATIONS)]
+    names = [
+        name for name, baseline in BASELINES.items() if baseline.scores in (("missing",), RELATIONS)
+    ]
     if options.baselines is not None:
         yardsticks = {YARDSTICKS[task][0] for task in tasks}
         names = [name for name in names if name in yardsticks | set(options.baselines)]
     entries += baseline_entries(0, names, related=plan.data.related, whole=False)
-    reports = _measured(plan, entries, options, f"{domain.name}, shuffled")
+    reports = _measure_all(plan, entries, options, f"{domain.name}, shuffled")
     weights = plan.parameters(entries)
     for task in tasks:
         yardstick, metric = YARDSTICKS[task]
-        some: Reports = {
+        task_reports: Reports = {
             row: {source: only(report, {task: (metric,)}) for source, report in by_source.items()}
             for row, by_source in reports.items()
         }
         # A task without metrics needs data that these scenes lack, for example room types.
-        if any(report.outcomes[task] for report in some[yardstick, 0].values()):
-            results = summarise(some, yardstick, weights)
+        if any(report.outcomes[task] for report in task_reports[yardstick, 0].values()):
+            results = summarise(task_reports, yardstick, weights)
             text = shuffled_text(task, results)
             _write(folder / slug(task), scenes, results.to_dict(), text)
             console.print("trained on shuffled scenes:", *results.tables({task: (metric,)}))
@@ -360,12 +355,10 @@ def _plan(
     return Plan(folder, data, settings, tasks)
 
 
-def _measured(plan: Plan, entries: Sequence[Entry], options: Options, title: str) -> Reports:
+def _measure_all(plan: Plan, entries: Sequence[Entry], options: Options, title: str) -> Reports:
     with shown(console, title, len(entries) * len(plan.settings)) as progress:
         reports, _ = measure_entries(
-            *(plan, entries, progress),
-            workers=options.workers,
-            fresh=options.fresh,
+            *(plan, entries, progress), workers=options.workers, fresh=options.fresh
         )
     return reports
 
@@ -405,10 +398,10 @@ Results of the paper on its own data:
 def shuffled_text(task: str, results: Results) -> str:
     """Return the Markdown page of one task of the control experiment."""
     _, metric = YARDSTICKS[task]
-    above = [
-        f"{gap.row} by {-gap.figure.value:.3f}"
-        for gap in results.differences
-        if gap.source == POOLED and gap.verdict == "worse"
+    better_models = [
+        f"{difference.row} by {-difference.figure.value:.3f}"
+        for difference in results.differences
+        if difference.source == POOLED and difference.verdict == "worse"
     ]
     return f"""# Shuffled scenes, {task}
 
@@ -419,5 +412,5 @@ outside the training scenes. A star marks a model that is worse than the bold mo
 interval of the paired difference is on one side of zero.
 
 {results.markdown({task: (metric,)})}
-Models above {results.ours} over the whole interval: {", ".join(above) or "none"}.
+Models above {results.ours} over the whole interval: {", ".join(better_models) or "none"}.
 """

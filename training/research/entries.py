@@ -47,11 +47,7 @@ class Entry:
 
 
 def baseline_entries(
-    seed: int,
-    names: Sequence[str] | None = None,
-    *,
-    related: bool = True,
-    whole: bool = True,
+    seed: int, names: Sequence[str] | None = None, *, related: bool = True, whole: bool = True
 ) -> Iterator[Entry]:
     """Generate the entries of the baselines in `names`; None means all baselines.
 
@@ -67,19 +63,20 @@ def baseline_entries(
     if unknown := sorted(set(names or ()) - set(BASELINES)):
         raise ValueError(f"unknown baselines {unknown}: choose from {list(BASELINES)}")
     for name, baseline in BASELINES.items():
-        wanted = (names is None or name in names) and (related or not baseline.learns_relations)
-        if wanted and (baseline.stochastic or seed == 0):
-            make = partial(_fitted, baseline, seed, whole)
+        is_usable = related or not baseline.learns_relations
+        is_selected = names is None or name in names
+        if is_usable and is_selected and (baseline.stochastic or seed == 0):
+            make = partial(_baseline_model, baseline, seed, whole)
             yield Entry(name, seed, f"{name}, seed {seed}", make)
 
 
 def reference_entries() -> Iterator[Entry]:
     """Generate the untrained references for the evaluation of generated scenes and densities."""
     for name in ("independent classes", "held-out scenes (floor)"):
-        yield Entry(name, 0, name, partial(_reference, name))
+        yield Entry(name, 0, name, partial(_reference_model, name))
 
 
-def _reference(name: str, data: TrainingData, folder: Path, say: Progress) -> Model:  # noqa: ARG001
+def _reference_model(name: str, data: TrainingData, folder: Path, say: Progress) -> Model:  # noqa: ARG001
     classes = data.train.v.shape[1]
     return independent_model(classes) if name == "independent classes" else floor_model()
 
@@ -87,11 +84,11 @@ def _reference(name: str, data: TrainingData, folder: Path, say: Progress) -> Mo
 def machine_entry(config: Config, *, calibrated: bool = True) -> Entry:
     """Return the entry of a machine, calibrated as for publication if `calibrated`."""
     identity = f"{config.digest}, calibrated" if calibrated else config.digest
-    make = partial(_machine, config, calibrated)
+    make = partial(_machine_model, config, calibrated)
     return Entry(config.name, config.training.seed, identity, make)
 
 
-def _fitted(
+def _baseline_model(
     baseline: Baseline, seed: int, whole: bool, data: TrainingData, folder: Path, say: Progress
 ) -> Model:
     """Fit a baseline.
@@ -114,18 +111,18 @@ def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: P
     """Fit a baseline, and write its trials into trials.jsonl in place of its earlier trials."""
     model = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
-    before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []
-    lines = [line for line in before if json.loads(line)["model"] != baseline.name]
+    lines_before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []
+    lines = [line for line in lines_before if json.loads(line)["model"] != baseline.name]
     lines += [json.dumps({"model": baseline.name, **asdict(trial)}) for trial in model.trials]
     write_whole(trials, "".join(f"{line}\n" for line in lines))
     return model
 
 
-def _machine(
+def _machine_model(
     config: Config, calibrated: bool, data: TrainingData, folder: Path, say: Progress
 ) -> Model:
     run, seed = folder / "run", config.training.seed
-    machine = _trained(config, data, run, say)
+    machine = _train_once(config, data, run, say)
     if not calibrated:
         draft = draft_artifact(machine.requires_grad_(False), data.classes)
         return artifact_model(draft, data.train, seed=seed, calibrated=False)
@@ -142,7 +139,7 @@ def _machine(
     return artifact_model(artifact, data.train, seed=seed)
 
 
-def _trained(config: Config, data: TrainingData, run: Path, say: Progress) -> BoltzmannMachine:
+def _train_once(config: Config, data: TrainingData, run: Path, say: Progress) -> BoltzmannMachine:
     try:
         return load_run(run).machine
     except RunError:

@@ -198,9 +198,9 @@ class Plan:
         """Return the reports of an entry, by data source. The pooled report has all tasks."""
         reports = self.finished(entry)
         if POOLED in self.settings:
-            every = pooled([reports[name] for name in self.settings if name != POOLED], POOLED)
-            every.outcomes |= reports[POOLED].outcomes
-            reports[POOLED] = every
+            merged = pooled([reports[name] for name in self.settings if name != POOLED], POOLED)
+            merged.outcomes |= reports[POOLED].outcomes
+            reports[POOLED] = merged
         return {source: reports[source] for source in self.settings}
 
 
@@ -234,7 +234,7 @@ def measure_entries(
     for entry in entries:
         if entry not in missing:
             plan.measure(entry, progress)
-    work = partial(_failure, plan, failures)
+    work = partial(_measure_or_error, plan, failures)
     if missing and workers > 1:
         failed = _measure_in_processes(work, missing, progress, min(workers, len(missing)))
     else:
@@ -246,7 +246,7 @@ def measure_entries(
     return {(entry.name, entry.seed): plan.report(entry) for entry in kept}, reasons
 
 
-def _failure(
+def _measure_or_error(
     plan: Plan, failures: tuple[type[Exception], ...], entry: Entry, progress: Progress
 ) -> Exception | None:
     try:
@@ -265,7 +265,7 @@ def _measure_in_processes(
     messages: SimpleQueue[tuple[str, str, str]] = context.SimpleQueue()
     # Pickling avoids the shared memory of torch, which is small in containers.
     begin = (pickle.dumps(work), messages)
-    with _one_thread(), ProcessPoolExecutor(workers, context, _begin, begin) as pool:
+    with _one_thread(), ProcessPoolExecutor(workers, context, _start_worker, begin) as pool:
         try:
             futures = {
                 pool.submit(_measure_here, entry): (entry.name, entry.seed) for entry in entries
@@ -287,12 +287,12 @@ def _measure_in_processes(
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Let processes that start here use one thread each."""
-    before = {name: os.environ.get(name) for name in _THREADS}
+    earlier = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name, value in earlier.items():
             if value is None:
                 del os.environ[name]
             else:
@@ -303,7 +303,7 @@ _work: Work
 _progress: Progress
 
 
-def _begin(material: bytes, messages: SimpleQueue[tuple[str, str, str]]) -> None:
+def _start_worker(material: bytes, messages: SimpleQueue[tuple[str, str, str]]) -> None:
     global _work, _progress  # set once in each process
     torch.set_num_threads(1)
     # Ctrl-C reaches every process of the terminal; only the main process handles it.

@@ -46,18 +46,18 @@ def write_plots(
     runs: dict[str, list[Path]] = {}
     for entry in machines:
         runs.setdefault(entry.name, []).append(plan.folder_of(entry) / "run" / "curve.csv")
-    drawn = {"learning-curves": learning_curves(runs), "recall": recall_curves(results, POOLED)}
+    figures = {"learning-curves": learning_curves(runs), "recall": recall_curves(results, POOLED)}
     for entry in machines:
         outcome = reports[entry.name, entry.seed][POOLED].outcomes.get("Calibration")
         if outcome is not None and entry.seed == machines[0].seed:
             title = f"{entry.name}, {POOLED}"
-            drawn[f"reliability-{slug(entry.name)}"] = reliability_diagrams(outcome, title)
-    written = []
-    for name, figure in drawn.items():
+            figures[f"reliability-{slug(entry.name)}"] = reliability_diagrams(outcome, title)
+    paths = []
+    for name, figure in figures.items():
         path = plan.folder / f"{name}.png"
         figure.savefig(path, dpi=110)
-        written.append(path)
-    return written
+        paths.append(path)
+    return paths
 
 
 def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
@@ -114,9 +114,9 @@ def recall_curves(results: Results, source: str) -> Figure:
     for axis, (task, (prefix, title)) in zip(axes, _RECALL.items(), strict=True):
         for row, points in recall_points(results, task, prefix, source).items():
             k, values = zip(*points, strict=True)
-            ours = row == results.ours
+            is_ours = row == results.ours
             axis.plot(
-                k, values, label=row, linewidth=2.5 if ours else 1, marker="." if ours else ""
+                k, values, label=row, linewidth=2.5 if is_ours else 1, marker="." if is_ours else ""
             )
         axis.set(xscale="log", xlabel="k", title=f"{title}, {source}", ylim=(0, 1))
         if axis.get_legend_handles_labels()[0]:

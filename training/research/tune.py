@@ -134,7 +134,7 @@ def tune(
     if not _finished(trial_study):
         console.print("[red]error:[/red] all trials failed or were stopped early")
         raise typer.Exit(1)
-    _conclude(search, trial_study, original)
+    _write_best(search, trial_study, original)
 
 
 def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
@@ -228,33 +228,34 @@ class Search:
         import optuna
 
         self._requeue(study)
-        while len(_counted(study)) < trials:
+        while len(_counted_trials(study)) < trials:
             trial = study.ask()
-            if sum(other.number < trial.number for other in _counted(study)) >= trials:
+            if sum(other.number < trial.number for other in _counted_trials(study)) >= trials:
                 # Another process took the last trial in the meantime.
                 study.tell(trial, state=optuna.trial.TrialState.FAIL)
                 return
             trial.set_user_attr("process", _process())
             # With one seed for all, each process would draw the same settings.
             study.sampler = optuna.samplers.TPESampler(seed=seed + trial.number)
-            original = trial.user_attrs.get("as it is", trial.number == 0)
-            self._run(study, trial, {} if original else _suggested(trial, self.space))
+            is_original = trial.user_attrs.get("as it is", trial.number == 0)
+            self._run(study, trial, {} if is_original else _suggest_settings(trial, self.space))
 
     def _requeue(self, study: Study) -> None:
         """Queue the trials of ended processes again; the new trials resume from the checkpoints."""
         from optuna.trial import TrialState
 
-        for halted in study.get_trials(states=(TrialState.RUNNING,)):
-            if _alive(halted.user_attrs.get("process", "")):
+        for trial in study.get_trials(states=(TrialState.RUNNING,)):
+            if _is_running(trial.user_attrs.get("process", "")):
                 continue
             attributes = {
-                "as it is": halted.user_attrs.get("as it is", halted.number == 0),
-                "folder": _folder(halted),
+                "as it is": trial.user_attrs.get("as it is", trial.number == 0),
+                "folder": _folder(trial),
             }
-            study.enqueue_trial(halted.params, user_attrs=attributes)
-            study.tell(halted.number, state=TrialState.FAIL)
+            study.enqueue_trial(trial.params, user_attrs=attributes)
+            study.tell(trial.number, state=TrialState.FAIL)
 
     def _run(self, study: Study, trial: Trial, settings: Mapping[str, Any]) -> None:
+        """Run one trial, and store its settings, its value or the reason of its end."""
         import optuna
         from optuna.trial import TrialState
 
@@ -287,8 +288,8 @@ class Search:
         def report(*_: object) -> None:
             nonlocal reported
             for epoch in trainer.epochs[reported:]:
-                both = {"MRR": epoch.mrr_validation, "R-precision": epoch.r_precision_validation}
-                value = sum(both[name] for name in _BY[self.by] if not math.isnan(both[name]))
+                scores = {"MRR": epoch.mrr_validation, "R-precision": epoch.r_precision_validation}
+                value = sum(scores[name] for name in _BY[self.by] if not math.isnan(scores[name]))
                 trial.report(value, reported)
                 reported += 1
                 if trial.should_prune():
@@ -333,7 +334,7 @@ def shown(settings: Mapping[str, Any]) -> str:
     return ", ".join(parts) or "as it is"
 
 
-def _counted(study: Study) -> list[FrozenTrial]:
+def _counted_trials(study: Study) -> list[FrozenTrial]:
     """Return the trials that ended by themselves or that still run."""
     return [
         trial
@@ -351,7 +352,7 @@ def _process() -> str:
     return f"{socket.gethostname()} {os.getpid()}"
 
 
-def _alive(process: str) -> bool:
+def _is_running(process: str) -> bool:
     """Return whether another process runs; those of other machines count as running."""
     host, _, number = process.partition(" ")
     if host != socket.gethostname():
@@ -369,7 +370,7 @@ def _finished(study: Study) -> list[FrozenTrial]:
     return study.get_trials(states=(TrialState.COMPLETE,))
 
 
-def _suggested(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str, Any]:
+def _suggest_settings(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str, Any]:
     from optuna.distributions import FloatDistribution, IntDistribution
 
     settings: dict[str, Any] = {}
@@ -385,8 +386,8 @@ def _suggested(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str,
 
 def _table(study: Study, title: str) -> Table:
     """Return a table of the trials from best to worst. Trials without a metric come last."""
-    heads = (f"{in_words(task)}, {name}" for name, (task, _) in FIGURES.items())
-    table = Table(*heads, "state", "settings", title=title)
+    headings = (f"{in_words(task)}, {name}" for name, (task, _) in FIGURES.items())
+    table = Table(*headings, "state", "settings", title=title)
     trials = [trial for trial in study.trials if "settings" in trial.user_attrs]
     for trial in sorted(trials, key=lambda t: math.inf if t.value is None else -t.value):
         figures = trial.user_attrs.get("figures", {})
@@ -397,10 +398,10 @@ def _table(study: Study, title: str) -> Table:
     return table
 
 
-def _conclude(search: Search, study: Study, original: Config) -> None:
+def _write_best(search: Search, study: Study, original: Config) -> None:
     """Write the best configuration to best.toml, with the original number of epochs."""
     best = study.best_trial
-    base = next((t for t in _finished(study) if not t.user_attrs["settings"]), None)
+    first = next((t for t in _finished(study) if not t.user_attrs["settings"]), None)
     settings = best.user_attrs["settings"]
     tuned = with_settings(original, settings).model_copy(update={"name": f"{original.name}-tuned"})
     figures = ", ".join(f"{name} {text}" for name, text in best.user_attrs["figures"].items())
@@ -408,10 +409,10 @@ def _conclude(search: Search, study: Study, original: Config) -> None:
         f"{original.name}, {shown(settings)}.",
         f"Metrics on validation scenes, {search.config.training.epochs} epochs: {figures}.",
     ]
-    if settings and base is not None:
-        ours, theirs = (search.metrics(search.folder / _folder(trial)) for trial in (best, base))
-        gaps = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
-        comment.append(f"Paired difference from {original.name}: {', '.join(gaps)}.")
+    if settings and first is not None:
+        ours, theirs = (search.metrics(search.folder / _folder(trial)) for trial in (best, first))
+        differences = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
+        comment.append(f"Paired difference from {original.name}: {', '.join(differences)}.")
         comment.append(
             f"The figures of the best of {len(study.trials)} trials are optimistic: train both "
             "configurations with several seeds."

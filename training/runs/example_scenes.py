@@ -63,22 +63,22 @@ def known_examples(
     examples: Sequence[Example], vocabulary: Vocabulary
 ) -> tuple[tuple[Example, ...], list[str]]:
     """Return the examples that a vocabulary covers, and the reasons against the others."""
-    kept, reasons = [], []
+    covered_examples, reasons = [], []
     for example in examples:
         try:
             example.require_known(vocabulary)
-            kept.append(example)
+            covered_examples.append(example)
         except ValueError as error:
             reasons.append(str(error))
-    return tuple(kept), reasons
+    return tuple(covered_examples), reasons
 
 
 def examples_json(examples: Sequence[Example]) -> str:
     """Return examples as JSON text that people can edit, with one object or relation on a line."""
-    return "[\n" + ",\n".join(map(_lines, examples)) + "\n]\n"
+    return "[\n" + ",\n".join(map(_example_json, examples)) + "\n]\n"
 
 
-def _lines(example: Example) -> str:
+def _example_json(example: Example) -> str:
     scene = example.request()
     entries = []
     for field, value in scene.items():
@@ -100,38 +100,38 @@ def choose_examples(
     type: in a complete scene, nothing would be missing. Scenes with positions take precedence.
     Scenes of research-only data sets are left out.
     """
-    usable_objects = {
-        scene: _known(scene, vocabulary)
+    objects_of = {
+        scene: _usable(scene, vocabulary)
         for scene in scenes
         if scene.source not in SOURCES or not SOURCES[scene.source].research_only
     }
-    classes = {scene: {index for index, _ in found} for scene, found in usable_objects.items()}
-    frequency = Counter(index for found in classes.values() for index in found)
-    usable = [scene for scene in usable_objects if len(classes[scene]) >= _FEWEST_CLASSES]
+    classes = {scene: {index for index, _ in pairs} for scene, pairs in objects_of.items()}
+    frequency = Counter(index for indices in classes.values() for index in indices)
+    candidates = [scene for scene in objects_of if len(classes[scene]) >= _FEWEST_CLASSES]
     sizes: dict[str | None, list[int]] = {}
-    for scene in usable:
+    for scene in candidates:
         sizes.setdefault(scene.room_type, []).append(len(classes[scene]))
-    usual = {room: np.median(found) for room, found in sizes.items()}
+    median_size = {room: np.median(counts) for room, counts in sizes.items()}
     ranked = sorted(
-        usable,
+        candidates,
         key=lambda scene: (
-            not any(thing.position for _, thing in usable_objects[scene]),
-            abs(len(classes[scene]) - usual[scene.room_type]),
+            not any(thing.position for _, thing in objects_of[scene]),
+            abs(len(classes[scene]) - median_size[scene.room_type]),
             -sum(frequency[index] for index in classes[scene]),
         ),
     )
-    first: dict[str | None, AnnotatedScene] = {}
+    first_of_room: dict[str | None, AnnotatedScene] = {}
     for scene in ranked:
-        first.setdefault(scene.room_type, scene)
-    groups = {scene.group for scene in first.values()}
+        first_of_room.setdefault(scene.room_type, scene)
+    groups = {scene.group for scene in first_of_room.values()}
     others = [scene for scene in ranked if scene.group not in groups]
     return tuple(
-        _example(scene, usable_objects[scene], vocabulary, frequency)
-        for scene in [*first.values(), *others][:_CHOSEN]
+        _make_example(scene, objects_of[scene], vocabulary, frequency)
+        for scene in [*first_of_room.values(), *others][:_CHOSEN]
     )
 
 
-def _known(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, AnnotatedObject]]:
+def _usable(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, AnnotatedObject]]:
     """Return the objects of a scene that a request can contain, with their class indices."""
     objects = []
     for thing in scene.objects:
@@ -144,20 +144,21 @@ def _known(scene: AnnotatedScene, vocabulary: Vocabulary) -> list[tuple[int, Ann
     return objects
 
 
-def _example(
+def _make_example(
     scene: AnnotatedScene,
-    known: Sequence[tuple[int, AnnotatedObject]],
+    usable: Sequence[tuple[int, AnnotatedObject]],
     vocabulary: Vocabulary,
     frequency: Counter[int],
 ) -> Example:
-    kept = _foremost(known, frequency)
+    """Build a request from a scene, with at most `_MOST_OBJECTS` objects and distinct ids."""
+    kept = _select_objects(usable, frequency)
     labels = {thing.id: vocabulary.labels[index] for index, thing in kept}
-    repeats = Counter(labels.values())
+    label_counts = Counter(labels.values())
     numbers: Counter[str] = Counter()
     names: dict[str, str] = {}
-    for own, label in labels.items():
+    for thing_id, label in labels.items():
         numbers[label] += 1
-        names[own] = f"{label[:90]}_{numbers[label]}" if repeats[label] > 1 else label
+        names[thing_id] = f"{label[:90]}_{numbers[label]}" if label_counts[label] > 1 else label
     values: dict[str, Any] = {}
     room = curated_names().canonical_room(scene.room_type)
     if room is not None and vocabulary.room_index(room) is not None:
@@ -169,22 +170,22 @@ def _example(
     values["objects"] = [
         {"id": names[thing.id], "label": labels[thing.id], **_pose(thing)} for _, thing in kept
     ]
-    own = "".join(filter(str.isprintable, scene.scene_id))
-    title = f"{values.get('room_type', 'scene').capitalize()}, {own}"
+    scene_id = "".join(filter(str.isprintable, scene.scene_id))
+    title = f"{values.get('room_type', 'scene').capitalize()}, {scene_id}"
     return Example.model_validate({"name": title[:MAX_WORD], "scene": values})
 
 
-def _foremost(
-    known: Sequence[tuple[int, AnnotatedObject]], frequency: Counter[int]
+def _select_objects(
+    objects: Sequence[tuple[int, AnnotatedObject]], frequency: Counter[int]
 ) -> list[tuple[int, AnnotatedObject]]:
     """Return the first objects of all classes, frequent classes first, then the second ones."""
-    seen: Counter[int] = Counter()
+    counts: Counter[int] = Counter()
     ranks = []
-    for index, _ in known:
-        ranks.append((seen[index], -frequency[index]))
-        seen[index] += 1
-    order = sorted(range(len(known)), key=ranks.__getitem__)[:_MOST_OBJECTS]
-    return [known[place] for place in sorted(order)]
+    for index, _ in objects:
+        ranks.append((counts[index], -frequency[index]))
+        counts[index] += 1
+    order = sorted(range(len(objects)), key=ranks.__getitem__)[:_MOST_OBJECTS]
+    return [objects[position] for position in sorted(order)]
 
 
 def _viewpoint(scene: AnnotatedScene) -> dict[str, float]:
@@ -213,16 +214,16 @@ def _pose(thing: AnnotatedObject) -> dict[str, Any]:
 def _relations(scene: AnnotatedScene, names: dict[str, str]) -> list[dict[str, str]]:
     """Return the annotated relations between named objects, without contradictions."""
     index_of = {thing.id: index for index, thing in enumerate(scene.objects)}
-    held = list(scene.relations or ())
+    triples = list(scene.relations or ())
     if scene.relations is None:
-        held = [
+        triples = [
             (index_of[thing.id], "on-top", index_of[thing.supported_by])
             for thing in scene.objects
             if thing.supported_by is not None
         ]
-    canonical = {canonicalise(*triple) for triple in held}
+    canonical = {canonicalise(*triple) for triple in triples}
     relations = []
-    for triple in held:
+    for triple in triples:
         relation, i, j = canonicalise(*triple)
         ends = [scene.objects[end].id for end in (triple[0], triple[2])]
         if i == j or (relation, j, i) in canonical or not names.keys() >= set(ends):

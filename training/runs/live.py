@@ -116,7 +116,7 @@ def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
 
 def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: Console) -> None:
     """Print the validation curve, best epoch and duration of a run."""
-    best = result.epochs[result.best_epoch]
+    best_epoch = result.epochs[result.best_epoch]
     table = Table("curve", "", "first", "best epoch", "last", title_justify="left")
     table.title = f"{trainer.config.name}, seed {trainer.config.training.seed}"
     for title, name in _CURVES:
@@ -127,14 +127,14 @@ def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: C
         table.add_row(title, sparkline(values), *(f"{value:.3f}" for value in ends))
     console.print(table)
     updates = (result.best_epoch + 1) * trainer.steps_per_epoch
-    stopped = len(result.epochs) < trainer.config.training.epochs
+    stopped_early = len(result.epochs) < trainer.config.training.epochs
     idle = len(result.epochs) - 1 - result.best_epoch
     console.print(
         f"best epoch {result.best_epoch + 1} of {len(result.epochs)} (update {updates:,}) in "
-        f"{result.seconds:.0f} s: {scores(best)}; curve in {folder / 'curve.png'}",
+        f"{result.seconds:.0f} s: {scores(best_epoch)}; curve in {folder / 'curve.png'}",
         soft_wrap=True,
     )
-    if stopped:
+    if stopped_early:
         console.print(f"stopped early: {idle} epochs without a better score on validation scenes")
     elif advice := _advice(result):
         console.print(advice, soft_wrap=True)

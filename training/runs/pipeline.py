@@ -79,8 +79,8 @@ class SplitScenes:
             ConfigError: a source has no scene in the training part.
         """
         annotated = annotated_classes(self.parts["train"], self.vocabulary)
-        every = {scene.source for scenes in self.parts.values() for scene in scenes}
-        for source in every - set(annotated):
+        sources = {scene.source for scenes in self.parts.values() for scene in scenes}
+        for source in sources - set(annotated):
             raise ConfigError(
                 f"the training part contains no scene of the source {source!r}; add scenes, or "
                 "remove the source from data.sources"
@@ -223,16 +223,16 @@ def split_and_encode(
     Raises:
         ConfigError: the vocabulary is invalid; see `build_vocabulary`.
     """
-    everything = [scene for source in scenes.values() for scene in source]
-    parts = split(everything, seed=data.split_seed, protocol=data.split)
+    all_scenes = [scene for source in scenes.values() for scene in source]
+    parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
         vocabulary = build_vocabulary(data, list(parts["train"]), root)
     return SplitScenes(
         data=data,
         vocabulary=vocabulary,
-        parts={part: encode(some, vocabulary) for part, some in parts.items()},
-        counts={source: len(some) for source, some in scenes.items()},
-        digests={source: digest_of(some) for source, some in scenes.items()},
+        parts={name: encode(part, vocabulary) for name, part in parts.items()},
+        counts={name: len(source) for name, source in scenes.items()},
+        digests={name: digest_of(source) for name, source in scenes.items()},
         words=_word_vectors(data, vocabulary, root),
     )
 

@@ -92,17 +92,15 @@ def publish_run(
         evaluated = calibrated = with_statistics(calibrated, scenes)
         test = data
     else:
-        other, kept_back = measured
-        other.require(kept_back.digest)
-        test = kept_back.training_data()
-        evaluated = calibrated_draft(other, kept_back.vocabulary, test)
+        measured_run, measured_scenes = measured
+        measured_run.require(measured_scenes.digest)
+        test = measured_scenes.training_data()
+        evaluated = calibrated_draft(measured_run, measured_scenes.vocabulary, test)
         calibrated = calibrated_draft(run, scenes.vocabulary, data, evaluated.calibration)
-        evaluated, calibrated = (
-            with_statistics(evaluated, kept_back),
-            with_statistics(calibrated, scenes),
-        )
-    untouched = untouched_alarms(calibrated, scenes.parts["validation"])
-    reasons = [*filter(None, (one.objection() for one in untouched)), *judge(calibrated)]
+        evaluated = with_statistics(evaluated, measured_scenes)
+        calibrated = with_statistics(calibrated, scenes)
+    alarms = untouched_alarms(calibrated, scenes.parts["validation"])
+    reasons = [*filter(None, (entry.objection() for entry in alarms)), *judge(calibrated)]
     for reason in reasons:
         if accept is None:
             raise RefusedError(reasons)
@@ -129,7 +127,7 @@ def publish_run(
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
         examples=scenes.examples,
     )
-    return _stored(store, description, calibrated)
+    return _publish_rounded(store, description, calibrated)
 
 
 def refit(
@@ -158,33 +156,33 @@ def refit(
     """
     manifest = artifact.manifest
     config = Config.model_validate(manifest.training["config"])
-    data, named = config.data, config.examples
+    data, examples_name = config.data, config.examples
     if manifest.name in shipped_configs():
-        named = load_config(manifest.name).examples
-    examples, reasons = known_examples(read_examples(named, root), artifact.vocabulary)
+        examples_name = load_config(manifest.name).examples
+    examples, reasons = known_examples(read_examples(examples_name, root), artifact.vocabulary)
     for reason in reasons:
         progress(reason)
     progress("reading scenes")
     annotated = read_sources(data, root)
     scenes = split_and_encode(data, annotated, artifact.vocabulary, root)
     digests = {source.source: source.digest for source in manifest.data}
-    if changed := sorted(name for name, found in scenes.digests.items() if digests[name] != found):
+    if changed := sorted(name for name in scenes.digests if digests[name] != scenes.digests[name]):
         raise RunError(
             f"{root} does not contain the training scenes of {manifest.name}@{manifest.version}: "
             f"the scenes of {', '.join(changed)} have changed"
         )
-    kept_back = scenes
+    evaluated_scenes = scenes
     if "measured_split" in manifest.training:
         split = {"split": manifest.training["measured_split"]}
-        kept_back = split_and_encode(
+        evaluated_scenes = split_and_encode(
             DataConfig.model_validate(data.model_dump() | split),
             annotated,
             artifact.vocabulary,
             root,
         )
     progress("fitting statistics")
-    evaluated = with_statistics(artifact, kept_back)
-    rows = _measure(evaluated, kept_back.training_data(), progress, tuple(STATISTICS))
+    evaluated = with_statistics(artifact, evaluated_scenes)
+    rows = _measure(evaluated, evaluated_scenes.training_data(), progress, tuple(STATISTICS))
     fields = {name: getattr(manifest, name) for name in Description.model_fields}
     fields["metrics"] = (
         *(metric for metric in manifest.metrics if metric.task not in STATISTICS),
@@ -193,7 +191,7 @@ def refit(
     changes = {"version": version, "created": _now(), "examples": examples}
     changes["vocabulary"] = VocabularyEntry.of(with_aliases(artifact.vocabulary), artifact.spec.A)
     description = Description(**fields | changes)
-    return _stored(store, description, with_statistics(artifact, scenes))
+    return _publish_rounded(store, description, with_statistics(artifact, scenes))
 
 
 def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
@@ -206,7 +204,7 @@ def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
     )
 
 
-def _stored(store: Store, description: Description, artifact: Artifact) -> Artifact:
+def _publish_rounded(store: Store, description: Description, artifact: Artifact) -> Artifact:
     """Publish weights and statistics in half precision."""
     state = dict(artifact.weights.arrays)
     for statistics in (artifact.offsets, artifact.counts):
@@ -220,10 +218,7 @@ def _now() -> datetime:
 
 
 def calibrated_draft(
-    run: FinishedRun,
-    vocabulary: Vocabulary,
-    data: TrainingData,
-    chosen: Calibration | None = None,
+    run: FinishedRun, vocabulary: Vocabulary, data: TrainingData, chosen: Calibration | None = None
 ) -> Artifact:
     """Return the calibrated model of a run in half precision. `chosen`: see `calibrate_objects`."""
     machine = as_stored(run.machine)
@@ -247,9 +242,7 @@ def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
 
 
 def draft_artifact(
-    machine: BoltzmannMachine,
-    vocabulary: Vocabulary,
-    calibration: Calibration | None = None,
+    machine: BoltzmannMachine, vocabulary: Vocabulary, calibration: Calibration | None = None
 ) -> Artifact:
     """Return a model in memory, without files. The default calibration leaves log-odds as is."""
     return Artifact(
@@ -308,11 +301,13 @@ def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
 
 def terms(scenes: SplitScenes) -> str:
     """Return a sentence about the permitted use of the trained weights."""
-    every = {source: terms_of(source, scenes.data) for source in scenes.counts}
-    if research := [source for source, (_, research_only) in every.items() if research_only]:
-        return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."
-    if own := {source: words for source, (words, _) in every.items() if source not in SOURCES}:
-        return " ".join(
-            f"Trained on {source}: {words.rstrip('.')}." for source, words in own.items()
-        )
-    return "No restriction from the training data beyond its attribution."
+    entries = {source: terms_of(source, scenes.data) for source in scenes.counts}
+    sources = [source for source, (_, research_only) in entries.items() if research_only]
+    if sources:
+        return f"Research use only: trained on {', '.join(sources)}. Not for commercial robots."
+    sentences = [
+        f"Trained on {source}: {words.rstrip('.')}."
+        for source, (words, _) in entries.items()
+        if source not in SOURCES
+    ]
+    return " ".join(sentences) or "No restriction from the training data beyond its attribution."

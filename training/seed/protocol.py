@@ -82,24 +82,24 @@ def removed_switched_on(model: Model, setting: Setting) -> Outcome | None:
         return None
     scenes = setting.some(related=True)
     targets = _targets(scenes, setting.structure, setting.seed)
-    asked = targets >= 0
-    if not bool(asked.any()):
+    has_target = targets >= 0
+    if not bool(has_target.any()):
         return None
     metrics: dict[str, Metric] = {}
     for name, left_on in (("relations left on", True), ("relations deleted", False)):
-        drawn = torch.zeros(len(scenes))
+        switched_on = torch.zeros(len(scenes))
         for index, batch, generator in _blocks(scenes, setting.seed):
-            some = asked[index].nonzero().squeeze(1)
-            if len(some):
-                chosen = targets[index[some]]
+            rows = has_target[index].nonzero().squeeze(1)
+            if len(rows):
+                classes = targets[index[rows]]
                 p = switch_on_probability(
-                    model.machine, batch.rows(some), chosen, left_on, generator
+                    model.machine, batch.rows(rows), classes, left_on, generator
                 )
-                drawn[index[some]] = bernoulli(p, generator)
+                switched_on[index[rows]] = bernoulli(p, generator)
         metrics[f"removed objects switched on, {name}"] = Ratio(
-            drawn.double().numpy(), asked.double().numpy()
+            switched_on.double().numpy(), has_target.double().numpy()
         )
-    return Outcome(metrics, len(scenes), int((~asked).sum()))
+    return Outcome(metrics, len(scenes), int((~has_target).sum()))
 
 
 def reconstruction_after_addition(model: Model, setting: Setting) -> Outcome | None:
@@ -108,27 +108,27 @@ def reconstruction_after_addition(model: Model, setting: Setting) -> Outcome | N
         return None
     machine, scenes = model.machine, setting.some()
     added = draw_intruders(scenes, setting.structure, seed=setting.seed)
-    asked = (added >= 0).double().numpy()
-    if not asked.any():
+    is_altered = (added >= 0).double().numpy()
+    if not is_altered.any():
         return None
     V = scenes.v.shape[1]
-    wrong, off, kept, there = (np.zeros(len(scenes)) for _ in range(4))
+    wrong, off, kept, present = (np.zeros(len(scenes)) for _ in range(4))
     for index, batch, generator in _blocks(scenes, setting.seed):
         intruder = added[index].clamp(min=0).unsqueeze(1)
         h1 = _draw_h1(machine, Evidence(batch.v.scatter(1, intruder, 1.0)), generator)
         v = bernoulli(machine.object_logits(h1).sigmoid(), generator)
-        weight = asked[index]
+        weight = is_altered[index]
         wrong[index] = (v - batch.v).abs().sum(1).double().numpy() * weight
         off[index] = (1 - v.gather(1, intruder).squeeze(1)).double().numpy() * weight
         kept[index] = (v * batch.v).sum(1).double().numpy() * weight
-        there[index] = batch.v.sum(1).double().numpy() * weight
+        present[index] = batch.v.sum(1).double().numpy() * weight
     metrics: dict[str, Metric] = {
-        "error measure": Ratio(wrong, asked * V),
-        "error measure, doing nothing": Ratio(asked, asked * V),
-        "added objects switched off": Ratio(off, asked),
-        "objects of the scene kept on": Ratio(kept, there),
+        "error measure": Ratio(wrong, is_altered * V),
+        "error measure, doing nothing": Ratio(is_altered, is_altered * V),
+        "added objects switched off": Ratio(off, is_altered),
+        "objects of the scene kept on": Ratio(kept, present),
     }
-    return Outcome(metrics, len(scenes), int((asked == 0).sum()))
+    return Outcome(metrics, len(scenes), int((is_altered == 0).sum()))
 
 
 @torch.no_grad()
@@ -164,20 +164,20 @@ def switch_on_probability(
     The relations of the removed class, `target` (scenes,), are unobserved without `left_on`.
     """
     column = target.unsqueeze(1)
-    absent, there = batch.v.scatter(1, column, 0.0), batch.v.scatter(1, column, 1.0)
+    absent, present = batch.v.scatter(1, column, 0.0), batch.v.scatter(1, column, 1.0)
     edges, r, observed = relation_units(machine, batch)
     if not left_on:
-        touched = _touches(edges, target)
+        touched = _contains_class(edges, target)
         r, observed = r * ~touched, observed & ~touched
     h1 = _draw_h1(machine, Evidence(absent, edges, r, observed), generator)
     logit = machine.object_logits(h1).gather(1, column).squeeze(1)
-    for v, sign in ((there, 1.0), (absent, -1.0)):
+    for v, sign in ((present, 1.0), (absent, -1.0)):
         logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
         logit = logit + sign * machine.relation_term(logits, gate, r, observed).sum(-1)
     # The gate of a relation is closed if one of its objects is absent. So a relation that is on
     # forces object i on.
-    held = (observed * r > machine.gate(edges, absent)).any(-1)
-    return torch.where(held, torch.inf, logit).sigmoid()
+    is_forced = (observed * r > machine.gate(edges, absent)).any(-1)
+    return torch.where(is_forced, torch.inf, logit).sigmoid()
 
 
 def _draw_h1(machine: BoltzmannMachine, evidence: Evidence, generator: torch.Generator) -> Tensor:
@@ -185,7 +185,7 @@ def _draw_h1(machine: BoltzmannMachine, evidence: Evidence, generator: torch.Gen
         return bernoulli(mean_field(machine, evidence).y.sigmoid(), generator)
 
 
-def _touches(edges: Edges, target: Tensor) -> Tensor:
+def _contains_class(edges: Edges, target: Tensor) -> Tensor:
     """Return a mask (scenes, units) of the relation units that contain the class `target`."""
     i = target.unsqueeze(1)
     return ((edges.subject == i) | (edges.object == i)) & edges.valid

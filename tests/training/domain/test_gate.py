@@ -13,7 +13,7 @@ from tests.http.stores import corrupt, make_store
 from training.datasets.batches import subset
 from training.domain.candidates import Candidate
 from training.domain.compare import RELATIONAL, Comparison, unmeasured
-from training.domain.gate import Usefulness, losses, measure_usefulness, seat
+from training.domain.gate import Usefulness, losses, measure_usefulness, served_model
 from training.evaluation.metrics import Figure
 from training.evaluation.results import Difference, Results
 from training.fit.configuration import Config
@@ -181,15 +181,15 @@ def test_too_few_test_scenes_decide_nothing_and_are_refused(which) -> None:
 
 def test_an_alias_serves_a_model_or_nothing_that_can_be_compared_with(tmp_path) -> None:
     store = Store(make_store(tmp_path / "store"))
-    found = seat(store, "default")
-    assert found.holder is not None
-    assert (found.holder.title, found.note) == ("home@1.0.0", "")
-    assert found.holder.config is None  # random weights do not say how they were trained
-    new = seat(store, "fresh")
-    assert (new.target, new.holder) == (None, None)
+    found = served_model(store, "default")
+    assert found.candidate is not None
+    assert (found.candidate.title, found.note) == ("home@1.0.0", "")
+    assert found.candidate.config is None  # random weights do not say how they were trained
+    new = served_model(store, "fresh")
+    assert (new.target, new.candidate) == (None, None)
     assert "fresh is a new alias" in new.note
     corrupt(store.root, "home", "1.0.0")
-    broken = seat(store, "default")
+    broken = served_model(store, "default")
     assert str(broken.target) == "home@1.0.0"
-    assert broken.holder is None
+    assert broken.candidate is None
     assert "cannot be read" in broken.note

@@ -118,6 +118,7 @@ class ObjectChains:
     def _start(
         self, machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
     ) -> dict[str, Tensor]:
+        """Start this process' chains at random scenes of the batch of all processes."""
         pick = share(torch.randint(len(v), (self.count,), generator=generator, device="cpu"))
         state = initial_state(machine, v[pick], generator, Clamp(room=room[pick]))
         return {"v": state.v, "h1": state.h1, "h2": state.h2, "room": room[pick]}

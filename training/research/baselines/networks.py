@@ -96,11 +96,11 @@ def train_network(
         network.parameters(), lr=course.learning_rate, weight_decay=course.weight_decay
     )
     steps = math.ceil(len(v) / course.batch_size)
-    cycle = OneCycleLR(
+    schedule = OneCycleLR(
         optimiser, course.learning_rate, total_steps=steps * course.epochs + 1, pct_start=_WARM_UP
     )
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(_AVERAGING))
-    offers = {max(1, round(share * course.epochs)) for share in course.offers}
+    candidate_epochs = {max(1, round(share * course.epochs)) for share in course.offers}
     for epoch in range(1, course.epochs + 1):
         # Dropout uses the global random generator. The fork restores its state after the block.
         with torch.random.fork_rng(devices=[]):
@@ -110,19 +110,19 @@ def train_network(
                 optimiser.zero_grad()
                 removal_loss(network, v[index], structure, course.noise).backward()
                 optimiser.step()
-                cycle.step()
+                schedule.step()
                 average.update_parameters(network)
-        if epoch in offers:
+        if epoch in candidate_epochs:
             yield epoch, NetworkScore(copy.deepcopy(average.module).eval(), structure)
 
 
 def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float) -> Tensor:
     """Return the cross-entropy of one randomly removed class a scene, averaged over scenes."""
     target = torch.multinomial(v * ~structure, 1)
-    left = v.scatter(1, target, 0.0)
+    remaining = v.scatter(1, target, 0.0)
     hidden = torch.rand(v.shape) < noise * torch.rand(len(v), 1)
-    candidate = ((left == 0) & ~structure).scatter(1, target, True)
-    values = network(left * ~hidden).masked_fill(~candidate, -torch.inf)
+    candidate = ((remaining == 0) & ~structure).scatter(1, target, True)
+    values = network(remaining * ~hidden).masked_fill(~candidate, -torch.inf)
     return -values.log_softmax(1).gather(1, target).mean()
 
 
@@ -209,10 +209,10 @@ class SetTransformer(nn.Module):
         present, token = v.topk(most, dim=1)
         token = torch.where(present > 0, token, self.classes + 1)
         token = nn.functional.pad(token, (1, 0), value=self.classes)
-        seen: Tensor = self.encoder(
+        encoded: Tensor = self.encoder(
             self.embedding(token), src_key_padding_mask=token == self.classes + 1
         )
-        return seen[:, 0] @ self.embedding.weight[: self.classes].T + self.bias
+        return encoded[:, 0] @ self.embedding.weight[: self.classes].T + self.bias
 
 
 def transformer(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:

@@ -36,10 +36,10 @@ def evidence(v: Tensor, smoothing: float) -> Tensor:
         smoothing: number of average scenes that are added to the scenes with i, and to the scenes
             without i.
     """
-    both, count, scenes = v.T @ v, v.sum(0), len(v)
+    pair_count, count, scenes = v.T @ v, v.sum(0), len(v)
     average = frequency(v).unsqueeze(1) * smoothing
-    with_class = (both + average) / (count + smoothing)
-    without_class = (count.unsqueeze(1) - both + average) / (scenes - count + smoothing)
+    with_class = (pair_count + average) / (count + smoothing)
+    without_class = (count.unsqueeze(1) - pair_count + average) / (scenes - count + smoothing)
     return (with_class / without_class).log().fill_diagonal_(0.0)
 
 
@@ -72,10 +72,10 @@ def nearest_score(v: Tensor, *, neighbours: int, sharpness: float) -> ObjectScor
 
     def score(query: Tensor) -> Tensor:
         cosine = normalize(query, dim=1) @ index
-        near, place = cosine.topk(min(neighbours, len(v)), dim=1)
+        similarity, neighbour = cosine.topk(min(neighbours, len(v)), dim=1)
         # The vote of a training scene without a class of the query is 0.
-        vote = (near / near[:, :1].clamp(min=1e-6)) ** sharpness
-        share = embedding_bag(place, v, per_sample_weights=vote, mode="sum") + popularity
+        vote = (similarity / similarity[:, :1].clamp(min=1e-6)) ** sharpness
+        share = embedding_bag(neighbour, v, per_sample_weights=vote, mode="sum") + popularity
         return (share / (vote.sum(1, keepdim=True) + 1.0)).logit()
 
     return score

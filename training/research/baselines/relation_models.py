@@ -63,7 +63,7 @@ def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -
     i, j = counts.together.nonzero(as_tuple=True)
     trials, held = counts.together[i, j], counts.held[:, i, j]
     optimiser = torch.optim.Adam([classes, relations, bias], lr=_LEARNING_RATE)
-    cycle = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
     for _ in range(_STEPS):
         optimiser.zero_grad()
         values = complex_logits(bias, relations, classes)[:, i, j]
@@ -72,7 +72,7 @@ def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -
         norm = (size[i] + size[j]).sum() + len(i) / A * (relations.abs() ** 3).sum()
         ((misfit + penalty * norm) / len(i)).backward()
         optimiser.step()
-        cycle.step()
+        schedule.step()
     with torch.no_grad():
         return complex_logits(bias, relations, classes)
 
@@ -132,9 +132,9 @@ class ClosureScore:
 
     def __call__(self, batch: Batch) -> Tensor:
         """Return log-odds given the observed relations of a batch, (scenes, relations, n, n)."""
-        given = (batch.holds > 0) & batch.observed
-        closed = transitive_closure(given)
-        follows, mirror = closed & ~given, closed.mT & ~closed
+        observed = (batch.holds > 0) & batch.observed
+        closed = transitive_closure(observed)
+        follows, mirror = closed & ~observed, closed.mT & ~closed
         return self.table(batch) + self.bonus * follows - self.penalty * mirror
 
 
