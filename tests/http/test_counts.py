@@ -36,7 +36,6 @@ def counts() -> Counts:
 def store_of_counts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("store")
     publish(root, "counted", "1.0.0", alias="default", counts=counts())
-    publish(root, "plain", "1.0.0")
     return root
 
 
@@ -74,10 +73,10 @@ async def test_candidates_name_listed_classes_too(client: httpx.AsyncClient) -> 
     assert entry["probability"] == pytest.approx(0.2, abs=1e-3)
 
 
-async def test_coverage_a_place_and_a_model_without_counts(client: httpx.AsyncClient) -> None:
-    assert await more(client, coverage=1.0) == []
+async def test_a_question_about_a_place_lists_no_further_instances(
+    client: httpx.AsyncClient,
+) -> None:
     assert await more(client, at={"relation": "on-top", "object": "bed"}) == []
-    assert await more(client, model="plain") == []
 
 
 async def test_ignored_labels_do_not_count(client: httpx.AsyncClient) -> None:
