@@ -234,7 +234,7 @@ def evaluate_command(
             stored = Store(store)
             artifact = stored.load(*stored.resolve(reference))
             config = Config.model_validate(artifact.manifest.training["config"])
-            wanted = source or [source_name(name) for name in config.data.sources]
+            names = source or list(map(source_name, config.data.sources))
             with console.status("reading scenes"):
                 # The split must include all data sources, as in training. Otherwise the test part
                 # could contain training scenes.
@@ -242,15 +242,15 @@ def evaluate_command(
                     config.data, read_sources(config.data, data or DATA), artifact.vocabulary
                 )
             tensors = scenes.training_data()
-            some = {"train": tensors.train, "validation": tensors.validation, "test": tensors.test}
-            if part not in some:
-                raise ConfigError(f"--part is {part!r}; it must be one of {', '.join(some)}")
-            index = [k for k, scene in enumerate(some[part].scenes) if scene.source in wanted]
+            parts = {"train": tensors.train, "validation": tensors.validation, "test": tensors.test}
+            if part not in parts:
+                raise ConfigError(f"--part is {part!r}; it must be one of {', '.join(parts)}")
+            index = [k for k, scene in enumerate(parts[part].scenes) if scene.source in names]
             if not index:
                 raise ConfigError(
-                    f"{reference}: the {part} part has no scenes of the sources {', '.join(wanted)}"
+                    f"{reference}: the {part} part has no scenes of the sources {', '.join(names)}"
                 )
-            test = subset(some[part], torch.tensor(index, dtype=torch.int64))
+            test = subset(parts[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:
                 tables[reference] = evaluate(
                     *(artifact, test, tensors.structure, tensors.train),

@@ -152,16 +152,16 @@ def _parse_objects(entries: list[Any]) -> tuple[AnnotatedObject, ...]:
     for thing in things:
         _check_fields("an object", thing, {"label"}, _OBJECT_FIELDS)
     nameless = Counter(_require_text("label", t["label"]) for t in things if t.get("id") is None)
-    taken = {_require_id(thing["id"]) for thing in things if thing.get("id") is not None}
+    ids = {_require_id(thing["id"]) for thing in things if thing.get("id") is not None}
     objects = []
     for thing in things:
         name, number = thing.get("id"), 0
         if name is None:
             name = label = thing["label"]
-            while name in taken or (not number and nameless[label] > 1):
+            while name in ids or (not number and nameless[label] > 1):
                 number += 1
                 name = f"{label}_{number}"
-            taken.add(name)
+            ids.add(name)
         objects.append(_parse_object(thing, _require_id(name)))
     return tuple(objects)
 

@@ -306,19 +306,19 @@ class _Layout:
 
     def _free(self, box: _Box) -> bool:
         """Return True if a box overlaps no other box."""
-        others = [
-            other
-            for other in self.boxes
-            if abs(other.z - box.z) < (other.size[2] + box.size[2]) / 2 - 1e-6
+        neighbours = [
+            neighbour
+            for neighbour in self.boxes
+            if abs(neighbour.z - box.z) < (neighbour.size[2] + box.size[2]) / 2 - 1e-6
         ]
-        if not others:
+        if not neighbours:
             return True
-        n = len(others)
+        n = len(neighbours)
         _, gap = overlap_and_gap(
             np.tile([box.x, box.y], (n, 1)), np.tile(box.size[:2], (n, 1)), np.full(n, box.yaw),
-            np.array([[other.x, other.y] for other in others]),
-            np.array([other.size[:2] for other in others]),
-            np.array([other.yaw for other in others]),
+            np.array([[neighbour.x, neighbour.y] for neighbour in neighbours]),
+            np.array([neighbour.size[:2] for neighbour in neighbours]),
+            np.array([neighbour.yaw for neighbour in neighbours]),
         )  # fmt: skip
         clearance = 0.0 if box.support is not None else _CLEARANCE
         return bool((gap > clearance).all())

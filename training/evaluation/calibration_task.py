@@ -64,7 +64,7 @@ def uncalibrated(artifact: Artifact) -> Artifact:
     Calibration multiplies log-odds by a slope. The slope -1 turns the log-odds of an object or
     relation into the log-odds that the object or relation is wrong.
     """
-    plain = Calibration.neutral(artifact.spec.A).model_copy(
+    neutral = Calibration.neutral(artifact.spec.A).model_copy(
         update={
             "outlier": CountSlope(slope=-1.0),
             "outlier_thresholds": NEVER,
@@ -72,7 +72,7 @@ def uncalibrated(artifact: Artifact) -> Artifact:
             "misplaced_thresholds": NEVER,
         }
     )
-    return replace(artifact, calibration=plain)
+    return replace(artifact, calibration=neutral)
 
 
 def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:

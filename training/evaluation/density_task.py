@@ -277,8 +277,8 @@ class State:
         uniform = rng.random(self.v.shape)
         logits = np.log(uniform) - np.log1p(-uniform)
         bias = (1 - beta) * a + beta * self.model.b
-        for i, (drawn, old) in enumerate(zip(logits, self.v, strict=True)):
-            new = drawn < bias[i] + beta * self.field[i]
+        for i, (logit, old) in enumerate(zip(logits, self.v, strict=True)):
+            new = logit < bias[i] + beta * self.field[i]
             changed = np.flatnonzero(new != old)
             if len(changed):
                 self.field[:, changed] += np.outer(self.model.W[i], new[changed] - old[changed])

@@ -108,13 +108,13 @@ def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> Lines:
 def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
     """Build a scene of the known labels; several objects of a label have the ids label_number."""
     objects = []
-    taken: set[str] = set()
+    ids: set[str] = set()
     for label in labels:
         name, number = label, 0
-        while name in taken or (number == 0 and labels.count(label) > 1):
+        while name in ids or (number == 0 and labels.count(label) > 1):
             number += 1
             name = f"{label}_{number}"
-        taken.add(name)
+        ids.add(name)
         if (index := artifact.vocabulary.index(label)) is not None:
             objects.append(SceneObject(name, label, index))
     return Scene(tuple(objects))

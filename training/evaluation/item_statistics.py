@@ -43,8 +43,8 @@ def auroc(score: Floats, truth: Flags) -> Prepared:
     _, count = _by_score(score, truth)
 
     def at(weight: Floats) -> float:
-        every, true = count(weight)
-        false = every - true
+        totals, true = count(weight)
+        false = totals - true
         below = np.cumsum(false) - false
         pairs = true.sum() * false.sum()
         return float((true * (below + false / 2)).sum() / pairs) if pairs else float("nan")
@@ -85,10 +85,10 @@ def calibration_error(score: Floats, truth: Flags) -> Prepared:
     scores, count = _by_score(score, truth)
 
     def at(weight: Floats) -> float:
-        every, true = count(weight)
-        if not every.sum():
+        totals, true = count(weight)
+        if not totals.sum():
             return float("nan")
-        p, y = _bins(scores, every, true)
+        p, y = _bins(scores, totals, true)
         return float(np.abs(p - y) @ np.full(BINS, 1 / BINS))
 
     return at
@@ -102,11 +102,11 @@ def brier_skill(score: Floats, truth: Flags) -> Prepared:
     scores, count = _by_score(score, truth)
 
     def at(weight: Floats) -> float:
-        every, true = count(weight)
-        total = every.sum()
+        totals, true = count(weight)
+        total = totals.sum()
         rate = true.sum() / total if total else 0.0
         base = rate * (1 - rate)
-        brier = (true * (1 - scores) ** 2 + (every - true) * scores**2).sum()
+        brier = (true * (1 - scores) ** 2 + (totals - true) * scores**2).sum()
         return float(1 - brier / total / base) if base > 0 else float("nan")
 
     return at
@@ -118,16 +118,16 @@ def reliability(score: Floats, truth: Flags) -> tuple[Floats, Floats]:
     return _bins(scores, *count(np.ones(len(score))))
 
 
-def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats]:
+def _bins(scores: Floats, totals: Floats, true: Floats) -> tuple[Floats, Floats]:
     """Return the mean score and the share of true items of each bin of `calibration_error`.
 
     If a bin border divides items of equal score, each bin gets a proportional part of the true
     items among them.
     """
-    total = every.sum()
+    total = totals.sum()
     edges = total * _EDGES
-    last = np.zeros(len(every) + 1)
-    np.cumsum(every, out=last[1:])
+    last = np.zeros(len(totals) + 1)
+    np.cumsum(totals, out=last[1:])
 
     def means(values: Floats) -> Floats:
         sums = np.zeros(len(values) + 1)
@@ -135,7 +135,7 @@ def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats]:
         upto = np.interp(edges, last, sums)
         return (upto[1:] - upto[:-1]) * (BINS / total)
 
-    return means(every * scores), means(true)
+    return means(totals * scores), means(true)
 
 
 STATISTICS: dict[str, Callable[[Floats, Flags], Prepared]] = {

@@ -168,11 +168,11 @@ class Partial:
 
 def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int = 0) -> Partial:
     """Hide classes of each scene with at least two: all but a share of them, or one (None)."""
-    plain = ~structure.numpy()
+    is_thing = ~structure.numpy()
     rows: list[int] = []
     hidden = torch.zeros_like(scenes.v, dtype=torch.bool)
     for k, scene in enumerate(scenes.scenes):
-        classes = scene.evidence.classes[plain[scene.evidence.classes]]
+        classes = scene.evidence.classes[is_thing[scene.evidence.classes]]
         if len(classes) < 2:
             continue
         order = scene_rng(scene, seed).permutation(classes)
@@ -231,10 +231,10 @@ def removed_places(
 ) -> tuple[Tensor, Tensor, Places]:
     """Return the indices of the scenes (N,), the removed classes (N,), and the places."""
     removals: list[tuple[int, int, int, int, bool]] = []
-    plain = ~structure.numpy()
+    not_structure = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
         evidence = scene.evidence
-        is_thing = plain[evidence.classes]
+        is_thing = not_structure[evidence.classes]
         if is_thing.sum() < 2:
             continue
         pair = is_thing[:, None] & is_thing & ~np.eye(len(is_thing), dtype=np.bool_)

@@ -63,12 +63,12 @@ PairScore = Callable[[ScenePairs], Floats]
 
 def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
     """Return the vertical pairs of every scene that has such pairs."""
-    plain = ~structure.numpy()
+    not_structure = ~structure.numpy()
     pairs = []
     for index, scene in enumerate(scenes.scenes):
         holds = scene.evidence.holds
         vertical = holds[[a for a in VERTICAL if a < len(holds)]].any(0)
-        is_thing = plain[scene.evidence.classes]
+        is_thing = not_structure[scene.evidence.classes]
         pair = np.triu(vertical | vertical.T, 1) & is_thing[:, None] & is_thing
         ends = np.argwhere(pair)
         if len(ends):
@@ -81,10 +81,10 @@ def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
 def service_score(artifact: Artifact) -> PairScore:
     """Return a score: probabilities of `/relations` between the first instances of both classes."""
 
-    def score(asked: ScenePairs) -> Floats:
-        scene, classes = asked.scene, asked.scene.evidence.classes
+    def score(question: ScenePairs) -> Floats:
+        scene, classes = question.scene, question.scene.evidence.classes
         first = [int(np.flatnonzero(scene.instance_classes == c)[0]) for c in classes]
-        ends = [(first[x], first[y]) for x, y in asked.ends.tolist()]
+        ends = [(first[x], first[y]) for x, y in question.ends.tolist()]
         pairs = ends + [(y, x) for x, y in ends]
         p = relation_probabilities(artifact, labels_alone(scene), pairs)
         x, y = np.array(ends).T
@@ -97,10 +97,10 @@ def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
     """Return a score from log-odds of relations between classes."""
 
     @torch.no_grad()
-    def score(asked: ScenePairs) -> Floats:
-        batch = scenes.batch(torch.tensor([asked.place]))
+    def score(question: ScenePairs) -> Floats:
+        batch = scenes.batch(torch.tensor([question.place]))
         p = relations(telling(batch))[0].double().sigmoid().numpy()
-        x, y = asked.ends.T
+        x, y = question.ends.T
         return np.concatenate([p[:, x, y], p[:, y, x]]).T
 
     return score

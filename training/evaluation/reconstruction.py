@@ -23,8 +23,8 @@ def reconstruction_error(machine: BoltzmannMachine, scenes: SceneTensors) -> tup
     """Return (object error, relation error) of random scenes; NaN without observed relations."""
     object_sum = relation_sum = 0.0
     objects = relations = 0
-    chosen = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:_SCENES]
-    for index in chosen.split(_BLOCK):
+    sample = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:_SCENES]
+    for index in sample.split(_BLOCK):
         batch = scenes.batch(index)
         edges, r, observed = relation_units(machine, batch)
         field = mean_field(machine, Evidence(batch.v, edges, r, observed, batch.room))

@@ -221,23 +221,23 @@ def expected_hits(score: Floats, truth: Flags, count: int) -> float:
     return float(truth[is_above].sum() + share * truth[is_tied].sum())
 
 
-def alter(holds: Flags, usable: Flags, rng: Rng) -> tuple[Triple, Triple] | None:
+def alter(holds: Flags, allowed: Flags, rng: Rng) -> tuple[Triple, Triple] | None:
     """Draw a triple of a scene and a false replacement; return (true, false) or None."""
-    triples = np.argwhere(holds & usable)
+    triples = np.argwhere(holds & allowed)
     if len(triples) < 2:
         return None
     A, n, _ = holds.shape
     a, x, y = triples[rng.integers(len(triples))].tolist()
     for _ in range(_TRIES):
-        kind, other = rng.random(), int(rng.integers(n))
+        kind, replacement = rng.random(), int(rng.integers(n))
         if kind < 0.5:
             false = (int(rng.integers(A)), x, y)
         elif kind < 0.75:
-            false = (a, x, other)
+            false = (a, x, replacement)
         else:
-            false = (a, other, y)
+            false = (a, replacement, y)
         b, i, j = false
-        if usable[false] and not holds[b, i, j] and not holds[b, j, i]:
+        if allowed[false] and not holds[b, i, j] and not holds[b, j, i]:
             return (a, x, y), false
     return None
 
@@ -253,12 +253,12 @@ def placement_scores(
     """
     parts: list[Tensor] = [torch.zeros(0, 3, dtype=torch.float64)]
     for index, batch in _batches(scenes, 2):
-        usable = scorable(batch, structure)
-        truth = (batch.holds > 0) & usable
+        mask = scorable(batch, structure)
+        truth = (batch.holds > 0) & mask
         observed, is_false = torch.zeros_like(truth), torch.zeros_like(truth)
         for row, k in enumerate(index):
             rng = scene_rng(scenes.scenes[k], seed)
-            case = alter(batch.holds[row].numpy() > 0, usable[row].numpy(), rng)
+            case = alter(batch.holds[row].numpy() > 0, mask[row].numpy(), rng)
             if case is not None:
                 true_triple, false_triple = case
                 observed[row] = truth[row]
@@ -278,10 +278,10 @@ def relations_task(model: Model, setting: Setting) -> Outcome | None:
         return None
     scenes, structure, score = setting.scenes, setting.structure, model.relations
     with_counts = score_scenes(scenes, structure, score)
-    plain = score_scenes(scenes, structure, score, counts=False)
-    if not _any_true(plain):
+    uncounted = score_scenes(scenes, structure, score, counts=False)
+    if not _any_true(uncounted):
         return None
-    ranking, counted = rank(plain, len(scenes)), rank(with_counts, len(scenes))
+    ranking, counted = rank(uncounted, len(scenes)), rank(with_counts, len(scenes))
     metrics: dict[str, Metric] = {
         "R-precision, distinct classes": ranking.pooled(),
         "R-precision, instance counts": counted.pooled(),

@@ -146,13 +146,13 @@ def measure(
     Raises:
         ValueError: a task is unknown, or the file belongs to other scenes or questions.
     """
-    wanted = list(tasks)
-    if unknown := sorted(set(wanted) - set(registry)):
+    names = list(tasks)
+    if unknown := sorted(set(names) - set(registry)):
         raise ValueError(f"unknown tasks {unknown}: choose from {list(registry)}")
     report = SourceReport(source, digest(setting))
     if path is not None and path.exists():
         report = SourceReport.read(path, setting)
-    for task in wanted:
+    for task in names:
         if task in report.outcomes:
             continue
         progress(f"{source}: {task}")
@@ -213,7 +213,7 @@ def evaluate(
     if limit is None:
         limit = _LIMIT if artifact.oracle is None else _LIMIT_OF_DRAWS
     model = artifact_model(artifact, train)
-    wanted = [
+    selected = [
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)
     ]
     rows: list[CardMetric] = []
@@ -231,12 +231,12 @@ def evaluate(
 
     settings = dict(settings_by_source(scenes, structure, train, None, limit=limit))
     for source, setting in settings.items():
-        add(setting, source, [task for task in wanted if task not in WHOLE_SET])
+        add(setting, source, [task for task in selected if task not in WHOLE_SET])
     together = next(iter(settings)) if len(settings) == 1 else "pooled"
-    whole = [task for task in wanted if task in WHOLE_SET and task not in ONCE]
+    whole = [task for task in selected if task in WHOLE_SET and task not in ONCE]
     add(Setting(scenes, structure, train, limit=limit), together, whole)
     setting = Setting(scenes, structure, limit=limit, everyday=everyday)
-    add(setting, SOURCE, [task for task in wanted if task in ONCE])
+    add(setting, SOURCE, [task for task in selected if task in ONCE])
     return rows
 
 

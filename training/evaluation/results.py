@@ -118,8 +118,8 @@ class Results:
             "ours": self.ours,
             "parameters": dict(self.parameters),
             "cells": [asdict(cell) for cell in self.cells],
-            "differences": [asdict(one) | {"verdict": one.verdict} for one in self.differences],
-            "asked": [asdict(asked) for asked in self.asked],
+            "differences": [asdict(row) | {"verdict": row.verdict} for row in self.differences],
+            "asked": [asdict(entry) for entry in self.asked],
         }
 
     def markdown(self, shown: Shown = SHOWN, *, changes: bool = False) -> str:

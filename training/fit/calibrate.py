@@ -189,8 +189,8 @@ def fit_placements(
 
 def _examples(blocks: list[Floats]) -> Floats:
     """Return the examples for which the machine has a relation unit, and so log-odds."""
-    every = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
-    return every[every[:, _LOGIT] > NO_UNIT]
+    examples = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
+    return examples[examples[:, _LOGIT] > NO_UNIT]
 
 
 def _from_complete(examples: Floats, sources: Sequence[str]) -> Floats:
@@ -254,10 +254,10 @@ def rising_curve(
         Intercept and slope of the line at the lowest logits, and the bends (logit, change of slope)
         of the curve; see `PairSlope`.
     """
-    at = np.quantile(logits, np.linspace(0, 1, _BENDS + 2)[1:-1])
-    edges = np.concatenate([[-np.inf], at, [np.inf]])
+    knots = np.quantile(logits, np.linspace(0, 1, _BENDS + 2)[1:-1])
+    edges = np.concatenate([[-np.inf], knots, [np.inf]])
     pieces = np.clip(logits[:, None], edges[:-1], edges[1:])
-    pieces -= np.concatenate([[0.0], at])
+    pieces -= np.concatenate([[0.0], knots])
     sign = np.where(truth, -1.0, 1.0)
 
     def loss(weights: Floats) -> tuple[float, Floats]:
@@ -273,7 +273,7 @@ def rising_curve(
     start = np.concatenate([[0.0], np.ones(_BENDS + 1)])
     intercept, slope, *others = minimize(loss, start, jac=True, bounds=bounds).x.tolist()
     changes = np.diff([slope, *others]) / slope
-    bend_logits = (intercept + slope * at).tolist()
+    bend_logits = (intercept + slope * knots).tolist()
     return intercept, slope, tuple(zip(bend_logits, changes.tolist(), strict=True))
 
 
@@ -337,15 +337,16 @@ def _instance_pairs(
     logs = np.log(evidence.counts[index])
     is_thing = ~structure[scene.instance_classes]
     pairs = pairs & is_thing[:, None] & is_thing[None, :] & ~np.eye(len(index), dtype=np.bool_)
-    annotated, every = annotated_relations(scene)[: len(values)], values[:, index[:, None], index]
+    annotated = annotated_relations(scene)[: len(values)]
+    log_odds = values[:, index[:, None], index]
     # The smallest of the `_LISTED` largest values of each relation.
     few = pairs.sum() <= _LISTED
-    least = [-np.inf if few else np.partition(v[pairs], -_LISTED)[-_LISTED] for v in every]
-    examples = pairs & (annotated | (every >= np.array(least)[:, None, None]))
+    least = [-np.inf if few else np.partition(v[pairs], -_LISTED)[-_LISTED] for v in log_odds]
+    examples = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
     relation, i, j = np.nonzero(examples)
     truth = np.where(annotated, scene.instance_holds[: len(values)], _UNKNOWN)[examples]
     size = np.log(len(evidence.classes))
-    columns = number, relation, every[examples], logs[i] + logs[j], size, truth, source
+    columns = number, relation, log_odds[examples], logs[i] + logs[j], size, truth, source
     return np.stack(np.broadcast_arrays(*columns), 1)
 
 

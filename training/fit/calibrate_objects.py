@@ -96,8 +96,8 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
     complete = scenes.complete.numpy()
     # Photographs have no complete object lists. If all scenes are photographs, use all of them.
     complete = complete if complete.any() else ~complete
-    kept = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
-    return subset(scenes, torch.from_numpy(np.flatnonzero(kept)))
+    mask = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
+    return subset(scenes, torch.from_numpy(np.flatnonzero(mask)))
 
 
 def calibrate_objects(
@@ -153,10 +153,10 @@ def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple
     with fewer than 20 scenes.
     """
     sizes = ((train.v > 0) & ~structure).sum(1).numpy()
-    every = int(np.quantile(sizes, _SMALL))
-    of = [sizes[train.room.numpy() == t] for t in range(rooms)]
-    quantiles = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else every for n in of]
-    return (*quantiles, every)
+    limit = int(np.quantile(sizes, _SMALL))
+    by_room = [sizes[train.room.numpy() == t] for t in range(rooms)]
+    quantiles = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else limit for n in by_room]
+    return (*quantiles, limit)
 
 
 def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:

@@ -160,7 +160,7 @@ class _Cases:
                 numbers = np.stack([part.classes, part.listed, part.number])[:, indices]
                 cases += [(*case, row, source) for case in numbers.T.tolist()]
         index, listed, number, scene_rows, sources = np.array(cases, dtype=np.int64).T
-        columns, values = (np.concatenate(some) for some in zip(*rows, strict=True))
+        columns, values = (np.concatenate(arrays) for arrays in zip(*rows, strict=True))
         bounds = np.cumsum([0, *(len(row) for row, _ in rows)])
         shape = (len(cases), start + len(vocabulary))
         features = sparse.csr_matrix((values, columns, bounds), shape=shape)

@@ -22,10 +22,10 @@ def bernoulli(p: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """Return binary draws with probabilities p (float32 or float64), in p's dtype and shape."""
     device = p.device
     p = p.detach().cpu().contiguous()
-    drawn = torch.empty_like(p)
+    sample = torch.empty_like(p)
     # numpy converts the type during the multiplication, so temporary arrays use one byte for each
     # draw. numpy also finds the rare ties ten times faster than torch on one core.
-    source, target = p.view(-1).numpy(), drawn.view(-1).numpy()
+    source, target = p.view(-1).numpy(), sample.view(-1).numpy()
     first, rows = own_rows(len(p), generator)
     width = p.shape[1:].numel()
     words = torch.empty((rows * width + 7) // 8, dtype=torch.int64, device="cpu")
@@ -39,7 +39,7 @@ def bernoulli(p: Tensor, generator: torch.Generator | None = None) -> Tensor:
     ties = np.flatnonzero(bits == whole)
     draw = uniform((ties.size,), generator, torch.float64).cpu().numpy()
     target[ties] = draw < source[ties] * 256 - whole[ties]
-    return drawn.to(device)
+    return sample.to(device)
 
 
 def uniform(

@@ -97,8 +97,8 @@ def draw_hidden(
         logits = machine.relation_logits(edges, evidence.v, h1)
         term = machine.relation_term(logits, gate, r, observed)
         if pull < 1:
-            unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
-            term = torch.lerp(unseen, term, pull)
+            unobserved = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
+            term = torch.lerp(unobserved, term, pull)
         target = target + term.sum(-1)
     log_weight = target - log_q
     return HiddenDraws(h1, log_weight - log_weight.logsumexp(0), field)

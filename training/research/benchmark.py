@@ -216,24 +216,24 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
     return list(domains.values())
 
 
-def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
-    """Return the tasks with the wanted names or prefixes; without `wanted`, all tasks.
+def chosen_tasks(names: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
+    """Return the tasks with these names or prefixes; without `names`, all tasks.
 
-    With `quick`, slow tasks are left out, unless they are wanted.
+    With `quick`, slow tasks are left out, unless they are named.
 
     Raises:
-        ValueError: a wanted name matches no task.
+        ValueError: a name matches no task.
     """
-    if not wanted:
+    if not names:
         return tuple(name for name in TASKS if not quick or name not in _SLOW_TASKS)
-    chosen: set[str] = set()
-    for part in wanted:
+    selected: set[str] = set()
+    for part in names:
         # A full name selects only that task, even if it is a prefix of other names.
         matches = {part} & set(TASKS) or {name for name in TASKS if name.startswith(part)}
         if not matches:
             raise ValueError(f"unknown task {part!r}: use a name, or the start, of {list(TASKS)}")
-        chosen |= matches
-    return tuple(name for name in TASKS if name in chosen)
+        selected |= matches
+    return tuple(name for name in TASKS if name in selected)
 
 
 def shuffled_tasks(tasks: Sequence[str]) -> tuple[str, ...]:

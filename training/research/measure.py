@@ -242,8 +242,8 @@ def measure_entries(
             if error := work(entry, progress):
                 failed[entry.name, entry.seed] = error
     reasons = {name: f"seed {seed}: {error}" for (name, seed), error in failed.items()}
-    kept = [entry for entry in entries if entry.name not in reasons]
-    return {(entry.name, entry.seed): plan.report(entry) for entry in kept}, reasons
+    measured = [entry for entry in entries if entry.name not in reasons]
+    return {(entry.name, entry.seed): plan.report(entry) for entry in measured}, reasons
 
 
 def _measure_or_error(

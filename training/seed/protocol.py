@@ -112,21 +112,21 @@ def reconstruction_after_addition(model: Model, setting: Setting) -> Outcome | N
     if not is_altered.any():
         return None
     V = scenes.v.shape[1]
-    wrong, off, kept, present = (np.zeros(len(scenes)) for _ in range(4))
+    errors, switched_off, still_on, present = (np.zeros(len(scenes)) for _ in range(4))
     for index, batch, generator in _blocks(scenes, setting.seed):
         intruder = added[index].clamp(min=0).unsqueeze(1)
         h1 = _draw_h1(machine, Evidence(batch.v.scatter(1, intruder, 1.0)), generator)
         v = bernoulli(machine.object_logits(h1).sigmoid(), generator)
         weight = is_altered[index]
-        wrong[index] = (v - batch.v).abs().sum(1).double().numpy() * weight
-        off[index] = (1 - v.gather(1, intruder).squeeze(1)).double().numpy() * weight
-        kept[index] = (v * batch.v).sum(1).double().numpy() * weight
+        errors[index] = (v - batch.v).abs().sum(1).double().numpy() * weight
+        switched_off[index] = (1 - v.gather(1, intruder).squeeze(1)).double().numpy() * weight
+        still_on[index] = (v * batch.v).sum(1).double().numpy() * weight
         present[index] = batch.v.sum(1).double().numpy() * weight
     metrics: dict[str, Metric] = {
-        "error measure": Ratio(wrong, is_altered * V),
+        "error measure": Ratio(errors, is_altered * V),
         "error measure, doing nothing": Ratio(is_altered, is_altered * V),
-        "added objects switched off": Ratio(off, is_altered),
-        "objects of the scene kept on": Ratio(kept, present),
+        "added objects switched off": Ratio(switched_off, is_altered),
+        "objects of the scene kept on": Ratio(still_on, present),
     }
     return Outcome(metrics, len(scenes), int((is_altered == 0).sum()))
 
@@ -194,9 +194,9 @@ def _contains_class(edges: Edges, target: Tensor) -> Tensor:
 def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
     """Draw a class to remove from each scene, (scenes,); -1 with fewer than two plain classes."""
     targets = torch.full((len(scenes),), -1, dtype=torch.int64)
-    plain = ~structure.numpy()
+    is_thing = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
-        removable = scene.evidence.classes[plain[scene.evidence.classes]]
+        removable = scene.evidence.classes[is_thing[scene.evidence.classes]]
         if len(removable) >= 2:
             targets[k] = int(scene_rng(scene, seed).choice(removable))
     return targets

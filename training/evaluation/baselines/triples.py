@@ -186,13 +186,13 @@ def smoothed_log_p(
     """
     # In the second table, the removed class is the subject of the relation. The transpose puts the
     # class j of the place first.
-    held = torch.stack([counts.held, counts.held.mT])
+    holds = torch.stack([counts.held, counts.held.mT])
     share = popularity / popularity.sum()
-    any_anchor = held.sum(2)
+    any_anchor = holds.sum(2)
     back_off = any_anchor + relation * share
     back_off = back_off / back_off.sum(-1, keepdim=True)
-    table = held + place * back_off.unsqueeze(2)
-    return (table / (held.sum(-1, keepdim=True) + place)).log()
+    table = holds + place * back_off.unsqueeze(2)
+    return (table / (holds.sum(-1, keepdim=True) + place)).log()
 
 
 def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[PlacedScore]:

@@ -61,13 +61,13 @@ def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -
     classes, relations = factors(V, 0.1), factors(A, 1.0)
     bias = counts.overall().logit().requires_grad_()
     i, j = counts.together.nonzero(as_tuple=True)
-    trials, held = counts.together[i, j], counts.held[:, i, j]
+    trials, successes = counts.together[i, j], counts.held[:, i, j]
     optimiser = torch.optim.Adam([classes, relations, bias], lr=_LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
     for _ in range(_STEPS):
         optimiser.zero_grad()
         values = complex_logits(bias, relations, classes)[:, i, j]
-        misfit = (trials * softplus(values) - held * values).sum()
+        misfit = (trials * softplus(values) - successes * values).sum()
         size = classes.abs() ** 3
         norm = (size[i] + size[j]).sum() + len(i) / A * (relations.abs() ** 3).sum()
         ((misfit + penalty * norm) / len(i)).backward()
