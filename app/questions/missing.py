@@ -63,13 +63,13 @@ def missing(
 
     The model assumes that a present class is listed with probability `coverage`. If the coverage is
     low, an unlisted class may well be present. Each class is judged separately, so the
-    probabilities do not sum to 1. The answer never contains listed or structural classes.
+    probabilities do not sum to 1. The list `missing` never contains listed or structural classes.
 
     Args:
         scene: the listed objects, their relations and the room type.
         top_k: maximum number of classes in each list of the answer.
-        candidates: indices of the classes to rank. Listed and structural classes are ignored. None
-            means all classes.
+        candidates: indices of the classes to rank; the list `more` contains listed candidates at
+            any probability. None means all classes.
         at: a place, as (relation, index of the anchor object). If set, `probability` is the
             probability that the class is present *and* has this relation to the anchor.
         coverage: probability that a present class is listed. None means the model's value. At 1,

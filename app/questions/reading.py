@@ -116,7 +116,7 @@ def read_scene(
         RequestError: the scene is invalid; see `ErrorList.raise_any`.
     """
     errors = ErrorList()
-    _check_sizes(request, limits, errors)
+    _check_fields(request, limits, errors)
     ids = _ids(request.objects, errors)
     unknown = Unknown(vocabulary, request.unknown_labels, look_ups or LookUps())
     reading = Reading(Scene(()), ids, unknown)
@@ -168,7 +168,8 @@ def read_scene(
     return reading
 
 
-def _check_sizes(request: SceneRequest, limits: Limits, errors: ErrorList) -> None:
+def _check_fields(request: SceneRequest, limits: Limits, errors: ErrorList) -> None:
+    """Refuse a scene that is too large or contradictory, before any costly step."""
     for name, most in (("objects", limits.objects), ("relations", limits.relations)):
         if len(getattr(request, name) or ()) > most:
             errors.add(InvalidRequestError, (name,), f"the scene must have at most {most} {name}")

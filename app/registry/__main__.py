@@ -52,6 +52,8 @@ def _list(store: Store) -> None:
         _print(f"{name}@{version}{state}")
     for alias, target in models.aliases.items():
         _print(f"{alias} -> {target}")
+    if models.failure is not None:
+        raise models.failure
 
 
 def _target(reference: str) -> AliasTarget:

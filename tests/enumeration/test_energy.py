@@ -8,10 +8,13 @@ import pytest
 import torch
 
 from tests.enumeration.small_machines import (
+    ONE_LAYER,
     SEED_FORM,
     SMALL,
+    binary,
     enumerate_joint,
     full_frame,
+    same,
     small_machine,
 )
 
@@ -117,3 +120,46 @@ def test_free_energy_refuses_what_has_no_closed_form(name):
     given = (v, r, edges, h2) if machine.spec.form == "local" else (v, None, None, h2)
     with pytest.raises(ValueError, match="no closed form"):
         machine.free_energy(*given)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_conditionals_of_every_block(name):
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    generator = torch.Generator().manual_seed(2)
+    logits = machine.relation_logits(joint.edges, joint.v, joint.h1)
+    second = machine.second_layer_logits(joint.h1)
+    gate = machine.gate(joint.edges, joint.v)
+    for n in torch.randint(len(joint.v), (40,), generator=generator).tolist():
+        v, r, h1, h2 = (joint.v == joint.v[n], joint.r == joint.r[n], joint.h1 == joint.h1[n],
+                        joint.h2 == joint.h2[n])  # fmt: skip
+        rest = v.all(1) & h1.all(1) & h2.all(1)
+        for e in range(r.shape[1]):
+            others = torch.ones(r.shape[1], dtype=torch.bool)
+            others[e] = False
+            if gate[n, e]:
+                exact = joint.log_odds(joint.r[:, e] > 0, rest & r[:, others].all(1))
+                assert float(logits[n, e]) == pytest.approx(exact, abs=1e-9)
+        for k in range(machine.spec.H2):
+            others = torch.arange(machine.spec.H2) != k
+            given = v.all(1) & r.all(1) & h1.all(1) & h2[:, others].all(1)
+            exact = joint.log_odds(joint.h2[:, k] > 0, given)
+            assert float(second[n, k]) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ONE_LAYER)
+def test_attraction_is_what_summing_relations_adds(name):
+    """log sum_{R_i} exp(-E) at v_i = 1 minus at v_i = 0, given h1, is b_i + W_i·h1 + attraction."""
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    for h1 in binary(machine.spec.H1):
+        for v in binary(machine.spec.V):
+            for i in range(machine.spec.V):
+                others = torch.arange(machine.spec.V) != i
+                given = same(joint.h1, h1) & same(joint.v[:, others], v[others])
+                exact = joint.log_odds(joint.v[:, i] > 0, given)
+                absent = v.clone()
+                absent[i] = 0
+                gain = machine.attraction(absent[None], h1[None], joint.edges, torch.tensor([[i]]))
+                ours = machine.object_logits(h1[None])[0, i] + gain[0, 0]
+                assert float(ours) == pytest.approx(exact, abs=1e-9)

@@ -60,3 +60,15 @@ def test_requests_below_http_break_nothing(service: LiveService) -> None:
         assert all(answer.status < 500 for answer in answers), wire.name
     assert service.control() == before
     assert '"smuggled"' not in service.log.read_text()
+
+
+def test_every_field_of_every_request_is_attacked() -> None:
+    from app.questions import QUESTIONS
+    from scene_client import schemas
+
+    forms = {f"/{question.name}": question.request for question in QUESTIONS}
+    forms[corpus.ALIAS] = schemas.AliasRequest
+    for path, form in forms.items():
+        assert set(corpus.VALID[path]) == set(form.model_fields)
+    detection = corpus.SCENE["objects"][1]
+    assert set(detection) == set(schemas.Detection.model_fields)

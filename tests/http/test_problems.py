@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import uuid
 from collections.abc import AsyncIterator
 from html import escape
@@ -548,3 +549,13 @@ async def test_no_json_breaks_the_service(
     assert response.status_code in {200, 400, 404, 422}
     if response.status_code != 200:
         assert response.headers["content-type"] == "application/problem+json"
+
+
+def test_every_problem_type_is_provoked_by_a_test() -> None:
+    # As in `problem(response, 404, "not-found")`, in whatever folder.
+    checked = {
+        (slug, int(status))
+        for file in Path(__file__).parents[1].glob("*/test_*.py")
+        for status, slug in re.findall(r'\b(\d{3}),\s*"([a-z-]+)"\)', file.read_text("utf-8"))
+    }
+    assert {(slug, kind.status) for slug, kind in ERRORS.items()} <= checked

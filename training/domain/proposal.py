@@ -110,21 +110,22 @@ def propose(
     """Analyse the scenes, and propose a vocabulary and a configuration.
 
     Raises:
-        ConfigError: there are fewer than `FEWEST_SCENES` scenes, or they cannot be split.
-        ValueError: the list of scenes is empty, or the scenes contain no objects.
+        ConfigError: there are fewer than `FEWEST_SCENES` scenes, no label occurs often enough, or
+            the scenes cannot be split.
+        ValueError: the list of scenes is empty.
     """
     names = curated_names()
     facts = look(scenes, names)
-    labels = count_labels(scenes, names)
-    similar = lookalikes(labels, scenes, names)
-    minimum, covered = _choose_minimum(scenes, similar)
-    vocabulary = _use_frequent_names(_vocabulary(scenes, similar, minimum), scenes)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} scenes are too few: from fewer than {FEWEST_SCENES} scenes, a model "
             "may learn no more than the frequency of each class. Provide at least "
             f"{FEWEST_SCENES} scenes, better {FEW_SCENES} scenes of {FEW_SCENES // 2} places"
         )
+    labels = count_labels(scenes, names)
+    similar = lookalikes(labels, scenes, names)
+    minimum, covered = _choose_minimum(scenes, similar)
+    vocabulary = _use_frequent_names(_vocabulary(scenes, similar, minimum), scenes)
     seed, parts, test_groups = _split(scenes)
     settings, reasons = _configuration(facts, parts)
     reasons |= {

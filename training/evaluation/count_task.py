@@ -92,15 +92,16 @@ def _ask_counts(
     An answer is (class, number in the scene, listed number, expected number, low, high,
     probability).
     """
-    part, is_asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
+    part, asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
     room = part.room if part.room >= 0 else None
     listed = replace(of_classes(np.repeat(part.classes, part.listed).tolist()), room_type=room)
-    candidates = part.classes[is_asked].tolist()
+    candidates = part.classes[asked].tolist()
     labels = artifact.vocabulary.labels
     pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
     number_of = {labels[index]: (index, number) for index, number in pairs}
     entries = more(artifact, listed, top_k=len(candidates), candidates=candidates)
-    return [(*number_of[entry.pop("label")], *entry.values()) for entry in entries]
+    fields = ("listed_count", "expected_count", "low", "high", "probability")
+    return [(*number_of[entry["label"]], *(entry[name] for name in fields)) for entry in entries]
 
 
 def _mean_counts(scenes: Sequence[EncodedScene], artifact: Artifact) -> Floats:

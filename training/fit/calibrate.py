@@ -236,11 +236,16 @@ def _fit_curve(
     if len(np.unique(truth)) < 2:
         return slopes
     intercept, slope, bends = rising_curve(_logits(examples, slopes), truth)
-    scaled = (
-        (intercept + slope * entry.intercept, slope * entry.slope, slope * entry.log_count)
+    return tuple(
+        PairSlope(
+            intercept=intercept + slope * entry.intercept,
+            slope=slope * entry.slope,
+            log_count=slope * entry.log_count,
+            log_classes=slope * entry.log_classes,
+            bends=bends,
+        )
         for entry in slopes
     )
-    return tuple(PairSlope(intercept=a, slope=b, log_count=c, bends=bends) for a, b, c in scaled)
 
 
 def rising_curve(

@@ -11,6 +11,7 @@ import torch
 from tests.enumeration.small_machines import binary
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from tests.training.fit.test_trainer import same, small_config, weights
+from training.fit import object_weights as objects
 from training.fit.configuration import FineTuneConfig, ObjectsConfig
 from training.fit.object_weights import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
 from training.fit.trainer import Trainer
