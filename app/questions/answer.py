@@ -183,7 +183,7 @@ def written(answer: Any) -> bytes:
     Raises:
         ValueError: a number in the answer is not finite.
     """
-    body = orjson.dumps(answer, default=_fields)
+    body = orjson.dumps(answer, default=lambda part: to_jsonable_python(part, exclude_none=True))
     if b"null" not in body:
         return body
     # orjson writes NaN, infinity and fields without a value as `null`. A name may also contain the
@@ -194,7 +194,3 @@ def written(answer: Any) -> bytes:
     except ValueError:
         raise ValueError("an answer contains a number that is not finite") from None
     return body
-
-
-def _fields(part: Any) -> Any:
-    return to_jsonable_python(part, exclude_none=True)
