@@ -219,7 +219,7 @@ def gains_without(y, share, W, group):
 def gains_without_others(y, share, W, rows, common, index, group):
     """Return the gain of class i at the logits y without the shares of classes i and j, (N, n).
 
-    Each row of the result is a class i of ``rows``, and each column is a class j.
+    Rows are classes i of ``rows``, columns are classes j. Entries with j = i have no meaning.
 
     Args:
         y, share, W, group: see `gains_without`.

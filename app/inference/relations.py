@@ -478,6 +478,7 @@ class FreeUnits(RelationUnits):
         self.G = NO_VALUES
         self._U, self._d, self._g = U, weights["d"], g
         self._table, index = _pair_table(weights)
+        # The unit of each pair and relation, or -1. The last row is for pairs outside the table.
         self._index = np.full((len(self._table[1]) + 1, self._A), -1, np.int32)
         self._index[index] = np.arange(len(U))
 

@@ -193,9 +193,9 @@ class Request(Ticket):
 def _kind_of_cost(name: str, scene: Scene, parameters: Mapping[str, object]) -> str:
     """Return the kind of a question, which is the key for its expected computation time.
 
-    Questions of the same kind and with the same number of objects take a similar time. The time
-    also depends on the numbers of classes, related classes and related pairs in the scene. So the
-    key contains the orders of magnitude of these numbers.
+    Questions of the same kind and with the same number of objects take a similar time. The key
+    contains the orders of magnitude of the numbers of classes, related classes and related pairs
+    in the scene, and of the question's options. A string option counts by its length.
     """
     classes = [thing.class_index for thing in scene.objects]
     orders = [len(set(classes)).bit_length(), 0, 0]

@@ -61,6 +61,7 @@ def integers(limit: int, shape: Sequence[int], generator: torch.Generator | None
 def categorical(weight: Tensor, generator: torch.Generator | None) -> Tensor:
     """Return a column for each row (B,), drawn in proportion to the weights (B, n)."""
     first, rows = own_rows(len(weight), generator)
+    # The rows of other processes get any weights: a draw advances the generator alike for all.
     weights = torch.ones(rows, weight.shape[1], dtype=weight.dtype, device="cpu")
     weights[first : first + len(weight)] = weight.cpu()
     columns = torch.multinomial(weights, 1, generator=generator).squeeze(1)

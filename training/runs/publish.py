@@ -293,6 +293,7 @@ def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
 
 def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
     """Return a source's terms of use, and True if they allow only research."""
+    # A user's file may have the name of a known source. `data.sources` then contains its path.
     if source in SOURCES and source in data.sources:
         return SOURCES[source].terms, SOURCES[source].research_only
     words = data.terms or "the user's own scenes, without stated terms of use"

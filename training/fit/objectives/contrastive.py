@@ -116,6 +116,7 @@ class PersistentCD(Objective):
         super().__init__(config, machine, structure)
         spec = machine.spec
         self.chains: State | None = None
+        # Chains of a checkpoint, which the next update continues.
         self.saved: dict[str, Tensor] = {}
         # Running averages of the data means of v, h1 and h2, which centre the gradients.
         self.offsets = [torch.full((n,), 0.5) for n in (spec.V, spec.H1, spec.H2)]
@@ -156,7 +157,6 @@ class PersistentCD(Objective):
         return state | blocks | {"classes": gather(self.chains.edges.classes)}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        # The chains continue at the next update.
         self.offsets = [state[name] for name in _OFFSETS]
         self.saved = {name: value for name, value in state.items() if name not in _OFFSETS}
 

@@ -49,7 +49,8 @@ def fit_complex(counts: TripleCounts, *, rank: int, penalty: float, seed: int) -
 
     Args:
         rank: number of complex dimensions of an embedding.
-        penalty: weight of the penalty, the mean cubed modulus of the factors of each pair.
+        penalty: weight of the penalty: for each pair of classes, the mean over the relations of the
+            sum of cubed moduli of its factors.
     """
     generator = torch.Generator().manual_seed(seed)
     A, V, _ = counts.held.shape
