@@ -349,3 +349,8 @@ def test_the_command_changes_the_store_of_the_service_and_creates_none(
     assert listed[2:] == ["default -> tiny@1.0.0"]
     assert main(["remove-alias", "default"]) == 0
     assert not store.aliases()
+    (store.root / "aliases.json").write_text("{")
+    assert main(["list"]) == 1
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[-2:] == listed[:2]
+    assert "store model_store: " in printed.err
