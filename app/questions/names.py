@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
@@ -167,10 +167,6 @@ class Unknown:
         else:
             self._refuse(label, location, errors, is_room=is_room)
         return None
-
-    def copy(self) -> Unknown:
-        """Return a copy. A question with further labels changes only its own copy."""
-        return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
 
     def _guess(self, label: str, *, is_room: bool) -> Guess | None:
         key = label, is_room
