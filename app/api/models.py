@@ -128,6 +128,7 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> schemas.Vocab
         ],
         relations=[cast("schemas.RelationName", name) for name in names],
         room_types=list(served.vocabulary.room_types),
+        profiles=list(served.artifact.manifest.vocabulary.profiles),
         examples=[
             schemas.ExampleScene(name=example.name, scene=example.request())
             for example in served.artifact.manifest.examples

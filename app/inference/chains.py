@@ -1,19 +1,22 @@
 """Sampling of scenes by Gibbs chains, each with its own random stream.
 
-The module supports machines in the local form. A chain starts at a stored scene and makes sweeps
-over h1, h2 and v. With observed relations, a chain samples h1 by Metropolis–Hastings. It samples
-relations once, at the end, because in the local form they do not act on the other units.
+A chain starts at a stored scene and makes sweeps over h1, h2 and v. It draws relations once, at the
+end, because relations do not act on the other units. Observed relations hold from the start.
 
 The start of a chain is a random stored scene. Its weight, given the evidence, is
 
-    log w = sum_{i given} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
+    log w = sum_{i given} log p(v_i = 1 | h1, other classes) + sum_{u held} log p(state of u)
             - 6 [sampled under another room type than t],
 
 where h1 is the mean of the hidden units given the stored scene, and t is the requested room type.
-If the machine stores no scene of room type t, the last term is h1·Q[t].
+If the machine stores no scene of room type t, the last term is h1·Q[t]. The method is sampling
+importance resampling, followed by Gibbs sweeps. The sweeps rarely change the room type of a scene.
 
 A sweep takes microseconds and releases the interpreter's lock. The result of a chain depends only
 on its conditions and its random stream.
+
+Source: Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian state
+estimation" (1993), for resampling and moving.
 """
 
 from __future__ import annotations
@@ -26,10 +29,10 @@ from numpy.typing import NDArray
 
 from app.inference import chain_kernels as kernels
 from app.inference.elementary import sigmoid, softplus
+from app.inference.objects import all_states
 from app.inference.relation_kernels import draw_in_groups
 from app.inference.relations import (
     NEVER,
-    Ends,
     ObservedRelations,
     RelationUnits,
     all_pairs,
@@ -57,38 +60,22 @@ def random_stream(seed: int, number: int) -> np.random.Generator:
 
 
 class Arrays(NamedTuple):
-    """Weights for the compiled kernels. `weights.layout` explains the attributes not listed here.
+    """Weights for the compiled kernel. `weights.layout` explains the attributes not listed here.
 
     Attributes:
         WT: (H1, V), transpose of W.
         JT: (H2, H1), transpose of J.
-        directions: (H1, R K') contribution of each h1 unit to the R K' factors of relation logits.
+        L: (V, V) couplings, or (0, V) for a machine without couplings.
+        b: (V,) biases of the classes, with those of the profile.
     """
 
     W: Floats
     WT: Floats
     J: Floats
     JT: Floats
+    L: Floats
     b: Floats
     c2: Floats
-    directions: Floats
-
-
-class ObservedUnits(NamedTuple):
-    """E observed relation units, each on or off.
-
-    Attributes:
-        a: (E,) index of the relation, or 0 if the units do not share factors. It selects a row of
-            `Arrays.directions`.
-        z: (E, K') factors of each unit. They are constant during a chain.
-        base: (E,) logit of each unit without the contribution of h1. It is constant during a chain.
-        r: (E,) 1 if the relation holds, else 0.
-    """
-
-    a: Indices
-    z: Floats
-    base: Floats
-    r: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +86,10 @@ class Conditions:
         classes: (n,) int64, distinct indices of the classes that stay present, ascending.
         log_counts: (n,) log of the number of instances of each class.
         observed: observed relations between these classes, or None without observed relations.
-        held, held2: distinct indices of the units of h1 and h2 that stay on.
+        held: (held units, 2) units of h1 and the state that each of them keeps.
+        held2: distinct indices of the units of h2 that stay on.
         room: index of the room type, or None if unknown.
+        profile: index of the data source whose base rates apply, or None for the served mix.
     """
 
     classes: Indices
@@ -109,6 +98,7 @@ class Conditions:
     held: Indices
     held2: Indices
     room: int | None = None
+    profile: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +107,8 @@ class ChainState:
 
     Attributes:
         classes: (n,) int64, indices of the present classes, ascending.
-        h1, h2: indices of the hidden units that are on, ascending.
+        h1: (units,) state of each unit of h1.
+        h2: indices of the units of h2 that are on, ascending.
         logits: (A, n, n) logits of the relations between the classes at temperature 1.
         r: (A, n, n) bool, relations that are on. Relations of a class to itself are on only if
             observed.
@@ -135,58 +126,67 @@ class SceneChains:
 
     Args:
         units: relation units of the machine. With None, the class builds them.
-
-    Raises:
-        ValueError: the class does not support the machine; see `supports`.
     """
 
     def __init__(self, weights: Weights, units: RelationUnits | None = None) -> None:
-        if not self.supports(weights):
-            raise ValueError(
-                "compiled chains need a machine in the local form with float32 weights"
-            )
         self.machine = weights
         self.units = units or relation_units(weights)
-        W, J, H1 = weights["W"], weights["J"], weights.spec.H1
-        shared = self.units.G.reshape(-1, H1) if len(self.units.G) else np.eye(H1)
+        W, J, spec = weights["W"], weights["J"], weights.spec
         self.arrays = Arrays(
             W=W,
             WT=np.ascontiguousarray(W.T),
             J=J,
             JT=np.ascontiguousarray(J.T),
+            L=weights["L"] if spec.coupled else np.zeros((0, spec.V), np.float32),
             b=weights["b"],
             c2=weights["c2"],
-            directions=np.ascontiguousarray(shared.T, np.float32),
         )
-        # (N, H1) means of h1 given the stored scenes.
-        self.mean: Floats = np.zeros((0, H1), np.float32)
-        if weights.spec.N:
-            x, _ = weights.with_second_layer(weights["c1"] + weights.scenes @ W)
-            self.mean = sigmoid(x).astype(np.float32)
-
-    @staticmethod
-    def supports(weights: Weights) -> bool:
-        """Return whether this module supports the machine: it needs the local form in float32."""
-        return weights.spec.is_local and weights["W"].dtype == np.float32
+        # (N, H1) means of h1 given the stored scenes, and (N, V) effect of the couplings.
+        self.mean: Floats = np.zeros((0, spec.H1), np.float32)
+        self._stored: Floats = np.zeros((0, spec.V), np.float32)
+        if spec.N:
+            self._stored = weights.scenes
+            x, _ = weights.with_second_layer(weights["c1"] + self._stored @ W)
+            self.mean = weights.state_means(x).astype(np.float32)
 
     def under(self, conditions: Conditions, temperature: float = 1.0) -> ConditionedChains:
         """Return the chains under the conditions of one request."""
         return ConditionedChains(self, conditions, temperature)
 
+    def continued(
+        self, present: Floats, room: int | None, steps: int, stream: np.random.Generator
+    ) -> Bits:
+        """Run ``steps`` sweeps of a chain that starts at a scene; return the presence, (V,).
+
+        Args:
+            present: presence of each class in the scene, (V,).
+            room: index of the room type that the chain keeps, or None.
+        """
+        none = np.zeros(0, np.int64)
+        held = np.zeros((0, 2), np.int64)
+        conditions = Conditions(none, np.zeros(0, np.float32), None, held, none, room)
+        on = (present > 0).astype(np.uint8)
+        self.under(conditions).sweep(on, steps, stream)
+        return on
+
     def sample_weights(self, conditions: Conditions) -> NDArray[np.float64]:
         """Return the probability of each stored scene as the start of a chain, (N,); see module."""
-        spec, Q, room = self.machine.spec, self.machine["Q"], conditions.room
+        machine, room, classes = self.machine, conditions.room, conditions.classes
         log_weights = np.zeros(len(self.mean), np.float32)
-        if room is not None and spec.C:
-            same_room = self.machine["fantasy_rooms"] == room
+        if room is not None and machine.spec.C:
+            same_room = machine["fantasy_rooms"] == room
             if same_room.any():
                 log_weights += np.where(same_room, 0, -OTHER_ROOM)
             else:
-                log_weights += self.mean @ Q[room]
-        classes = conditions.classes
-        logits = self.machine["b"][classes] + self.mean @ self.machine["W"][classes].T
+                log_weights += self.mean @ machine["Q"][room]
+        logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
+        if machine.spec.coupled:
+            logits += self._stored @ machine["L"][:, classes]
         log_weights -= softplus(-logits).sum(1)
-        log_weights += np.log(np.maximum(self.mean[:, conditions.held], 1e-37)).sum(1)
+        unit, state = conditions.held.T
+        others = self.mean.reshape(len(self.mean), -1, machine.spec.states - 1)
+        means = np.concatenate([1 - others.sum(2, keepdims=True), others], 2)
+        log_weights += np.log(np.maximum(means[:, unit, state], 1e-37)).sum(1)
         weights = np.exp(log_weights - log_weights.max()).astype(np.float64)
         probabilities: NDArray[np.float64] = weights / weights.sum()
         return probabilities
@@ -200,84 +200,77 @@ class ConditionedChains:
 
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
         self._chains, self._machine, self._w = chains, chains.machine, chains.arrays
-        spec = chains.machine.spec
+        spec, profile = chains.machine.spec, conditions.profile
+        if profile is not None:
+            self._w = self._w._replace(b=self._w.b + chains.machine["a"][profile])
         self._beta = np.float32(1.0 / temperature)
         self._bias = chains.machine.room_bias(conditions.room)
         self._required_classes = _indicator(spec.V, conditions.classes)
-        self._required_h1 = _indicator(spec.H1, conditions.held)
+        self._held = np.full(spec.units, -1, np.int64)
+        self._held[conditions.held[:, 0]] = conditions.held[:, 1]
         self._required_h2 = _indicator(spec.H2, conditions.held2)
-        self._classes, self._observed_relations = conditions.classes, conditions.observed
-        self._observed = self._observed_units(conditions)
+        self._classes, self._observed = conditions.classes, conditions.observed
         # Cumulative probabilities of the stored scenes as the start of a chain.
         self._start_cdf = np.zeros(0)
         if spec.N:
             self._start_cdf = np.cumsum(chains.sample_weights(conditions))
 
-    def _observed_units(self, conditions: Conditions) -> ObservedUnits:
-        observed, units = conditions.observed, self._chains.units
-        if observed is None:
-            empty = np.zeros(0, np.float32)
-            width = units.G.shape[1] if len(units.G) else self._machine.spec.H1
-            no_factors = np.zeros((0, width), np.float32)
-            return ObservedUnits(a=np.zeros(0, np.int64), z=no_factors, base=empty, r=empty)
-        ends = _present(conditions.classes, observed.i, observed.j, conditions.log_counts)
-        selected = units.select(observed.a, ends)
-        a = selected.a if len(units.G) else np.zeros_like(selected.a)
-        return ObservedUnits(a, selected.z, selected.base, observed.r[selected.kept])
-
     def draw(self, steps: int, stream: np.random.Generator) -> ChainState:
         """Run ``steps`` sweeps of one chain with its random stream and return its final state.
 
         The chain starts at a random stored scene; see `SceneChains.sample_weights`. If the machine
-        stores no scenes, the start has only the required classes, and h1 follows from its biases.
+        stores no scenes, the start has only the required classes.
         """
-        V, H1 = self._w.W.shape
-        present, h1_mean = np.zeros(V, np.uint8), sigmoid(self._bias)
+        on = np.zeros(self._machine.spec.V, np.uint8)
         if len(self._start_cdf):
             start = int(np.searchsorted(self._start_cdf[:-1], stream.random(), "right"))
             packed = self._machine["fantasies"][start : start + 1]
-            present = unpack_scenes(packed, V)[0].astype(np.uint8)
-            h1_mean = self._chains.mean[start]
-        h1 = (stream.random(H1, np.float32) < h1_mean).astype(np.uint8) | self._required_h1
-        h2 = np.zeros_like(self._required_h2)
-        if len(h2):
-            h2_mean = sigmoid(self._machine["c2"] + h1 @ self._machine["J"])
-            h2 = (stream.random(len(h2), np.float32) < h2_mean) | self._required_h2
-        return self.move(present | self._required_classes, h1, h2, steps, stream)
-
-    def move(
-        self, on: Bits, h1: Bits, h2: Bits, steps: int, stream: np.random.Generator
-    ) -> ChainState:
-        """Continue a chain from a state, change the state in place, and return the final state.
-
-        The state has the presence of the classes (V,) and the hidden units h1 (H1,) and h2 (H2,).
-        """
-        per_sweep = len(on) + 2 * len(h1) + len(h2) + kernels.PROPOSALS
-        required = self._required_classes, self._required_h1, self._required_h2
-        chain = on, h1, h2
-        while steps > 0:
-            uniform = stream.random((min(steps, _AT_ONCE), per_sweep), np.float32)
-            kernels.sweeps(
-                self._w, self._bias, *required, self._observed, self._beta, uniform, *chain
-            )
-            steps -= _AT_ONCE
+            on = unpack_scenes(packed, len(on))[0].astype(np.uint8)
+        h1, h2 = self.sweep(on, steps, stream)
         classes = np.flatnonzero(on)
         logits = self._logits(classes, h1)
         r = self._relations(classes, logits, stream)
-        return ChainState(classes, np.flatnonzero(h1), np.flatnonzero(h2), logits, r)
+        return ChainState(classes, h1, np.flatnonzero(h2), logits, r)
 
-    def _context_bias(self, classes: Indices, beta: float = 1.0) -> tuple[Floats, Floats]:
+    def sweep(
+        self, on: Bits, steps: int, stream: np.random.Generator, h2: Bits | None = None
+    ) -> tuple[Indices, Bits]:
+        """Run ``steps`` sweeps from the classes ``on``, (V,), which change in place.
+
+        Args:
+            h2: (H2,) states of the second layer, which change in place. By default, they are drawn
+                from their mean field.
+
+        Returns:
+            The state of each unit of h1, (units,), and the states of h2, (H2,).
+        """
+        on |= self._required_classes
+        h1 = np.zeros(len(self._held), np.int64)
+        if h2 is None:
+            _, means = self._context(np.flatnonzero(on), float(self._beta))
+            h2 = (stream.random(len(means), np.float32) < means).astype(np.uint8)
+        h2 |= self._required_h2
+        required = self._required_classes, self._held, self._required_h2
+        per_sweep = len(on) + len(h1) + len(h2)
+        while steps > 0:
+            uniform = stream.random((min(steps, _AT_ONCE), per_sweep), np.float32)
+            kernels.sweeps(self._w, self._bias, *required, self._beta, uniform, on, h1, h2)
+            steps -= _AT_ONCE
+        return h1, h2
+
+    def _context(self, classes: Indices, beta: float = 1.0) -> tuple[Floats, Floats]:
         """Return the logits x of h1 given present classes, (H1,), and the means of h2, (H2,)."""
         base = self._bias + self._machine["W"][classes].sum(0)
         x, m2 = self._machine.with_second_layer(base[None], beta)
-        return x[0].astype(np.float32), m2[0]
+        return x[0].astype(np.float32), m2[0].astype(np.float32)
 
-    def _logits(self, classes: Indices, h1: Bits) -> Floats:
+    def _logits(self, classes: Indices, h1: Indices) -> Floats:
         """Return the logits of the relations between classes with one instance each, (A, n, n)."""
-        n, A = len(classes), self._machine.spec.A
-        ends = _present(classes, *all_pairs(n), np.zeros(n, np.float32))
-        mean, _ = self._chains.units.normal(h1[None].astype(np.float32), ends, certain=True)
-        return mean.reshape(A, n, n)
+        n, spec = len(classes), self._machine.spec
+        ends = ends_of(classes, np.ones(n, np.float32), np.zeros(n, np.float32), *all_pairs(n))
+        entries = (h1[:, None] == np.arange(1, spec.states)).astype(np.float32).reshape(1, -1)
+        mean, _ = self._chains.units.normal(entries, ends, certain=True)
+        return mean.reshape(spec.A, n, n)
 
     def _relations(self, classes: Indices, logits: Floats, stream: np.random.Generator) -> Mask:
         """Sample the relations r (A, n, n) between different classes.
@@ -287,7 +280,7 @@ class ConditionedChains:
         """
         r = np.zeros(logits.shape, np.bool_)
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
-        observed = self._observed_relations
+        observed = self._observed
         if observed is not None:
             # The observed classes are always present, so ``classes`` contains each of them.
             rows = np.searchsorted(classes, self._classes)
@@ -297,7 +290,7 @@ class ConditionedChains:
             r[units], free[units] = observed.r[has_unit] > 0, False
         uniform, group_numbers = stream.random((2, *r.shape), np.float32)
         if self._machine.spec.G:
-            x, _ = self._context_bias(classes, float(self._beta))
+            x, _ = self._context(classes, float(self._beta))
             weight = self._chains.units.implication_weights(x, float(self._beta))
             draw_in_groups(weight, self._beta * logits, free, uniform, group_numbers, r)
         else:
@@ -307,26 +300,30 @@ class ConditionedChains:
     def log_score(self, state: ChainState, shown: Mask, kept: Mask) -> float:
         """Return the log score of a sampled scene at temperature 1, up to a constant of the model.
 
-            b·v + sum_k softplus(x_k) + log p(kept | v, h1)
+            b·v + v'Lv/2 + sum_m log sum_z exp(x_mz) + log p(kept | v, h1)
 
-        The first two terms are log p(v) + log Z. The last term is the log-probability of the
-        relations given the sampled h1. With a second layer, m is the mean field of h2. Then x
-        contains J m, and the score also contains c2·m and the entropy of m. This score is a lower
-        bound on the log of the sum over h2.
+        The first terms are log p(v) + log Z. The last term is the log-probability of the relations
+        given the sampled h1. With a second layer, m is the mean field of h2. Then x contains J m,
+        and the score also contains c2·m and the entropy of m. This score is a lower bound on the
+        log of the sum over h2.
 
         Args:
             state: final state of a chain.
             shown: (n,) bool, True for classes that count as present.
             kept: (A, n, n) bool, True for relations that count as on.
         """
-        listed = state.classes[shown]
-        x, m = self._context_bias(listed)
+        listed, machine = state.classes[shown], self._machine
+        x, m = self._context(listed)
+        first, _ = all_states(x.astype(np.float64), machine.spec.states)
         # A mean of exactly 0 or 1 has the entropy 0, but its logarithm would be infinite.
         uncertain = m[(m > 0) & (m < 1)].astype(np.float64)
         entropy = -(uncertain * np.log(uncertain) + (1 - uncertain) * np.log1p(-uncertain)).sum()
         logits = state.logits[:, shown][:, :, shown].astype(np.float64)
         on = kept[:, shown][:, :, shown]
-        score = self._machine["b"][listed].sum() + softplus(x).sum() + self._machine["c2"] @ m
+        # The log of the sum over the states of a unit is -log p(first state).
+        score = self._w.b[listed].sum() - np.log(first).sum() + machine["c2"] @ m
+        if machine.spec.coupled:
+            score += 0.5 * machine["L"][np.ix_(listed, listed)].sum()
         return float(score + entropy + (on * logits - softplus(logits)).sum())
 
 
@@ -334,8 +331,3 @@ def _indicator(size: int, units: Indices) -> Bits:
     indicator = np.zeros(size, np.uint8)
     indicator[units] = 1
     return indicator
-
-
-def _present(classes: Indices, i: Indices, j: Indices, log_counts: Floats) -> Ends:
-    """Return `Ends` for pairs (i, j) of indices into ``classes``, with presence 1."""
-    return ends_of(classes, np.ones(len(classes), np.float32), log_counts, i, j)

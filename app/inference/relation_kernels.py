@@ -1,4 +1,4 @@
-"""Compiled kernels of relation units: look-up of residual weights, mean field, implications.
+"""Compiled kernels of relation units: look-up of residual weights, log-odds, implications.
 
 An implication is a change of a relation's logit by other relations that hold. The formulas of the
 implications are in `training/machines/triway.py`. All other formulas are in the module `relations`.
@@ -14,7 +14,6 @@ from app.inference.elementary import exp, log, logistic
 SPREAD, SHIFT = 2654435761, 16
 """Constants of a hash table: bucket of a pair = (key * SPREAD) >> SHIFT, modulo the table size."""
 
-_DAMPING = np.float32(0.8)
 # `draw_in_groups` samples the relations in 2 * _GROUPS groups.
 _GROUPS = 4
 # Limit of a degree feature. This feature counts the relations of one kind that a class has. More
@@ -41,31 +40,6 @@ def pair_rows(start, keys, pairs):
             if keys[row] == pair:
                 rows[e] = row
     return rows
-
-
-@compiled_in_any_order
-def unit_terms(w, g, a, ends):
-    """Return the logits of E units without the term U_e·h1, (E,), and the factors z_e (E, K).
-
-    Args:
-        w: weights of the units; see `relations.SharedArrays`.
-        g: (A, K) weights of the factors z_e. The logit of unit e contains the product g[a_e]·z_e.
-        a: (E,) indices of the relations.
-        ends: subject and object classes of the relations; see `relations.Ends`.
-    """
-    S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
-    i, j, log_i, log_j = ends.i, ends.j, ends.log_i, ends.log_j
-    pairs = pair_rows(w.start, w.key, i * len(S) + j)
-    base, z = np.empty(len(a), np.float32), np.empty((len(a), S.shape[1]), np.float32)
-    for e in range(len(a)):
-        S_i, O_j, into, row = S[i[e]], O[j[e]], z[e], g[a[e]]
-        total = s[i[e], a[e]] + n[a[e], 0] * log_i[e] + o[j[e], a[e]] + n[a[e], 1] * log_j[e]
-        total += residual[pairs[e], a[e]]
-        for k in range(len(into)):
-            into[k] = S_i[k] * O_j[k]
-            total += row[k] * into[k]
-        base[e] = total
-    return base, z
 
 
 @compiled
@@ -175,156 +149,6 @@ def _wide_log_odds(means, spreads):
         log_odds = abs(means[e]) - log(on[e] / off[e])
         on[e] = log_odds if means[e] >= 0.0 else -log_odds
     return on
-
-
-@compiled
-def accumulate(keys, weights, rows, size):
-    """Return the sum of the weighted rows of each key, (size, K).
-
-    The function ignores rows with the key -1.
-
-    Args:
-        keys: (E,) key of each row, or (2E,) for two keys per row.
-        weights, rows: (E,) weights, and (E, K) rows to sum.
-        size: number of keys.
-    """
-    sums = np.zeros((size, rows.shape[1]), np.float32)
-    for n in range(len(keys)):
-        if keys[n] >= 0:
-            e = n % len(rows)
-            key_sum, row, weight = sums[keys[n]], rows[e], weights[e]
-            for k in range(len(row)):
-                key_sum[k] += weight * row[k]
-    return sums
-
-
-@compiled
-def expanded(G, a, z):
-    """Compute the weights U_e = G[a_e]'z_e between each relation unit e and h1, (E, H1)."""
-    U = np.zeros((len(a), G.shape[2]), np.float32)
-    for e in range(len(a)):
-        into, shared, factors = U[e], G[a[e]], z[e]
-        for k in range(len(factors)):
-            row, factor = shared[k], factors[k]
-            for h in range(len(into)):
-                into[h] += factor * row[h]
-    return U
-
-
-@compiled
-def _set_means(x, out):
-    for k in range(len(x)):
-        out[k] = logistic(x[k])
-
-
-@compiled_in_any_order
-def _products(rows, m, out):
-    """Write the product of the matrix ``rows`` and the vector m to ``out``."""
-    for e in range(len(rows)):
-        row, total = rows[e], np.float32(0.0)
-        for k in range(len(row)):
-            total += row[k] * m[k]
-        out[e] = total
-
-
-@compiled_in_any_order
-def _selected_products(rows, a, columns, out):
-    """Write the dot product of rows[e] and columns[a[e]] to out[e], for each e."""
-    for e in range(len(rows)):
-        row, column, total = rows[e], columns[a[e]], np.float32(0.0)
-        for k in range(len(row)):
-            total += row[k] * column[k]
-        out[e] = total
-
-
-@compiled
-def normal_without_itself(y, U, base, slopes):
-    """Return the means (E,) and √3 times the standard deviations (E,) of the logits of E units.
-
-    For each unit e, the function first subtracts slope_e U_e from y. This product is the
-    contribution of the unit itself.
-
-    Args:
-        y: (H1,) logits of h1.
-        U: (E, H1) weights between the units and h1.
-        base: (E,) logits of the units without the term U_e·h1.
-        slopes: (E,) see `RelationUnits.fixed_point`.
-    """
-    mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
-    y_without, m = np.empty_like(y), np.empty_like(y)
-    for e in range(len(U)):
-        row = U[e]
-        for k in range(len(y)):
-            y_without[k] = y[k] - slopes[e] * row[k]
-        _set_means(y_without, m)
-        mean[e], variance = _moments(row, m)
-        mean[e] += base[e]
-        spread[e] = np.sqrt(np.float32(3.0) * variance)
-    return mean, spread
-
-
-@compiled_in_any_order
-def _moments(row, m):
-    """Return mean and variance of the sum of row_k h_k for independent bits h_k with means m_k."""
-    mean = variance = np.float32(0.0)
-    for k in range(len(row)):
-        mean += row[k] * m[k]
-        variance += row[k] * row[k] * (m[k] * (np.float32(1.0) - m[k]))
-    return mean, variance
-
-
-@compiled
-def fixed_point(x, G, a, base, z, r, gate, sweeps):
-    """Compute y (H1,) and the slopes (E,) by the mean field of `RelationUnits.fixed_point`.
-
-    Args:
-        x: (H1,) logits of h1 given the objects.
-        G: (A, K, H1) shared weights. U_e is G[a_e]'z_e. If G is empty, z (E, H1) is the array U.
-        a: (E,) indices of the relations.
-        base: (E,) logits of the units without the term U_e·h1.
-        z: (E, K) factors z_e of each unit.
-        r: (E,) 1 if the relation holds, else 0.
-        gate: (E,) product of the presence of subject and object class of each relation.
-        sweeps: number of iterations.
-    """
-    E, (A, K, _) = len(a), G.shape
-    y, m, logits = x.copy(), np.empty_like(x), np.empty(E, np.float32)
-    slopes, on = np.zeros(E, np.float32), np.empty(E, np.float32)
-    shared, through = G.reshape(A * K, -1), np.empty(A * K, np.float32)
-    factors = np.empty((A, K), np.float32)
-    for sweep in range(sweeps):
-        _set_means(y, m)
-        if A:
-            _products(shared, m, through)
-            _selected_products(z, a, through.reshape(A, K), logits)
-        else:
-            _products(z, m, logits)
-        for e in range(E):
-            logits[e] += base[e]
-        _set_means(logits, on)
-        damping = _DAMPING if sweep else np.float32(0.0)
-        for e in range(E):
-            slopes[e] = damping * slopes[e] + (np.float32(1.0) - damping) * gate[e] * (r[e] - on[e])
-        y[:] = x
-        if A:
-            factors[:] = np.float32(0.0)
-            for e in range(E):
-                into, row, slope = factors[a[e]], z[e], slopes[e]
-                for k in range(K):
-                    into[k] += slope * row[k]
-            _add_rows(factors.reshape(-1), shared, y)
-        else:
-            _add_rows(slopes, z, y)
-    return y, slopes
-
-
-@compiled
-def _add_rows(weights, rows, out):
-    """Add the sum of weights[e] rows[e] to out."""
-    for e in range(len(rows)):
-        row, weight = rows[e], weights[e]
-        for k in range(len(out)):
-            out[k] += weight * row[k]
 
 
 @compiled

@@ -4,12 +4,12 @@ A relation e is a triple (relation a, subject class i, object class j). r_e is 1
 holds, else 0. The logit ℓ_e is a sum of many small independent terms, one for each hidden unit k of
 h1. This module treats the logit as a normal variable with
 
-    mean base_e + U_e·m   and variance   σ_e² = sum_k U_ek² m_k (1 - m_k)
+    mean base_e + U_e·m   and variance   σ_e² = sum_u [sum_z U_euz² m_uz - (sum_z U_euz m_uz)²]
 
-where m are the means of h1. Quadrature gives the mean of sigmoid(ℓ_e). For the quadrature errors,
-see docs/decisions/inference.md. The variant of the machine defines base and U. Each unit of
-`FreeUnits` has its own row of U. `SharedUnits` computes U from factors. All variants share the
-other code.
+where m_uz is the probability of state z of hidden unit u (its first state has the weight 0).
+Quadrature gives the mean of sigmoid(ℓ_e). For the quadrature errors, see
+docs/decisions/inference.md. The variant of the machine defines base and U. Each unit of `FreeUnits`
+has its own row of U. `SharedUnits` computes U from factors. All variants share the other code.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import relation_kernels as kernels
-from app.inference.elementary import sigmoid
-from app.inference.weights import SWEEPS, Weights
+from app.inference.weights import Weights, state_means
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -77,63 +76,33 @@ class ObservedRelations:
         a: (E,) number of the relation (left, on top, ...) of each unit.
         i, j: (E,) indices of the subject classes and of the object classes, from 0 to n - 1.
         r: (E,) 1 if the relation holds, else 0.
-        g: (E,) product of the presence of subject and object class.
     """
 
     a: Indices
     i: Indices
     j: Indices
     r: Floats
-    g: Floats
-
-
-class Units(NamedTuple):
-    """The relation units that `RelationUnits.select` finds for the relations in its arguments.
-
-    Attributes:
-        kept: (E,) index of each unit's relation in the arguments of `select`.
-        a: (E,) number of the relation (left, on top, ...) of each unit.
-        base: (E,) logits ℓ_e without the term U_e·h1.
-        z: (E, K') factors z_e of the weights U_e = G[a_e]'z_e. If G is empty, z_e is U_e.
-    """
-
-    kept: Indices
-    a: Indices
-    base: Floats
-    z: Floats
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """The hidden units of a scene, given its observed objects and relations.
+    """The hidden units of a scene, given its objects, and the observed relations of the scene.
 
     Attributes:
         classes: (n,) int64, distinct indices of the classes in the scene.
         presence: (n,) probability that each class is present.
         log_counts: (n,) log of the number of instances of each class.
         x: (H1,) logits of h1 given the objects.
-        y: (H1,) logits of h1 given objects and relations, for questions about relations.
+        shares: (n, H1) contribution of each class to x.
         observed: observed relations, or None if the scene has no observed relations.
-        units: relation units of `observed`, or None if the scene has no observed relations.
-        slopes: (E,) factor slope_e with which each unit of `units` acts on y, for questions about
-            relations; see `RelationUnits.fixed_point`.
-        object_y: (H1,) logits of h1 given objects and relations, for questions about objects.
-        object_slopes: (E,) factor with which each unit of `units` acts on `object_y`.
-        through: (n, H1) contribution of each class to y through the second layer, or None for a
-            machine with one layer.
     """
 
     classes: Indices
     presence: Floats
     log_counts: Floats
     x: Floats
-    y: Floats
+    shares: Floats
     observed: ObservedRelations | None
-    units: Units | None
-    slopes: Floats
-    object_y: Floats
-    object_slopes: Floats
-    through: Floats | None
 
     def ends(self, i: Indices, j: Indices) -> Ends:
         """See `ends_of`."""
@@ -166,22 +135,18 @@ def ends_of(classes: Indices, presence: Floats, log_counts: Floats, i: Indices, 
 class Between(NamedTuple):
     """The logits of all A relations between n classes, and the effects of observed relations.
 
-    If the scene has no observed relations, `slopes`, `shift` and `apart` are empty.
+    If the scene has no observed relations, `shift` and `apart` are empty.
 
     Attributes:
         mean: (A, n, n) means of the logits.
         spread: (A, n, n) √3 σ, where σ is the standard deviation of each logit.
-        slopes: (A, n, n) factors with which observed relations act on h1, and 0 for other
-            relations; see `RelationUnits.fixed_point`.
-        shift: (A, n, n) change of each logit by the observed relations that hold, without the
-            effect through h1.
+        shift: (A, n, n) change of each logit by the observed relations that hold.
         apart: (A, n, n) the same change without the observed relations between the two classes of
             the logit.
     """
 
     mean: Floats
     spread: Floats
-    slopes: Floats
     shift: Floats
     apart: Floats
 
@@ -209,25 +174,17 @@ class SharedArrays(NamedTuple):
 
 
 class RelationUnits(ABC):
-    """The relation units of a machine.
-
-    Attributes:
-        G: (A, K', H1) weights that all units of the same relation share. G is empty if each unit
-            has its own row of U.
-    """
-
-    G: Floats
+    """The relation units of a machine."""
 
     def __init__(self, weights: Weights) -> None:
         self._W, self._A, self._V = weights["W"], weights.spec.A, weights.spec.V
+        self._states = weights.spec.states
 
     @abstractmethod
-    def select(self, a: Indices, ends: Ends) -> Units:
-        """Return the units of some relations. Relations without a unit are left out.
+    def context_weights(self, a: Indices, i: Indices, j: Indices) -> Floats:
+        """Return the weights U_e of E relations a between classes i and j, (E, H1).
 
-        Args:
-            a: indices of the canonical relations, an array with one axis.
-            ends: subject and object class of each relation.
+        The weights of a relation without a unit are 0.
         """
 
     @abstractmethod
@@ -246,67 +203,21 @@ class RelationUnits(ABC):
             certain: True if all means of h1 are 0 or 1. The variance of the logits is then 0.
         """
 
-    def rows(self, units: Units) -> Floats:
-        """Return the weights U_e between each unit and h1, (E, H1)."""
-        if not len(self.G):
-            return units.z
-        rows: Floats = kernels.expanded(self.G, units.a, units.z)
-        return rows
-
-    def rows_of(self, a: Indices, i: Indices, j: Indices) -> Floats:
-        """Return the weights U_e of relations a between classes i and j, (E, H1).
-
-        The result has no rows for relations without a unit.
-        """
-        zeros = np.zeros(len(a), np.float32)  # counts and presence do not change the weights
-        return self.rows(self.select(a, Ends(i, j, zeros, zeros, zeros, zeros)))
-
-    def fixed_point(
-        self, x: Floats, observed: ObservedRelations, ends: Ends, sweeps: int = SWEEPS
-    ) -> tuple[Floats, Units, Floats]:
-        """Compute the mean field of h1 given E observed relations.
-
-        The iteration starts at y = x, with the means m = sigmoid(y) of h1. g_e is the product of
-        the presence of subject and object class:
-
-            y = x + sum_e slope_e U_e,   slope_e = g_e (r_e - sigmoid(base_e + U_e·m))
-
-        The slope of a unit is the factor with which the observed relation acts on y.
-
-        Returns:
-            The logits y (H1,), the units of the observed relations, and their slopes (E,).
-        """
-        units = self.select(observed.a, ends)
-        G, z = self.G, units.z
-        if 2 * len(z) < G.shape[0] * G.shape[1]:
-            # For a small number of units, products with U are faster than products with G.
-            G, z = NO_VALUES, self.rows(units)
-        r, g = observed.r[units.kept], observed.g[units.kept]
-        y, slopes = kernels.fixed_point(x, G, units.a, units.base, z, r, g, sweeps)
-        return y, units, slopes
-
     def between(self, context: Context) -> Between:
         """Return the logits of all relations between the classes of a scene."""
         n = len(context.classes)
-        mean, spread = self.normal(sigmoid(context.y)[None], context.ends(*all_pairs(n)))
+        means = state_means(context.x[None], self._states)
+        mean, spread = self.normal(means, context.ends(*all_pairs(n)))
         shape = self._A, n, n
-        return Between(mean.reshape(shape), spread.reshape(shape), *self.observed_effects(context))
+        shifts = self._implication_shifts(context.x, n, context.observed)
+        return Between(mean.reshape(shape), spread.reshape(shape), *shifts)
 
-    def observed_effects(self, context: Context) -> tuple[Floats, Floats, Floats]:
-        """Return the values `slopes`, `shift` and `apart` of `Between`."""
-        observed, units, n = context.observed, context.units, len(context.classes)
-        if observed is None or units is None:
-            return NO_VALUES, NO_VALUES, NO_VALUES
-        slopes, kept = np.zeros((self._A, n, n), dtype=np.float32), units.kept
-        slopes[observed.a[kept], observed.i[kept], observed.j[kept]] = context.slopes
-        return slopes, *self.implication_shifts(context.x, n, observed)
-
-    def implication_shifts(
-        self, x: Floats, n: int, observed: ObservedRelations
+    def _implication_shifts(
+        self, x: Floats, n: int, observed: ObservedRelations | None
     ) -> tuple[Floats, Floats]:
         """Return `shift` and `apart` of `Between` for n classes; x (H1,) are the logits of h1."""
         weight = self.implication_weights(x)
-        if not len(weight):
+        if observed is None or not len(weight):
             return NO_VALUES, NO_VALUES
         on = (observed.r > 0) & (observed.i != observed.j)
         ends = observed.i[on], observed.j[on]
@@ -324,56 +235,14 @@ class RelationUnits(ABC):
         del x, beta
         return NO_VALUES.reshape(0, 0)
 
-    def log_odds(self, between: Between) -> Floats:
+    def log_odds(self, between: Between, *, apart: bool = False) -> Floats:
         """Return the log-odds of all relations between the n classes of a scene, (A, n, n).
 
-        An observed relation e changes the mean of its own logit by slope_e σ_e², to first order.
-        The method subtracts this change, so that a relation is not evidence for itself.
+        With `apart`, the observed relations of a pair are not evidence for its other relations.
         """
-        mean, spread = between.mean, between.spread
-        if len(between.slopes):
-            mean = mean - between.slopes * spread * spread / np.float32(3)
-        if len(between.shift):
-            mean = mean + between.shift
-        return to_log_odds(mean, spread)
-
-    def log_odds_without_itself(
-        self, context: Context, a: Indices, i: Indices, j: Indices, slopes: Floats, shift: Floats
-    ) -> Floats:
-        """Return the log-odds of E relations without the effect of each relation on itself, (E,).
-
-        The method subtracts slope_e U_e from y. Unlike the first-order formula of `log_odds`, this
-        is exact.
-
-        Args:
-            context: hidden units of the scene.
-            a, i, j: (E,) indices of the relations, and of their subject and object classes in the
-                scene.
-            slopes: (E,) factor with which each relation acts on y; see `fixed_point`.
-            shift: (A, n, n) value `shift` of `Between`, or an empty array.
-        """
-        units = self.select(a, context.ends(i, j))
-        mean, spread = kernels.normal_without_itself(
-            context.y, self.rows(units), units.base, slopes[units.kept]
-        )
-        if len(shift):
-            mean += shift[a, i, j][units.kept]
-        log_odds = np.full(len(a), NO_UNIT)
-        log_odds[units.kept] = to_log_odds(mean, spread)
-        return log_odds
-
-    @abstractmethod
-    def log_odds_apart(self, context: Context, between: Between, i: Indices, j: Indices) -> Floats:
-        """Return the log-odds of all relations of P pairs of classes, (2, A, P).
-
-        Index 0 of the first axis has the relations from i to j. Index 1 has the relations from j to
-        i. The observed relations of a pair are not evidence for the relations of the same pair.
-
-        Args:
-            context: hidden units of the scene.
-            between: logits of the relations between the classes of the scene.
-            i, j: (P,) indices of the two classes of each pair in the scene.
-        """
+        change = between.apart if apart else between.shift
+        mean = between.mean + change if len(change) else between.mean
+        return to_log_odds(mean, between.spread)
 
     def placement_log_odds(
         self, context: Context, candidates: Indices, anchors: Indices, only: int | None = None
@@ -403,62 +272,9 @@ class RelationUnits(ABC):
         log_j[:, :m] = log_i[:, m:] = context.log_counts[anchors]
         p_j[:, :m] = p_i[:, m:] = context.presence[anchors]
         ends = Ends(i, j, log_i, log_j, p_i, p_j)
-        means = sigmoid(context.y + self._W[candidates])
+        means = state_means(context.x + self._W[candidates], self._states)
         log_odds = to_log_odds(*self.normal(means, ends, only))
         return log_odds[:, :, :m], log_odds[:, :, m:]
-
-    def shares(self, context: Context) -> Floats:
-        """Return the contribution of each class and its relations to `object_y`, (n, H1)."""
-        shares: Floats = context.presence[:, None] * self._W[context.classes]
-        observed, units = context.observed, context.units
-        if observed is not None and units is not None:
-            i, j = observed.i[units.kept], observed.j[units.kept]
-            keys = np.stack([i, np.where(i == j, -1, j)])
-            shares += self._sums(units, keys, context.object_slopes, len(context.classes))
-        return shares
-
-    def common(self, context: Context) -> tuple[Floats, Indices]:
-        """Return the contribution of the observed relations of each pair of classes to `object_y`.
-
-        `shares` counts these relations twice, once for each of the two classes.
-
-        Returns:
-            Contributions (P, H1) of the P pairs with observed relations, and an array (n, n) with
-            the row of each pair of classes in the contributions. The row is -1 for a pair without
-            observed relations.
-        """
-        n = len(context.classes)
-        observed, units = context.observed, context.units
-        index = np.full((n, n), -1)
-        if observed is None or units is None:
-            return np.zeros((0, self._W.shape[1]), np.float32), index
-        i, j = observed.i[units.kept], observed.j[units.kept]
-        keys = np.where(i == j, -1, np.minimum(i, j) * n + np.maximum(i, j))
-        has_relations = np.zeros(n * n, np.bool_)
-        has_relations[keys[keys >= 0]] = True
-        pairs = np.flatnonzero(has_relations)
-        index.reshape(-1)[pairs] = np.arange(len(pairs))
-        rows = np.where(keys < 0, -1, index.reshape(-1)[keys])
-        contributions = self._sums(units, rows, context.object_slopes, len(pairs))
-        return contributions, np.maximum(index, index.T)
-
-    def _sums(self, units: Units, keys: Indices, slopes: Floats, size: int) -> Floats:
-        """Return the sum of slope_e U_e over the units of each key, (size, H1).
-
-        Args:
-            units: E relation units.
-            keys: (E,) key of each unit, or (2, E) for two keys per unit. Units with the key -1 are
-                ignored.
-            slopes: (E,) factor slope_e with which each unit acts on y; see `fixed_point`.
-            size: number of keys. The keys are 0 to size - 1.
-        """
-        if not len(self.G):
-            sums: Floats = kernels.accumulate(keys.reshape(-1), slopes, units.z, size)
-            return sums
-        A, K, H1 = self.G.shape
-        keys = np.where(keys < 0, -1, keys * A + units.a).reshape(-1)
-        factors = kernels.accumulate(keys, slopes, units.z, size * A).reshape(size, A * K)
-        return np.asarray(factors @ self.G.reshape(A * K, H1))
 
 
 class FreeUnits(RelationUnits):
@@ -475,22 +291,22 @@ class FreeUnits(RelationUnits):
 
     def __init__(self, weights: Weights, U: Floats, g: Floats | None = None) -> None:
         super().__init__(weights)
-        self.G = NO_VALUES
         self._U, self._d, self._g = U, weights["d"], g
         self._table, index = _pair_table(weights)
         # The unit of each pair and relation, or -1. The last row is for pairs outside the table.
         self._index = np.full((len(self._table[1]) + 1, self._A), -1, np.int32)
         self._index[index] = np.arange(len(U))
 
-    def select(self, a: Indices, ends: Ends) -> Units:
+    def context_weights(self, a: Indices, i: Indices, j: Indices) -> Floats:
         """See `RelationUnits`."""
-        rows = self._index[kernels.pair_rows(*self._table, ends.i * self._V + ends.j), a]
-        kept = np.flatnonzero(rows >= 0)
-        rows = rows[kept]
-        base = self._d[rows]
-        if self._g is not None:
-            base = base + self._g[rows, 0] * ends.p_i[kept] + self._g[rows, 1] * ends.p_j[kept]
-        return Units(kept, a[kept], base.astype(np.float32), self._U[rows])
+        unit = self._units(a, i, j)
+        rows: Floats = self._U[unit] * (unit >= 0)[:, None]
+        return rows
+
+    def _units(self, a: Indices, i: Indices, j: Indices) -> Indices:
+        """Return the unit of each relation, or -1 for relations without a unit, (E,)."""
+        units: Indices = self._index[kernels.pair_rows(*self._table, i * self._V + j), a]
+        return units
 
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
@@ -501,34 +317,25 @@ class FreeUnits(RelationUnits):
         shape = len(means), chosen.stop - chosen.start, ends.i.shape[1]
         # Row b of the means, relation a and pair p of each entry of the result.
         b, a, p = (indices.reshape(-1) for indices in np.indices(shape))
-        units = self.select(chosen.start + a, Ends(*(values[b, p] for values in ends)))
+        units = self._units(chosen.start + a, ends.i[b, p], ends.j[b, p])
+        kept = np.flatnonzero(units >= 0)
+        units, b, p = units[kept], b[kept], p[kept]
+        base = self._d[units]
+        if self._g is not None:
+            g = self._g[units]
+            base = base + g[:, 0] * ends.p_i[b, p] + g[:, 1] * ends.p_j[b, p]
+        terms = self._by_unit(self._U[units])
+        m = self._by_unit(means)[b if len(means) > 1 else np.zeros(1, np.int64)]
+        weighted = terms * m
+        by_unit = weighted.sum(2)
+        variance = ((weighted * terms).sum(2) - by_unit * by_unit).sum(1)
         mean, spread = np.full(shape, NEVER), np.zeros(shape, np.float32)
-        U, kept = units.z, units.kept
-        if len(means) == 1:
-            m = means[0]
-            logits, variance = U @ m, (U * U) @ (m * (1 - m))
-        else:
-            m = means[b[kept]]
-            logits = np.einsum("eh,eh->e", U, m)
-            m *= 1 - m
-            variance = np.einsum("eh,eh->e", U * U, m)
-        mean.reshape(-1)[kept] = units.base + logits
-        spread.reshape(-1)[kept] = np.sqrt(3 * variance)
+        mean.reshape(-1)[kept] = base + by_unit.sum(1)
+        spread.reshape(-1)[kept] = np.sqrt(3 * np.maximum(variance, 0))
         return mean, spread
 
-    def log_odds_apart(self, context: Context, between: Between, i: Indices, j: Indices) -> Floats:
-        """See `RelationUnits`. The result is exact."""
-        del between
-        ends = context.ends(np.stack([i, j], 1), np.stack([j, i], 1))
-        y = np.tile(context.y, (len(i), 1))
-        observed, units, n = context.observed, context.units, len(context.classes)
-        if observed is not None and units is not None:
-            keys = observed.i[units.kept] * n + observed.j[units.kept]
-            contributions = kernels.accumulate(keys, context.slopes, units.z, n * n)
-            backward = np.where((i != j)[:, None], contributions[j * n + i], 0)
-            y -= contributions[i * n + j] + backward
-        log_odds = to_log_odds(*self.normal(sigmoid(y), ends))
-        return np.ascontiguousarray(log_odds.transpose(2, 1, 0))
+    def _by_unit(self, rows: Floats) -> Floats:
+        return rows.reshape(len(rows), -1, self._states - 1)
 
 
 class SharedUnits(RelationUnits):
@@ -536,8 +343,8 @@ class SharedUnits(RelationUnits):
 
     The units share weights. A sparse residual adds a weight for some triples. The factors are
     z_e = (S_i * O_j, 1), and the weights are U_e = G[a]'z_e. The rows of G[a] are the rows of M[a],
-    followed by P[a]. The variance of a logit is q'C q, with C = F_a diag(m (1 - m)) F_a'. The rows
-    of F_a are the directions with the largest variance. The vector q = Y[a] z_e has the coordinates
+    followed by P[a]. The variance of a logit is q'C q, with C = F_a cov(h1) F_a'. The rows of F_a
+    are the directions with the largest variance. The vector q = Y[a] z_e has the coordinates
     of U_e in these directions.
     """
 
@@ -557,14 +364,14 @@ class SharedUnits(RelationUnits):
             *table,
             residual,
         )
-        self.G = np.concatenate([weights["M"], weights["P"][:, None]], 1)
+        self._G = np.concatenate([weights["M"], weights["P"][:, None]], 1)
         self._g = np.concatenate([weights["R"], weights["d"][:, None]], 1)
         F, self._Y = _directions(weights)
         self._F = F.reshape(-1, F.shape[2])
         # Products of two directions give the lower half of C. Entries off the diagonal are doubled.
-        p, q = np.tril_indices(F.shape[1])
+        self._lower = p, q = np.tril_indices(F.shape[1])
         self._FF = _columns(F[:, p] * F[:, q] * np.where(p == q, 1, 2)[:, None])
-        self._GT = _columns(self.G)
+        self._GT = _columns(self._G)
         self._B = weights["B"] if weights.spec.G else None
         if self._B is not None:
             gamma = weights["gamma"].swapaxes(1, 2).copy()
@@ -572,10 +379,11 @@ class SharedUnits(RelationUnits):
             gamma[:, range(A), range(A)] = 0
             self._gamma = gamma.reshape(len(gamma), -1)
 
-    def select(self, a: Indices, ends: Ends) -> Units:
+    def context_weights(self, a: Indices, i: Indices, j: Indices) -> Floats:
         """See `RelationUnits`."""
-        base, z = kernels.unit_terms(self._w, self._g, a, ends)
-        return Units(np.arange(len(a)), a, base, z)
+        z = self._w.S[i] * self._w.O[j]
+        weights: Floats = np.einsum("ek,ekh->eh", z, self._G[a])
+        return weights
 
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
@@ -591,8 +399,27 @@ class SharedUnits(RelationUnits):
         if certain:
             return mean[:, :, :P], np.zeros((B, len(Y), P), np.float32)
         q = (Y.reshape(-1, Y.shape[2]) @ z).reshape(B, *Y.shape[:2], width)
-        spread = kernels.spreads(self._products(chosen, means * (1 - means), self._FF), q)
+        spread = kernels.spreads(self._covariances(chosen, means), q)
         return mean[:, :, :P], spread[:, :, :P]
+
+    def _covariances(self, chosen: slice, means: Floats) -> Floats:
+        """Return C of each chosen relation (see `relation_kernels.spreads`), (B, R, r (r + 1) / 2).
+
+        cov(h1) is diag(m) - m m' within each hidden unit, and 0 between units.
+        """
+        if self._states == 2:
+            return self._products(chosen, means * (1 - means), self._FF)
+        C = self._products(chosen, means, self._FF)
+        (R, r), B = self._Y[chosen].shape[:2], len(means)
+        F = self._F.reshape(self._A, r, -1, self._states - 1)[chosen]
+        by_unit = means.reshape(B, -1, self._states - 1).transpose(1, 0, 2)
+        # (units, B, states) by (units, states, R r) sums over the states of each unit.
+        f = by_unit @ F.transpose(2, 3, 0, 1).reshape(len(by_unit), self._states - 1, R * r)
+        f = f.reshape(-1, B, R, r)
+        p, q = self._lower
+        products = (f[..., p] * f[..., q]).sum(0) * np.where(p == q, 1, 2).astype(np.float32)
+        C -= products
+        return C
 
     def _products(self, chosen: slice, rows: Floats, columns: Floats) -> Floats:
         """Return the product of the rows (B, H1) with n columns of each chosen relation, (B, R, n).
@@ -606,40 +433,13 @@ class SharedUnits(RelationUnits):
     def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
         """See `RelationUnits`.
 
-        The weights are beta (gamma_0 + sum_q z_q gamma_q) with z = B sigmoid(beta x).
+        The weights are beta (gamma_0 + sum_q z_q gamma_q) with z = B m(beta x).
         """
         if self._B is None:
             return super().implication_weights(x, beta)
-        scale = np.append(np.float32(1), self._B @ sigmoid(beta * x))
+        scale = np.append(np.float32(1), self._B @ state_means(beta * x, self._states))
         weight: Floats = (np.float32(beta) * scale) @ self._gamma
         return weight.reshape(-1, self._A)
-
-    def log_odds_apart(self, context: Context, between: Between, i: Indices, j: Indices) -> Floats:
-        """See `RelationUnits`. The result is correct to first order.
-
-        The observed units e' of the pair, in both directions, change the mean of the logit ℓ_e by
-        sum_e' slope_e' cov(ℓ_e, ℓ_e'), where cov = sum_k U_ek U_e'k m_k (1 - m_k).
-        """
-        A, P = self._A, len(i)
-        # The first P columns have the direction from i to j, and the others from j to i.
-        start, end = np.concatenate([i, j]), np.concatenate([j, i])
-        mean, spread = between.mean[:, start, end], between.spread[:, start, end]
-        if len(between.slopes):
-            m, classes = sigmoid(context.y), context.classes
-            z = self._w.S[classes[start]] * self._w.O[classes[end]]
-            # q has the shape (2 directions within a pair, P, A, r coordinates).
-            q = (z @ self._Y.reshape(len(self._F), -1).T).reshape(2, P, A, -1)
-            slopes = between.slopes[:, start, end].T.reshape(2, P, A, 1).copy()
-            # For a pair of a class with itself, both directions belong to the same unit.
-            slopes[1, i == j] = 0
-            # The sum of slope_e' U_e' of each pair, in coordinates of the directions F.
-            pair_sum = (slopes * q).sum(0).reshape(P, -1)
-            covariance = (pair_sum @ self._F) * (m * (1 - m)) @ self._F.T
-            mean -= (q * covariance.reshape(P, A, -1)).sum(3).reshape(2 * P, A).T
-        if len(between.apart):
-            mean += between.apart[:, start, end]
-        log_odds = to_log_odds(mean, spread).reshape(A, 2, P)
-        return np.ascontiguousarray(log_odds.swapaxes(0, 1))
 
 
 def relation_units(weights: Weights) -> RelationUnits:
@@ -703,11 +503,10 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     """
     spec = weights.spec
     rows = np.concatenate([weights["P"][:, None], weights["M"]], 1).astype(np.float64)
-    frequency, variance = np.ones(spec.V), np.full(spec.H1, 0.25)
+    frequency, means = np.ones(spec.V), np.full((1, spec.H1), 1 / spec.states)
     if spec.N:
         frequency = weights.scenes.mean(0).astype(np.float64)
-        mean = sigmoid(weights["c1"] + weights.scenes @ weights["W"]).astype(np.float64)
-        variance = (mean * (1 - mean)).mean(0)
+        means = weights.state_means(weights["c1"] + weights.scenes @ weights["W"])
     p = (frequency / frequency.sum())[:, None]
     ones = np.ones((spec.V, 1))
     S, O = (  # noqa: E741
@@ -717,7 +516,8 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     moment = (S.T @ (p * S)) * (O.T @ (p * O))
     scale = np.trace(moment) / len(moment)
     root = np.linalg.cholesky(moment + 1e-9 * scale * np.eye(len(moment)))
-    covariance = root.T @ ((rows * variance) @ rows.transpose(0, 2, 1)) @ root
+    of_h1 = _mean_covariance(means.astype(np.float64), spec.states)
+    covariance = root.T @ (rows @ of_h1 @ rows.transpose(0, 2, 1)) @ root
     values, vectors = np.linalg.eigh(covariance)
     left_out = np.cumsum(values.clip(min=0), axis=1)
     kept = max(1, int((left_out > _LEFT_OUT).sum(1).max()))
@@ -725,3 +525,11 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     Y = np.linalg.solve(root.T, vectors).transpose(0, 2, 1)
     F = vectors.transpose(0, 2, 1) @ root.T @ rows
     return F.astype(np.float32), np.roll(Y, -1, axis=2).astype(np.float32)
+
+
+def _mean_covariance(means: NDArray[np.float64], states: int) -> NDArray[np.float64]:
+    """Return the mean over N scenes of cov(h1), (H1, H1), given the means of h1, (N, H1)."""
+    units = means.shape[1] // (states - 1)
+    same_unit = np.kron(np.eye(units), np.ones((states - 1, states - 1)))
+    covariance: NDArray[np.float64] = np.diag(means.mean(0)) - means.T @ means / len(means)
+    return covariance * same_unit

@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Final, Literal, get_args
 
 Variant = Literal["rbm", "gbm", "triway"]
-Form = Literal["seed", "local"]
 Shapes = dict[str, tuple[int, ...]]
 
 
@@ -71,7 +70,6 @@ class Triway:
         shapes: Shapes = {
             "d": (A,), "s": (A, V), "o": (A, V), "S": (V, K), "O": (V, K), "R": (A, K),
             "M": (A, K, H1), "P": (A, H1), "n": (A, 2), "usual": (V,), "residual": (spec.T,),
-            "kappa": (A,),
         }  # fmt: skip
         if spec.G:
             shapes |= {"gamma": (1 + spec.G, A, feature_count(A)), "B": (spec.G, H1)}
@@ -83,59 +81,61 @@ VARIANTS: Final[dict[str, type[RBM | Triway]]] = {"rbm": RBM, "gbm": GBM, "triwa
 
 @dataclass(frozen=True, slots=True)
 class MachineSpec:
-    """Sizes and form of one Boltzmann machine.
+    """Sizes of one Boltzmann machine.
 
     Attributes:
         variant: ``rbm``, ``gbm`` or ``triway``.
         V: number of object classes (visible units v).
         A: number of canonical relations.
-        H1: number of hidden units in the first layer.
-        H2: number of hidden units in the second layer. 0 means no second layer.
-        C: number of room types. A known room type changes the biases of h1.
+        units: number of hidden units in the first layer.
+        states: number of states of a hidden unit in the first layer. 2 means a binary unit.
+        H2: number of binary hidden units in the second layer. 0 means no second layer.
+        C: number of room types.
         K: rank of the weights that relation units share (Triway).
-        G: rank of the effect of h1 on implications between relations (Triway in the local form). An
-            implication is a change of a relation's logit by other relations. 0 means no
-            implications.
+        G: rank of the effect of h1 on implications between relations (Triway). An implication is a
+            change of a relation's logit by other relations. 0 means no implications.
         T: number of relation triples with an own weight. In RBM and GBM, each relation unit has
             such a weight. In the Triway, only the triples of the sparse residual have own weights.
-        N: number of stored samples from persistent Gibbs chains. New chains start at these samples.
-            0 means no stored samples.
-        form: energy function. ``seed`` is the energy of the paper. In the ``local`` form, each
-            relation unit is normalised separately.
+        N: number of stored samples from Gibbs chains. New chains start at these samples. 0 means no
+            stored samples.
+        profiles: number of data sources with own base rates of the classes.
+        coupled: True if the machine has couplings L between classes.
     """
 
     variant: Variant
     V: int
     A: int
-    H1: int
+    units: int
+    states: int = 2
     H2: int = 0
     C: int = 0
     K: int = 0
     T: int = 0
     G: int = 0
     N: int = 0
-    form: Form = "seed"
+    profiles: int = 0
+    coupled: bool = False
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
             raise ValueError(f"variant must be one of {get_args(Variant)}, not {self.variant!r}")
-        if self.form not in get_args(Form):
-            raise ValueError(f"form must be one of {get_args(Form)}, not {self.form!r}")
-        for name in ("V", "A", "H1"):
+        for name in ("V", "A", "units"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("H2", "C", "K", "T", "G", "N"):
+        if self.states < 2:
+            raise ValueError(f"states must be at least 2, not {self.states}")
+        for name in ("H2", "C", "K", "T", "G", "N", "profiles"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must be at least 0, not {getattr(self, name)}")
         kind = self.kind
         if kind.factorised and self.K < 1:
             raise ValueError(f"a {self.variant} machine needs a rank K of at least 1, not {self.K}")
-        if self.G and not (kind.implications and self.is_local):
-            raise ValueError(
-                f"G is {self.G}, but only a triway in the local form may have a G above 0"
-            )
+        if self.G and not kind.implications:
+            raise ValueError(f"G is {self.G}, but only a triway may have a G above 0")
         if self.H2 and not kind.two_layers:
             raise ValueError(f"an RBM has one hidden layer, so H2 must be 0, not {self.H2}")
+        if self.H2 and self.coupled:
+            raise ValueError("a machine with two hidden layers has no couplings between classes")
 
     @property
     def kind(self) -> type[RBM | Triway]:
@@ -143,9 +143,12 @@ class MachineSpec:
         return VARIANTS[self.variant]
 
     @property
-    def is_local(self) -> bool:
-        """Whether each relation unit is normalised separately (local form)."""
-        return self.form == "local"
+    def H1(self) -> int:  # noqa: N802 - the symbol of docs/models.md
+        """Number of states of the first layer that have weights: units · (states - 1).
+
+        The first state of each unit has the energy 0, so it has no weights.
+        """
+        return self.units * (self.states - 1)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the specification as JSON-compatible values."""

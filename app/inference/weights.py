@@ -1,12 +1,17 @@
 """The weights of a trained machine: their layout for all variants, and the hidden layers.
 
-Given the objects, the logits x of h1 and the means m1 and m2 of the hidden layers are:
+A hidden unit of the first layer has Z states. h1 has an entry for each state but the first, whose
+energy is 0: h1 is 1 for the state of the unit, else 0. x are the logits of these entries:
 
-    x = c1 + Q[t] + v'W + J m2,   m1 = sigmoid(beta x),   m2 = sigmoid(beta (c2 + m1'J))
+    x = c1 + Q[t] + v'W + J m2,   m1 = exp(x_z) / (1 + sum_z' exp(x_z'))
 
-v is the presence of the classes, t is the room type, and beta is 1 / temperature. A mean-field
-iteration computes m2. The iteration starts at m2 = sigmoid(beta c2). For a machine with one hidden
-layer, x is exact.
+v is the presence of the classes, t is the room type, and z' runs over the states of the same unit.
+m1 are the probabilities of the states. For Z = 2, m1 is sigmoid(x). The second layer is binary:
+
+    m2 = sigmoid(c2 + m1'J)
+
+A mean-field iteration computes m2. The iteration starts at m2 = sigmoid(c2). For a machine with one
+hidden layer, x is exact. At the temperature 1 / beta, beta multiplies all logits.
 """
 
 from __future__ import annotations
@@ -25,8 +30,12 @@ SWEEPS: Final = 10
 """Number of iterations of a mean field. The shipped machines converge within these iterations. The
 number is constant, so that answers are reproducible."""
 
-WORD = 32
+WORD: Final = 32
 """Number of bits in a word of the packed stored scenes."""
+
+SHARES: Final = (0.3, 0.6, 1.0)
+"""Upper limits of the listed share of a scene in the bins of kappa. The last row of kappa is for
+lists of all classes but one."""
 
 
 def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
@@ -35,7 +44,11 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     All variants have the arrays below. The classes in `variants` add the arrays of each variant.
     `MachineSpec` defines the sizes.
 
-        b (V,), c1 (H1,), c2 (H2,), W (V, H1), J (H1, H2), Q (C, H1): biases and weights
+        b (V,), c1 (H1,), c2 (H2,), e (C,): biases of objects, hidden units and room types
+        W (V, H1), J (H1, H2), Q (C, H1): weights between h1 and objects, h2 and room types
+        L (V, V): couplings between classes, symmetric with a diagonal of 0, if `coupled`
+        a (profiles, V): change of b in scenes of a data source
+        kappa (4, V): change of the log-odds of unlisted classes by the listed share; see `SHARES`
         triples (T, 3): sorted triples (relation a, subject class i, object class j) with an own
             weight
         fantasies (N, ceil(V / 32)): stored samples of Gibbs chains. Each bit is the presence of
@@ -44,8 +57,11 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     """
     V, H1, H2 = spec.V, spec.H1, spec.H2
     floats: dict[str, tuple[int, ...]] = {
-        "b": (V,), "c1": (H1,), "c2": (H2,), "W": (V, H1), "J": (H1, H2), "Q": (spec.C, H1)
+        "b": (V,), "c1": (H1,), "c2": (H2,), "e": (spec.C,), "W": (V, H1), "J": (H1, H2),
+        "Q": (spec.C, H1), "a": (spec.profiles, V), "kappa": (len(SHARES) + 1, V),
     }  # fmt: skip
+    if spec.coupled:
+        floats["L"] = (V, V)
     ints: dict[str, tuple[int, ...]] = {"triples": (spec.T, 3)}
     if spec.N:
         ints |= {"fantasies": (spec.N, -(-V // WORD)), "fantasy_rooms": (spec.N,)}
@@ -58,7 +74,7 @@ class Weights:
     """The constant arrays of a machine. `layout` lists their names.
 
     Attributes:
-        spec: sizes and form of the machine.
+        spec: sizes of the machine.
         arrays: maps names to arrays. All float arrays have the same precision. Integer arrays are
             int32.
 
@@ -114,6 +130,10 @@ class Weights:
         bias: NDArray[Any] = self["c1"]
         return bias if room is None or not self.spec.C else bias + self["Q"][room]
 
+    def state_means(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Return the probabilities of the states of h1 with the logits x, both (..., H1)."""
+        return state_means(x, self.spec.states)
+
     def with_second_layer(
         self, base: NDArray[Any], beta: float = 1.0
     ) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -128,9 +148,23 @@ class Weights:
         J, c2 = self["J"], self["c2"]
         m2 = np.broadcast_to(sigmoid(beta * c2), (len(base), len(c2)))
         for _ in range(SWEEPS):
-            m1 = sigmoid(beta * (base + m2 @ J.T))
+            m1 = self.state_means(beta * (base + m2 @ J.T))
             m2 = sigmoid(beta * (c2 + m1 @ J))
         return base + m2 @ J.T, m2
+
+
+def state_means(x: NDArray[Any], states: int) -> NDArray[Any]:
+    """Return the probabilities of the states of hidden units, shaped like the logits x, (..., H1).
+
+    Each unit has `states` states. Its first state has the logit 0 and no entry in x.
+    """
+    if states == 2:
+        return sigmoid(x)
+    logits = x.reshape(*x.shape[:-1], -1, states - 1)
+    top = np.maximum(logits.max(-1, keepdims=True), 0)
+    odds = np.exp(logits - top)
+    means: NDArray[Any] = odds / (np.exp(-top) + odds.sum(-1, keepdims=True))
+    return means.reshape(x.shape)
 
 
 def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:
@@ -138,3 +172,10 @@ def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32
     octets = packed.astype("<i4").view(np.uint8).reshape(len(packed), -1)
     bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
     return bits.astype(np.float32)
+
+
+def pack_scenes(presence: NDArray[Any]) -> NDArray[np.int32]:
+    """Convert the presence of each class, (N, V), to bits, (N, 32-bit words)."""
+    bits = np.zeros((len(presence), -(-presence.shape[1] // WORD) * WORD), np.uint8)
+    bits[:, : presence.shape[1]] = presence > 0
+    return np.packbits(bits, axis=1, bitorder="little").view("<i4").astype(np.int32)

@@ -1,4 +1,4 @@
-"""Describe hidden units by the objects, relations and room types with the largest weights."""
+"""Describe states of hidden units by the objects, relations and room types of largest weight."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ Weighted: TypeAlias = tuple[tuple[Named, float], ...]
 
 
 def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
-    """Describe the hidden units of each layer by their largest positive weights.
+    """Describe the states of the hidden units of each layer by their largest positive weights.
 
-    The weights of a unit of layer h1 are its columns in W (objects), U (relations that occur in
-    training) and Q (room types). Layer h2 is connected to objects, relations and room types only
+    The weights of a state of layer h1 are its columns in W (objects), U (relations that occur in
+    training) and Q (room types). State 0 of a unit has no weights and is left out. Layer h2 is connected to objects, relations and room types only
     through h1. The weights of a unit of h2 are therefore its columns in W J, U J and Q J. Q is
     empty for a machine without room types. Structural classes (floor, wall) are left out.
 
-    From the weight of each relation, the function subtracts the mean over the units of the layer.
-    So a relation that every unit favours, such as a faucet on a sink, is not in any description.
+    From the weight of each relation, the function subtracts the mean over the states of the layer.
+    So a relation that every state favours, such as a faucet on a sink, is not in any description.
 
     Returns:
-        Maps the name of each layer, "h1" or "h2", to the descriptions of its units. They have the
-        order of the units.
+        Maps the name of each layer, "h1" or "h2", to the descriptions of its states. They have
+        the order of the units and of their states.
     """
     weights, vocabulary = artifact.weights, artifact.vocabulary
     named = ~vocabulary.structure
@@ -61,22 +61,30 @@ def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
             _strongest(to_rooms, vocabulary.room_types, ROOM_TYPES),
             strict=True,
         )
-        descriptions[layer] = [_description(unit, *names) for unit, names in enumerate(units)]
+        others = weights.spec.states - 1 if layer == "h1" else 1
+        descriptions[layer] = [
+            _description(*divmod(column, others), *names) for column, names in enumerate(units)
+        ]
     return descriptions
 
 
 def _description(
     unit: int,
+    before: int,
     objects: Weighted[str],
     relations: Weighted[tuple[str, str, str]],
     rooms: Weighted[str],
 ) -> ContextUnit:
-    """Return the description of a unit. Its name has its first objects and its first relation."""
+    """Return the description of state ``before`` + 1 of a unit.
+
+    The name has the first objects and the first relation.
+    """
     parts = [", ".join(label for label, _ in objects[:_NAMED])]
     parts += [" ".join(triple) for triple, _ in relations[:1]]
     return ContextUnit(
         unit=unit,
-        name="; ".join(filter(None, parts)) or f"unit {unit}",
+        state=before + 1,
+        name="; ".join(filter(None, parts)) or f"unit {unit}, state {before + 1}",
         objects=[WeightedLabel(label=label, weight=weight) for label, weight in objects],
         relations=[
             WeightedRelation(

@@ -16,16 +16,16 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.errors import InvalidRequestError
-from app.inference import MachineSpec, Weights
+from app.inference import MachineSpec
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
-from app.inference.elementary import softplus
+from app.inference.posterior import context_of
 from app.questions.answer import OBJECT_BYTES, RELATION_BYTES, Fields, SizeLimit, rounded_number
 from app.questions.names import ErrorList
 from app.questions.outliers import intruders
@@ -54,7 +54,7 @@ DRAWN_SEED_BITS: Final = 53
 A JSON reader may store numbers as doubles. A double represents an integer of 53 bits exactly.
 """
 
-_UNIT_BYTES: Final = 12  # maximum size in bytes of the number of one hidden unit
+_UNIT_BYTES: Final = 20  # maximum size in bytes of the pair of one hidden unit
 
 
 def generate(
@@ -65,7 +65,7 @@ def generate(
     seed: int,
     steps: int | None = None,
     temperature: float = 1.0,
-    context: Mapping[str, Sequence[int]] | None = None,
+    context: Mapping[str, Sequence[tuple[int, int]]] | None = None,
     stop: Callable[[], bool] = lambda: False,
     size_limit: SizeLimit | None = None,
 ) -> Fields:
@@ -88,8 +88,8 @@ def generate(
         seed: seed of the random numbers. The same seed gives the same scenes.
         steps: number of Gibbs sweeps for each draw. None means `STEPS`.
         temperature: temperature of the chains. Above 1, the scenes are more varied.
-        context: maps the name of a layer, "h1" or "h2", to the indices of the hidden units that are
-            held on.
+        context: maps the name of a layer, "h1" or "h2", to pairs (unit, state). These hidden units
+            keep their state.
         stop: function called between draws. After it returns True, `generate` returns the scenes
             drawn so far.
         size_limit: limit on the size of the answer, or None.
@@ -134,33 +134,52 @@ def generate(
 
 
 def _conditions(
-    artifact: Artifact, scene: Scene, context: Mapping[str, Sequence[int]]
+    artifact: Artifact, scene: Scene, context: Mapping[str, Sequence[tuple[int, int]]]
 ) -> Conditions:
-    """Return the fixed part of each chain: classes, relations, room type and active hidden units.
+    """Return the fixed part of each chain: classes, relations, room type and hidden units.
 
     Raises:
-        ValueError: the machine does not have a layer or unit in `context`.
+        ValueError: the machine does not have a layer, unit or state in `context`.
     """
     spec, listing = artifact.spec, present(scene, artifact.spec)
-    sizes = _layer_sizes(spec)
-    for layer, units in context.items():
-        if layer not in sizes:
+    layers = _layers(spec)
+    for layer, pairs in context.items():
+        if layer not in layers:
             raise ValueError(
                 f"the model has no layer {layer!r}; layers are h1, and h2 in two-layer models"
             )
-        for unit in units:
-            if not 0 <= unit < sizes[layer]:
-                raise ValueError(
-                    f"unit {unit} of {layer} does not exist: a unit must be at least 0 and below "
-                    f"{sizes[layer]}"
-                )
-    held, held2 = (
-        np.unique(np.array(context.get(layer, ()), dtype=np.int64)) for layer in ("h1", "h2")
-    )
+        if error := next(filter(None, (layers[layer].error(*pair) for pair in pairs)), None):
+            raise ValueError(f"context of {layer}: {error}")
+    held = np.array(context.get("h1", ()), dtype=np.int64).reshape(-1, 2)
+    # A unit of h2 is binary. It can be held in state 1 only; state 0 is its most common state.
+    held2 = np.unique(np.array([u for u, _ in context.get("h2", ())], dtype=np.int64))
     observed = given_relations(scene, listing, spec.A)
     return Conditions(
-        listing.classes, listing.log_counts, observed, held, held2, room=scene.room_type
+        *(listing.classes, listing.log_counts, observed, held, held2),
+        room=scene.room_type,
+        profile=scene.profile,
     )
+
+
+class _Layer(NamedTuple):
+    """The number of units of a hidden layer, and the states that `context` can hold."""
+
+    units: int
+    states: range
+
+    def error(self, unit: int, state: int) -> str | None:
+        """Return the reason why a unit cannot be held in a state, or None."""
+        if not 0 <= unit < self.units:
+            return f"the hidden layer has only the units 0 to {self.units - 1}"
+        if state not in self.states:
+            return f"a unit has only the states {self.states[0]} to {self.states[-1]}"
+        return None
+
+
+def _layers(spec: MachineSpec) -> dict[str, _Layer]:
+    """Map the name of each hidden layer to its sizes."""
+    layers = {"h1": _Layer(spec.units, range(spec.states))}
+    return layers | ({"h2": _Layer(spec.H2, range(1, 2))} if spec.H2 else {})
 
 
 def _scene(
@@ -189,13 +208,14 @@ def _scene(
             for a, i, j in triples
         ],
         "log_score": rounded_number(chains.log_score(state, shown, kept)),
-        "context": {layer: getattr(state, layer).tolist() for layer in _layer_sizes(artifact.spec)},
+        "context": _context(artifact.spec, state),
     }
 
 
-def _layer_sizes(spec: MachineSpec) -> dict[str, int]:
-    """Map the name of each hidden layer to its number of units."""
-    return {"h1": spec.H1, "h2": spec.H2} if spec.H2 else {"h1": spec.H1}
+def _context(spec: MachineSpec, state: ChainState) -> dict[str, list[tuple[int, int]]]:
+    """Return (unit, state) of the hidden units that are not in state 0, by layer."""
+    h1 = [(unit, value) for unit, value in enumerate(state.h1.tolist()) if value]
+    return {"h1": h1} | ({"h2": [(unit, 1) for unit in state.h2.tolist()]} if spec.H2 else {})
 
 
 def staying(
@@ -313,29 +333,22 @@ class Plausible:
         limits = self._artifact.calibration.room_fit
         if self._room is None or not limits:
             return True
-        v = np.zeros((1, self._artifact.spec.V), dtype=np.float32)
-        v[0, classes] = 1.0
-        return bool(room_fit(self._artifact.weights, v, self._room)[0] >= limits[self._room])
+        return room_fit(self._artifact, classes, self._room) >= limits[self._room]
 
 
-def room_fit(weights: Weights, v: NDArray[np.float32], room: int) -> NDArray[np.float64]:
-    """Return how well B scenes fit a room type: log p(v | t) / p(v) plus a constant, (B,).
+def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
+    """Return how well a scene fits a room type t: log p(v | t) / p(v), plus a constant of t.
 
-    v is the presence of the classes in a scene, and t is the room type. The constant depends only
-    on t. The result is a sum over the hidden units k of the first layer:
-
-        sum_k [softplus(x_k + Q_tk) - softplus(x_k)],   x = c1 + v'W
-
-    The formula leaves out a second hidden layer.
+    The result is the gain of the weights Q_t (`app.inference.objects`).
 
     Args:
-        v: (B, V) presence of each class in each scene.
+        classes: indices of the classes in the scene.
         room: index t of the room type.
     """
-    x = weights["c1"] + v @ weights["W"]
-    change = softplus(x + weights["Q"][room]) - softplus(x)
-    fit: NDArray[np.float64] = np.sum(change, axis=1, dtype=np.float64)
-    return fit
+    presence = np.ones(len(classes), np.float32)
+    index = np.array(classes, dtype=np.int64)
+    context = context_of(artifact.weights, index, presence, np.zeros_like(presence))
+    return float(artifact.objects.room_gains(context.x[None])[0, room])
 
 
 def _size(scenes: Sequence[Fields]) -> tuple[int, int]:
@@ -349,17 +362,15 @@ def _size(scenes: Sequence[Fields]) -> tuple[int, int]:
 
 def _read(request: GenerateRequest, artifact: Artifact, _: Reading) -> Options:
     """Return the arguments of `generate` for a request."""
-    errors, sizes = ErrorList(), _layer_sizes(artifact.spec)
-    for layer, units in (request.context or {}).items():
-        size = sizes.get(layer)
-        if size is None:
+    errors, layers = ErrorList(), _layers(artifact.spec)
+    for layer, pairs in (request.context or {}).items():
+        if layer not in layers:
             message = "the model lacks this hidden layer"
-            errors.add(InvalidRequestError, ("context", layer), message, tuple(sizes))
+            errors.add(InvalidRequestError, ("context", layer), message, tuple(layers))
             continue
-        for position, unit in enumerate(units):
-            if unit >= size:
-                message = f"the hidden layer has only the units 0 to {size - 1}"
-                errors.add(InvalidRequestError, ("context", layer, position), message)
+        for position, pair in enumerate(pairs):
+            if error := layers[layer].error(*pair):
+                errors.add(InvalidRequestError, ("context", layer, position), error)
     errors.raise_any()
     return {
         "count": request.count,
@@ -382,8 +393,8 @@ _EXAMPLES: Final = {
     ),
     "poses": Example("scenes around the objects that the robot sees", {**POSES, "seed": 7}),
     "context": Example(
-        "active hidden units (GET /models/{name}/contexts lists all units)",
-        {"context": {"h1": [0, 3]}, "seed": 7},
+        "hidden units in given states (GET /models/{name}/contexts lists them)",
+        {"context": {"h1": [[0, 1], [3, 1]]}, "seed": 7},
     ),
     "varied": Example(
         "more Gibbs steps and a higher temperature, for more varied scenes",
@@ -398,7 +409,7 @@ _EXAMPLE_ANSWER: Final = {
             "objects": ["bed", "nightstand", "lamp"],
             "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
             "log_score": -6.1,
-            "context": {"h1": [3, 17]},
+            "context": {"h1": [[3, 1], [5, 1]]},
         }
     ],
 }

@@ -29,7 +29,7 @@ from app.questions.answer import (
 from app.questions.counts import more
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
-from app.questions.posterior import Posterior, calibrated, placed_logits, posterior_of
+from app.questions.posterior import Posterior, calibrated, placed_logits
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.ranking import likeliest_classes
 from app.questions.reading import Reading
@@ -61,7 +61,7 @@ def missing(
 ) -> Fields:
     """Rank the unlisted classes by the probability that they are present, likeliest first.
 
-    The model assumes that a present class is listed with probability `coverage`. If the coverage is
+    The model assumes that the scene lists the share `coverage` of its classes. If the coverage is
     low, an unlisted class may well be present. Each class is judged separately, so the
     probabilities do not sum to 1. The list `missing` never contains listed or structural classes.
 
@@ -72,8 +72,8 @@ def missing(
             any probability. None means all classes.
         at: a place, as (relation, index of the anchor object). If set, `probability` is the
             probability that the class is present *and* has this relation to the anchor.
-        coverage: probability that a present class is listed. None means the model's value. At 1,
-            the model treats the other unlisted classes as absent.
+        coverage: listed share of the classes of the scene. None means the model's value. At 1, at
+            most one class is missing.
         axes: viewer's axes in the frame of the offsets; see `viewer_axes`. None means that the
             viewing direction is unknown.
         details: whether the answer contains `placements` and `because`.
@@ -93,7 +93,7 @@ def missing(
     if not 0 <= used_coverage <= 1:
         raise ValueError(f"coverage must be in [0, 1], not {used_coverage}")
     place = None if at is None else Place.of(scene, artifact.spec.A, *at)
-    posterior = posterior_of(artifact, scene)
+    posterior = Posterior(artifact, scene)
     classes, probabilities, log_odds = _ranked(
         artifact, posterior, top_k, candidates, place, used_coverage
     )
@@ -143,7 +143,7 @@ def _ranked(
         chosen = _among(absent, artifact.spec.V, candidates)
     if not chosen.any():
         return absent[:0], np.zeros(0), np.zeros(0)
-    log_odds = posterior.absent_posterior(absent, coverage)
+    log_odds = posterior.absent_log_odds(absent, coverage)
     listed = max(1, int(np.count_nonzero(~structure[listed_classes])))
     if place is None:
         logits = calibrated(artifact.calibration.missing, log_odds, listed)

@@ -5,13 +5,12 @@ reports as a probable intruder. The answer for an outlier names its companions: 
 usually occur with the class of the outlier. In a scene without other objects, the presence of class
 j raises the log-odds of class i by
 
-    increase_ij = gain_j(c1 + W_i) - gain_j(c1)
-    gain_j(x)   = sum_k softplus(x_k + W_jk) - softplus(x_k)
+    increase_ij = gain_j(c1 + W_i) - gain_j(c1) + L_ij
 
-Here c1 are the biases of the hidden units k, and W_i are the weights of class i. The increase is
-symmetric in i and j. So the gains of all classes at c1 + W_i give the increase by every class j.
-The formula is exact for a machine with one hidden layer in the local form. It leaves out a second
-layer, relations and the room type.
+Here c1 are the biases of the hidden units, W_i are the weights of class i, and `gain` is the
+contribution of the hidden units (`app.inference.objects`). The increase is symmetric in i and j. So
+the gains of all classes at c1 + W_i give the increase by every class j. The formula is exact for a
+machine with one hidden layer. It leaves out a second layer and the room type.
 
 Rare classes have the largest increases, such as a toilet paper holder for a toilet. Common classes
 such as chair are likely in any scene. So companions are ranked by a product: the increase,
@@ -39,22 +38,17 @@ from app.questions.answer import (
     rounded_number,
     significant,
 )
-from app.questions.posterior import Posterior, calibrated, false_log_odds, posterior_of
+from app.questions.posterior import Posterior, calibrated, false_log_odds
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
 from app.questions.ranking import best
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
-from app.registry.description import CountSlope, Thresholds
+from app.registry.description import AlarmLine, AlarmLines, CountSlope
 from app.scene.relations import CANONICAL, opposite
 from app.scene.scene import Scene
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
 
 Sensitivity = Literal["low", "medium", "high"]
-
-# The time to explain one object grows with the number of classes multiplied by the number of
-# relation units. This limit on the total bounds the number of explained objects in scenes with very
-# many relations.
-_REASON_UNITS: Final = 1 << 22
 
 COMPANIONS: Final = 3
 """Maximum number of companions in the answer for one outlier."""
@@ -105,17 +99,16 @@ def outliers(
     """
     if threshold is not None and not 0 <= threshold <= 1:
         raise ValueError(f"threshold must be in [0, 1], not {threshold}")
-    entry, presets = artifact.calibration.outlier, artifact.calibration.outlier_thresholds
+    entry, lines = artifact.calibration.outlier, artifact.calibration.outlier_lines
     judged: list[Fields] = []
     wrong: list[Fields] = []
-    posterior = posterior_of(artifact, scene) if scene.objects else None
-    if entry is not None and presets is not None and threshold is None:
-        if posterior is not None:
-            presets = _presets(artifact, posterior, presets)
-        threshold = _threshold(presets, sensitivity)
+    posterior = Posterior(artifact, scene) if scene.objects else None
+    if lines is not None and threshold is None:
+        listed = 0 if posterior is None else _listed(artifact, posterior)
+        threshold = _line(lines, sensitivity).threshold(listed)
     if posterior is not None:
         wrong = _misplaced(artifact, posterior, scene, sensitivity, flipped)
-        if entry is not None and presets is not None and threshold is not None:
+        if entry is not None and threshold is not None:
             judged = _judged(artifact, entry, posterior, scene, threshold, details=details)
     if size_limit is not None:
         size_limit.check("objects", *_size(judged, wrong))
@@ -156,7 +149,7 @@ def _judged(
     if details:
         for fields in class_fields:
             fields["because"], fields["usually_with"] = [], []
-        explained = np.array(list(dict.fromkeys(rows[: _affordable(posterior)])), dtype=np.int64)
+        explained = np.array(list(dict.fromkeys(rows[:EXPLAINED])), dtype=np.int64)
         if len(present.classes) > 1:
             change = posterior.reasons(explained)
             change = np.where(is_outlier[explained, None] == (change < 0), change, 0)
@@ -177,22 +170,19 @@ def misplaced(
     """Judge every stated relation like `outliers`, but do not judge objects."""
     if not scene.objects:
         return []
-    return _misplaced(artifact, posterior_of(artifact, scene), scene, sensitivity, ())
+    return _misplaced(artifact, Posterior(artifact, scene), scene, sensitivity, ())
 
 
 def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
-    """Return the classes that do not belong to a whole scene, at medium sensitivity.
-
-    A whole scene lists all its objects. So the thresholds for short lists, which are often
-    incomplete, do not apply.
-    """
-    entry, presets = artifact.calibration.outlier, artifact.calibration.outlier_thresholds
-    posterior = posterior_of(artifact, scene)
+    """Return the classes that do not belong to a scene, at medium sensitivity."""
+    entry, lines = artifact.calibration.outlier, artifact.calibration.outlier_lines
+    posterior = Posterior(artifact, scene)
     classes = posterior.present.classes
-    if entry is None or presets is None:
+    if entry is None or lines is None:
         return classes[:0]
     logits = _intruder_logits(artifact, entry, classes, posterior.log_odds_given_rest())
-    return classes[_probability(logits) >= presets.medium]
+    threshold = lines.medium.threshold(_listed(artifact, posterior))
+    return classes[_probability(logits) >= threshold]
 
 
 def _intruder_logits(
@@ -206,8 +196,10 @@ def _intruder_logits(
     The logit of a structural class is -inf. `entry` is `Calibration.outlier`.
     """
     adjusted = _adjusted(artifact, classes, log_odds).astype(np.float64)
-    logits = calibrated(entry, adjusted, len(log_odds)).astype(np.float64)
-    logits[artifact.vocabulary.structure[classes]] = -np.inf
+    is_structure = artifact.vocabulary.structure[classes]
+    listed = max(1, int((~is_structure).sum()))
+    logits = calibrated(entry, adjusted, listed).astype(np.float64)
+    logits[is_structure] = -np.inf
     return logits
 
 
@@ -215,15 +207,14 @@ def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isinf(logits), 0.0, sigmoid(logits))
 
 
-def _presets(artifact: Artifact, posterior: Posterior, presets: Thresholds) -> Thresholds:
-    """Return the thresholds for a scene. Short lists have thresholds of their own."""
-    structure = artifact.vocabulary.structure[posterior.present.classes]
-    listed, short = int((~structure).sum()), artifact.calibration.short_list_thresholds
-    return short[listed - 1] if 0 < listed <= len(short) else presets
+def _listed(artifact: Artifact, posterior: Posterior) -> int:
+    """Return the number of listed classes without structure."""
+    return int((~artifact.vocabulary.structure[posterior.present.classes]).sum())
 
 
-def _threshold(presets: Thresholds, sensitivity: Sensitivity) -> float:
-    return {"low": presets.low, "medium": presets.medium, "high": presets.high}[sensitivity]
+def _line(lines: AlarmLines, sensitivity: Sensitivity) -> AlarmLine:
+    line: AlarmLine = getattr(lines, sensitivity)
+    return line
 
 
 def _adjusted(
@@ -237,12 +228,6 @@ def _adjusted(
     if popularity is None:
         return log_odds
     return log_odds - artifact.calibration.popularity_weight * popularity[classes]
-
-
-def _affordable(posterior: Posterior) -> int:
-    """Return the maximum number of objects with reasons in the answer."""
-    per_object = len(posterior.present.classes) * max(1, posterior.unit_count)
-    return min(EXPLAINED, max(1, _REASON_UNITS // per_object))
 
 
 def stated_log_odds(
@@ -282,7 +267,7 @@ def _misplaced(
         return []
     order = np.argsort(log_odds, kind="stable")
     p = sigmoid(false_log_odds(entry, log_odds[order]))
-    is_misplaced = (p >= _threshold(presets, sensitivity)).tolist()
+    is_misplaced = (p >= getattr(presets, sensitivity)).tolist()
     return [
         _spelled(scene, triple, flipped) | {"probability": probability, "is_misplaced": flag}
         for triple, probability, flag in zip(
@@ -314,7 +299,9 @@ def _companions(
         return [[] for _ in flagged]
     # The rows of the arrays are outliers i, and the columns are classes j.
     weights, labels = artifact.weights, artifact.vocabulary.labels
-    gain_with_outlier = artifact.scorer.gain(weights["c1"] + weights["W"][flagged])
+    gain_with_outlier = artifact.objects.gains(weights["c1"] + weights["W"][flagged])
+    if artifact.spec.coupled:
+        gain_with_outlier += weights["L"][flagged]
     increase = np.where(usable, gain_with_outlier - artifact.empty_gain, 0)
     least = np.maximum(_LEAST_SHARE * increase.max(1, keepdims=True), 1e-6)
     score = np.where(increase < least, 0, increase * sigmoid(weights["b"] + gain_with_outlier))

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import MachineSpec
-from app.inference.posterior import Pull, ScenePosterior
+from app.inference.posterior import ScenePosterior, context_of
 from app.inference.relations import ObservedRelations
 from app.questions.ranking import bend
 from app.registry.artifact import Artifact
-from app.registry.description import Calibration, CountSlope, EvidenceWeights, Slope
+from app.registry.description import Calibration, CountSlope, Slope
 from app.scene.scene import Scene, instance_evidence, pool_classes, pool_relations
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
-
-FULL: Final = 0.999
-"""Coverage from which on the model assumes that the scene lists every present class.
-
-The coverage is the probability that a present class is listed.
-"""
-
 
 class Present(NamedTuple):
     """The n distinct classes of a scene of N objects.
@@ -52,7 +45,7 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
     """Group the objects of a scene by class.
 
     Raises:
-        ValueError: the machine does not know the class of an object or the room type.
+        ValueError: the machine does not know the class of an object, the room type or the profile.
     """
     V, indices = spec.V, [thing.class_index for thing in scene.objects]
     for number, index in enumerate(indices):
@@ -61,6 +54,8 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
             raise ValueError(f"class_index of {name!r} is {index}, but must be below V = {V}")
     if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
         raise ValueError(f"room_type is {scene.room_type}, but must be from 0 to {spec.C - 1}")
+    if scene.profile is not None and not 0 <= scene.profile < spec.profiles:
+        raise ValueError(f"profile is {scene.profile}, but must be below {spec.profiles}")
     confidence = np.array([thing.confidence for thing in scene.objects], dtype=np.float64)
     classes, first, row, counts, presence = pool_classes(
         np.array(indices, dtype=np.int64), confidence
@@ -82,20 +77,12 @@ def given_relations(scene: Scene, present: Present, relations: int) -> ObservedR
     holds, observed = pool_relations(present.row, len(present.classes), *instance_evidence(scene))
     # np.stack() makes contiguous arrays. For another layout, numba would compile the loops again.
     a, i, j = np.stack(np.nonzero(observed[:relations]))
-    presence = present.presence[i] * present.presence[j]
-    return ObservedRelations(a, i, j, r=holds[a, i, j].astype(np.float32), g=presence)
+    return ObservedRelations(a, i, j, r=holds[a, i, j].astype(np.float32))
 
 
 def relations_given(scene: Scene) -> bool:
     """Return whether the scene has observed relations, either stated or derived from poses."""
     return bool(scene.relations or scene.relations_complete or scene.poses)
-
-
-def pull_of(scene: Scene, weights: EvidenceWeights) -> Pull:
-    """Return the weights with which the observed relations of a scene act on the hidden units."""
-    if scene.poses is None:
-        return Pull(weights.relations_on_objects, weights.relations_on_relations)
-    return Pull(weights.poses_on_objects, weights.poses_on_relations)
 
 
 class Posterior(ScenePosterior):
@@ -105,88 +92,17 @@ class Posterior(ScenePosterior):
         present: the classes of the scene.
 
     Raises:
-        ValueError: the machine does not know the class of an object or the room type.
+        ValueError: the machine does not know the class of an object, the room type or the profile.
     """
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
         self.present = listing = present(scene, artifact.spec)
-        self._artifact, self._room = artifact, scene.room_type
         observed = given_relations(scene, listing, artifact.spec.A)
-        pull = pull_of(scene, artifact.calibration.evidence)
-        context = artifact.closed_form.context(
-            listing.classes, listing.presence, listing.log_counts, self._room, observed, pull
+        context = context_of(
+            artifact.weights,
+            *(listing.classes, listing.presence, listing.log_counts, scene.room_type, observed),
         )
-        super().__init__(artifact.closed_form, context)
-
-    def absent_log_odds(self, absent: Indices) -> Floats:
-        """Return the log-odds of presence of N absent classes, (N,).
-
-        The relations of these classes are unobserved. All other absent classes count as absent.
-        """
-        gain = self._artifact.scorer.gain(self.context.object_y)
-        log_odds: Floats = self._closed.b + gain
-        return log_odds[absent]
-
-    def absent_posterior(self, absent: Indices, coverage: float) -> Floats:
-        """Return the log-odds that each of N unlisted classes is present, (N,).
-
-        Args:
-            absent: (N,) indices of the unlisted classes.
-            coverage: probability that a present class is listed.
-        """
-        log_odds, y = self.absent_log_odds(absent), self.context.object_y
-        return with_unlisted(
-            self._artifact, log_odds, absent, y, self.present, self._room, coverage
-        )
-
-
-def posterior_of(artifact: Artifact, scene: Scene) -> Posterior:
-    """Return the posterior of a scene. If the artifact has an oracle, the oracle computes it."""
-    posterior: Posterior = (artifact.oracle or Posterior)(artifact, scene)
-    return posterior
-
-
-def with_unlisted(
-    artifact: Artifact,
-    log_odds: Floats,
-    absent: Indices,
-    y: NDArray[np.float32],
-    present: Present,
-    room: int | None,
-    coverage: float,
-    closed: Floats | None = None,
-) -> Floats:
-    """Return the log-odds that each of N unlisted classes is present, (N,).
-
-    The result is a weighted mean of two estimates:
-
-        (1 - λ) (closed + log(1 - c)) + λ partial
-
-    λ is the calibration's `coverage_weight`, and c is the coverage. `closed` are log-odds in closed
-    form. They treat all other unlisted classes as absent and have no sampling error. `partial` are
-    log-odds that `Completions` estimates from the stored samples. For machines without stored
-    samples, the result is log_odds + log(1 - c). For a coverage of at least `FULL`, the result is
-    the same with c = `FULL`, because c = 1 would give minus infinity.
-
-    Args:
-        log_odds: (N,) log-odds of the absent classes. All other unlisted classes count as absent.
-        absent: (N,) class indices of the absent classes.
-        y: (H1,) logits of h1 in the closed form.
-        room: index of the room type, or None if the room type is unknown.
-        coverage: probability that a present class is listed.
-        closed: (N,) log-odds in closed form at y. None means that `log_odds` are these log-odds.
-            Otherwise, `log_odds` are a better estimate. The function then adds λ times the
-            difference between `partial` and the closed form to `log_odds`.
-    """
-    completions, weight = artifact.completions, artifact.calibration.coverage_weight
-    unlisted = math.log1p(-min(coverage, FULL))
-    total: Floats = log_odds + unlisted
-    if completions is None or coverage >= FULL or weight == 0:
-        return total
-    partial = completions.log_odds(y, present.classes, present.presence, coverage, room)[absent]
-    base = (log_odds if closed is None else closed) + unlisted
-    total += np.float32(weight) * (partial - base)
-    return total
+        super().__init__(artifact.objects, artifact.relation_units, context, scene.profile)
 
 
 # --------------------------------------------------------------------------------- calibration

@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from functools import cached_property
 from statistics import median
 from typing import Final, Literal
@@ -101,6 +102,7 @@ def read_scene(
     limits: Limits,
     look_ups: LookUps | None = None,
     *,
+    profiles: Sequence[str] = (),
     may_be_empty: bool = False,
 ) -> Reading:
     """Convert the scene of a request: find the class of each label, and derive relations.
@@ -110,6 +112,7 @@ def read_scene(
         limits: limits on the scene.
         look_ups: searches for similar classes, shared by all scenes of a batch. None means that the
             request has only this scene.
+        profiles: names of the model's profiles.
         may_be_empty: whether a scene without objects of known classes is valid.
 
     Raises:
@@ -146,6 +149,7 @@ def read_scene(
         room = vocabulary.room_index(room_name)
         if room is None:
             room = unknown.resolve(room_name, room_name, ("room_type",), errors, is_room=True)
+    profile = None if request.profile is None else _profile(request.profile, profiles, errors)
     if not objects and not may_be_empty and not errors.by_class:
         errors.add(
             InvalidRequestError, ("objects",), "the model does not know any of these objects"
@@ -153,7 +157,7 @@ def read_scene(
     if errors.by_class:
         errors.raise_any()
 
-    reading.scene = Scene(tuple(objects), None, False, room)
+    reading.scene = Scene(tuple(objects), None, False, room, profile)
     if reading.left_out:
         left_out = {name for name, _ in reading.left_out}
         reading.ids = [name for name in ids if name not in left_out]
@@ -162,10 +166,20 @@ def read_scene(
         triples, reading.flipped = _triples(stated, reading, errors)
         if errors.by_class:
             errors.raise_any()
-        reading.scene = Scene(reading.scene.objects, triples, request.relations_complete, room)
+        complete = request.relations_complete
+        reading.scene = Scene(reading.scene.objects, triples, complete, room, profile)
     if has_detections:
         _derive(request, reading, vocabulary, has_poses=has_poses)
     return reading
+
+
+def _profile(name: str, profiles: Sequence[str], errors: ErrorList) -> int | None:
+    """Return the index of a profile, or None after an error."""
+    if name in profiles:
+        return profiles.index(name)
+    similar = tuple(get_close_matches(name, profiles, 3, 0.0))
+    errors.add(InvalidRequestError, ("profile",), "the model does not have this profile", similar)
+    return None
 
 
 def _check_fields(request: SceneRequest, limits: Limits, errors: ErrorList) -> None:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from app.errors import InvalidRequestError, Location
 from app.questions.answer import RELATION_BYTES, Fields, SizeLimit, significant
 from app.questions.names import ErrorList
-from app.questions.posterior import Posterior, Present, posterior_of, relations_given
+from app.questions.posterior import Posterior, Present, relations_given
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.ranking import disagreeing, likeliest_relations, observed_pairs
 from app.questions.reading import Reading, Triple
@@ -84,7 +84,7 @@ def relations(
         raise ValueError(f"min_probability must be in [0, 1], not {min_probability}")
     if not scene.objects:
         return {"relations": [], "disagreements": []}
-    posterior = posterior_of(artifact, scene)
+    posterior = Posterior(artifact, scene)
     present, slopes = posterior.present, artifact.relation_slopes
     judged = _judged(artifact, present, pairs)
     # This limit is slightly lower than the requested minimum, because the final comparison uses

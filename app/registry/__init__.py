@@ -4,11 +4,12 @@ from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.counts import Counts
 from app.registry.description import (
     NEVER,
+    AlarmLine,
+    AlarmLines,
     Calibration,
     CountSlope,
     DataSource,
     Description,
-    EvidenceWeights,
     Metric,
     PairSlope,
     Slope,
@@ -25,6 +26,8 @@ from app.registry.store import Store, StoreState
 
 __all__ = [
     "NEVER",
+    "AlarmLine",
+    "AlarmLines",
     "AliasTarget",
     "Artifact",
     "ArtifactError",
@@ -34,7 +37,6 @@ __all__ = [
     "Counts",
     "DataSource",
     "Description",
-    "EvidenceWeights",
     "Example",
     "Manifest",
     "Metric",

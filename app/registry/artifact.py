@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,10 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from app.inference import MachineSpec, Weights
 from app.inference.chains import SceneChains
-from app.inference.completions import Completions
-from app.inference.objects import ContextScorer
-from app.inference.posterior import ClosedForm
-from app.inference.relations import relation_units
+from app.inference.objects import LARGEST_WEIGHT, ObjectScorer
+from app.inference.relations import RelationUnits, relation_units
 from app.inference.weights import layout
 from app.registry.card import render_card
 from app.registry.counts import PREFIX as COUNTS
@@ -35,7 +33,6 @@ from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
 from app.registry.offsets import PREFIX as OFFSETS
 from app.registry.offsets import Offsets
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
-from app.scene.scene import Scene
 from app.scene.vocabulary import Vocabulary
 
 MAX_MANIFEST_BYTES: Final = 4 * 2**20
@@ -47,8 +44,8 @@ SCENE_MAX_WEIGHTS_BYTES sets another maximum."""
 
 _DTYPES: Final = {float: "float32", int: "int32"}
 _UNSUPPORTED: Final = (
-    "the service does not support this machine: it needs the local form and weights W between -64 "
-    "and 64"
+    "the service does not support this machine: its weights W and Q must be between "
+    f"-{LARGEST_WEIGHT:g} and {LARGEST_WEIGHT:g}"
 )
 
 
@@ -69,8 +66,6 @@ class Artifact:
             training scenes had no poses.
         counts: statistics of the numbers of instances. None means that the training scenes do not
             count instances.
-        oracle: function that computes the posterior of a scene in place of the closed form. Only
-            training sets an oracle.
     """
 
     manifest: Manifest
@@ -82,7 +77,6 @@ class Artifact:
     path: Path
     offsets: Offsets | None = None
     counts: Counts | None = None
-    oracle: Callable[[Artifact, Scene], Any] | None = None
 
     @cached_property
     def spec(self) -> MachineSpec:
@@ -90,21 +84,14 @@ class Artifact:
         return self.weights.spec
 
     @cached_property
-    def scorer(self) -> ContextScorer:
-        """Scorer that computes the log-odds of all object classes. The first access builds it."""
-        return ContextScorer(self.weights["W"])
+    def objects(self) -> ObjectScorer:
+        """Log-odds of classes and room types. The first access prepares the weights."""
+        return ObjectScorer(self.weights)
 
     @cached_property
-    def closed_form(self) -> ClosedForm:
-        """The machine, prepared for log-odds in closed form. The first access prepares it."""
-        return ClosedForm(self.weights)
-
-    @cached_property
-    def completions(self) -> Completions | None:
-        """Posterior of unlisted classes. None means that the machine has no stored samples."""
-        if not Completions.supports(self.weights):
-            return None
-        return Completions(self.weights, self.vocabulary.structure, self.scorer)
+    def relation_units(self) -> RelationUnits:
+        """Relation units of the machine. The first access prepares the weights."""
+        return relation_units(self.weights)
 
     @cached_property
     def relation_slopes(self) -> RelationSlopes:
@@ -120,18 +107,18 @@ class Artifact:
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:
         """(V,) contribution of the hidden units h1 to each class's log-odds in an empty scene."""
-        gain: NDArray[np.float32] = self.scorer.gain(self.weights["c1"])
+        gain: NDArray[np.float32] = self.objects.gains(self.weights["c1"][None])[0]
         return gain
 
     def context_rows(self) -> NDArray[np.float32]:
         """Return the weights between h1 and each of the T triples of the weights, (T, H1)."""
         relation, subject, object_ = self.weights["triples"].astype(np.int64).T.copy()
-        return relation_units(self.weights).rows_of(relation, subject, object_)
+        return self.relation_units.context_weights(relation, subject, object_)
 
     @cached_property
     def scene_chains(self) -> SceneChains:
         """Compiled Gibbs chains that sample scenes."""
-        return SceneChains(self.weights, self.closed_form.units)
+        return SceneChains(self.weights, self.relation_units)
 
 
 def write_artifact(
@@ -230,7 +217,8 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
         weights = Weights(spec, tensors)
     except ValueError as error:
         raise ArtifactError("invalid_tensor", str(error)) from None
-    if not ClosedForm.supports(weights):
+    largest = max(np.abs(weights[name]).max(initial=0) for name in ("W", "Q"))
+    if not largest <= LARGEST_WEIGHT:
         raise ArtifactError("unsupported", _UNSUPPORTED)
     return weights
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Self
 
@@ -71,44 +72,44 @@ NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 """Thresholds that raise no alarm below a probability of 1."""
 
 
-class EvidenceWeights(Frozen):
-    """Weights from 0 to 1 with which observed relations act on the hidden units.
+class AlarmLine(Frozen):
+    """Minimum log-odds of an outlier in a list of n classes: intercept + log_count·log n."""
 
-    A request states relations, or the service derives relations from poses. The weights are
-    different for questions about objects and for questions about relations.
-    """
+    intercept: float
+    log_count: float = 0.0
 
-    relations_on_objects: Annotated[float, Field(ge=0, le=1)] = 1.0
-    relations_on_relations: Annotated[float, Field(ge=0, le=1)] = 1.0
-    poses_on_objects: Annotated[float, Field(ge=0, le=1)] = 1.0
-    poses_on_relations: Annotated[float, Field(ge=0, le=1)] = 1.0
+    def threshold(self, n: int) -> float:
+        """Return the minimum probability of an outlier in a list of n classes."""
+        return 1 / (1 + math.exp(-self.intercept - self.log_count * math.log(max(n, 1))))
+
+
+class AlarmLines(Frozen):
+    """The alarm line of each sensitivity. A short list has a higher line than a whole scene."""
+
+    low: AlarmLine
+    medium: AlarmLine
+    high: AlarmLine
 
 
 class Calibration(Frozen):
     """The conversion of a machine's log-odds into probabilities.
 
-    With the default values, the calibration changes only the log-odds of unlisted classes, by
-    `coverage`, and the model judges neither objects nor relations. An intruder is an object that
+    With the default values, the calibration changes nothing, and the model judges neither objects
+    nor relations. An intruder is an object that
     does not belong to the scene. Structural classes are parts of the building (floor, wall) and
     vague names (object).
 
     Attributes:
-        coverage: probability that a request lists a class that is present in the scene. A request
-            may contain another value.
-        coverage_weight: weight of the log-odds that `Completions` estimates for unlisted classes.
-            The remaining weight belongs to the closed form, which treats the other unlisted classes
-            as absent. Training chooses the weight on validation scenes.
+        coverage: share of the classes of a scene that a request lists. A request may contain
+            another value.
         missing: calibration of the log-odds that an unlisted class is present. n is the number of
             listed classes.
-        evidence: weights with which observed relations act on the hidden units.
         popularity: (V,) log-odds that a training scene has each class. If the tuple is empty, all
             classes have the same popularity.
         popularity_weight: exponent alpha. The prior probability of an intruder's class is
             proportional to popularity^alpha, where popularity is the odds of the class.
-        outlier_thresholds: minimum probability of an outlier in a large scene. None exactly if
-            `outlier` is None.
-        short_list_thresholds: minimum probability of an outlier in scenes of 1, 2, ... classes.
-            Structural classes do not count. Larger scenes use `outlier_thresholds`.
+        outlier_lines: minimum log-odds of an outlier, by the number of listed classes without
+            structure. None exactly if `outlier` is None.
         misplaced_thresholds: minimum probability of a misplaced (probably false) relation. None
             exactly if `misplaced` is None.
         smallest: (C + 1,) minimum number of classes in a generated scene of each room type. 90 % of
@@ -132,13 +133,10 @@ class Calibration(Frozen):
     """
 
     coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
-    coverage_weight: Annotated[float, Field(ge=0, le=1)] = 0.5
     missing: CountSlope = CountSlope()
-    evidence: EvidenceWeights = EvidenceWeights()
     popularity: Many[float] = ()
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
-    outlier_thresholds: Thresholds | None = None
-    short_list_thresholds: Annotated[Many[Thresholds], Field(max_length=256)] = ()
+    outlier_lines: AlarmLines | None = None
     misplaced_thresholds: Thresholds | None = None
     smallest: Many[Count] = ()
     room_fit: Many[float] = ()
@@ -151,9 +149,9 @@ class Calibration(Frozen):
 
     @model_validator(mode="after")
     def _has_fits_with_thresholds(self) -> Self:
-        for name in ("outlier", "misplaced"):
-            if (getattr(self, name) is None) != (getattr(self, f"{name}_thresholds") is None):
-                raise ValueError(f"{name} and {name}_thresholds must both have a value, or neither")
+        for fit, limits in (("outlier", "outlier_lines"), ("misplaced", "misplaced_thresholds")):
+            if (getattr(self, fit) is None) != (getattr(self, limits) is None):
+                raise ValueError(f"{fit} and {limits} must both have a value, or neither")
         return self
 
     @classmethod
@@ -206,12 +204,16 @@ class ClassEntry(Frozen):
 
 
 class VocabularyEntry(Frozen):
-    """The object classes, relations and room types of a model, in the order of their indices."""
+    """The object classes, relations, room types and profiles of a model, by their indices.
+
+    A profile is a data source whose base rates a request can choose.
+    """
 
     objects: Many[ClassEntry]
     relations: Many[str] = CANONICAL
     room_types: Many[Text] = ()
     room_aliases: dict[Text, Many[Text]] = Field(default_factory=dict)
+    profiles: Many[Text] = ()
     _words: Vocabulary = PrivateAttr()
 
     @model_validator(mode="after")
@@ -220,13 +222,20 @@ class VocabularyEntry(Frozen):
             raise ValueError(
                 f"relations must be the first entries of {CANONICAL}, in the same order"
             )
-        self._words = Vocabulary.from_dict(self.model_dump(mode="json", exclude={"relations"}))
+        words = self.model_dump(mode="json", exclude={"relations", "profiles"})
+        self._words = Vocabulary.from_dict(words)
         return self
 
     @classmethod
-    def of(cls, vocabulary: Vocabulary, relations: int = len(CANONICAL)) -> Self:
+    def of(
+        cls,
+        vocabulary: Vocabulary,
+        relations: int = len(CANONICAL),
+        profiles: tuple[str, ...] = (),
+    ) -> Self:
         """Return the manifest entry of a vocabulary for a machine with A = ``relations``."""
-        return cls.model_validate({**vocabulary.to_dict(), "relations": CANONICAL[:relations]})
+        names = {"relations": CANONICAL[:relations], "profiles": profiles}
+        return cls.model_validate(vocabulary.to_dict() | names)
 
     def vocabulary(self) -> Vocabulary:
         """Return the vocabulary."""
@@ -315,12 +324,13 @@ class Description(Frozen):
         for name, what, length in (
             ("V", "vocabulary objects", len(words.objects)),
             ("A", "vocabulary relations", len(words.relations)),
+            ("profiles", "vocabulary profiles", len(words.profiles)),
             *(
                 ("A", f"entries of calibration.{name}", len(getattr(self.calibration, name)))
                 for name in PAIR_CALIBRATIONS
             ),
         ):
-            if self.spec.get(name) != length:
+            if self.spec.get(name, 0) != length:
                 raise ValueError(
                     f"the description has {length} {what}, but the spec has "
                     f"{name} = {self.spec.get(name)}"

@@ -90,6 +90,7 @@ class Scene:
             to hold.
         room_type: index of the room type in the model's vocabulary. None means that the room type
             is unknown.
+        profile: index of the data source whose base rates apply. None means the model's own mix.
         poses: relations derived from poses by `observe`. They include relations observed
             not to hold, and replace ``relations`` as evidence. ``relations`` must list the derived
             relations that hold, but the class does not check this condition. None means that no
@@ -105,6 +106,7 @@ class Scene:
     relations: tuple[tuple[int, int, int], ...] | None = None
     relations_complete: bool = False
     room_type: int | None = None
+    profile: int | None = None
     poses: PoseRelations | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -172,6 +172,7 @@ class TrainingData:
     room_types: int
     digest: str = ""
     words: Tensor | None = None
+    parents: Tensor | None = None
     vocabulary: Vocabulary | None = None
 
     @property

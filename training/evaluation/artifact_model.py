@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.questions.posterior import posterior_of
+from app.questions.posterior import Posterior
 from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES, Scene
 from training.datasets.batches import Batch, SceneTensors
@@ -84,7 +84,7 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
                 for a, x, y in sorted(observed)
             ]
             scene = Scene(scene.objects, tuple(triples) or None)
-            values = posterior_of(artifact, scene).relation_log_odds()
+            values = Posterior(artifact, scene).relation_log_odds()
             log_odds[row, : len(values), :n, :n] = torch.from_numpy(values)
         return log_odds
 

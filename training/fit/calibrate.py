@@ -27,7 +27,7 @@ from scipy.special import expit
 
 from app.questions.outliers import stated_log_odds
 from app.questions.placements import PLACES
-from app.questions.posterior import posterior_of
+from app.questions.posterior import Posterior
 from app.registry import Artifact, Calibration, PairSlope, Slope
 from app.scene import Scene
 from training.datasets import EncodedScene
@@ -140,7 +140,7 @@ def _examples_of_pairs(
             if not observed:
                 continue
         scene = replace(scene_of(encoded, range(len(pairs)), observed), room_type=None)
-        values = posterior_of(artifact, scene).relation_log_odds()
+        values = Posterior(artifact, scene).relation_log_odds()
         source = sources.index(encoded.source)
         blocks.append(_instance_pairs(number, source, encoded, values, structure, pairs))
     return blocks
@@ -165,7 +165,7 @@ def fit_placements(
             continue
         target, kept = removal
         instance = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
-        posterior = posterior_of(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
+        posterior = Posterior(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
         present = posterior.present
         anchors = np.flatnonzero(~structure[present.classes])
         tables = posterior.placement_log_odds(np.array([target]), anchors)
@@ -395,5 +395,5 @@ def fit_misplaced(
 
 def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
     """Return the log-odds of each stated relation given the rest of the scene."""
-    triples, log_odds = stated_log_odds(artifact, posterior_of(artifact, scene), scene)
+    triples, log_odds = stated_log_odds(artifact, Posterior(artifact, scene), scene)
     return dict(zip(map(tuple, triples.T.tolist()), log_odds.tolist(), strict=True))

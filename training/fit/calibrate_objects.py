@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from app.questions.generate import room_fit
-from app.questions.posterior import calibrated, posterior_of
+from app.questions.posterior import calibrated, Posterior
 from app.registry import NEVER, Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
 from app.scene import Scene
 from training.datasets.array_types import Flags, Floats, Rng
@@ -267,7 +267,7 @@ def _draw_partial_lists(
         for k, v, hidden in zip(cases.scene, cases.v.numpy(), cases.hidden.numpy(), strict=True):
             classes = np.flatnonzero(v)
             absent = np.flatnonzero((v == 0) & ~structure.numpy())
-            posterior = posterior_of(whole, of_classes(classes.tolist()))
+            posterior = Posterior(whole, of_classes(classes.tolist()))
             partial = {}
             if whole.completions is not None:
                 partial = {
@@ -490,7 +490,7 @@ def smallest_good_weight(scores: dict[float, float]) -> float:
 
 
 def _rank(artifact: Artifact, scene: Scene, target: int, structure: Flags) -> int:
-    posterior = posterior_of(artifact, scene)
+    posterior = Posterior(artifact, scene)
     absent = np.setdiff1d(np.flatnonzero(~structure), posterior.present.classes)
     z = posterior.absent_posterior(absent, artifact.calibration.coverage)
     return 1 + int((z > z[absent == target]).sum())

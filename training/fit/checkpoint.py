@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -18,27 +19,30 @@ class RunError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Epoch:
-    """Loss, errors and scores of one epoch. `evaluation.reconstruction` defines the errors."""
+class CurvePoint:
+    """One point of the training curve.
 
-    epoch: int
+    Attributes:
+        phase: "objects" or "relations".
+        done: finished share of the phase, from 0 to 1.
+        loss: mean loss since the previous point of the phase.
+        score: score on validation scenes. NaN means that no scene can be scored.
+        seconds: duration since the previous point.
+    """
+
+    phase: str
+    done: float
     loss: float
-    object_error_train: float
-    relation_error_train: float
-    object_error_validation: float
-    relation_error_validation: float
-    mrr_validation: float
-    r_precision_validation: float
+    score: float
     seconds: float
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """The result of training: the machine with its best weights, and figures of each epoch."""
+    """The trained machine, the training curve and the duration in seconds."""
 
     machine: BoltzmannMachine
-    epochs: list[Epoch]
-    best_epoch: int
+    curve: list[CurvePoint]
     seconds: float
 
 
@@ -73,24 +77,29 @@ def load_checkpoint(path: Path, digest: str) -> dict[str, Any] | None:
     return state
 
 
-def write_csv(path: Path, epochs: list[Epoch]) -> None:
-    """Write a CSV file with one row for each epoch."""
+def write_csv(path: Path, curve: Sequence[CurvePoint]) -> None:
+    """Write a CSV file with one row for each point of a curve."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Epoch)])
+        writer = csv.DictWriter(file, [field.name for field in fields(CurvePoint)])
         writer.writeheader()
-        writer.writerows(asdict(epoch) for epoch in epochs)
+        writer.writerows(asdict(point) for point in curve)
 
 
-def write_plot(path: Path, epochs: list[Epoch], title: str) -> None:
-    """Plot the reconstruction errors of objects and of relations against the epoch."""
+def write_plot(path: Path, curve: Sequence[CurvePoint], title: str) -> None:
+    """Plot loss and validation score of both phases."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3.2), layout="constrained")
-    x = [epoch.epoch for epoch in epochs]
-    for axis, unit in zip(figure.subplots(1, 2), ("object", "relation"), strict=True):
-        for part in ("train", "validation"):
-            axis.plot(x, [getattr(e, f"{unit}_error_{part}") for e in epochs], label=part)
-        axis.set(xlabel="epoch", ylabel="mean absolute error", title=f"{unit}s")
+    left, right = figure.subplots(1, 2)
+    scores = {"objects": "MRR of hidden classes", "relations": "R-precision of relations"}
+    for phase, score in scores.items():
+        points = [point for point in curve if point.phase == phase]
+        done = [point.done for point in points]
+        left.plot(done, [point.loss for point in points], marker=".", label=phase)
+        right.plot(done, [point.score for point in points], marker=".", label=score)
+    left.set(xlabel="finished share of the phase", ylabel="loss", title="loss")
+    right.set(xlabel="finished share of the phase", title="validation score")
+    for axis in (left, right):
         axis.legend()
-    figure.suptitle(f"Reconstruction error, {title}")
+    figure.suptitle(title)
     figure.savefig(path, dpi=120)

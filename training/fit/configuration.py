@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from app.inference.variants import VARIANTS, Form, Variant
+from app.inference.variants import VARIANTS, Variant
 from training.machines import MachineSpec, build
 
 
@@ -74,97 +74,84 @@ class MachineConfig(_Section):
     """
 
     variant: Variant
-    H1: int = Field(default=200, ge=1)
-    H2: int = Field(default=100, ge=0)
+    units: int = Field(default=8, ge=1, description="hidden units of the first layer")
+    states: int = Field(default=32, ge=2, description="states of such a unit; 2: binary")
+    H2: int = Field(default=0, ge=0, description="binary hidden units of the second layer")
+    coupled: bool = Field(default=False, description="couplings between classes")
     K: int = Field(default=32, ge=0)
     G: int = Field(default=0, ge=0, description="rank of the implication factors (Triway)")
-    N: int = Field(default=0, ge=0, description="number of stored chain samples")
-    form: Form = "seed"
+    N: int = Field(default=1024, ge=0, description="number of stored chain samples")
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
-    initial_c1: float = 0.0
     without: tuple[str, ...] = Field(
         default=(), exclude_if=not_, description="names of weights held at zero"
     )
 
 
-class ObjectiveConfig(_Section):
-    """The training objective, and its settings."""
-
-    name: Literal["contrastive_divergence", "persistent_cd", "composite", "relations"]
-    k: int = Field(default=1, ge=1, description="Gibbs steps for each update (CD, PCD)")
-    chains: int = Field(default=128, ge=1, description="number of persistent chains (PCD)")
-    presence_weight: float = Field(default=0.1, ge=0, description="weight of the presence term")
-    relation_weight: float = Field(default=0.05, ge=0)
-    unlisted: Literal["unobserved", "off"] = Field(
-        default="unobserved", description="meaning of unlisted relations in annotated scenes"
-    )
-    generative_weight: float = Field(default=0.0, ge=0, description="weight of PCD (composite)")
-    room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of hidden room types")
-    structure_dropout: float = Field(default=0.5, ge=0, le=1)
-    object_dropout: float = Field(default=0.0, ge=0, lt=1)
-    count_dropout: float = Field(
-        default=0.0, ge=0, le=1, description="share of scenes with hidden counts"
-    )
-    offset_prior: float = Field(
-        default=8.0, ge=0, description="precision of the offsets of the sources (relations)"
-    )
-    weight_prior: float = Field(
-        default=16.0, ge=0, description="precision of the relation weights (relations)"
-    )
-    word_weight: float = Field(
-        default=0.0, ge=0, description="scale of the word-vector term (relations)"
-    )
-    source_weights: dict[str, float] = Field(
-        default={}, description="weight of relations by source, default 1 (relations)"
-    )
-
-
 class ObjectsConfig(_Section):
-    """The first training phase: objects only, by persistent Gibbs chains.
+    """The fit of the object weights (`training.fit.objects`)."""
 
-    The phase needs a machine of the local form (`training.machines.machine`).
-    """
+    steps: int = Field(default=800, ge=1)
+    batch_size: int = Field(default=256, ge=1)
+    learning_rate: float = Field(default=0.01, gt=0)
+    warm_up: int = Field(default=50, ge=1, description="steps in which the rate rises")
+    leave_one_out: float = Field(default=0.3, ge=0, le=1, description="share of such parts")
+    room_share: float = Field(default=0.5, ge=0, le=1, description="share of listed room types")
+    weight_prior: float = Field(
+        default=1.5, ge=0, description="precision of W, J and Q, in numbers of scenes"
+    )
+    coupling_prior: float = Field(default=2.5, ge=0, description="precision of L")
+    rate_prior: float = Field(default=7.5, ge=0, description="precision of a and kappa")
+    generative_weight: float = Field(default=0.2, ge=0, description="weight of PCD")
+    chains: int = Field(default=256, ge=1, description="number of persistent chains (PCD)")
+    classes_per_sweep: int = Field(
+        default=250, ge=1, description="random classes that a sweep of coupled classes draws"
+    )
+    word_weight: float = Field(default=1.0, ge=0, description="scale of the word-vector term")
+    source_weights: dict[str, float] = Field(
+        default={}, description="weight of the scenes of a source; default 1, 0: not used"
+    )
+    served_sources: dict[str, float] = Field(
+        default={},
+        description="weights of the sources in the base rates that are served; empty: all equal",
+    )
+    open_sources: tuple[str, ...] = Field(
+        default=(),
+        description="sources that show every class; empty: those with an open vocabulary",
+    )
 
-    epochs: int = Field(default=0, ge=0, description="passes over the scenes; 0 skips the phase")
-    learning_rate: float = Field(default=0.2, gt=0, description="initial rate; falls to 0")
-    chains: int = Field(default=64, ge=1)
-    batch_size: int = Field(default=32, ge=1)
+    def precision_of(self, name: str) -> float:
+        """Return the precision of the normal prior of an object weight, by the name of it."""
+        if name in ("W", "J", "Q") or name.startswith("parametrizations.W"):
+            return self.weight_prior
+        return {"L": self.coupling_prior, "a": self.rate_prior, "kappa": self.rate_prior}.get(
+            name, 0.0
+        )
 
 
-class FineTuneConfig(_Section):
-    """The last training phase, which fine-tunes the weights of objects by persistent chains.
+class RelationsConfig(_Section):
+    """The fit of the relation weights (`training.fit.relations`)."""
 
-    The phase needs a machine of the local form (`training.machines.machine`).
-    """
-
-    updates: int = Field(default=0, ge=0)
-    chains: int = Field(default=512, ge=1)
-    k: int = Field(default=2, ge=1, description="Gibbs steps for each update")
-    learning_rate: float = Field(default=0.002, gt=0)
-    anchor: float = Field(default=0.1, ge=0, description="penalty on changes of the weights")
+    epochs: int = Field(default=8, ge=0, description="passes over the scenes; 0: no relations")
+    learning_rate: float = Field(default=0.01, gt=0)
+    batch_size: int = Field(default=64, ge=1)
+    averaging: float = Field(default=0.99, ge=0, lt=1, description="decay of average weights")
+    count_dropout: float = Field(
+        default=0.3, ge=0, le=1, description="share of scenes with hidden counts"
+    )
+    offset_prior: float = Field(default=8.0, ge=0, description="precision of source offsets")
+    weight_prior: float = Field(default=16.0, ge=0, description="precision of the weights")
+    word_weight: float = Field(default=1.0, ge=0, description="scale of the word-vector term")
+    source_weights: dict[str, float] = Field(
+        default={}, description="weight of relations by source, default 1"
+    )
 
 
 class TrainingConfig(_Section):
-    """The optimiser, and the rules that end training."""
+    """Settings of the whole run."""
 
-    optimiser: Literal["adamw", "sgd"] = "adamw"
-    learning_rate: float = Field(default=0.01, gt=0)
-    schedule: Literal["one_cycle", "constant"] = "one_cycle"
-    epochs: int = Field(default=30, ge=1)
-    batch_size: int = Field(default=64, ge=1)
-    weight_decay: float = Field(default=0.0, ge=0)
-    relation_decay: float = Field(default=0.0, ge=0, description="decay of the relation weights")
-    relation_rate: float = Field(default=1.0, gt=0, description="rate factor of relation weights")
-    averaging: float = Field(default=0.0, ge=0, lt=1, description="decay of average weights")
-    patience: int | None = Field(default=None, ge=1)
     seed: int = 0
     threads: int = Field(default=1, ge=1)
-    device: Literal["auto", "cpu", "cuda"] = Field(
-        default="auto",
-        exclude_if=lambda device: device == "auto",
-        description="device of the epochs; auto: a GPU if there is one",
-    )
 
 
 class Config(_Section):
@@ -180,44 +167,34 @@ class Config(_Section):
     )
     data: DataConfig
     machine: MachineConfig
-    objective: ObjectiveConfig
-    training: TrainingConfig = TrainingConfig()
     objects: ObjectsConfig = ObjectsConfig()
-    polish: FineTuneConfig = FineTuneConfig()
+    relations: RelationsConfig = RelationsConfig()
+    training: TrainingConfig = TrainingConfig()
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
+        kind = VARIANTS[self.machine.variant]
         if self.machine.without:
-            smallest = build(MachineSpec(self.machine.variant, V=1, A=1, H1=1, K=1))
+            smallest = build(MachineSpec(self.machine.variant, V=1, A=1, units=1, K=1))
             names = [name for name, _ in smallest.named_parameters()]
             if unknown := sorted(set(self.machine.without) - set(names)):
                 raise ValueError(
                     f"machine.without: a {self.machine.variant} has no weights "
                     f"{', '.join(unknown)}, only {', '.join(names)}"
                 )
-        kind, local = VARIANTS[self.machine.variant], self.machine.form == "local"
-        local_only = {
-            "machine.N": self.machine.N,
-            "objective.generative_weight": self.objective.generative_weight,
-            "objects.epochs": self.objects.epochs,
-            "polish.updates": self.polish.updates,
-        }
         rules = {
             "machine.H2 must be 0, because this machine.variant has one hidden layer": (
                 self.machine.H2 and not kind.two_layers
             ),
-            "machine.G is defined for the local form of the Triway only: it must be 0": (
-                self.machine.G and not (local and kind.implications)
+            "machine.coupled must be false, because the machine has two hidden layers": (
+                self.machine.H2 and self.machine.coupled
+            ),
+            "machine.G is defined for the Triway only: it must be 0": (
+                self.machine.G and not kind.implications
             ),
             "data.rooms must be at least 1, because `rooms` is a source": (
                 "rooms" in self.data.sources and not self.data.rooms
             ),
-            "objects.epochs must be at least 1: the objective `relations` trains no objects": (
-                self.objective.name == "relations" and not self.objects.epochs
-            ),
-        } | {
-            f"{name} is defined for the local form only: it must be 0": value and not local
-            for name, value in local_only.items()
         }
         if broken := next((message for message, breaks in rules.items() if breaks), None):
             raise ValueError(broken)

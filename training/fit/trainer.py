@@ -1,31 +1,25 @@
-"""The trainer of every machine and objective: updates, early stopping, checkpoints, curves.
+"""Train a machine in two phases: the object weights, and then the relation weights.
 
-With one thread, two runs with the same seed give bit-identical weights, even if a run is
-interrupted and resumed after an epoch. `machines.distributed` splits the batches between processes.
+`training.fit.objects` and `training.fit.relations` define the losses. Two runs with the same seed
+and one thread give bit-identical weights, even if a run is interrupted and resumed.
 """
 
 from __future__ import annotations
 
-import copy
-import math
 import time
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from app.inference.variants import VARIANTS
-from training.datasets.batches import Batch, SceneTensors, TrainingData, seen_triples, subset
-from training.evaluation.missing_tasks import MachineScore, leave_one_out
-from training.evaluation.reconstruction import reconstruction_error
-from training.evaluation.relation_tasks import machine_score as relation_score
-from training.evaluation.relation_tasks import rank_relations
+from training.datasets.batches import SceneTensors, TrainingData, seen_triples
 from training.fit.checkpoint import (
-    Epoch,
+    CurvePoint,
     TrainingResult,
     load_checkpoint,
     save_checkpoint,
@@ -33,47 +27,39 @@ from training.fit.checkpoint import (
     write_plot,
 )
 from training.fit.configuration import Config
-from training.fit.object_weights import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
-from training.fit.objectives import OBJECTIVES, Objective
-from training.machines import BoltzmannMachine, MachineSpec, build, distributed
-from training.machines.bernoulli import log_odds_of
+from training.fit.objects import ObjectFit, ObjectScenes, start_objects
+from training.fit.relations import SHARED_COLUMNS, SHARED_ROWS, RelationFit
+from training.fit.samples import store_samples
+from training.fit.sharing import bake_shared_weights, share_weights
+from training.fit.validation import object_score, relation_score
+from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.edges import find_triples, triple_keys
+from training.machines.machine import OBJECT_WEIGHTS
 
-_VALIDATION_SCENES = 400
-_DRAWN_EVERY = 20.0  # s
-# Attributes of the trainer that a checkpoint stores as they are.
-_COUNTERS = ("objects_trained", "best_epoch", "best_score", "updates", "seconds")
-# Function that is called in the first training phase (objects only) with its finished share.
-ObjectProgress = Callable[[float], None]
-# Names of the weights with the full learning rate. The setting `relation_rate` can lower the rate
-# of all other weights. Relation weights can overfit within one epoch.
-_FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
+_STEPS = 100  # steps of the first phase between two checkpoints
 
-# Function that is called after every update with the epoch, its finished share and its mean loss.
-Progress = Callable[[int, float, float], None]
-Ended = Callable[[Epoch], None]  # is called after every epoch
+Progress = Callable[[str, float, float], None]
+"""Function that is called with the phase, its finished share, and its mean loss."""
+
+Passed = Callable[[CurvePoint], None]
+"""Function that is called with each new point of the curve."""
 
 
-def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
+def new_machine(config: Config, data: TrainingData, scenes: ObjectScenes) -> BoltzmannMachine:
     """Return a machine with small random matrices and log-odds of training counts as biases."""
     shape = config.machine
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
     spec = MachineSpec(
-        shape.variant, V=V, A=data.relations, H1=shape.H1, H2=shape.H2, C=data.room_types,
-        K=shape.K if VARIANTS[shape.variant].factorised else 0, T=len(triples), G=shape.G,
-        N=shape.N, form=shape.form,
+        shape.variant, V=V, A=data.relations, units=shape.units, states=shape.states, H2=shape.H2,
+        C=data.room_types, K=shape.K if VARIANTS[shape.variant].factorised else 0, T=len(triples),
+        G=shape.G, N=shape.N, profiles=len(scenes.sources), coupled=shape.coupled,
     )  # fmt: skip
+    generator = torch.Generator().manual_seed(config.training.seed)
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
+    start_objects(machine, scenes)
+    _start_relations(machine, data.train)
     with torch.no_grad():
-        annotated = data.train.annotated_classes[data.train.source].sum(0)
-        # If no data source annotates a class, its bias must mean a rare class. The formula alone
-        # would give a probability of 1/2.
-        annotated = torch.where(annotated > 0, annotated, len(data.train))
-        machine.b.copy_(log_odds_of(data.train.v.sum(0), annotated))
-        machine.c1.fill_(shape.initial_c1)
-        machine.Q.zero_()
-        _start_relations(machine, data.train)
         for name in shape.without:
             machine.get_parameter(name).zero_().requires_grad_(False)
     return machine
@@ -99,112 +85,46 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
         logs[classes] += torch.from_numpy(evidence.counts).log()
         times[classes] += 1
     machine.start_relations(
-        log_odds_of(holding, observed),
-        log_odds_of(per_unit, torch.full_like(per_unit, annotated)),
+        _log_odds(holding, observed),
+        _log_odds(per_unit, torch.full_like(per_unit, annotated)),
         logs / times.clamp(min=1),
     )
 
 
-class _Loss(nn.Module):
-    """The loss of this process' share of a batch; the mean over processes is the global loss."""
-
-    def __init__(self, objective: Objective, machine: BoltzmannMachine) -> None:
-        super().__init__()
-        self.objective, self.machine = objective, machine
-        self.objective_parameters = nn.ParameterList(objective.parameters())
-
-    def forward(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the loss, times the number of processes."""
-        return self.objective.loss(self.machine, batch, generator) * distributed.size()
+def _log_odds(count: Tensor, total: Tensor) -> Tensor:
+    """Return the log-odds of `count` events in `total` trials, with 1/2 added to both counts."""
+    return ((count + 0.5) / (total - count + 0.5)).log()
 
 
 class Trainer:
     """Train one configuration on one set of scenes.
 
-    The first process writes `checkpoint.pt`, `curve.csv` and `curve.png` into the folder, if any.
+    The trainer writes `checkpoint.pt`, `curve.csv` and `curve.png` into the folder, if any.
+
+    Raises:
+        ValueError: no training scene has two classes.
     """
 
     def __init__(self, config: Config, data: TrainingData, folder: Path | None = None) -> None:
         self.config, self.data, self.folder = config, data, folder
         torch.set_num_threads(config.training.threads)
-        self.device = distributed.device_of(config.training.device)
-        self.generator = distributed.new_generator(config.training.seed)
-        self.machine = new_machine(config, data, self.generator).to(self.device)
-        self.machine.index_triples()
-        kind = OBJECTIVES[config.objective.name]
-        with self._on_device():
-            self.objective: Objective = kind.of(config.objective, self.machine, data)
-        self.train = data.train
-        if config.objects.epochs:
-            self.train = _select_annotated(data.train)
-            for name in OBJECT_WEIGHTS:
-                self.machine.get_parameter(name).requires_grad_(False)
-        self.loss = distributed.parallel(_Loss(self.objective, self.machine))
-        self.optimiser = self._new_optimiser()
-        self.steps_per_epoch = math.ceil(len(self.train) / config.training.batch_size)
-        self.scheduler = self._new_scheduler()
-        self.average = self._copy_weights()
-        self.updates = 0
-        self.epochs: list[Epoch] = []
-        self.best: dict[str, Tensor] = {}
-        self.best_epoch, self.best_score = -1, -math.inf
+        self.scenes = ObjectScenes.of(data.train, data.structure, config.objects)
+        self.machine = new_machine(config, data, self.scenes)
+        self._share()
+        self.objects = ObjectFit(self.machine, self.scenes, config.objects, config.training.seed)
+        self.curve: list[CurvePoint] = []
         self.seconds = 0.0
-        self.objects_trained = not config.objects.epochs
-        self._plotted_at = -math.inf
+        self._relations: RelationFit | None = None
 
-    def _copy_weights(self) -> dict[str, Tensor]:
-        return {name: p.detach().clone() for name, p in self.machine.named_parameters()}
-
-    def _on_device(self) -> torch.device | nullcontext[None]:
-        """Return a context in which new tensors are on the device."""
-        return nullcontext() if self.device.type == "cpu" else self.device
-
-    def _on_cpu(self) -> BoltzmannMachine:
-        """Return the machine, on a GPU a copy; objects and validation use the CPU."""
-        if self.device.type == "cpu":
-            return self.machine
-        machine = copy.deepcopy(self.machine).cpu()
-        machine.index_triples()
-        return machine
-
-    def _new_optimiser(self) -> torch.optim.Optimizer:
-        """Return an optimiser; biases have no decay, and weights of relations their own rate."""
-        t = self.config.training
-        groups: tuple[list[Tensor], list[Tensor], list[Tensor]] = ([], [], [])
-        matrices, biases, relations = groups
-        for name, parameter in self.machine.named_parameters():
-            if not parameter.requires_grad:
-                continue
-            group = matrices if parameter.dim() > 1 else biases
-            (group if name in _FULL_RATE else relations).append(parameter)
-        biases += self.objective.parameters()
-        decays = t.weight_decay, 0.0, t.relation_decay
-        rates = t.learning_rate, t.learning_rate, t.learning_rate * t.relation_rate
-        settings = [
-            {"params": group, "weight_decay": decay, "lr": rate}
-            for group, decay, rate in zip(groups, decays, rates, strict=True)
-        ]
-        kind = torch.optim.SGD if t.optimiser == "sgd" else torch.optim.AdamW
-        return kind(settings, lr=t.learning_rate, fused=True)
-
-    def _new_scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
-        """Return the schedule of the learning rate.
-
-        In the one-cycle schedule, it rises over the first tenth of the updates, and then falls to 0
-        along a cosine.
-        """
-        t = self.config.training
-        if t.schedule == "constant":
-            return torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda _: 1.0)
-        total = t.epochs * self.steps_per_epoch
-        rise = max(1, total // 10)
-
-        def factor(step: int) -> float:
-            if step < rise:
-                return (step + 1) / rise
-            return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(total - rise, 1))))
-
-        return torch.optim.lr_scheduler.LambdaLR(self.optimiser, factor)
+    def _share(self) -> None:
+        """Let classes share weights with their parents and with similar words."""
+        data, V = self.data, self.machine.spec.V
+        words = torch.zeros(V, 0) if data.words is None else data.words
+        parents = torch.full((V,), -1) if data.parents is None else data.parents
+        objects, relations = self.config.objects, self.config.relations
+        share_weights(self.machine, words * objects.word_weight, parents, ["W"])
+        words = words * relations.word_weight
+        share_weights(self.machine, words, parents, SHARED_ROWS, SHARED_COLUMNS)
 
     def resume(self) -> bool:
         """Load the checkpoint in the folder of the run. Return False if there is no checkpoint.
@@ -214,195 +134,117 @@ class Trainer:
         """
         if self.folder is None:
             return False
-        path = self.folder / "checkpoint.pt"
-        state = distributed.on_first(partial(load_checkpoint, path, self._digest))
+        state = load_checkpoint(self.folder / "checkpoint.pt", self._digest)
         if state is None:
             return False
-        for name in ("objective", "average", "best"):
-            state[name] = {key: value.to(self.device) for key, value in state[name].items()}
-        self.machine.load_state_dict(state["machine"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.scheduler.load_state_dict(state["scheduler"])
-        self.objective.load_state(state["objective"])
-        self.generator.set_state(state["generator"])
-        self.average, self.best = state["average"], state["best"]
-        for name in _COUNTERS:
-            setattr(self, name, state[name])
-        self.epochs = [Epoch(**row) for row in state["epochs"]]
+        self.curve = [CurvePoint(**row) for row in state["curve"]]
+        self.seconds = state["seconds"]
+        if state["relations"] is None:
+            self.machine.load_state_dict(state["machine"])
+            self.objects.load_state(state["objects"])
+        else:
+            self.objects.steps = self.config.objects.steps
+            self._begin_relations()
+            self.machine.load_state_dict(state["machine"])
+            self._relation_fit.load_state(state["relations"])
         return True
 
     def run(
-        self,
-        progress: Progress | None = None,
-        ended: Ended | None = None,
-        objects: ObjectProgress = lambda _: None,
+        self, progress: Progress = lambda *_: None, passed: Passed = lambda _: None
     ) -> TrainingResult:
-        """Run the first training phase (objects only) if there is one, then all epochs.
+        """Run both phases from the state of the trainer.
 
-        Training ends earlier if the validation score does not improve for `training.patience`
-        epochs. After a KeyboardInterrupt, the checkpoint of the last finished epoch is on disk.
+        After a KeyboardInterrupt, the last checkpoint is on disk.
+
+        Raises:
+            FloatingPointError: the training diverged.
         """
-        if not self.objects_trained:
-            began = time.perf_counter()
-            state = distributed.on_first(partial(self._fit_objects, objects))
-            self.machine.load_state_dict(state)
-            self.objects_trained = True
-            self.average = self._copy_weights()
-            self.seconds += time.perf_counter() - began
+        for point in self._points(progress):
+            self.curve.append(point)
+            self.seconds += point.seconds
             self._save()
-        while len(self.epochs) < self.config.training.epochs and not self._out_of_patience():
-            self._epoch(progress)
-            self._save()
-            if ended is not None:
-                ended(self.epochs[-1])
-        self._plot()
-        with torch.no_grad():
-            for name, value in self.best.items():
-                self.machine.get_parameter(name).copy_(value)
-        self.machine.cpu().index_triples()
-        machine = self.objective.finish(self.machine, self.train)
-        if not self.config.objects.epochs:
-            training, dropout = self.config.training, self.config.objective.room_dropout
-            data = self.data.train
-            fine_tune(self.machine, data, self.config.polish, dropout, training.seed)
-        return TrainingResult(machine, self.epochs, self.best_epoch, self.seconds)
+            passed(point)
+        began = time.perf_counter()
+        machine = self._relation_fit.finish()
+        store_samples(machine, self.scenes, self.config.training.seed)
+        self.seconds += time.perf_counter() - began
+        if self.folder is not None:
+            write_plot(self.folder / "curve.png", self.curve, self.config.name)
+        return TrainingResult(machine, self.curve, self.seconds)
 
-    def _fit_objects(self, progress: ObjectProgress) -> dict[str, Tensor]:
-        machine, seed = self._on_cpu(), self.config.training.seed
-        fit_objects(machine, self.data.train, self.config.objects, seed, progress)
-        store_samples(machine, self.data.train, self.config.objective.room_dropout, seed)
-        return machine.state_dict()
+    def _points(self, progress: Progress) -> Iterator[CurvePoint]:
+        """Run the rest of both phases. Yield a point of the curve at each checkpoint."""
+        fit = self.objects
+        while not fit.finished:
+            began, losses = time.perf_counter(), []
+            while len(losses) < _STEPS and not fit.finished:
+                fit.step()
+                losses.append(fit.loss)
+                progress("objects", fit.steps / fit.config.steps, float(np.mean(losses)))
+            if fit.finished:
+                fit.finish()
+            score = object_score(self.machine, self.data)
+            seconds = time.perf_counter() - began
+            done = fit.steps / fit.config.steps
+            if fit.finished:
+                self._begin_relations()
+            yield CurvePoint("objects", done, float(np.mean(losses)), score, seconds)
+        if self._relations is None:
+            self._begin_relations()
+        relations = self._relation_fit
+        while not relations.finished:
+            began = time.perf_counter()
+            loss = relations.epoch(partial(progress, "relations"))
+            with relations.averaged():
+                score = relation_score(self.machine, self.data)
+            seconds = time.perf_counter() - began
+            yield CurvePoint("relations", relations.done, loss, score, seconds)
+
+    def _begin_relations(self) -> None:
+        """Fix the object weights, and start the second phase."""
+        with torch.no_grad():
+            bake_shared_weights(self.machine, ["W"])
+            silence(self.machine, self.data.structure)
+        for name in OBJECT_WEIGHTS:
+            if name in dict(self.machine.named_parameters()):
+                self.machine.get_parameter(name).requires_grad_(False)
+        config = self.config
+        seed = config.training.seed
+        self._relations = RelationFit(self.machine, self.data.train, config.relations, seed)
+
+    @property
+    def _relation_fit(self) -> RelationFit:
+        if self._relations is None:
+            raise RuntimeError("the second phase has not begun")
+        return self._relations
 
     @property
     def _digest(self) -> str:
         return f"{self.config.digest} {self.data.digest}"
 
-    def _out_of_patience(self) -> bool:
-        patience = self.config.training.patience
-        return patience is not None and len(self.epochs) - 1 - self.best_epoch >= patience
-
-    def _epoch(self, progress: Progress | None) -> None:
-        began = time.perf_counter()
-        number = len(self.epochs)
-        total, steps = 0.0, 0
-        order = torch.randperm(len(self.train), generator=self.generator)
-        for index in order.split(self.config.training.batch_size):
-            total, steps = total + self._update(index), steps + 1
-            if progress is not None:
-                progress(number, steps / self.steps_per_epoch, total / steps)
-        global_total = distributed.total(torch.tensor(total, dtype=torch.float64))
-        loss = float(global_total) / distributed.size() / steps
-        is_finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
-        if not math.isfinite(loss) or not is_finite:
-            raise FloatingPointError(
-                f"the training diverged in epoch {number}, with a loss of {loss}: lower the "
-                "learning rate (training.learning_rate)"
-            )
-        self._close_epoch(number, loss, began)
-
-    def _update(self, index: Tensor) -> float:
-        """Update the weights and their average on a batch. Return the loss of this process."""
-        width = max(len(self.train.scenes[k].evidence.classes) for k in index.tolist())
-        batch = self.train.batch(distributed.share(index), width).to(self.device)
-        with self._on_device():
-            loss = self.loss(batch, self.generator)
-            self.optimiser.zero_grad()
-            loss.backward()
-            self.objective.adjust_gradients(self.machine)
-        self.optimiser.step()
-        self.scheduler.step()
-        self.updates += 1
-        decay = self.config.training.averaging
-        if decay:
-            # During the first updates, a smaller decay reduces the share of the initial weights in
-            # the average.
-            weight = 1 - min(decay, self.updates / (self.updates + 10))
-            for name, parameter in self.machine.named_parameters():
-                self.average[name].lerp_(parameter.detach(), weight)
-        return float(loss.detach())
-
-    @torch.no_grad()
-    def _close_epoch(self, number: int, loss: float, began: float) -> None:
-        """Evaluate the weights, or their average, on validation scenes. Keep the best weights."""
-        parameters, current = dict(self.machine.named_parameters()), self._copy_weights()
-        if self.config.training.averaging:
-            for name, p in parameters.items():
-                p.copy_(self.average[name])
-        machine = self._on_cpu()
-        works: list[Callable[[], tuple[float, ...]]] = [
-            partial(self._rank_objects, machine),
-            partial(self._rank_relations, machine),
-            partial(reconstruction_error, machine, self.data.train),
-            partial(reconstruction_error, machine, self.data.validation),
-        ]
-        (mrr,), (precision,), train, validation = distributed.spread(works)
-        score = mrr + (0.0 if math.isnan(precision) else precision)
-        if score > self.best_score or self.objective.keeps_last:
-            self.best_score, self.best_epoch = score, number
-            self.best = self._copy_weights()
-        for name, p in parameters.items():
-            p.copy_(current[name])
-        seconds = time.perf_counter() - began
-        self.seconds += seconds
-        errors = train[0], train[1], validation[0], validation[1]
-        self.epochs.append(Epoch(number, loss, *errors, mrr, precision, seconds))
-
-    def _rank_objects(self, machine: BoltzmannMachine) -> tuple[float]:
-        """Return the MRR of removed objects on fixed validation scenes."""
-        generator = torch.Generator().manual_seed(0)
-        pick = torch.randperm(len(self.data.validation), generator=generator)[:_VALIDATION_SCENES]
-        sample = subset(self.data.validation, pick)
-        result = leave_one_out(sample, self.data.structure, MachineScore(machine))
-        return (float(result.reciprocal_rank().mean()) if len(result.target) else math.nan,)
-
-    def _rank_relations(self, machine: BoltzmannMachine) -> tuple[float]:
-        """Return the R-precision of relations on fixed validation scenes."""
-        annotated = [
-            k for k, scene in enumerate(self.data.validation.scenes) if scene.evidence.holds.any()
-        ][:_VALIDATION_SCENES]
-        if not annotated:
-            return (math.nan,)
-        sample = subset(self.data.validation, torch.tensor(annotated))
-        ranking = rank_relations(sample, self.data.structure, relation_score(machine, draws=16))
-        return (float(ranking.hits.sum() / max(ranking.annotated.sum(), 1)),)
-
     def _save(self) -> None:
-        """Write the checkpoint and the curve; all processes must call, as chains are gathered."""
+        """Write the checkpoint and the curve."""
         if self.folder is None:
             return
-        objective = self.objective.state()
-        if not distributed.is_first():
-            return
+        relations = self._relations
         save_checkpoint(
             self.folder / "checkpoint.pt",
             {
                 "digest": self._digest,
                 "machine": self.machine.state_dict(),
-                "optimiser": self.optimiser.state_dict(),
-                "scheduler": self.scheduler.state_dict(),
-                "objective": objective,
-                "generator": self.generator.get_state(),
-                "average": self.average,
-                "best": self.best,
-                **{name: getattr(self, name) for name in _COUNTERS},
-                "epochs": [asdict(epoch) for epoch in self.epochs],
+                "objects": None if relations else self.objects.state(),
+                "relations": relations.state() if relations else None,
+                "curve": [asdict(point) for point in self.curve],
+                "seconds": self.seconds,
             },
         )
-        if not self.epochs:
-            return
-        write_csv(self.folder / "curve.csv", self.epochs)
-        # Plot at most once in _DRAWN_EVERY seconds. With few scenes, a plot takes longer than an
-        # epoch.
-        if time.perf_counter() - self._plotted_at > _DRAWN_EVERY:
-            self._plot()
-
-    def _plot(self) -> None:
-        if self.folder is not None and distributed.is_first():
-            write_plot(self.folder / "curve.png", self.epochs, self.config.name)
-            self._plotted_at = time.perf_counter()
+        write_csv(self.folder / "curve.csv", self.curve)
 
 
-def _select_annotated(scenes: SceneTensors) -> SceneTensors:
-    """Return the scenes with an annotated relation, or all scenes if no scene has one."""
-    annotated = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
-    return subset(scenes, torch.tensor(annotated, dtype=torch.int64)) if annotated else scenes
+def silence(machine: BoltzmannMachine, structure: Tensor) -> None:
+    """Set the object weights of structure classes to 0, so that listing them changes nothing."""
+    for name in ("W", "L"):
+        if name in dict(machine.named_parameters()):
+            machine.get_parameter(name)[structure] = 0
+    if machine.spec.coupled:
+        machine.L[:, structure] = 0

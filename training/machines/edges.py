@@ -9,10 +9,9 @@ of a scene does not list are 0.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,15 +35,6 @@ class Edges(ABC):
     def shape(self) -> torch.Size:
         """Shape of tensors with one value for each unit, (scenes or 1, units)."""
 
-    @property
-    @abstractmethod
-    def classes(self) -> Tensor:
-        """Class indices that `BoltzmannMachine.edges` needs for these units, (scenes or 1, n)."""
-
-    @abstractmethod
-    def expand(self, rows: int) -> Edges:
-        """Return the units of one scene, repeated for `rows` scenes."""
-
     @abstractmethod
     def ends_present(self, v: Tensor) -> Tensor:
         """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
@@ -62,14 +52,6 @@ class TripleEdges(Edges):
     @property
     def shape(self) -> torch.Size:
         return self.valid.shape
-
-    @property
-    def classes(self) -> Tensor:
-        # The table does not depend on the classes of a scene.
-        return self.subject.new_zeros(1, 0)
-
-    def expand(self, rows: int) -> TripleEdges:
-        return self
 
     def ends_present(self, v: Tensor) -> Tensor:
         present: Tensor = v[..., self.subject[0]] * v[..., self.object[0]] * self.valid
@@ -102,14 +84,6 @@ class PairEdges(Edges):
     def shape(self) -> torch.Size:
         (B, n), m = self.subjects.shape, self.objects.shape[1]
         return torch.Size((B, self.relations * n * m))
-
-    @property
-    def classes(self) -> Tensor:
-        return torch.where(self.valid_subjects, self.subjects, -1)
-
-    def expand(self, rows: int) -> PairEdges:
-        ends = [getattr(self, field.name) for field in fields(self) if field.name != "relations"]
-        return PairEdges(self.relations, *(end.expand(rows, -1) for end in ends))
 
     @cached_property
     def relation(self) -> Tensor:  # type: ignore[override]
@@ -192,26 +166,3 @@ def find_triples(table: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
         return torch.zeros_like(keys), torch.zeros_like(keys, dtype=torch.bool)
     position = torch.searchsorted(table, keys.contiguous()).clamp(max=table.numel() - 1)
     return position, table[position] == keys
-
-
-def present_classes(v: Tensor, leading: Tensor | None = None, least: int = 0) -> Tensor:
-    """Return the classes present in each row of v, (B, n) int64, padded with -1.
-
-    Args:
-        leading: (B, k) present classes that come first, in the given order.
-        least: least number of columns n.
-    """
-    # numpy lists the active units several times faster than torch.
-    present = v.detach().cpu().numpy() > 0
-    lead = np.zeros((len(v), 0), np.int64) if leading is None else leading.cpu().numpy()
-    rows = np.arange(len(v))[:, None]
-    if lead.size:
-        present[rows, lead] = False
-    row, column = present.nonzero()
-    counts = present.sum(1)
-    width = max(lead.shape[1] + int(counts.max(initial=0)), least)
-    classes = np.full((len(v), width), -1, dtype=np.int64)
-    classes[:, : lead.shape[1]] = lead
-    rank = np.arange(len(row)) - np.repeat(counts.cumsum() - counts, counts)
-    classes[row, lead.shape[1] + rank] = column
-    return torch.from_numpy(classes).to(v.device)

@@ -1,20 +1,24 @@
 """The common interface of the machines, and the whole energy except its relation logits.
 
-    E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_e r_e ℓ_e(v,h1)
+    E(v,r,h1,h2,t | q) = - (b + a_q)·v - v'Lv/2 - c1·h1 - v'W h1 - h1'J h2 - c2·h2 - e_t - Q_t·h1
+                         - sum_e g_e (r_e ℓ_e(v, h1) - log(1 + exp ℓ_e(v, h1)))
 
-The sum runs over the relation units e = (a,i,j) of the machine variant. A variant defines its
-relation units, the gate of a unit and the logit ℓ_e. A gate of 0 forces its unit to 0. This module
-defines all other terms. If a room type t is given, c1 means c1 + Q[t]. The model is conditioned on
-the room type, so the room type has no unit.
+q is the data source of the scene, and t its room type. A hidden unit of the first layer has Z
+states. h1 has one entry for each state but the first: 1 for the state of the unit, else 0. The
+first state has the energy 0. For Z = 2, the units are binary, as in the paper. An unknown room type
+has e_t = 0 and Q_t = 0. The last sum runs over the relation units e = (a, i, j). A variant defines
+its relation units, the gate g_e of a unit and the logit ℓ_e. A gate of 0 forces its unit to 0.
 
-Every variant has two forms of the relation part of the energy. A unit with an open gate adds:
+The term log(1 + exp ℓ_e) normalises each relation separately. So the sum over an unobserved
+relation is 1, and relations have no effect on objects and hidden units. The published machine lacks
+this term; `training.seed` has it as published.
 
-    seed    - r_e ℓ_e - κ_a
-    local   - r_e ℓ_e + log(1 + exp ℓ_e)
+Given the objects, the log-odds of an unlisted class i have a closed form (one hidden layer):
 
-Both forms have the same p(r | v, h1). In the local form, unobserved relations have no effect on
-other units. The seed form is the energy of the paper. A relation that is summed out in the seed
-form raises the probability of its two objects. The weight κ (0 in the paper) compensates for this.
+    log-odds_i = b_i + a_qi + (vL)_i + sum_m log sum_z p_m(z | v, t) exp(W_i[m, z])
+
+p_m are the probabilities of the states of unit m, with the logits x = c1 + Q_t + v'W + J m2. With a
+second layer, m2 are its mean-field means given v. They stay the same for v_i = 0 and v_i = 1.
 
 Tensor dimensions: "..." stands for samples. They come first, then scenes, then units.
 """
@@ -22,7 +26,6 @@ Tensor dimensions: "..." stands for samples. They come first, then scenes, then 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import Self
 
 import torch
@@ -30,36 +33,20 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from app.inference.variants import MachineSpec
-from training.machines.bernoulli import bernoulli
-from training.machines.edges import Edges, PairEdges, triple_keys
+from app.inference.weights import SHARES, SWEEPS
+from training.machines.edges import Edges, triple_keys
 
-
-@dataclass(frozen=True)
-class State:
-    """The state of several Gibbs chains.
-
-    Attributes:
-        v: presence of objects, (chains, classes).
-        h1, h2: hidden units of each layer, (chains, hidden units).
-        r: values of the relation units, (chains, units).
-        edges: layout of the relation units in r.
-    """
-
-    v: Tensor
-    h1: Tensor
-    h2: Tensor
-    r: Tensor
-    edges: Edges
+OBJECT_WEIGHTS = ("b", "c1", "c2", "e", "W", "J", "Q", "L", "a", "kappa")
+"""Names of the weights without relations."""
 
 
 class BoltzmannMachine(nn.Module, ABC):
-    """A Boltzmann machine over objects v, relations r and hidden units h1 and h2.
+    """A Boltzmann machine over objects v, relations r, hidden units h1 and h2, and a room type t.
 
     Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
     """
 
-    # True if single triples have residual weights besides the shared weights. The objective
-    # `relation_likelihood` can fit the residual weights.
+    # True if single triples have residual weights besides the shared weights.
     has_residuals = False
 
     def __init__(self, spec: MachineSpec) -> None:
@@ -68,9 +55,14 @@ class BoltzmannMachine(nn.Module, ABC):
         self.b = nn.Parameter(torch.zeros(spec.V))
         self.c1 = nn.Parameter(torch.zeros(spec.H1))
         self.c2 = nn.Parameter(torch.zeros(spec.H2))
+        self.e = nn.Parameter(torch.zeros(spec.C))
         self.W = nn.Parameter(torch.zeros(spec.V, spec.H1))
         self.J = nn.Parameter(torch.zeros(spec.H1, spec.H2))
         self.Q = nn.Parameter(torch.zeros(spec.C, spec.H1))
+        self.a = nn.Parameter(torch.zeros(spec.profiles, spec.V))
+        self.kappa = nn.Parameter(torch.zeros(len(SHARES) + 1, spec.V))
+        if spec.coupled:
+            self.L = nn.Parameter(torch.zeros(spec.V, spec.V))
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         self.triples: Tensor
         if spec.N:
@@ -89,7 +81,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def index_triples(self) -> None:
         """Check the table of triples and build its search keys."""
         table = self.triples.long()
-        limits = torch.tensor([self.spec.A, self.spec.V, self.spec.V], device=table.device)
+        limits = torch.tensor([self.spec.A, self.spec.V, self.spec.V])
         if bool((table < 0).any()) or bool((table >= limits).any()):
             raise ValueError(
                 "the table of triples has an index out of range; (a, i, j) must be below (A, V, V)"
@@ -113,12 +105,151 @@ class BoltzmannMachine(nn.Module, ABC):
         return self
 
     @torch.no_grad()
-    def initialise(self, generator: torch.Generator, scale: float = 0.01) -> Self:
-        """Draw the weight matrices from N(0, scale²). Biases keep their values."""
-        for parameter in self.parameters():
-            if parameter.dim() > 1:
+    def initialise(self, generator: torch.Generator, scale: float = 0.05) -> Self:
+        """Draw W, J and the factors of relations from N(0, scale²). Other weights keep 0."""
+        for name, parameter in self.named_parameters():
+            if parameter.dim() > 1 and name not in ("Q", "a", "kappa", "L"):
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
         return self
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of trained weights. A coupling of two classes counts once."""
+        V = self.spec.V
+        doubled = V * (V + 1) // 2 if self.spec.coupled else 0
+        return sum(parameter.numel() for parameter in self.parameters()) - doubled
+
+    # ------------------------------------------------------------------ hidden units and objects
+
+    @property
+    def couplings(self) -> Tensor | None:
+        """The couplings between classes, (V, V), symmetric with a diagonal of 0, or None."""
+        if not self.spec.coupled:
+            return None
+        symmetric = (self.L + self.L.T) / 2
+        return symmetric - torch.diag(symmetric.diagonal())
+
+    def by_unit(self, x: Tensor) -> Tensor:
+        """Return values of h1, (..., H1), by unit and state, (..., units, states - 1)."""
+        return x.unflatten(-1, (self.spec.units, self.spec.states - 1))
+
+    def state_means(self, x: Tensor) -> Tensor:
+        """Return the probabilities of the states of h1 with the logits x, both (..., H1)."""
+        if self.spec.states == 2:
+            return x.sigmoid()
+        return self._all_states(x).softmax(-1)[..., 1:].flatten(-2)
+
+    def _all_states(self, x: Tensor) -> Tensor:
+        """Return the logits of all states, the first one included, (..., units, states)."""
+        logits = self.by_unit(x)
+        return torch.cat([torch.zeros_like(logits[..., :1]), logits], -1)
+
+    def context_bias(self, room: Tensor | None) -> Tensor:
+        """Return the bias c1 + Q[t] of h1, (scenes or 1, H1).
+
+        The room type t of a scene is its entry of `room`, (scenes,) int64. -1 means unknown.
+        """
+        if room is None or not self.spec.C:
+            return self.c1.unsqueeze(0)
+        return self.c1 + self.Q[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
+
+    def second_layer_logits(self, h1: Tensor) -> Tensor:
+        """Return the logits c2 + h1'J of p(h2 = 1 | h1), (..., scenes, units of h2)."""
+        return self.c2 + h1 @ self.J
+
+    def context(self, v: Tensor, room: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the logits x of h1, (scenes, H1), and the means of h2, (scenes, H2), given v.
+
+        With two layers, the means of h2 are a mean-field fixed point, differentiable in the
+        weights.
+        """
+        base = self.context_bias(room) + v @ self.W
+        m2 = base.new_zeros(len(base), self.spec.H2)
+        if not self.spec.H2:
+            return base, m2
+        m2 = self.c2.sigmoid().expand(len(base), -1)
+        for _ in range(SWEEPS):
+            m1 = self.state_means(base + m2 @ self.J.T)
+            m2 = self.second_layer_logits(m1).sigmoid()
+        return base + m2 @ self.J.T, m2
+
+    def gain(self, x: Tensor, weights: Tensor) -> Tensor:
+        """Return sum_m log sum_z p_m(z) exp(w[m, z]) for each row w of the weights, (scenes, rows).
+
+        Args:
+            x: logits of h1, (scenes, H1).
+            weights: rows of weights between h1 and a unit, (rows, H1).
+        """
+        states = self._all_states(x).softmax(-1).movedim(-2, 0)
+        factors = self.by_unit(weights).exp().permute(1, 2, 0)
+        return (states[..., :1] + states[..., 1:] @ factors).log().sum(0)
+
+    def class_bias(self, source: Tensor | None) -> Tensor:
+        """Return b + a[q], (scenes or 1, classes). A source q of -1 or None has a[q] = 0."""
+        if source is None:
+            return self.b.unsqueeze(0)
+        return self.b + self.a[source.clamp(min=0)] * (source >= 0).unsqueeze(-1)
+
+    def object_log_odds(
+        self,
+        v: Tensor,
+        *,
+        room: Tensor | None = None,
+        source: Tensor | None = None,
+        share: Tensor | None = None,
+    ) -> Tensor:
+        """Return the log-odds of each unlisted class, (scenes, classes), in closed form.
+
+        Args:
+            v: listed classes, (scenes, classes) 0 or 1. The entry of a listed class has no meaning.
+            room, source: room types and data sources, (scenes,) int64. -1 means unknown.
+            share: bin of the listed share, (scenes,) int64; see `app.inference.weights.SHARES`. It
+                adds kappa to the log-odds.
+        """
+        x, _ = self.context(v, room)
+        log_odds = self.class_bias(source) + self.gain(x, self.W)
+        couplings = self.couplings
+        if couplings is not None:
+            log_odds = log_odds + v @ couplings
+        return log_odds if share is None else log_odds + self.kappa[share]
+
+    def room_logits(self, v: Tensor) -> Tensor:
+        """Return log p(t | v) of each room type t, plus a constant of each scene, (scenes, C)."""
+        x, _ = self.context(v)
+        return self.e + self.gain(x, self.Q)
+
+    def free_energy(
+        self,
+        v: Tensor,
+        h2: Tensor | None = None,
+        room: Tensor | None = None,
+        source: Tensor | None = None,
+    ) -> Tensor:
+        """Return F = -log sum over h1 and r of exp(-E), (scenes,), in closed form.
+
+        A machine with a second hidden layer needs the state h2, (scenes, H2).
+        """
+        if self.spec.H2 and h2 is None:
+            raise ValueError(
+                "the free energy of a machine with two hidden layers has a closed form only given "
+                "h2: pass h2"
+            )
+        free = -(v * self.class_bias(source)).sum(-1)
+        x = self.context_bias(room) + v @ self.W
+        if h2 is not None:
+            x, free = x + h2 @ self.J.T, free - h2 @ self.c2
+        couplings = self.couplings
+        if couplings is not None:
+            free = free - 0.5 * ((v @ couplings) * v).sum(-1)
+        if room is not None and self.spec.C:
+            free = free - self.e[room.clamp(min=0)] * (room >= 0)
+        return free - self.log_states(x)
+
+    def log_states(self, x: Tensor) -> Tensor:
+        """Return the log of the sum over the states of h1 of exp(h1·x), (scenes,)."""
+        return self._all_states(x).logsumexp(-1).sum(-1)
+
+    # ---------------------------------------------------------------------------------- relations
 
     @abstractmethod
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
@@ -130,25 +261,12 @@ class BoltzmannMachine(nn.Module, ABC):
             usual: mean log number of instances of each class, (classes,).
         """
 
-    @property
-    def parameter_count(self) -> int:
-        """Number of trained weights."""
-        return sum(parameter.numel() for parameter in self.parameters())
-
     @abstractmethod
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
         """Return the relation units between the given classes of each scene.
 
         The class indices are (scenes, n) int64, with padding -1. The counts are the numbers of
         instances, 0 where unknown. The default is one instance of each class.
-        """
-
-    @abstractmethod
-    def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """Return the units, the index of the unit of each relation in `pairs`, and its existence.
-
-        The last two have the shape (scenes, relations of `pairs`). Without a unit, the index is
-        arbitrary.
         """
 
     @abstractmethod
@@ -167,17 +285,6 @@ class BoltzmannMachine(nn.Module, ABC):
         """
 
     @abstractmethod
-    def open_units(
-        self, v: Tensor, observed: tuple[Edges, Tensor, Tensor] | None, least: int = 0
-    ) -> tuple[Edges, Tensor, Tensor]:
-        """Return edges, r and observed of the relation units that can be 1 given the objects v.
-
-        Args:
-            observed: observed relations, whose values r contains.
-            least: least number of classes between which there are units, with padding.
-        """
-
-    @abstractmethod
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
         """Return 1 for each unit that can be 1 given v, else 0, (..., scenes, units)."""
 
@@ -186,203 +293,47 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the logit ℓ_e(v, h1) of each relation unit e, (..., scenes, units).
 
         Args:
-            h1: binary states or means of the hidden units, (..., scenes, hidden units).
+            h1: states or means of the hidden units, (..., scenes, H1).
         """
 
-    @abstractmethod
-    def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """Return sum_e weight_e U_e for weights (..., scenes, units), (..., scenes, H1)."""
-
-    def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sum_e r_e ℓ_e(v, 0), (..., scenes), and sum_e r_e U_e, (..., scenes, H1)."""
-        bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
-        return (r * bare).sum(-1), self.hidden_input(edges, r)
-
-    def implied(self, edges: Edges, observed: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
+    def implied(self, edges: Edges, observed: Tensor, h1: Tensor) -> Tensor:
         """Return the change of each relation logit due to observed relations, (scenes, units).
 
         The change is zero in a machine without implication weights (`training.machines.triway`).
 
         Args:
             observed: observed relations, (scenes, units). 1 means that the relation holds.
-            h1: means of the hidden units given the objects, (scenes, hidden units).
-            apart: True leaves out the effects between relations of the same two classes.
+            h1: means of the hidden units given the objects, (scenes, H1).
         """
-        del edges, h1, apart
+        del edges, h1
         return torch.zeros_like(observed)
 
-    @abstractmethod
-    def relation_context(self, edges: Edges) -> Tensor:
-        """Return the weights U_e to h1 of few units, (scenes or 1, units, hidden units)."""
-
-    @abstractmethod
-    def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Return the part of each candidate's log-odds that comes from its unobserved relations.
-
-        For candidate i, the part is log sum_{R_i} exp(-E) at v_i = 1 minus the same at v_i = 0,
-        given h1. R_i are the relations of i. The terms b_i + W_i·h1 are left out.
-
-        Args:
-            v: presence of objects, (..., scenes, classes). Each candidate counts as absent.
-            edges: relation units of the scene. The units of a candidate are unobserved.
-            candidates: class indices, (scenes or 1, candidates) int64.
-        """
-
-    @abstractmethod
-    def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return values of the units as a table, (scenes, relations, n, n); -inf without unit.
-
-        The units are those between the classes, (scenes, n) int64. Padding is -1.
-        """
-
-    @property
-    def relations_act(self) -> bool:
-        """True if unobserved relations affect objects and hidden units (seed form only)."""
-        return not self.spec.is_local
-
-    @abstractmethod
-    def acting_units(self, v: Tensor) -> Edges | None:
-        """Return the unobserved relation units that affect objects. The local form returns None."""
-
-    def context_units(self, edges: Edges) -> Edges | None:
-        """Return the unobserved relation units that affect h1 while relations are trained."""
-        del edges
-        return None
-
-    def sample_objects(
-        self, state: State, generator: torch.Generator, *, held: Tensor | None, collapsed: bool
-    ) -> Tensor:
-        """Sample the objects v given the other units, (scenes, classes); see `gibbs`.
-
-        Args:
-            held: bool, broadcastable to v. True marks objects that keep their value.
-            collapsed: True sums out the unobserved relations that affect objects.
-        """
-        del held, collapsed
-        return bernoulli(self._object_input(state.h1).sigmoid_(), generator)
-
-    def _object_input(self, h1: Tensor) -> Tensor:
-        # addmm adds the bias within the product, because memory access limits the speed of a sweep.
-        return torch.addmm(self.b, h1, self.W.T)
-
-    def begin_independent(self, machine: BoltzmannMachine) -> None:
-        """Set the relation weights to those of `machine.scaled(beta=0)`."""
-
-    def relation_log_partition(self) -> float:
-        """Return the contribution of the relation units to log Z at beta = 0 (`scaled`)."""
-        return 0.0
-
-    @abstractmethod
-    def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """Return a machine between `base` (beta = 0) and this machine (beta = 1).
-
-        The objects of `base` are independent. Without a base, beta multiplies every logit: the
-        result is this machine at temperature 1 / beta.
-        """
-
-    def relation_term(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Return the term of each unit in log sum_{unobserved r} exp(-E), (..., scenes, units).
-
-        Args:
-            logits, gate: logit ℓ_e and gate of each relation unit, (..., scenes, units).
-            r, observed: values and bool mask of the observed relations, broadcastable to `logits`.
-        """
-        summed = softplus(logits)
-        if not self.relations_act:
-            return torch.where(observed, r * logits - summed, 0.0) * gate
-        return torch.where(observed, r * logits, summed) * gate
-
-    def relation_slope(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Return the derivative of `relation_term` by the logit ℓ_e, (..., scenes, units)."""
-        mean = logits.sigmoid()
-        if not self.relations_act:
-            return torch.where(observed, r - mean, 0.0) * gate
-        return torch.where(observed, r, mean) * gate
-
-    def context_bias(self, room: Tensor | None) -> Tensor:
-        """Return the bias c1 + Q[t] of the hidden units, (scenes or 1, hidden units).
-
-        The room type t of a scene is its entry of `room`, (scenes,) int64. -1 means unknown.
-        """
-        if room is None or not self.spec.C:
-            return self.c1.unsqueeze(0)
-        return self.c1 + self.Q[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
+    def relation_term(self, edges: Edges, v: Tensor, r: Tensor, h1: Tensor) -> Tensor:
+        """Return sum_e g_e (r_e ℓ_e - log(1 + exp ℓ_e)) = log p(r | v, h1), (..., scenes)."""
+        logits = self.relation_logits(edges, v, h1)
+        return ((r * logits - softplus(logits)) * self.gate(edges, v)).sum(-1)
 
     def energy(
-        self, v: Tensor, r: Tensor, h1: Tensor, h2: Tensor, edges: Edges, room: Tensor | None = None
-    ) -> Tensor:
-        """Return the energy E(v, r, h1, h2), (..., scenes); +inf if a unit with gate 0 is 1."""
-        gate = self.gate(edges, v)
-        logits = self.relation_logits(edges, v, h1)
-        observed = torch.ones_like(gate, dtype=torch.bool)
-        relation = self.relation_term(logits, gate, r, observed).sum(-1)
-        energy = self.object_energy(v, h1, h2, room) - relation - self.pair_offset(edges, v)
-        return torch.where((r > gate).any(-1), torch.inf, energy)
-
-    def object_energy(self, v: Tensor, h1: Tensor, h2: Tensor, room: Tensor | None) -> Tensor:
-        """Return the energy without the terms of relations, (..., scenes)."""
-        context = (h1 * (self.context_bias(room) + v @ self.W)).sum(-1)
-        return -(v @ self.b + h2 @ self.c2 + context + ((h1 @ self.J) * h2).sum(-1))
-
-    def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the sum of κ_a over units with an open gate, (..., scenes); 0 without κ."""
-        return v.new_zeros(v.shape[:-1])
-
-    def free_energy(
         self,
         v: Tensor,
-        r: Tensor | None = None,
-        edges: Edges | None = None,
-        h2: Tensor | None = None,
+        r: Tensor,
+        h1: Tensor,
+        h2: Tensor,
+        edges: Edges,
         room: Tensor | None = None,
+        source: Tensor | None = None,
     ) -> Tensor:
-        """Return the free energy F = -log sum_{h1} exp(-E), (..., scenes), in closed form.
+        """Return the energy E(v, r, h1, h2, t), (scenes,); +inf if a unit with gate 0 is 1.
 
-        In the seed form, r contains the observed values of all units in `edges`. Other units are 0.
-        In the local form, all relations must be unobserved (r = None). A machine with a second
-        hidden layer needs the state h2 of that layer.
-
-        Raises:
-            ValueError: the free energy has no closed form for these arguments.
+        The states of h1 are 0 or 1, (scenes, H1). At most one state of each unit is 1.
         """
-        if self.spec.H2 and h2 is None:
-            raise ValueError(
-                "the free energy of a machine with two hidden layers has a closed form only given "
-                "h2: pass h2"
-            )
-        if not self.relations_act:
-            if r is not None:
-                raise ValueError(
-                    "the free energy of a local-form machine has no closed form with observed "
-                    "relations: pass r=None"
-                )
-            return self.free_energy_given(v, v.new_zeros(()), h2, room)
-        if r is None or edges is None:
-            raise ValueError(
-                "the free energy of a seed-form machine needs observed relations (r and edges): "
-                "without them it has no closed form"
-            )
-        bare, context = self.linear_relations(edges, v, r)
-        free = self.free_energy_given(v, context, h2, room) - bare - self.pair_offset(edges, v)
-        return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, free)
-
-    def free_energy_given(
-        self, v: Tensor, context: Tensor, h2: Tensor | None = None, room: Tensor | None = None
-    ) -> Tensor:
-        """Return -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k, (..., scenes).
-
-        The context is an addition to the logits of h1, (..., scenes, hidden units).
-        """
-        free = -(v @ self.b)
-        x = self.context_bias(room) + v @ self.W + context
-        if h2 is not None:
-            x, free = x + h2 @ self.J.T, free - h2 @ self.c2
-        return free - softplus(x).sum(-1)
-
-    def second_layer_logits(self, h1: Tensor) -> Tensor:
-        """Return the logits c2 + h1'J of p(h2 = 1 | h1), (..., scenes, units of h2)."""
-        return self.c2 + h1 @ self.J
-
-    def object_logits(self, h1: Tensor) -> Tensor:
-        """Return the log-odds b + W h1 of each object without relations, (..., scenes, classes)."""
-        return self.b + h1 @ self.W.T
+        context = (h1 * (self.context_bias(room) + v @ self.W)).sum(-1)
+        log_weight = (v * self.class_bias(source)).sum(-1) + context + h2 @ self.c2
+        log_weight = log_weight + ((h1 @ self.J) * h2).sum(-1)
+        couplings = self.couplings
+        if couplings is not None:
+            log_weight = log_weight + 0.5 * ((v @ couplings) * v).sum(-1)
+        if room is not None and self.spec.C:
+            log_weight = log_weight + self.e[room.clamp(min=0)] * (room >= 0)
+        energy = -log_weight - self.relation_term(edges, v, r, h1)
+        return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, energy)

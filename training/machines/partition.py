@@ -1,9 +1,10 @@
 """Estimates of the log-partition function log Z by annealed importance sampling (AIS).
 
-AIS moves chains through machines between a base (beta = 0) and the machine (beta = 1), as returned
-by `BoltzmannMachine.scaled`. The objects of the base are independent, so its log Z is exact. For
-forward runs, the expected log weight is a lower bound: E[log w] ≤ log Z. Reverse runs start from
-samples of the machine and give an upper bound.
+AIS moves chains from independent objects (beta = 0) to the machine (beta = 1). At beta, all weights
+of the machine are multiplied by beta, and the log-odds of the independent objects by 1 - beta. At
+beta = 0, log Z is exact. For forward runs, the expected log weight is a lower bound:
+E[log w] ≤ log Z. Reverse runs start from samples of the machine and give an upper bound. Relations
+add nothing: the sum over the relations of a scene is 1.
 
 Sources: Neal, "Annealed importance sampling" (2001); Salakhutdinov and Murray, "On the quantitative
 analysis of deep belief networks" (2008); Burda, Grosse and Salakhutdinov, "Accurate and
@@ -21,10 +22,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from training.machines import build
-from training.machines.bernoulli import bernoulli
-from training.machines.gibbs import gibbs_step, initial_state
-from training.machines.machine import BoltzmannMachine, State
+from training.machines.gibbs import Chains, start_chains, sweep
+from training.machines.machine import BoltzmannMachine
 
 
 @dataclass(frozen=True)
@@ -48,9 +47,9 @@ class LogPartition:
         """Return the estimate from the log weights of forward or reverse runs.
 
         Args:
-            base: exact log Z of the base machine (beta = 0).
+            base: exact log Z at beta = 0.
             log_weight: accumulated log weight of each run, (chains,).
-            reverse: True if the runs end at the base machine, False if the runs start there.
+            reverse: True if the runs end at beta = 0, False if they start there.
         """
         sign, count = (-1 if reverse else 1), len(log_weight)
         mean = float(log_weight.logsumexp(0)) - math.log(count)
@@ -59,24 +58,11 @@ class LogPartition:
         return cls(base + sign * mean, error, base + sign * float(log_weight.mean()))
 
 
-def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> BoltzmannMachine:
-    """Return the base machine at beta = 0, with independent objects of log-odds b, (classes,).
-
-    The relation units of an RBM or GBM keep their bias d. The relation units of a Triway contribute
-    a factor of one to Z.
-    """
-    base = build(machine.spec).to(machine.b.dtype).requires_grad_(False)
-    with torch.no_grad():
-        base.set_triples(machine.triples)
-        base.b.copy_(machine.b if b is None else b)
-        base.begin_independent(machine)
-    return base
-
-
-def base_log_partition(machine: BoltzmannMachine, base: BoltzmannMachine) -> float:
-    """Return the exact log Z of `base`."""
-    log_z = float(softplus(base.b).sum()) + (machine.spec.H1 + machine.spec.H2) * math.log(2)
-    return log_z + base.relation_log_partition()
+def base_log_partition(machine: BoltzmannMachine, base: Tensor) -> float:
+    """Return the exact log Z at beta = 0, for objects with the log-odds `base`, (classes,)."""
+    spec = machine.spec
+    hidden = spec.units * math.log(spec.states) + spec.H2 * math.log(2)
+    return float(softplus(base).sum()) + hidden
 
 
 @torch.no_grad()
@@ -85,20 +71,24 @@ def ais(
     betas: Sequence[float],
     chains: int,
     generator: torch.Generator,
-    base: BoltzmannMachine | None = None,
+    base: Tensor | None = None,
 ) -> LogPartition:
-    """Run forward AIS through the machines at `betas`, which increase from 0 to 1."""
+    """Run forward AIS through `betas`, which increase from 0 to 1.
+
+    Args:
+        base: log-odds of the independent objects, (classes,). The default are the biases b.
+    """
     _check(betas)
-    base = independent_base(machine) if base is None else base
-    start = machine.scaled(0.0, base)
-    v = bernoulli(base.b.sigmoid().expand(chains, -1), generator)
-    state = initial_state(start, v, generator)
+    base = machine.b if base is None else base
+    v = torch.bernoulli(base.sigmoid().expand(chains, -1), generator=generator)
+    state = start_chains(machine, v, generator)
+    # At beta = 0, the units of the second layer are on with probability 1/2.
+    state.h2 = torch.bernoulli(torch.full_like(state.h2, 0.5), generator=generator)
     log_weight = torch.zeros(chains, dtype=torch.float64)
-    for previous, beta in pairwise(betas):
-        cold = machine.scaled(beta, base)
-        warm = machine.scaled(previous, base)
-        log_weight += (_free_energy(warm, state) - _free_energy(cold, state)).double()
-        state = gibbs_step(cold, state, generator)
+    for warm, cold in pairwise(betas):
+        change = _free_energy(machine, state, warm, base) - _free_energy(machine, state, cold, base)
+        log_weight += change.double()
+        sweep(machine, state, generator, beta=cold, base=base)
     return LogPartition.of_weights(base_log_partition(machine, base), log_weight)
 
 
@@ -106,28 +96,32 @@ def ais(
 def reverse_ais(
     machine: BoltzmannMachine,
     betas: Sequence[float],
-    state: State,
+    state: Chains,
     generator: torch.Generator,
-    base: BoltzmannMachine | None = None,
+    base: Tensor | None = None,
 ) -> LogPartition:
     """Run reverse AIS from samples of the machine, with `betas` in increasing order as in `ais`."""
     _check(betas)
-    base = independent_base(machine) if base is None else base
+    base = machine.b if base is None else base
     log_weight = torch.zeros(len(state.v), dtype=torch.float64)
-    for previous, beta in zip(betas[-2::-1], betas[:0:-1], strict=True):
-        cold = machine.scaled(beta, base)
-        warm = machine.scaled(previous, base)
-        state = gibbs_step(cold, state, generator)
-        log_weight += (_free_energy(cold, state) - _free_energy(warm, state)).double()
+    for cold, warm in pairwise(betas[::-1]):
+        sweep(machine, state, generator, beta=cold, base=base)
+        change = _free_energy(machine, state, cold, base) - _free_energy(machine, state, warm, base)
+        log_weight += change.double()
     log_base = base_log_partition(machine, base)
     return LogPartition.of_weights(log_base, log_weight, reverse=True)
 
 
-def _free_energy(machine: BoltzmannMachine, state: State) -> Tensor:
-    h2 = state.h2 if machine.spec.H2 else None
-    if not machine.relations_act:
-        return machine.free_energy(state.v, h2=h2)
-    return machine.free_energy(state.v, state.r, state.edges, h2)
+def _free_energy(
+    machine: BoltzmannMachine, state: Chains, beta: float, base: Tensor
+) -> Tensor:
+    """Return the free energy at beta, (chains,); see the module."""
+    x = machine.c1 + state.v @ machine.W + state.h2 @ machine.J.T
+    hidden = machine.log_states(beta * x) + beta * (state.h2 @ machine.c2)
+    couplings = machine.couplings
+    if couplings is not None:
+        hidden = hidden + 0.5 * beta * ((state.v @ couplings) * state.v).sum(-1)
+    return -(state.v @ (beta * machine.b + (1 - beta) * base)) - hidden
 
 
 def _check(betas: Sequence[float]) -> None:

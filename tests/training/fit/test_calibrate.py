@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.questions.posterior import calibrated, posterior_of
+from app.questions.posterior import calibrated, Posterior
 from app.registry import Calibration, CountSlope
 from tests.questions.answers import outliers
 from tests.questions.artifacts import artifact_of
@@ -378,7 +378,7 @@ def test_misplaced_needs_enough_scenes_and_likely_true_relations(count, sign):
     scenes = []
     for k, one in enumerate(random_scenes(count, artifact.spec.V - 1)):
         classes = one.evidence.classes
-        log_odds = sign * posterior_of(artifact, of_classes(classes.tolist())).relation_log_odds()
+        log_odds = sign * Posterior(artifact, of_classes(classes.tolist())).relation_log_odds()
         a, i, j = np.unravel_index(np.argsort(-log_odds, axis=None), log_odds.shape)
         triples = [(r, x, y) for r, x, y in zip(a, classes[i], classes[j], strict=True) if x < y]
         scenes.append(scene(classes.tolist(), triples[:3], group=f"group {k}"))

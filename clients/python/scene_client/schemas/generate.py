@@ -40,19 +40,21 @@ class GenerateRequest(SceneRequest):
         ),
     ] = 1.0
     context: Annotated[
-        dict[Name, Annotated[list[UnitNumber], Field(max_length=4096)]] | None, Field(max_length=8)
+        dict[Name, Annotated[list[tuple[UnitNumber, UnitNumber]], Field(max_length=4096)]] | None,
+        Field(max_length=8),
     ] = None
-    """hidden units that are on: maps the name of each layer to unit numbers"""
+    """states that hidden units keep: maps the name of each layer to pairs [unit, state]"""
 
 
 class GeneratedScene(Reply):
-    """A sampled scene: labels, relations between the labels, and the hidden units that are on."""
+    """A sampled scene: labels, relations between the labels, and the states of hidden units."""
 
     objects: list[str]
     relations: list[Relation]
     log_score: Finite
-    context: dict[str, list[int]]
-    """hidden units that are on: maps the name of each layer to unit numbers"""
+    context: dict[str, list[tuple[int, int]]]
+    """states of the hidden units: maps the name of each layer to pairs [unit, state]. Units in
+    state 0 are left out"""
 
 
 class GenerateAnswer(Answer):
@@ -71,4 +73,4 @@ class GenerateFields(SceneFields, total=False):
     count: int
     steps: int
     temperature: float
-    context: Mapping[str, Sequence[int]]
+    context: Mapping[str, Sequence[tuple[int, int]]]

@@ -110,6 +110,8 @@ class VocabularyAnswer(Reply):
     objects: list[VocabularyEntry]
     relations: list[RelationName]
     room_types: list[str]
+    profiles: list[str] = []
+    """names of the data sources whose base rates a request can choose"""
     examples: list[ExampleScene] = []
     """example scenes; older models have none"""
 
@@ -131,9 +133,11 @@ class WeightedRelation(Reply):
 
 
 class ContextUnit(Reply):
-    """A hidden unit with the objects, relations and room types of largest weight."""
+    """A state of a hidden unit with the objects, relations and room types of largest weight."""
 
     unit: int
+    state: int
+    """state of the unit. State 0 has no weights and is not listed"""
     name: str
     """name made of the objects and the relation with the largest weights"""
     objects: list[WeightedLabel]

@@ -275,6 +275,13 @@ class SceneRequest(Request):
     """whether every relation that `relations` does not list is false"""
     room_type: Label | None = None
     """one of the model's room types"""
+    profile: Annotated[
+        Name | None,
+        Field(
+            description="name of a data source of the model. Its base rates of the classes replace "
+            "the model's own mix, which stands for real rooms"
+        ),
+    ] = None
     frame_id: Annotated[
         str | None,
         Field(
@@ -331,6 +338,7 @@ class SceneFields(TypedDict, total=False):
     relations: Iterable[Relation | Body | tuple[str, RelationName, str]]
     relations_complete: bool
     room_type: str
+    profile: str
     frame_id: str
     stamp: Stamp | Body
     viewpoint: Viewpoint | Body

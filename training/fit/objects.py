@@ -1,0 +1,366 @@
+"""Fit the object weights as a robot asks: by random parts of scenes.
+
+A robot lists a few objects of a room and asks for the rest. Each step shows a random part of each
+scene. The loss is the negative log-likelihood of every class that is not listed:
+
+    loss = mean over scenes of sum_i [ζ(λ_i) - v_i λ_i] - log p(t | listed) + g [F(v) - F(chains)]
+
+λ_i is the closed-form log-odds of class i given the listed classes (`BoltzmannMachine`), and ζ the
+softplus.
+
+- 30 % of the parts list all classes but one. The class left out counts as often as the scene has
+  classes. The other parts list a share of U(.05, 1) of the classes.
+- The room type t is listed in half of the parts. If it is not listed, the loss contains its
+  cross-entropy.
+- A class that a source shows in fewer than 3 scenes says nothing there: it has no term in the loss
+  (partial labels). Structure is neither listed nor asked for.
+- Each source q has its own base rates a_q, and each listed share its own bias kappa.
+- With the weight g, persistent Gibbs chains (PCD) keep samples of the machine like scenes. The
+  chains of a source have its base rates.
+
+The weights have normal priors. The precision of a prior is divided by the number of scenes. Without
+it, the machine would learn few scenes by heart.
+
+Sources: Besag, "Statistical analysis of non-lattice data" (1975), for conditional likelihoods;
+Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for PCD.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import torch
+from torch import Tensor
+from torch.nn.functional import cross_entropy, softplus
+from torch.nn.utils.parametrize import cached
+
+from app.inference.weights import SHARES
+from training.datasets.batches import SceneTensors
+from training.datasets.sources import SOURCES
+from training.fit.configuration import ObjectsConfig
+from training.machines import BoltzmannMachine
+from training.machines.gibbs import Chains, start_chains, sweep
+from training.machines.machine import OBJECT_WEIGHTS
+
+_SHOWN = 3  # scenes of a source in which a class must occur
+_LEAST_SHARE = 0.05
+_AVERAGED = 0.3  # last share of the steps whose weights are averaged
+_RARE = -9.0  # least initial bias of a class
+ALL_BUT_ONE = len(SHARES)
+"""Bin of kappa for lists of all classes but one."""
+
+
+@dataclass(frozen=True)
+class ObjectScenes:
+    """The scenes that teach objects: at least two classes, and a source with a weight above 0.
+
+    Attributes:
+        v: presence of the classes that the source shows, without structure, (scenes, classes).
+        room: index of the room type, (scenes,) int64; -1 where unknown.
+        source: index of the source in `sources`, (scenes,) int64.
+        weight: weight of each scene, (scenes,).
+        shows: True for classes that a source shows, (sources, classes) bool.
+        sources: names of the sources.
+    """
+
+    v: Tensor
+    room: Tensor
+    source: Tensor
+    weight: Tensor
+    shows: Tensor
+    sources: tuple[str, ...]
+
+    @classmethod
+    def of(cls, train: SceneTensors, structure: Tensor, config: ObjectsConfig) -> Self:
+        """Select the scenes.
+
+        Raises:
+            ValueError: no scene has two classes.
+        """
+        weights = torch.tensor([config.source_weights.get(q, 1.0) for q in train.source_names])
+        counts = torch.zeros(train.annotated_classes.shape)
+        counts.index_add_(0, train.source, (train.v > 0).float())
+        used = (weights > 0) & (counts.sum(1) > 0)
+        open_sources = [shows_everything(q, config) for q in train.source_names]
+        shows = (counts >= _SHOWN) | torch.tensor(open_sources).unsqueeze(1)
+        shows &= ~structure & ~left_out(train)
+        v = (train.v > 0) & shows[train.source]
+        kept = (used[train.source] & (v.sum(1) >= 2)).nonzero().squeeze(1)
+        if not len(kept):
+            raise ValueError("no training scene has two classes; add scenes with more objects")
+        index = used.long().cumsum(0) - 1
+        return cls(
+            v=v[kept].float(),
+            room=train.room[kept],
+            source=index[train.source[kept]],
+            weight=(train.weight * weights[train.source])[kept],
+            shows=shows[used],
+            sources=tuple(q for q, u in zip(train.source_names, used.tolist(), strict=True) if u),
+        )
+
+    @property
+    def size(self) -> float:
+        """Sum of the weights of the scenes."""
+        return float(self.weight.sum())
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return indices of scenes, (count,), drawn in proportion to their weights."""
+        return torch.multinomial(self.weight, count, replacement=True, generator=generator)
+
+    def log_odds(self) -> Tensor:
+        """Return the smoothed log-odds of each class in the scenes that can show it, (classes,)."""
+        weight = self.weight.unsqueeze(1)
+        count = (self.v * weight).sum(0)
+        per_source = torch.zeros(len(self.sources)).index_add_(0, self.source, self.weight)
+        total = (self.shows * per_source.unsqueeze(1)).sum(0)
+        total = torch.where(total > 0, total, self.size)
+        return ((count + 0.5) / (total - count + 0.5)).log()
+
+
+def shows_everything(source: str, config: ObjectsConfig) -> bool:
+    """Return True if a class that the source never lists is absent from its scenes.
+
+    A user's own source shows everything.
+    """
+    if config.open_sources:
+        return source in config.open_sources
+    return source not in SOURCES or SOURCES[source].open_vocabulary
+
+
+def left_out(train: SceneTensors) -> Tensor:
+    """Return True for classes whose annotation in a source is incomplete, (sources, classes)."""
+    has_open_words = torch.tensor(
+        [q in SOURCES and SOURCES[q].open_vocabulary for q in train.source_names]
+    )
+    return has_open_words.unsqueeze(1) & ~train.annotated_classes
+
+
+class Parts(NamedTuple):
+    """Random parts of scenes.
+
+    Attributes:
+        listed: listed classes, (scenes, classes) 0 or 1.
+        share: bin of the listed share, (scenes,) int64; see `app.inference.weights.SHARES`.
+        weight: weight of a hidden class that is present, (scenes,).
+    """
+
+    listed: Tensor
+    share: Tensor
+    weight: Tensor
+
+
+def random_parts(v: Tensor, leave_one_out: float, generator: torch.Generator) -> Parts:
+    """List a random part of each scene, (scenes, classes), with at least one class hidden.
+
+    Args:
+        leave_one_out: share of the scenes that hide one class.
+    """
+    n = v.sum(1)
+    hides_one = torch.rand(len(v), generator=generator) < leave_one_out
+    share = _LEAST_SHARE + (1 - _LEAST_SHARE) * torch.rand(len(v), generator=generator)
+    count = torch.where(hides_one, n - 1, (share * n).round().clamp(min=1).minimum(n - 1))
+    # Listed are the `count` present classes with the smallest random keys.
+    keys = torch.rand(v.shape, generator=generator) + 2 * (1 - v)
+    rank = keys.argsort(1).argsort(1)
+    listed = v * (rank < count.unsqueeze(1))
+    bins = torch.where(hides_one, ALL_BUT_ONE, share_bin(count / n))
+    return Parts(listed, bins, torch.where(hides_one, n, 1.0))
+
+
+def share_bin(share: Tensor) -> Tensor:
+    """Return the bin of each listed share between 0 and 1, int64."""
+    return torch.bucketize(share - 1e-6, torch.tensor(SHARES[:-1]))
+
+
+class ObjectFit:
+    """The fit of the object weights of a machine. It can stop after each step and continue.
+
+    Attributes:
+        steps: number of finished steps.
+        loss: loss of the last step.
+    """
+
+    def __init__(
+        self, machine: BoltzmannMachine, scenes: ObjectScenes, config: ObjectsConfig, seed: int
+    ) -> None:
+        self.machine, self.scenes, self.config = machine, scenes, config
+        self.steps, self.loss = 0, math.nan
+        self._generator = torch.Generator().manual_seed(seed)
+        names = [name for name, _ in machine.named_parameters() if _is_of_objects(name)]
+        self._weights = {name: machine.get_parameter(name) for name in names}
+        self._average = {name: w.detach().clone() for name, w in self._weights.items()}
+        self._optimiser = torch.optim.Adam(self._weights.values(), lr=config.learning_rate)
+        self._chains: Chains | None = None
+        if config.generative_weight:
+            index = scenes.draw(config.chains, self._generator)
+            source = scenes.source[index]
+            self._chains = start_chains(
+                *(machine, scenes.v[index], self._generator),
+                source=source,
+                possible=scenes.shows[source],
+            )
+
+    @property
+    def finished(self) -> bool:
+        """True after the last step."""
+        return self.steps >= self.config.steps
+
+    def step(self) -> None:
+        """Update the weights by one batch of random parts.
+
+        Raises:
+            FloatingPointError: the loss is infinite or NaN.
+        """
+        config = self.config
+        with cached():
+            loss = self._batch_loss()
+        self.loss = float(loss.detach())
+        if not math.isfinite(self.loss):
+            raise FloatingPointError(
+                "the object weights diverged in training: lower objects.learning_rate"
+            )
+        for group in self._optimiser.param_groups:
+            group["lr"] = config.learning_rate * self._schedule()
+        self._optimiser.zero_grad()
+        loss.backward()
+        self._optimiser.step()
+        self.steps += 1
+        self._add_to_average()
+
+    def _batch_loss(self) -> Tensor:
+        """Return the loss of the next batch."""
+        scenes = self.scenes
+        index = scenes.draw(self.config.batch_size, self._generator)
+        v, room, source = scenes.v[index], scenes.room[index], scenes.source[index]
+        loss = self._conditional_loss(v, room, source) + self._prior()
+        if self._chains is not None:
+            difference = self._generative_loss(self._chains, v, source)
+            loss = loss + self.config.generative_weight * difference
+        return loss
+
+    def _conditional_loss(self, v: Tensor, room: Tensor, source: Tensor) -> Tensor:
+        """Return the mean over scenes of the negative log-likelihood of what is not listed."""
+        machine = self.machine
+        parts = random_parts(v, self.config.leave_one_out, self._generator)
+        has_room = torch.rand(len(v), generator=self._generator) < self.config.room_share
+        log_odds = machine.object_log_odds(
+            parts.listed,
+            room=torch.where(has_room, room, -1),
+            source=source,
+            share=parts.share,
+        )
+        hidden = v - parts.listed
+        weight = self.scenes.shows[source] * (1 - parts.listed)
+        weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
+        loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum()
+        asked = ~has_room & (room >= 0)
+        if bool(asked.any()):
+            logits = machine.room_logits(parts.listed[asked])
+            loss = loss + cross_entropy(logits, room[asked], reduction="sum")
+        return loss / len(v)
+
+    def _generative_loss(self, chains: Chains, v: Tensor, source: Tensor) -> Tensor:
+        """Return F(scenes) - F(chains), after a sweep of the chains."""
+        machine, generator = self.machine, self._generator
+        sweep(machine, chains, generator, classes=self.config.classes_per_sweep)
+        h2 = None
+        chain_h2 = None
+        if machine.spec.H2:
+            with torch.no_grad():
+                h2 = torch.bernoulli(machine.context(v)[1], generator=generator)
+            chain_h2 = chains.h2
+        data = machine.free_energy(v, h2, source=source).mean()
+        return data - machine.free_energy(chains.v, chain_h2, source=chains.source).mean()
+
+    def _prior(self) -> Tensor:
+        """Return the negative log prior of the weights, divided by the number of scenes."""
+        total = torch.zeros(())
+        for name, weight in self._weights.items():
+            precision = self.config.precision_of(name)
+            if precision:
+                total = total + 0.5 * precision * (weight**2).sum()
+        return total / self.scenes.size
+
+    def _schedule(self) -> float:
+        """Return the factor of the learning rate: it rises, stays, and falls along a cosine."""
+        total, done = self.config.steps, self.steps
+        if done < self.config.warm_up:
+            return (done + 1) / self.config.warm_up
+        if done < total / 2:
+            return 1.0
+        return 0.5 * (1 + math.cos(math.pi * (2 * done / total - 1)))
+
+    @torch.no_grad()
+    def _add_to_average(self) -> None:
+        count = self.steps - int((1 - _AVERAGED) * self.config.steps)
+        for name, weight in self._weights.items():
+            self._average[name].lerp_(weight, 1 / max(count, 1))
+
+    @torch.no_grad()
+    def finish(self) -> None:
+        """Set the weights to their average, with the base rates of the served mix in b.
+
+        Afterwards, a[q] is the difference of source q from the served mix.
+        """
+        for name, weight in self._weights.items():
+            weight.copy_(self._average[name])
+        machine = self.machine
+        if machine.spec.profiles:
+            mix = served_base_rates(machine.a, self.scenes, self.config)
+            machine.b += mix
+            machine.a -= mix
+        couplings = machine.couplings
+        if couplings is not None:
+            machine.L.copy_(couplings)
+
+    def state(self) -> dict[str, Any]:
+        """Return the state for a checkpoint, without the weights of the machine."""
+        chains = self._chains
+        return {
+            "steps": self.steps,
+            "optimiser": self._optimiser.state_dict(),
+            "generator": self._generator.get_state(),
+            "average": self._average,
+            "chains": None if chains is None else (chains.v, chains.h2),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from the state of a checkpoint."""
+        self.steps = state["steps"]
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._generator.set_state(state["generator"])
+        self._average = state["average"]
+        if self._chains is not None:
+            self._chains.v, self._chains.h2 = state["chains"]
+
+
+def served_base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
+    """Return the weighted mean of a[q] over the sources q that show each class, (classes,)."""
+    weights = torch.tensor([config.served_sources.get(q, 0.0) for q in scenes.sources])
+    if not config.served_sources:
+        weights = torch.ones(len(scenes.sources))
+    weights = weights.unsqueeze(1) * scenes.shows
+    return (weights * a).sum(0) / weights.sum(0).clamp(min=1e-9)
+
+
+def start_objects(machine: BoltzmannMachine, scenes: ObjectScenes) -> None:
+    """Set the biases of classes to their log-odds in the scenes, and those of room types to 0."""
+    with torch.no_grad():
+        machine.b.copy_(scenes.log_odds().clamp(min=_RARE))
+
+
+def fit_objects(
+    fit: ObjectFit, progress: Callable[[float], None] = lambda _: None
+) -> None:
+    """Run all remaining steps of a fit, and set the weights to their average."""
+    while not fit.finished:
+        fit.step()
+        progress(fit.steps / fit.config.steps)
+    fit.finish()
+
+
+def _is_of_objects(name: str) -> bool:
+    return name.removeprefix("parametrizations.").split(".")[0] in OBJECT_WEIGHTS

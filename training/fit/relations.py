@@ -1,0 +1,258 @@
+"""Conditional likelihood of relations that data sources annotate as true or false.
+
+    loss = - sum over scenes and annotated relations e of log p(r_e | v, E[h1 | v])
+    logit of r_e = ℓ_e + δ[source, a]
+
+Relations without an annotation have no term (`training.datasets.sources`). Data sources annotate
+different relations. For example, people mention notable relations, and generated rooms list all
+relations. Each source therefore has a trained logit correction δ, called offset, for each relation
+a. The service leaves the offsets out.
+
+Weights and offsets have normal priors, with the precisions `weight_prior` and `offset_prior`. The
+relation weights of a class can depend on its word vector. With the matrix X of word vectors, the
+weights are a trained linear map of X plus a small deviation of each class:
+
+    S = X A_S + S',   O = X A_O + O',   s = (X B_s)' + s',   o = (X B_o)' + o'
+
+A rare class then has weights similar to those of classes with similar word vectors.
+
+A robot seldom sees a whole scene. In training, the hidden units h1 therefore depend on a random
+subset of the objects. The size of the subset is drawn uniformly for each scene. Otherwise, the
+relations of complete scenes of one source would fit well, but relations in other scenes would not.
+
+For a machine with implication weights, the loss has a second term. This term conditions on a random
+share of the observed relations of each scene, and sums over the other relations. The object weights
+of the machine stay fixed.
+
+Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Salakhutdinov,
+"Probabilistic matrix factorization" (2007), for normal priors on factors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+from torch.nn.utils.parametrize import cached
+
+from training.datasets.batches import Batch, SceneTensors, relation_units, subset
+from training.fit.configuration import RelationsConfig
+from training.fit.parts import means_of_parts
+from training.fit.residuals import with_counted_residuals
+from training.fit.sharing import bake_shared_weights
+from training.machines import BoltzmannMachine
+from training.machines.machine import OBJECT_WEIGHTS
+
+_WITHOUT_PRIOR = frozenset({*OBJECT_WEIGHTS, "gamma", "B", "usual", "d"})
+# Factor of the prior precision for the map of word vectors. All classes share the map, so its prior
+# is weaker than the prior of the weights of a class.
+_MAP_PRIOR = 0.1
+SHARED_ROWS, SHARED_COLUMNS = ("S", "O"), ("s", "o")
+
+
+class RelationLikelihood(nn.Module):
+    """The negative conditional log-likelihood of annotated relations, plus priors.
+
+    Attributes:
+        offsets: corrections of the logits for each data source, (sources, relations).
+    """
+
+    def __init__(self, config: RelationsConfig, machine: BoltzmannMachine, train: SceneTensors):
+        super().__init__()
+        self.config, self.machine = config, machine
+        self.scenes = sum(bool(scene.evidence.observed.any()) for scene in train.scenes)
+        self.offsets = nn.Parameter(torch.zeros(len(train.source_names), machine.spec.A))
+        weights = [config.source_weights.get(name, 1.0) for name in train.source_names]
+        self.source_weights = torch.tensor(weights)
+
+    def weights(self) -> dict[str, nn.Parameter]:
+        """Return the trained parameters by name: those of relations, and the offsets."""
+        named = self.machine.named_parameters()
+        return {name: p for name, p in named if p.requires_grad} | {"offsets": self.offsets}
+
+    def forward(self, batch: Batch, generator: torch.Generator) -> Tensor:
+        """Return the negative log-likelihood plus the negative log prior, divided by scenes.
+
+        The likelihood is divided by the scenes of the batch, and the prior by all training scenes.
+        """
+        with cached():
+            return self._loss(batch, generator)
+
+    def _loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
+        machine = self.machine
+        batch = withhold_counts(batch, self.config.count_dropout, generator)
+        edges, r, observed = relation_units(machine, batch)
+        h1 = means_of_parts(machine, batch, generator)
+        offsets = self.offsets[batch.source]
+        weight = self.source_weights[batch.source].unsqueeze(1)
+        logits = machine.relation_logits(edges, batch.v, h1)
+        logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
+        weight = observed * machine.gate(edges, batch.v) * weight
+        nll = bernoulli_nll(logits, r, weight).sum()
+        if machine.spec.G:
+            share = torch.rand(len(r), 1, generator=generator)
+            condition = r * observed * (torch.rand(r.shape, generator=generator) < share)
+            shifted = logits + machine.implied(edges, condition, h1)
+            nll = nll + bernoulli_nll(shifted, r, weight * (1 - condition)).sum()
+        return nll / len(batch) + self._prior() / max(self.scenes, 1)
+
+    def _prior(self) -> Tensor:
+        """Return the negative log prior of weights and offsets, up to a constant."""
+        total = 0.5 * self.config.offset_prior * (self.offsets**2).sum()
+        half = 0.5 * self.config.weight_prior
+        for name, parameter in self.machine.named_parameters():
+            if name in _WITHOUT_PRIOR or not parameter.requires_grad:
+                continue
+            share = _MAP_PRIOR if name.endswith(".map") or name in ("R", "n") else 1.0
+            total = total + share * half * (parameter**2).sum()
+        return total
+
+
+def bernoulli_nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
+    """Return the weighted loss -weight log p(r) of each relation unit, shaped like `logits`."""
+    return (softplus(logits) - r * logits) * weight
+
+
+def withhold_counts(batch: Batch, share: float, generator: torch.Generator) -> Batch:
+    """Return the batch with unknown instance counts (0) in a random share of its scenes."""
+    if not share:
+        return batch
+    withheld = torch.rand(len(batch), 1, generator=generator) < share
+    return replace(batch, counts=batch.counts.masked_fill(withheld, 0))
+
+
+def with_annotations(scenes: SceneTensors) -> SceneTensors:
+    """Return the scenes with an annotated relation."""
+    annotated = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
+    return subset(scenes, torch.tensor(annotated, dtype=torch.int64))
+
+
+class RelationFit:
+    """The fit of the relation weights of a machine: epochs over the scenes with annotations.
+
+    Attributes:
+        epochs: number of finished epochs.
+        done: finished share of the fit, from 0 to 1.
+    """
+
+    def __init__(
+        self, machine: BoltzmannMachine, train: SceneTensors, config: RelationsConfig, seed: int
+    ) -> None:
+        self.config, self.machine = config, machine
+        self.train = with_annotations(train)
+        self.epochs = 0
+        self._generator = torch.Generator().manual_seed(seed)
+        self.likelihood = RelationLikelihood(config, machine, train)
+        self._weights = self.likelihood.weights()
+        self._average = {name: w.detach().clone() for name, w in self._weights.items()}
+        self._updates = 0
+        self._optimiser = torch.optim.Adam(
+            self._weights.values(), lr=self.config.learning_rate, fused=True
+        )
+
+    @property
+    def finished(self) -> bool:
+        """True after the last epoch, and if no scene has an annotated relation."""
+        return self.epochs >= self.config.epochs or not len(self.train)
+
+    @property
+    def done(self) -> float:
+        """Finished share of the fit, from 0 to 1."""
+        return self.epochs / self.config.epochs
+
+    def epoch(self, progress: Callable[[float, float], None]) -> float:
+        """Run one epoch, and return its mean loss.
+
+        Args:
+            progress: function that is called with the finished share of the fit and the mean loss.
+
+        Raises:
+            FloatingPointError: the loss is infinite or NaN.
+        """
+        order = torch.randperm(len(self.train), generator=self._generator)
+        batches = order.split(self.config.batch_size)
+        total = 0.0
+        for number, index in enumerate(batches, 1):
+            total += self._update(index, self.config.epochs * len(batches))
+            done = (self.epochs + number / len(batches)) / self.config.epochs
+            progress(done, total / number)
+        if not math.isfinite(total):
+            raise FloatingPointError(
+                "the relation weights diverged in training: lower relations.learning_rate"
+            )
+        self.epochs += 1
+        return total / len(batches)
+
+    def _update(self, index: Tensor, total: int) -> float:
+        loss = self.likelihood(self.train.batch(index), self._generator)
+        for group in self._optimiser.param_groups:
+            group["lr"] = self.config.learning_rate * self._schedule(total)
+        self._optimiser.zero_grad()
+        loss.backward()
+        self._optimiser.step()
+        self._updates += 1
+        # During the first updates, a smaller decay reduces the share of the initial weights.
+        decay = min(self.config.averaging, self._updates / (self._updates + 10))
+        with torch.no_grad():
+            for name, weight in self._weights.items():
+                self._average[name].lerp_(weight, 1 - decay)
+        return float(loss.detach())
+
+    def _schedule(self, total: int) -> float:
+        """Return the factor of the learning rate: one cycle that rises and falls to 0."""
+        rise = max(1, total // 10)
+        if self._updates < rise:
+            return (self._updates + 1) / rise
+        return 0.5 * (1 + math.cos(math.pi * (self._updates - rise) / max(total - rise, 1)))
+
+    @contextmanager
+    def averaged(self) -> Iterator[None]:
+        """Give the machine the average weights for the duration of the context."""
+        current = {name: w.detach().clone() for name, w in self._weights.items()}
+        self._set(self._average)
+        try:
+            yield
+        finally:
+            self._set(current)
+
+    @torch.no_grad()
+    def _set(self, values: dict[str, Tensor]) -> None:
+        for name, weight in self._weights.items():
+            weight.copy_(values[name])
+
+    def finish(self) -> BoltzmannMachine:
+        """Return the machine for storage, with averaged weights and counted residuals."""
+        self._set(self._average)
+        machine = self.machine
+        bake_shared_weights(machine, (*SHARED_ROWS, *SHARED_COLUMNS))
+        if machine.has_residuals and len(self.train) and machine.residual.requires_grad:
+            likelihood = self.likelihood
+            offsets = likelihood.offsets.detach()
+            return with_counted_residuals(machine, self.train, offsets, likelihood.source_weights)
+        return machine
+
+    def state(self) -> dict[str, Any]:
+        """Return the state for a checkpoint, without the weights of the machine."""
+        return {
+            "epochs": self.epochs,
+            "updates": self._updates,
+            "offsets": self.likelihood.offsets.detach(),
+            "average": self._average,
+            "optimiser": self._optimiser.state_dict(),
+            "generator": self._generator.get_state(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from the state of a checkpoint."""
+        self.epochs, self._updates = state["epochs"], state["updates"]
+        with torch.no_grad():
+            self.likelihood.offsets.copy_(state["offsets"])
+        self._average = state["average"]
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._generator.set_state(state["generator"])
