@@ -8,6 +8,7 @@ for neighbours"), or unobserved. The meaning depends on the data source and on t
 | boxes with sizes (procthor) | off | off | off for neighbours |
 | centres only (bedrooms) | unobserved | unobserved | off |
 | 3dssg | off | unobserved | off for neighbours |
+| support links (virtualhome) | off | unobserved | unobserved |
 | pictures and sentences | unobserved | unobserved | unobserved |
 | scenes of the user with listed relations | off | off | off |
 
@@ -66,6 +67,7 @@ BOXES: Final = Meaning(lateral="off for neighbours")
 
 _CENTRES: Final = Meaning(on_top="unobserved", above="unobserved")
 _SELECTED: Final = Meaning(on_top="unobserved", above="unobserved", lateral="unobserved")
+_SUPPORTS: Final = replace(_SELECTED, on_top="off")
 _MENTIONS: Final = replace(_SELECTED, complete_objects=False)
 
 _THE_EIGHT: Final = {name: name for name in RELATIONS}
@@ -170,8 +172,8 @@ SOURCES: Final[dict[str, Source]] = {
         predicates=_THE_EIGHT,
     ),
     "coco_captions": Source(
-        "COCO captions (Lin et al., ECCV 2014): triples from captions of indoor pictures; "
-        "CC BY 4.0",
+        "COCO captions (Lin et al., ECCV 2014; COCO Consortium): triples from captions of indoor "
+        "pictures; CC BY 4.0, with attribution",
         meaning=_MENTIONS,
         predicates=_THE_EIGHT,
     ),
@@ -198,6 +200,18 @@ SOURCES: Final[dict[str, Source]] = {
     "behavior1k_rooms": Source(
         "BEHAVIOR-1K (Li et al., CoRL 2022): object lists of rooms; MIT",
         meaning=LISTS,  # its scenes list no relations
+        predicates=_THE_EIGHT,
+    ),
+    "matterport_rooms": Source(
+        "Matterport3D (Chang et al., 3DV 2017): object lists of rooms, from REVERIE (Qi et al., "
+        "CVPR 2020) and LAD (Li et al., AAAI 2023); non-commercial use",
+        research_only=True,
+        meaning=LISTS,  # its scenes list no relations
+        left_out=("wall", "door"),
+    ),
+    "virtualhome": Source(
+        "VirtualHome (Puig et al., CVPR 2018): rooms of designed apartments; MIT",
+        meaning=_SUPPORTS,
         predicates=_THE_EIGHT,
     ),
     "vsr": Source(
