@@ -108,6 +108,21 @@ def test_virtualhome_lists_all_supports_and_no_sides() -> None:
     assert relation_of("virtualhome", "inside") is None
 
 
+def test_an_unlisted_class_of_a_coarse_source_is_unobserved() -> None:
+    labels = ("table", "coffee table", "lamp")
+    vocabulary = Vocabulary([ObjectClass(label) for label in labels])
+    things = tuple(AnnotatedObject(label, label) for label in labels[:2])
+    scenes = [AnnotatedScene("s", source, "g", None, things) for source in ("sunrgbd", "3dssg")]
+    found = encode(scenes, vocabulary)
+    assert [scene.evidence.classes.tolist() for scene in found] == [[0, 1]] * 2
+    annotated = annotated_classes(found, vocabulary)
+    assert annotated["sunrgbd"].tolist() == [True, False, True]
+    assert annotated["3dssg"].tolist() == [True, True, False]
+    # Without a class of its own, a coffee table is a table, which the source does annotate.
+    tables = Vocabulary([ObjectClass("table", ("coffee table",))])
+    assert annotated_classes(encode(scenes, tables), tables)["sunrgbd"].tolist() == [True]
+
+
 def test_a_floor_plan_counts_as_a_few_scenes() -> None:
     things = (AnnotatedObject("0", "desk", count=4), AnnotatedObject("1", "pencil"))
     scenes = [AnnotatedScene(f"s{k}", "alfred", f"g{k // 6}", None, things) for k in range(8)]
