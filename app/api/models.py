@@ -123,6 +123,8 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> schemas.Vocab
                 aliases=list(entry.aliases),
                 structure=entry.structure,
                 size=_size(entry.size),
+                parent=entry.parent,
+                anywhere=entry.anywhere,
             )
             for entry in served.vocabulary.objects
         ],

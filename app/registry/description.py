@@ -201,6 +201,8 @@ class ClassEntry(Frozen):
     aliases: Many[Text] = ()
     structure: bool = False
     size: tuple[float, float, float] | None = None
+    parent: Text | None = None
+    anywhere: bool = False
 
 
 class VocabularyEntry(Frozen):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ class ObjectClass:
             (object). Scenes may contain structural classes, but a model never proposes them.
         size: typical extents (x, y, z) in metres, with z vertical. None means that they are
             unknown.
+        parent: label of the broader class, such as "lamp" for "floor lamp". None means no parent.
+        anywhere: True if objects of the class belong in every room (pets, people, bags, toys).
 
     Raises:
         ValueError: a name is empty, or the size is not three positive finite numbers.
@@ -39,6 +41,8 @@ class ObjectClass:
     aliases: tuple[str, ...] = ()
     structure: bool = False
     size: Extents | None = None
+    parent: str | None = None
+    anywhere: bool = False
 
     def __post_init__(self) -> None:
         for name in (self.label, *self.aliases):
@@ -60,8 +64,9 @@ class Vocabulary:
 
     Raises:
         ValueError: the list of classes is empty, a room type has an empty name, a key of
-            `room_aliases` is not a room type, or a name is ambiguous. A name is ambiguous if two
-            classes, or two room types, have names with the same `label_key`.
+            `room_aliases` is not a room type, a parent is not a class or its own ancestor, or a
+            name is ambiguous. A name is ambiguous if two classes, or two room types, have names
+            with the same `label_key`.
     """
 
     def __init__(
@@ -88,6 +93,7 @@ class Vocabulary:
                         f"{self.objects[first].label!r} and {entry.label!r}"
                     )
                 self._by_spelling[name] = index
+        self._parents = self._parent_indices()
         self._room_by_key: dict[str, int] = {}
         self._room_by_spelling: dict[str, int] = {}
         for index, room in enumerate(self.room_types):
@@ -100,6 +106,25 @@ class Vocabulary:
                         f"room types {self.room_types[first]!r} and {room!r} have the same name"
                     )
                 self._room_by_spelling[name] = index
+
+    def _parent_indices(self) -> NDArray[np.int64]:
+        index_of = {entry.label: index for index, entry in enumerate(self.objects)}
+        parents = np.full(len(self.objects), -1, dtype=np.int64)
+        for index, entry in enumerate(self.objects):
+            if entry.parent is not None:
+                if entry.parent not in index_of:
+                    raise ValueError(
+                        f"the parent {entry.parent!r} of {entry.label!r} is not the label of a "
+                        "class"
+                    )
+                parents[index] = index_of[entry.parent]
+        ancestors = parents.copy()
+        while (ancestors >= 0).any():
+            if (own := np.flatnonzero(ancestors == np.arange(len(ancestors)))).size:
+                raise ValueError(f"{self.objects[own[0]].label!r} is its own ancestor")
+            ancestors = np.where(ancestors < 0, -1, parents[ancestors])
+        parents.flags.writeable = False
+        return parents
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -134,6 +159,18 @@ class Vocabulary:
     def structure(self) -> NDArray[np.bool_]:
         """(V,) True for structural classes, which a model never proposes. Read-only array."""
         mask = np.array([entry.structure for entry in self.objects], dtype=np.bool_)
+        mask.flags.writeable = False
+        return mask
+
+    @property
+    def parents(self) -> NDArray[np.int64]:
+        """(V,) index of the parent of each class, -1 without a parent. Read-only array."""
+        return self._parents
+
+    @cached_property
+    def anywhere(self) -> NDArray[np.bool_]:
+        """(V,) True for classes whose objects belong in every room. Read-only array."""
+        mask = np.array([entry.anywhere for entry in self.objects], dtype=np.bool_)
         mask.flags.writeable = False
         return mask
 
@@ -214,6 +251,8 @@ class Vocabulary:
                     "structure": entry.structure,
                     "size": None if entry.size is None else list(entry.size),
                 }
+                | ({"parent": entry.parent} if entry.parent is not None else {})
+                | ({"anywhere": True} if entry.anywhere else {})
                 for entry in self.objects
             ],
             "room_types": list(self.room_types),
@@ -223,7 +262,7 @@ class Vocabulary:
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Build a vocabulary from the result of `to_dict`.
 
-        ``aliases``, ``structure``, ``size`` and ``room_aliases`` are optional.
+        All fields of a class except ``label``, and ``room_aliases``, are optional.
 
         Raises:
             ValueError: a field is missing, unknown or of the wrong type. `Vocabulary` lists more
@@ -245,6 +284,9 @@ class Vocabulary:
         return cls([_object_class(entry) for entry in values["objects"]], rooms, aliases)
 
 
+_FIELDS: Final = tuple(field.name for field in fields(ObjectClass))
+
+
 def _are_extents(size: Sequence[float]) -> bool:
     return len(size) == 3 and all(math.isfinite(side) and side > 0 for side in size)
 
@@ -252,16 +294,19 @@ def _are_extents(size: Sequence[float]) -> bool:
 def _object_class(entry: Any) -> ObjectClass:
     if not isinstance(entry, Mapping) or not isinstance(entry.get("label"), str):
         raise ValueError(f"an object class must be a mapping with a string 'label', not {entry!r}")
-    if unknown := sorted(set(entry) - {"label", "aliases", "structure", "size"}):
+    if unknown := sorted(set(entry) - set(_FIELDS)):
         raise ValueError(
             f"object class {entry['label']!r} has unknown fields {unknown}; the known fields are "
-            "label, aliases, structure and size"
+            f"{', '.join(_FIELDS)}"
         )
-    aliases, structure = entry.get("aliases", []), entry.get("structure", False)
+    aliases, parent = entry.get("aliases", []), entry.get("parent")
     if not isinstance(aliases, list) or not all(isinstance(name, str) for name in aliases):
         raise ValueError(f"aliases of {entry['label']!r} must be a string list, not {aliases!r}")
-    if not isinstance(structure, bool):
-        raise ValueError(f"structure of {entry['label']!r} must be a boolean, not {structure!r}")
+    for name in ("structure", "anywhere"):
+        if not isinstance(flag := entry.get(name, False), bool):
+            raise ValueError(f"{name} of {entry['label']!r} must be a boolean, not {flag!r}")
+    if parent is not None and not isinstance(parent, str):
+        raise ValueError(f"parent of {entry['label']!r} must be a string, not {parent!r}")
     size = entry.get("size")
     if size is not None:
         try:
@@ -270,4 +315,4 @@ def _object_class(entry: Any) -> ObjectClass:
             raise ValueError(
                 f"size of {entry['label']!r} must be three numbers, not {size!r}"
             ) from None
-    return ObjectClass(entry["label"], tuple(aliases), structure, size)
+    return ObjectClass(**{**entry, "aliases": tuple(aliases), "size": size})

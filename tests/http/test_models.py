@@ -75,6 +75,7 @@ async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> Non
         "object",
     ]
     for entry, known in zip(words["objects"], VOCABULARY.objects, strict=True):
+        assert (entry["parent"], entry["anywhere"]) == (known.parent, known.anywhere)
         size = entry["size"]
         assert (size and tuple(size[axis] for axis in "xyz")) == known.size
     assert words["room_types"] == list(VOCABULARY.room_types)

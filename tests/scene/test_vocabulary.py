@@ -13,10 +13,11 @@ VOCABULARY = Vocabulary(
     [
         ObjectClass("garbage bin", ("trash can", "dustbin")),
         ObjectClass("tv", ("television",)),
-        ObjectClass("glass", ("wine glass",)),
+        ObjectClass("glass", ("wine glass",), parent="glasses"),
         ObjectClass("glasses", ("spectacles",)),
         ObjectClass("curtain", size=(0.3, 0.3, 2.0)),
         ObjectClass("wall", structure=True),
+        ObjectClass("dog", anywhere=True),
     ],
     ["bedroom", "living room"],
 )
@@ -73,9 +74,11 @@ def test_rooms_have_synonyms() -> None:
 
 
 def test_masks_and_sizes() -> None:
-    assert VOCABULARY.structure.tolist() == [False] * 5 + [True]
+    assert VOCABULARY.structure.tolist() == [False] * 5 + [True, False]
+    assert VOCABULARY.anywhere.tolist() == [False] * 6 + [True]
+    assert VOCABULARY.parents.tolist() == [-1, -1, 3, -1, -1, -1, -1]
     assert VOCABULARY.sizes[4].tolist() == [0.3, 0.3, 2.0]
-    assert np.isnan(VOCABULARY.sizes[[0, 1, 2, 3, 5]]).all()
+    assert np.isnan(VOCABULARY.sizes[[0, 1, 2, 3, 5, 6]]).all()
     with pytest.raises(ValueError, match="read-only"):
         VOCABULARY.structure[0] = True
 
@@ -85,7 +88,7 @@ def test_the_dictionary_form_survives_json() -> None:
     assert again == VOCABULARY
     assert hash(again) == hash(VOCABULARY)
     assert again != Vocabulary(VOCABULARY.objects)
-    assert len(again) == 6
+    assert len(again) == 7
 
 
 def test_two_classes_cannot_share_a_name() -> None:
@@ -112,6 +115,14 @@ def test_two_classes_cannot_share_a_name() -> None:
         ({"objects": [{"label": "bed", "size": [1, 2, float("nan")]}]}, "size of 'bed'"),
         ({"objects": [{"label": "bed", "size": "big"}]}, "size of 'bed'"),
         ({"objects": [{"label": "bed", "colour": "red"}]}, "unknown fields.*colour"),
+        ({"objects": [{"label": "bed", "anywhere": "no"}]}, "anywhere of 'bed'"),
+        ({"objects": [{"label": "bed", "parent": 1}]}, "parent of 'bed'"),
+        ({"objects": [{"label": "bed", "parent": "cot"}]}, "parent 'cot' of 'bed' is not"),
+        ({"objects": [{"label": "bed", "parent": "bed"}]}, "'bed' is its own ancestor"),
+        (
+            {"objects": [{"label": a, "parent": b} for a, b in ("ab", "bc", "cb")]},
+            "'b' is its own ancestor",
+        ),
         ({"objects": [{"label": "bed"}], "room_types": "attic"}, "room_types"),
         ({"objects": [{"label": "bed"}], "room_types": [1]}, "room_types"),
         (

@@ -172,7 +172,6 @@ class TrainingData:
     room_types: int
     digest: str = ""
     words: Tensor | None = None
-    parents: Tensor | None = None
     vocabulary: Vocabulary | None = None
 
     @property
@@ -181,6 +180,13 @@ class TrainingData:
         if self.vocabulary is None:
             raise ValueError("the classes of the training scenes have no names")
         return self.vocabulary
+
+    @cached_property
+    def parents(self) -> Tensor:
+        """(V,) int64 index of the parent of each class, -1 without a parent."""
+        if self.vocabulary is None:
+            return torch.full((len(self.structure),), -1, dtype=torch.int64)
+        return torch.from_numpy(self.vocabulary.parents.copy())
 
     @property
     def related(self) -> bool:

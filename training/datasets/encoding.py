@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -100,8 +100,9 @@ def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) ->
 
     If a scene does not list an annotated class, the class is absent. A data source annotates the
     classes that it mentions at least once. A source with an open vocabulary annotates all classes.
-    Labels in `Source.left_out` are excluded. The initial bias of a class is its frequency in the
-    sources that annotate the class. The evaluation of generated scenes uses only annotated classes.
+    Labels in `Source.left_out` and `Source.coarse` are excluded. The initial bias of a class is its
+    frequency in the sources that annotate the class. The evaluation of generated scenes uses only
+    annotated classes.
     """
     annotated: dict[str, Flags] = {}
     for scene in scenes:
@@ -111,14 +112,20 @@ def annotated_classes(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) ->
             annotated[scene.source] = np.full(len(vocabulary), start)
         annotated[scene.source][scene.instance_classes] = True
     for name, classes in annotated.items():
-        classes[_left_out(name, vocabulary)] = False
+        for kind in ("left_out", "coarse"):
+            classes[_indices_of(kind, name, vocabulary)] = False
     return annotated
 
 
-def _left_out(source: str, vocabulary: Vocabulary) -> list[int]:
-    """Return the class indices of the labels in `Source.left_out`."""
-    labels = SOURCES[source].left_out if source in SOURCES else ()
-    return [index for label in labels if (index := vocabulary.index(label)) is not None]
+def _indices_of(
+    kind: Literal["left_out", "coarse"], source: str, vocabulary: Vocabulary
+) -> list[int]:
+    """Return the indices of the classes in `Source.left_out` or `Source.coarse`.
+
+    A name that is only an alias is skipped, because the class then contains other objects too.
+    """
+    labels: tuple[str, ...] = getattr(SOURCES[source], kind) if source in SOURCES else ()
+    return [vocabulary.labels.index(label) for label in labels if label in vocabulary.labels]
 
 
 class _Encoder:
@@ -129,7 +136,7 @@ class _Encoder:
 
     def __call__(self, scene: AnnotatedScene, group_size: int) -> EncodedScene:
         meaning = meaning_of(scene.source, listed=scene.relations is not None)
-        left_out = _left_out(scene.source, self.vocabulary)
+        left_out = _indices_of("left_out", scene.source, self.vocabulary)
         classes = [self.index(thing.label) for thing in scene.objects]
         kept = [i for i, c in enumerate(classes) if c is not None and c not in left_out]
         relations, positions = _relations(scene, meaning)

@@ -25,9 +25,10 @@ class Names:
         not_objects: labels that never become a class.
         surroundings, outdoor: outdoor structures such as buildings, and outdoor objects. Indoor
             vocabularies exclude them.
+        anywhere: classes whose objects belong in every room, such as pets and bags.
         aliases: maps each class to its other names.
-        kinds: maps each class to more specific names. If a vocabulary lacks a specific name, the
-            name can become an alias of the class.
+        kinds: maps each class to more specific names. If a vocabulary has a class for the specific
+            name, the broader class is its parent. Otherwise the name can become an alias.
         rooms: maps each room type to its other names. The key "" lists names without a room type.
     """
 
@@ -37,6 +38,7 @@ class Names:
     not_objects: tuple[str, ...] = ()
     surroundings: tuple[str, ...] = ()
     outdoor: tuple[str, ...] = ()
+    anywhere: tuple[str, ...] = ()
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
     kinds: dict[str, tuple[str, ...]] = field(default_factory=dict)
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -46,7 +48,8 @@ class Names:
         for title, table in tables.items():
             owner: dict[str, str] = {}
             for name, others in table.items():
-                for other in (name, *others):
+                # A kind can have kinds of its own.
+                for other in others if title == "kinds" else (name, *others):
                     if other and owner.setdefault(label_key(other), name) != name:
                         first = owner[label_key(other)]
                         raise ValueError(f"{title}: {other!r} names both {first!r} and {name!r}")
@@ -55,10 +58,11 @@ class Names:
                 raise ValueError(
                     f"the base class {name!r} is an alias of {other!r}: remove it from `base`"
                 )
-        for name, kinds in self.kinds.items():
-            for kind in (name, *kinds):
-                if (other := self.canonical(kind)) != kind:
-                    raise ValueError(f"kinds: {kind!r} is an alias of {other!r}")
+        kinds = {"kinds": [kind for name, kinds in self.kinds.items() for kind in (name, *kinds)]}
+        for title, labels in (kinds | {"anywhere": self.anywhere}).items():
+            for label in labels:
+                if (other := self.canonical(label)) != label:
+                    raise ValueError(f"{title}: {label!r} is an alias of {other!r}")
 
     def canonical(self, label: str) -> str:
         """Return the curated name of a label, or the label in lower case with single spaces."""
@@ -74,6 +78,11 @@ class Names:
             return None
         name = self._rooms_by_key.get(label_key(room))
         return (_plain(room) if name is None else name) or None
+
+    @cached_property
+    def broader(self) -> dict[str, str]:
+        """The broader class of each kind."""
+        return {kind: name for name, kinds in self.kinds.items() for kind in kinds}
 
     @cached_property
     def _by_key(self) -> dict[str, str]:

@@ -8,6 +8,7 @@ for neighbours"), or unobserved. The meaning depends on the data source and on t
 | boxes with sizes (procthor) | off | off | off for neighbours |
 | centres only (bedrooms) | unobserved | unobserved | off |
 | 3dssg | off | unobserved | off for neighbours |
+| support links (virtualhome) | off | unobserved | unobserved |
 | pictures and sentences | unobserved | unobserved | unobserved |
 | scenes of the user with listed relations | off | off | off |
 
@@ -66,6 +67,7 @@ BOXES: Final = Meaning(lateral="off for neighbours")
 
 _CENTRES: Final = Meaning(on_top="unobserved", above="unobserved")
 _SELECTED: Final = Meaning(on_top="unobserved", above="unobserved", lateral="unobserved")
+_SUPPORTS: Final = replace(_SELECTED, on_top="off")
 _MENTIONS: Final = replace(_SELECTED, complete_objects=False)
 
 _THE_EIGHT: Final = {name: name for name in RELATIONS}
@@ -109,6 +111,8 @@ class Source:
             other predicates, such as "inside" and "wear". None means that another predicate is an
             error. Names of relations are predicates of every source.
         left_out: labels that are ignored because their annotation is too incomplete.
+        coarse: classes whose objects annotators mostly call by the name of the broader class, such
+            as "table" for a coffee table. An unlisted class of this kind is unobserved.
         open_vocabulary: True if annotators used free words, so that an unlisted class is absent.
             Otherwise a class outside their list of labels is unobserved.
         counts_movables: True if only movable objects are counted. Others occur once in a scene.
@@ -121,6 +125,7 @@ class Source:
     meaning: Meaning | None = None
     predicates: Mapping[str, str] | None = None
     left_out: tuple[str, ...] = ()
+    coarse: tuple[str, ...] = ()
     open_vocabulary: bool = False
     counts_movables: bool = False
     of_one_view: bool = False
@@ -140,6 +145,12 @@ SOURCES: Final[dict[str, Source]] = {
         research_only=True,
         meaning=LISTS,  # its scenes list no relations
         left_out=("wall", "floor"),
+        # Their share of all tables, chairs, lamps and clothes is less than a tenth of that in other
+        # sources.
+        coarse=(
+            *("coffee table", "side table", "console table", "armchair", "computer chair"),
+            *("floor lamp", "shirt", "pants", "jacket"),
+        ),
         open_vocabulary=True,
         of_one_view=True,
     ),
@@ -153,7 +164,9 @@ SOURCES: Final[dict[str, Source]] = {
         predicates=_3DSSG,
     ),
     "procthor": Source(
-        "ProcTHOR (Deitke et al., NeurIPS 2022): procedural rooms; Apache-2.0", meaning=BOXES
+        "ProcTHOR (Deitke et al., NeurIPS 2022): procedural rooms; Apache-2.0",
+        meaning=BOXES,
+        coarse=("coffee table",),
     ),
     "vrd": Source(
         "VRD (Lu, Krishna, Bernstein, Fei-Fei, ECCV 2016): annotated relations in photographs; "
@@ -170,8 +183,8 @@ SOURCES: Final[dict[str, Source]] = {
         predicates=_THE_EIGHT,
     ),
     "coco_captions": Source(
-        "COCO captions (Lin et al., ECCV 2014): triples from captions of indoor pictures; "
-        "CC BY 4.0",
+        "COCO captions (Lin et al., ECCV 2014; COCO Consortium): triples from captions of indoor "
+        "pictures; CC BY 4.0, with attribution",
         meaning=_MENTIONS,
         predicates=_THE_EIGHT,
     ),
@@ -188,6 +201,7 @@ SOURCES: Final[dict[str, Source]] = {
         # have the weight of three scenes.
         meaning=replace(_SELECTED, scenes_per_group=3.0),
         predicates=_THE_EIGHT,
+        left_out=("steps",),  # of a person: "walk two steps"
         counts_movables=True,
     ),
     "bddl_goal": Source(
@@ -198,6 +212,18 @@ SOURCES: Final[dict[str, Source]] = {
     "behavior1k_rooms": Source(
         "BEHAVIOR-1K (Li et al., CoRL 2022): object lists of rooms; MIT",
         meaning=LISTS,  # its scenes list no relations
+        predicates=_THE_EIGHT,
+    ),
+    "matterport_rooms": Source(
+        "Matterport3D (Chang et al., 3DV 2017): object lists of rooms, from REVERIE (Qi et al., "
+        "CVPR 2020) and LAD (Li et al., AAAI 2023); non-commercial use",
+        research_only=True,
+        meaning=LISTS,  # its scenes list no relations
+        left_out=("wall", "door"),
+    ),
+    "virtualhome": Source(
+        "VirtualHome (Puig et al., CVPR 2018): rooms of designed apartments; MIT",
+        meaning=_SUPPORTS,
         predicates=_THE_EIGHT,
     ),
     "vsr": Source(

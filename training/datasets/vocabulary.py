@@ -102,7 +102,8 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
 def with_aliases(vocabulary: Vocabulary, names: Names | None = None) -> Vocabulary:
     """Return the vocabulary with the curated synonyms of its classes, and of kinds that it lacks.
 
-    The classes, their order and their sizes stay the same.
+    The parents and the flag `anywhere` of its classes are renewed too. The labels, their order and
+    their sizes stay the same.
     """
     names = names or curated_names()
     objects = []
@@ -161,10 +162,22 @@ def source_vocabulary(
 
 
 def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> ObjectClass:
-    """Add more specific names of a class as aliases, if the vocabulary does not contain them."""
-    unknown = [kind for kind in names.kinds.get(entry.label, ()) if vocabulary.index(kind) is None]
-    synonyms = [name for kind in unknown for name in (kind, *names.aliases.get(kind, ()))]
-    return replace(entry, aliases=(*entry.aliases, *synonyms))
+    """Set the parent of a class, and add the names of its kinds without a class as aliases."""
+    parent = names.broader.get(entry.label)
+    while parent is not None and parent not in vocabulary.labels:
+        parent = names.broader.get(parent)
+    kinds = list(names.kinds.get(entry.label, ()))
+    synonyms = []
+    for kind in kinds:
+        if vocabulary.index(kind) is None:
+            synonyms += [kind, *names.aliases.get(kind, ())]
+            kinds += names.kinds.get(kind, ())
+    return replace(
+        entry,
+        aliases=(*entry.aliases, *synonyms),
+        parent=parent,
+        anywhere=entry.label in names.anywhere,
+    )
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:

@@ -16,7 +16,7 @@ from training.datasets import (
     encode,
 )
 from training.datasets.batches import scene_tensors
-from training.datasets.sources import SOURCES, meaning_of
+from training.datasets.sources import SOURCES, meaning_of, relation_of
 
 VOCABULARY = Vocabulary([ObjectClass("desk"), ObjectClass("monitor"), ObjectClass("pencil")])
 LATERAL, VERTICAL = [LEFT, FRONT], [ON_TOP, ABOVE]
@@ -97,6 +97,30 @@ def test_centres_tell_left_and_front_alone(source: str) -> None:
     assert (found.instance_observed[LATERAL] == ~np.eye(3, dtype=bool)).all()
     assert not found.instance_observed[VERTICAL].any()
     assert np.argwhere(found.instance_holds).tolist() == [[FRONT, 0, 1]]
+
+
+def test_virtualhome_lists_all_supports_and_no_sides() -> None:
+    found = encoded("virtualhome", relations=((1, "on-top", 0),))
+    pairs = ~np.eye(3, dtype=bool)
+    assert np.argwhere(found.instance_holds).tolist() == [[ON_TOP, 1, 0]]
+    assert (found.instance_observed[ON_TOP] == pairs).all()
+    assert np.argwhere(found.instance_observed[LEFT]).tolist() == [[0, 1], [1, 0]]
+    assert relation_of("virtualhome", "inside") is None
+
+
+def test_an_unlisted_class_of_a_coarse_source_is_unobserved() -> None:
+    labels = ("table", "coffee table", "lamp")
+    vocabulary = Vocabulary([ObjectClass(label) for label in labels])
+    things = tuple(AnnotatedObject(label, label) for label in labels[:2])
+    scenes = [AnnotatedScene("s", source, "g", None, things) for source in ("sunrgbd", "3dssg")]
+    found = encode(scenes, vocabulary)
+    assert [scene.evidence.classes.tolist() for scene in found] == [[0, 1]] * 2
+    annotated = annotated_classes(found, vocabulary)
+    assert annotated["sunrgbd"].tolist() == [True, False, True]
+    assert annotated["3dssg"].tolist() == [True, True, False]
+    # Without a class of its own, a coffee table is a table, which the source does annotate.
+    tables = Vocabulary([ObjectClass("table", ("coffee table",))])
+    assert annotated_classes(encode(scenes, tables), tables)["sunrgbd"].tolist() == [True]
 
 
 def test_a_floor_plan_counts_as_a_few_scenes() -> None:

@@ -61,7 +61,7 @@ def test_training_reads_the_vectors_beside_the_scenes(tmp_path: Path) -> None:
     vectors = dict(zip(scenes.vocabulary.labels, scenes.words.tolist(), strict=True))
     assert vectors["sofa"] == pytest.approx([0.6, -0.8])
     assert vectors["coffee table"] == pytest.approx([np.sqrt(0.5)] * 2)
-    assert vectors["bed"] == [0, 0]
+    assert vectors["pillow"] == [0, 0]
 
 
 @pytest.mark.parametrize(

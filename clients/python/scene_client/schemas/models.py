@@ -93,6 +93,10 @@ class VocabularyEntry(Reply):
     structure: bool
     size: Size | None = None
     """typical extents in metres, for detections without a size"""
+    parent: str | None = None
+    """label of the broader class, such as lamp for floor lamp"""
+    anywhere: bool = False
+    """true if objects of the class belong in every room: pets, people, bags, toys"""
 
 
 class ExampleScene(Reply):
