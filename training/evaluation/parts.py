@@ -1,0 +1,221 @@
+"""Random parts of scenes, as a robot lists them, and the rank of the hidden classes.
+
+A part lists some classes of a scene and hides the others. Structure classes are neither listed nor
+hidden, nor candidates. The rank of a hidden class ignores the other hidden classes, so these never
+count as errors. For ties, a metric is the expectation under random order. The random choices for a
+scene depend only on the seed and the id of the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from training.datasets.array_types import Floats, Ints, Rng
+from training.datasets.batches import SceneTensors, subset
+from training.datasets.cases import scene_rng, some_scenes
+from training.evaluation.metrics import Metric, Ratio
+
+REAL_SOURCES: Final = ("sunrgbd", "3dssg", "sunrgbd_bedrooms_3d", "matterport_rooms")
+"""Data sources of real rooms with nearly complete object lists."""
+
+SHARE_BINS: Final = (0.3, 0.6)
+"""Upper limits of the first two bins of the listed share of a scene, see `share_bin`."""
+
+LONGEST: Final = 12
+"""Maximum number of listed classes of a random part in `validation_score`."""
+
+_SCENES = 400  # maximum scenes of each source in `validation_score`
+_BLOCK = 256
+
+Size: TypeAlias = Callable[[int, Rng], int]
+"""Function of the number of classes of a scene. It returns the number to list, 0 for no part."""
+
+ListScore: TypeAlias = Callable[[Tensor, Tensor], Tensor]
+"""Function of lists (B, V) and their share bins (B,) int64. It returns scores (B, V)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """N parts of scenes.
+
+    Attributes:
+        scene: (N,) int64, index of the scene.
+        v: (N, V) 1 for listed classes.
+        hidden: (N, V) bool, True for hidden classes.
+        scenes: number of scenes of the set, with the scenes without a part.
+    """
+
+    scene: Tensor
+    v: Tensor
+    hidden: Tensor
+    scenes: int
+
+    @property
+    def skipped(self) -> int:
+        """Number of scenes without a part."""
+        return self.scenes - len(self.scene.unique())
+
+
+def all_but_one(classes: int, _: Rng) -> int:
+    """List all classes but one."""
+    return classes - 1
+
+
+def one_quarter(classes: int, _: Rng) -> int:
+    """List 25 % of the classes, at least one; at least one is hidden."""
+    return min(max(int(0.25 * classes + 0.5), 1), classes - 1)
+
+
+def exactly(number: int) -> Size:
+    """List `number` classes of scenes with more classes."""
+    return lambda classes, _: number if classes > number else 0
+
+
+def up_to_longest(classes: int, rng: Rng) -> int:
+    """List a random number of classes, from one to `LONGEST`; at least one is hidden."""
+    most = min(LONGEST, classes - 1)
+    return int(rng.integers(1, most + 1)) if most > 0 else 0
+
+
+def draw_parts(
+    scenes: SceneTensors, structure: Tensor, size: Size, seeds: Sequence[int] = (0,)
+) -> Parts:
+    """Draw a part of each scene for each seed."""
+    is_thing = ~structure.numpy()
+    rows: list[int] = []
+    hidden: list[Ints] = []
+    for seed in seeds:
+        for k, scene in enumerate(scenes.scenes):
+            rng = scene_rng(scene, seed)
+            order = rng.permutation(scene.evidence.classes[is_thing[scene.evidence.classes]])
+            if listed := size(len(order), rng) if len(order) else 0:
+                rows.append(k)
+                hidden.append(order[listed:])
+    index = torch.tensor(rows, dtype=torch.int64)
+    mask = torch.zeros(len(rows), len(is_thing), dtype=torch.bool)
+    for row, classes in enumerate(hidden):
+        mask[row, torch.from_numpy(classes)] = True
+    v = scenes.v[index].masked_fill(mask | structure, 0.0)
+    return Parts(index, v, mask, len(scenes))
+
+
+def share_bin(listed: Tensor, classes: Tensor) -> Tensor:
+    """Return the bin of the listed share of scenes of so many classes, (B,) int64.
+
+    The bins are up to 30 %, up to 60 %, below 100 %, and all classes but one.
+    """
+    bins = torch.bucketize(listed / classes, torch.tensor(SHARE_BINS))
+    return torch.where(listed >= classes - 1, len(SHARE_BINS) + 1, bins)
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """Ranks of all hidden classes of a set of scenes.
+
+    Attributes:
+        scene: (N,) index of the scene in the set.
+        target: (N,) the hidden class.
+        above: (N,) number of candidates with a higher score.
+        ties: (N,) number of other candidates with the same score.
+        skipped: number of scenes with too few classes.
+    """
+
+    scene: Ints
+    target: Ints
+    above: Ints
+    ties: Ints
+    scenes: int
+    skipped: int
+
+    @classmethod
+    def of(
+        cls, scene: Tensor, target: Tensor, values: Tensor, scenes: int, skipped: int
+    ) -> Ranking:
+        """Compute ranks from scores (N, V); classes that are not candidates have score -inf.
+
+        Raises:
+            FloatingPointError: a score is NaN.
+        """
+        if bool(values.isnan().any()):
+            raise FloatingPointError("the score of a class is NaN")
+        target_score = values.gather(1, target.unsqueeze(1))
+        above, ties = (values > target_score).sum(1), (values == target_score).sum(1) - 1
+        return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes, skipped)
+
+    def reciprocal_rank(self) -> Floats:
+        """Return the expectation of 1 / rank under random order of ties, (N,)."""
+        # Mean of 1/r over r = above + 1 .. above + ties + 1, by harmonic numbers.
+        last = self.above + self.ties + 1
+        ranks = np.arange(1, int(last.max(initial=1)) + 1)
+        harmonic = np.concatenate([[0.0], np.cumsum(1.0 / ranks)])
+        mean: Floats = (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
+        return mean
+
+    def top(self, k: int) -> Metric:
+        """Return the share of targets among the first k candidates."""
+        share = np.clip((k - self.above) / (self.ties + 1), 0.0, 1.0)
+        return Ratio.of_items(self.scene, share, self.scenes)
+
+    def mrr(self, selection: Ints | slice = slice(None)) -> Ratio:
+        """Return the mean reciprocal rank of the selected targets."""
+        return Ratio.of_items(self.scene[selection], self.reciprocal_rank()[selection], self.scenes)
+
+
+def rank_hidden(parts: Parts, structure: Tensor, values: Tensor) -> Ranking:
+    """Rank each hidden class among the unlisted classes, by scores (N, V)."""
+    # -inf marks classes that are no candidates. So a candidate of score -inf gets the smallest
+    # finite score.
+    values = values.clamp(min=torch.finfo(values.dtype).min)
+    values = values.masked_fill((parts.v > 0) | structure, -torch.inf)
+    row, target = parts.hidden.nonzero(as_tuple=True)
+    others = parts.hidden[row].scatter(1, target.unsqueeze(1), False)
+    competing = values[row].masked_fill(others, -torch.inf)
+    return Ranking.of(parts.scene[row], target, competing, parts.scenes, parts.skipped)
+
+
+@torch.no_grad()
+def validation_score(
+    score_function: ListScore, scenes: SceneTensors, structure: Tensor, seed: int = 0
+) -> float:
+    """Return the mean over real sources of the MRR of hidden classes; NaN without hidden classes.
+
+    The MRR of a source is the mean of two MRRs: of random parts of 1 to `LONGEST` classes, and of
+    parts of all classes but one. At most 400 scenes of each source take part. If the scenes
+    contain no source of `REAL_SOURCES`, all sources count.
+
+    Args:
+        score_function: function of lists (B, V) of zeros and ones, and their share bins (B,), see
+            `share_bin`. It returns scores (B, V). Higher scores mean likelier classes.
+        scenes: validation scenes. Scenes with incomplete object lists are left out, unless all
+            lists are incomplete.
+        structure: (V,) bool, True for structure classes.
+
+    Raises:
+        FloatingPointError: a score is NaN.
+    """
+    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
+    usable = scenes.complete.numpy() if bool(scenes.complete.any()) else ~scenes.complete.numpy()
+    sources = [name for name in REAL_SOURCES if (usable & (names == name)).any()]
+    values = []
+    for source in sources or np.unique(names[usable]).tolist():
+        index = torch.from_numpy(np.flatnonzero(usable & (names == source)))
+        sample = some_scenes(subset(scenes, index), _SCENES, seed)
+        for size in (up_to_longest, all_but_one):
+            parts = draw_parts(sample, structure, size, (seed,))
+            if len(parts.v):
+                values.append(_mrr(score_function, parts, structure))
+    return float(np.mean(values)) if values else float("nan")
+
+
+def _mrr(score_function: ListScore, parts: Parts, structure: Tensor) -> float:
+    listed = parts.v.sum(1)
+    bins = share_bin(listed, listed + parts.hidden.sum(1))
+    blocks = zip(parts.v.split(_BLOCK), bins.split(_BLOCK), strict=True)
+    scores = torch.cat([score_function(v, block) for v, block in blocks])
+    return rank_hidden(parts, structure, scores).mrr().value
