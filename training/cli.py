@@ -36,7 +36,6 @@ from training.evaluation.tasks import in_words
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, is_file, source_name
 from training.fit.trainer import Trainer
-from training.machines.distributed import is_first, process_group
 from training.research.ablate import ablate
 from training.research.benchmark import benchmark
 from training.research.tune import tune
@@ -103,11 +102,8 @@ def train(
 ) -> None:
     """Train a configuration. With --publish, also calibrate, evaluate and publish the model."""
     try:
-        with process_group():
-            first = is_first()
-            console.quiet = not first
-            config = load_config(configuration, seed=seed)
-            if publish is not None and first:
+        config = load_config(configuration, seed=seed)
+            if publish is not None:
                 Store(store).require_new(config.name, publish)
             root = data_folder(configuration, config, data)
             folder = runs / config.name / f"seed-{config.training.seed}"
@@ -308,23 +304,19 @@ def _train(
     fresh: bool,
     tensorboard: Path | None,
 ) -> None:
-    if fresh and is_first():
+    if fresh:
         for name in ("checkpoint.pt", "result.json"):
             (folder / name).unlink(missing_ok=True)
     trainer = Trainer(config, scenes.training_data(), folder)
     if trainer.resume():
-        console.print(f"resuming after epoch {len(trainer.epochs)}")
+        console.print(f"resuming after {trainer.position}")
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
     try:
-        with Display(trainer, console, tensorboard if is_first() else None) as display:
-            result = trainer.run(display.progress, display.ended, display.objects)
+        with Display(trainer, console, tensorboard) as display:
+            result = trainer.run(display.progress, display.passed)
     except KeyboardInterrupt:
-        # Count the epochs in the checkpoint, because the last epoch may be finished but not saved.
-        finished = len(trainer.epochs) if trainer.resume() else 0
-        console.print(f"stopped after epoch {finished}; run the same command to continue")
+        console.print(f"stopped after {trainer.position}; run the same command to continue")
         raise typer.Exit(130) from None
-    if not is_first():
-        return
     save_run(folder, config, result, data=root, scenes=scenes.digest)
     summarise(result, trainer, folder, console)
 

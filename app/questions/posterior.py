@@ -19,6 +19,7 @@ from app.scene.scene import Scene, instance_evidence, pool_classes, pool_relatio
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
 
+
 class Present(NamedTuple):
     """The n distinct classes of a scene of N objects.
 

@@ -25,14 +25,15 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
+from app.inference.relations import NO_UNIT
 from app.questions.outliers import stated_log_odds
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
-from app.registry import Artifact, Calibration, PairSlope, Slope
+from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
 from app.scene import Scene
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Rng
-from training.datasets.batches import SceneTensors, subset
+from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import (
     RIDGE,
     Triple,
@@ -45,14 +46,13 @@ from training.datasets.cases import (
     scene_of,
 )
 from training.datasets.sources import meaning_of
+from training.evaluation.alarms import ALARMS
 from training.evaluation.outlier_tasks import kept_in_each_source
-from training.fit.calibrate_objects import calibrate_objects, recalibrated, thresholds
-from training.fit.oracle.units import NO_UNIT
+from training.fit.calibrate_objects import calibrate_objects, recalibrated
+from training.fit.configuration import ObjectsConfig
+from training.fit.objects import ObjectScenes, served_popularity
 
 _SCENES = 2500
-# Number of scenes for a machine whose log-odds have no closed form. Sampling the log-odds takes a
-# hundred times longer than a closed form.
-_SCENES_OF_DRAWS = 300
 _LISTED = 20  # relations that an answer of the service lists by default
 _OF_THE_REST = 0.02
 _ROUNDS = 3
@@ -71,25 +71,28 @@ _UNKNOWN = -1.0  # truth of an example whose data source does not annotate the r
 # Number of objects that are removed from each scene in turn to fit placements. With one removed
 # object, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
+# Minimum thresholds. If true and false relations hardly overlap, the target shares would need
+# alarms for relations that probably hold.
+_LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
 _JUDGED_SCENES = 20  # minimum number of scenes with relations for a judgement of relations
 
 
 def calibrate(
     artifact: Artifact,
-    scenes: SceneTensors,
-    train: SceneTensors,
+    data: TrainingData,
+    config: ObjectsConfig,
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> Calibration:
     """Fit every entry of the calibration. `calibrate_objects` copies some values of `chosen`."""
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    objects = calibrate_objects(artifact, scenes, train, structure, seed, chosen)
+    popularity = served_popularity(ObjectScenes.of(data.train, data.structure, config), config)
+    scenes = data.validation
+    objects = calibrate_objects(artifact, scenes, data.train, popularity, seed, chosen)
     artifact = replace(artifact, calibration=objects)
     generator = torch.Generator().manual_seed(seed)
     pick = torch.randperm(len(scenes), generator=generator)
     annotated = [k for k in pick.tolist() if scenes.scenes[k].evidence.holds.any()]
-    count = _SCENES if artifact.oracle is None else _SCENES_OF_DRAWS
-    related = subset(scenes, torch.tensor(annotated[:count], dtype=torch.int64)).scenes
+    related = subset(scenes, torch.tensor(annotated[:_SCENES], dtype=torch.int64)).scenes
     if not len(related):
         return objects
     alone = fit_relations(artifact, related)
@@ -360,8 +363,7 @@ def fit_misplaced(
 ) -> dict[str, Any]:
     """Fit `misplaced` and `misplaced_thresholds` to log-odds given the rest of the scene.
 
-    Each scene takes part untouched and with one false relation. `thresholds` gives the minimum of a
-    threshold. Both entries are None if fewer than `_JUDGED_SCENES` scenes have relations, or if
+    Each scene takes part untouched and with one false relation. Both entries are None if fewer than `_JUDGED_SCENES` scenes have relations, or if
     false relations are not less likely than true relations. The model then judges no relation.
     """
     rng = np.random.default_rng(seed)
@@ -388,7 +390,8 @@ def fit_misplaced(
     group = np.array([encoded.group for encoded, _ in untouched])
     _, source = np.unique([encoded.source for encoded, _ in untouched], return_inverse=True)
     worst = expit(intercept + slope * np.array([least for _, least in untouched]))
-    limits = thresholds(partial(kept_in_each_source, worst, group, source, rng))
+    limit = partial(kept_in_each_source, worst, group, source, rng)
+    limits = Thresholds(**{name: max(_LEAST[name], limit(share)) for name, share in ALARMS.items()})
     entry = Slope(intercept=intercept, slope=slope)
     return {"misplaced": entry, "misplaced_thresholds": limits}
 

@@ -1,12 +1,15 @@
-"""Fit the calibration of answers about objects.
+"""Fit the calibration of answers about objects to short lists.
 
-    coverage   Assumed share of the objects that a scene lists, and the weight of the posterior for
-               partly listed scenes. Both are chosen by the rank of hidden classes.
-    missing    Probability that an unlisted class is present, fitted to scenes that show 25 %, 50 %,
-               75 % or all but one of their classes. Near-duplicate scenes have a lower weight.
-    outlier    Probability that a class is an intruder, with thresholds. Half of the scenes contain
-               an intruder.
-    evidence   See `fit_evidence`.
+A robot lists a few objects of a room. So all fits use random parts of validation scenes: of real
+scenes, if there are any (`training.evaluation.parts.REAL_SOURCES`). Structure is not listed.
+
+    coverage   Listed share that the answers assume: the share with the best rank of hidden classes.
+    missing    Probability that an unlisted class is present, fitted to the first classes of parts
+               of 1 to 12 classes, and of all classes but one.
+    outlier    Probability that a class is an intruder. Half of the parts contain an intruder.
+    lines      An object is an outlier if its log-odds of being an intruder are above a line in the
+               log of the number of listed classes. Each line raises alarms in a given share of the
+               untouched parts (`training.evaluation.alarms.ALARMS`), in the mean over the sources.
 
 The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
 logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
@@ -17,10 +20,8 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,106 +29,66 @@ import torch
 from torch import Tensor
 
 from app.questions.generate import room_fit
-from app.questions.posterior import calibrated, Posterior
-from app.registry import NEVER, Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
-from app.scene import Scene
-from training.datasets.array_types import Flags, Floats, Rng
+from app.questions.posterior import Posterior, calibrated
+from app.registry import AlarmLine, AlarmLines, Artifact, Calibration, CountSlope
+from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import RIDGE, logistic
 from training.evaluation.alarms import ALARMS
 from training.evaluation.asking import of_classes
-from training.evaluation.evidence_tasks import removals
-from training.evaluation.intruders import (
-    IntruderScores,
-    by_popularity,
-    by_signature,
-    clean_scores,
-    intruder_scores,
+from training.evaluation.intruders import by_popularity, by_signature, draw_intruders
+from training.evaluation.parts import (
+    REAL_SOURCES,
+    Parts,
+    all_but_one,
+    draw_parts,
+    exactly,
+    up_to_longest,
 )
-from training.evaluation.missing_tasks import SHARES, MachineScore, hide
-from training.evaluation.outlier_tasks import alarm_threshold
-from training.machines.arrays import machine_of
 
-COVERAGES = (0.3, 0.4, 0.5, 0.6, 0.7)
-WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
-# Tested exponents alpha. With 0.5, the detected share of uniformly drawn intruders in sunrgbd falls
-# from .47 to .35.
-ALPHAS = (0.0, 0.125, 0.25, 0.375)
-EVIDENCE_WEIGHTS = (0.0, 0.1, 0.2, 0.5, 1.0)
-# Minimum thresholds. If the scores of intruders and other objects do not overlap, as in scenes that
-# hardly vary, the target shares would need alarms for objects that probably belong to the scene.
-LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
-# Lists of up to `_SHORT_LISTS` classes have separate thresholds, until the threshold of whole
-# scenes raises alarms in at most `_ENOUGH` times the target share of the shortened lists. Each
-# threshold is fitted to at least `_SHORTENED` lists; few scenes are shortened several times.
-_SHORT_LISTS = 8
-_ENOUGH = 1.5
-_SHORTENED = 200
-_PARTIAL_SCENES = 120  # scenes used from each source
-# Number of times that the hidden class is drawn, for scenes that show all but one class.
-_DRAWS_OF_ONE = 4
+COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
+# Tested exponents alpha of the prior of intruders.
+ALPHAS = (0.0, 0.125, 0.25, 0.375, 0.5)
+LENGTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+"""Numbers of listed classes to which the alarm lines are fitted."""
+
+_LEAST_SCENES = 20  # from which objects are judged
+_SEEDS = (0, 1, 2)
+_LISTED = 10  # classes in the fit of each part; an answer of the service lists ten by default
+_SOURCE_SCENES = 400  # maximum scenes of each source
 # Quantiles over real rooms of a room type. A generated scene is too small if its number of classes
 # is below quantile `_SMALL`. A generated scene does not suit its room type if its `room_fit` is
 # below quantile `_UNSUITED`. A room type needs `_ROOM_SCENES` scenes for separate limits.
 _SMALL = 0.1
 _UNSUITED = 0.15
 _ROOM_SCENES = 20
-_EVIDENCE_SCENES = 400
-# Number of scenes for a machine whose log-odds have no closed form. Sampling the log-odds takes a
-# hundred times longer than a closed form.
-_EVIDENCE_SCENES_OF_DRAWS = 100
-# Maximum accepted losses. `_UNIFORM_LOSS`: hit@1 and detected share of uniformly drawn intruders.
-# `_COMPLETE_LOSS`: mean reciprocal rank (MRR) of hidden classes in nearly complete lists.
-_UNIFORM_LOSS = np.array([0.04, 0.06])
-_COMPLETE_LOSS = 0.002
-_NEARLY_COMPLETE = ("75 %", "all but one")
-# Weights whose MRR differs from the best MRR by at most this value count as equal. The smallest of
-# these weights is used.
-_AS_GOOD = 0.006
-_LISTED = 10  # classes in the fit of each scene; an answer of the service lists ten by default
-
-
-def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
-    """Return the scenes with complete object lists, or all scenes if no list is complete.
-
-    A near-duplicate scene is kept with a probability equal to its weight.
-    """
-    rng = np.random.default_rng(seed)
-    complete = scenes.complete.numpy()
-    # Photographs have no complete object lists. If all scenes are photographs, use all of them.
-    complete = complete if complete.any() else ~complete
-    mask = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
-    return subset(scenes, torch.from_numpy(np.flatnonzero(mask)))
 
 
 def calibrate_objects(
     artifact: Artifact,
     validation: SceneTensors,
     train: SceneTensors,
-    structure: Tensor,
+    popularity: Tensor,
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> Calibration:
     """Return the model's calibration with newly fitted entries about objects.
 
-    The training scenes give the frequency of each class, and limits for room types. The coverage,
-    coverage weight, weights of evidence and alpha of a `chosen` calibration are copied.
+    The training scenes give the intruders, and limits for room types. The coverage and alpha of a
+    `chosen` calibration are copied.
+
+    Args:
+        popularity: log-odds of each class in the served mix of sources, (classes,).
     """
-    scenes = complete_scenes(validation, seed)
-    if not len(scenes):
-        return artifact.calibration
-    is_used = validation.complete if bool(validation.complete.any()) else ~validation.complete
-    used_scenes = subset(validation, is_used.nonzero().squeeze(1))
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+    scenes = real_scenes(validation)
     learnt = complete_scenes(train, seed)
-    popular = tuple(np.round(popularity(train), 4).tolist())
-    artifact = recalibrated(artifact, popularity=popular)
-    coverage = fit_coverage(artifact, used_scenes, structure, seed, chosen)
-    artifact = recalibrated(artifact, **coverage)
-    weights = chosen.evidence if chosen else fit_evidence(artifact, validation, structure, seed)
-    artifact = recalibrated(artifact, evidence=weights)
+    rounded = tuple(np.round(popularity.double().numpy(), 4).tolist())
+    artifact = recalibrated(artifact, popularity=rounded)
+    artifact = recalibrated(artifact, **fit_missing(artifact, scenes, structure, chosen))
     return recalibrated(
         artifact,
-        **fit_outliers(artifact, scenes, learnt, structure, seed, chosen),
+        **fit_outliers(artifact, scenes, learnt, structure, chosen),
         smallest=smallest_scenes(learnt, structure, artifact.spec.C),
         room_fit=room_limits(artifact, learnt),
     ).calibration
@@ -138,12 +99,293 @@ def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
     return replace(artifact, calibration=artifact.calibration.model_copy(update=entries))
 
 
-def popularity(train: SceneTensors) -> Floats:
-    """Return the smoothed log-odds that a complete training scene contains a class, (classes,)."""
-    weight = train.weight * (train.complete if bool(train.complete.any()) else 1.0)
-    count = (train.v * weight.unsqueeze(1)).sum(0).double().numpy()
-    total = float(weight.sum())
-    return np.log((count + 0.5) / (total - count + 0.5))
+def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
+    """Return the scenes with complete object lists, or all scenes if no list is complete.
+
+    A near-duplicate scene is kept with a probability equal to its weight.
+    """
+    rng = np.random.default_rng(seed)
+    complete = scenes.complete.numpy()
+    complete = complete if complete.any() else ~complete
+    mask = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
+    return subset(scenes, torch.from_numpy(np.flatnonzero(mask)))
+
+
+def real_scenes(scenes: SceneTensors) -> SceneTensors:
+    """Return scenes of real sources with complete lists; all complete scenes if there are none.
+
+    At most 400 scenes of each source take part.
+    """
+    scenes = complete_scenes(scenes)
+    sources = [scenes.source_names[q] for q in scenes.source.tolist()]
+    real = set(sources) & set(REAL_SOURCES)
+    kept: list[int] = []
+    for source in sorted(real or set(sources)):
+        index = [k for k, name in enumerate(sources) if name == source]
+        kept += np.random.default_rng(0).permutation(index)[:_SOURCE_SCENES].tolist()
+    return subset(scenes, torch.tensor(sorted(kept), dtype=torch.int64))
+
+
+def source_weights(scenes: SceneTensors, index: Tensor) -> Floats:
+    """Return weights of parts, (parts,), so that all sources count alike.
+
+    Args:
+        index: index of the scene of each part, (parts,).
+    """
+    source = scenes.source[index].numpy()
+    counts = np.bincount(source, minlength=len(scenes.source_names))
+    return len(source) / (np.count_nonzero(counts) * counts[source])
+
+
+# ------------------------------------------------------------------------------------ missing
+
+
+def fit_missing(
+    artifact: Artifact,
+    scenes: SceneTensors,
+    structure: Tensor,
+    chosen: Calibration | None = None,
+) -> dict[str, Any]:
+    """Fit the entries `coverage` and `missing` of the calibration."""
+    parts = [
+        draw_parts(scenes, structure, size, seeds)
+        for size, seeds in ((up_to_longest, _SEEDS), (all_but_one, _SEEDS[:1]))
+    ]
+    v, hidden = (torch.cat([getattr(part, name) for part in parts]) for name in ("v", "hidden"))
+    if not len(v):
+        return {}
+    weight = source_weights(scenes, torch.cat([part.scene for part in parts]))
+    candidates = (v == 0) & ~structure
+    coverages = COVERAGES if chosen is None else (chosen.coverage,)
+    log_odds = {c: unlisted_log_odds(artifact, v, c) for c in coverages}
+    masks = candidates.numpy(), hidden.numpy()
+    coverage = max(coverages, key=lambda c: _mean_rank(log_odds[c], *masks, weight))
+    examples, weights = _first_classes(log_odds[coverage], *masks, v.sum(1).numpy(), weight)
+    entry = CountSlope()
+    if len(np.unique(examples[:, 2])) == 2:
+        slope, count, intercept = logistic(examples[:, :2], examples[:, 2] > 0, weights)
+        entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
+    return {"coverage": coverage, "missing": entry}
+
+
+def unlisted_log_odds(artifact: Artifact, v: Tensor, coverage: float) -> Floats:
+    """Return the log-odds of every class for lists v, (lists, classes)."""
+    every = np.arange(artifact.spec.V)
+    rows = [Posterior(artifact, of_classes(row.nonzero().squeeze(1).tolist())) for row in v]
+    return np.stack([posterior.absent_log_odds(every, coverage) for posterior in rows])
+
+
+def _mean_rank(z: Floats, candidates: Flags, hidden: Flags, weight: Floats) -> float:
+    """Return the weighted mean reciprocal rank of hidden classes among the other candidates."""
+    total = 0.0
+    for row, usable, truth, w in zip(z, candidates, hidden, weight, strict=True):
+        others = np.sort(row[usable & ~truth])
+        above = len(others) - np.searchsorted(others, row[truth], side="right")
+        total += w * float((1.0 / (1.0 + above)).mean())
+    return total / weight.sum()
+
+
+def _first_classes(
+    z: Floats, candidates: Flags, hidden: Flags, listed: Floats, weight: Floats
+) -> tuple[Floats, Floats]:
+    """Return the examples of the fit, (examples, 3), and their weights: the first of each part.
+
+    The columns are the log-odds, the log of the number of listed classes, and 1 for a hidden class.
+    """
+    first = np.argsort(np.where(candidates, -z, np.inf), axis=1, kind="stable")[:, :_LISTED]
+    rows = np.arange(len(z))[:, None]
+    size = np.broadcast_to(np.log(np.maximum(listed, 1))[:, None], first.shape)
+    columns = z[rows, first], size, hidden[rows, first]
+    examples = np.stack([np.asarray(column, np.float64).ravel() for column in columns], 1)
+    return examples, np.repeat(weight, first.shape[1])
+
+
+# ----------------------------------------------------------------------------------- outliers
+
+
+@dataclass(frozen=True, eq=False)
+class ListScores:
+    """Log-odds of the listed classes of N lists.
+
+    Attributes:
+        row: list of each listed class, (n,).
+        log_odds: log-odds of each listed class given the rest of its list, (n,).
+        popularity: log-odds of each class in the served mix, (n,).
+        intruder: True for intruders, (n,) bool.
+        size: number of listed classes of each list, (N,).
+        weight: weight of each list, (N,).
+    """
+
+    row: Ints
+    log_odds: Floats
+    popularity: Floats
+    intruder: Flags
+    size: Ints
+    weight: Floats
+
+    def score(self, alpha: float) -> Floats:
+        """Return log-odds with the prior of intruders, (n,); low values mean intruders."""
+        return self.log_odds - alpha * self.popularity
+
+    def extreme(self, values: Floats) -> Floats:
+        """Return the largest value of each list, (N,)."""
+        worst = np.full(len(self.size), -np.inf)
+        np.maximum.at(worst, self.row, values)
+        return worst
+
+
+def fit_outliers(
+    artifact: Artifact,
+    scenes: SceneTensors,
+    train: SceneTensors,
+    structure: Tensor,
+    chosen: Calibration | None = None,
+) -> dict[str, Any]:
+    """Fit `popularity_weight`, `outlier` and `outlier_lines`, or nothing with too few scenes."""
+    if len(scenes) < _LEAST_SCENES:
+        return {}
+    untouched = {
+        n: score_lists(artifact, scenes, draw_parts(scenes, structure, exactly(n), _SEEDS))
+        for n in LENGTHS
+    }
+    untouched = {n: scores for n, scores in untouched.items() if len(scores.size) >= _LEAST_SCENES}
+    laws = {"uniform": None, "popularity": by_popularity, "signature": by_signature}
+    altered = {}
+    for name, law in laws.items():
+        weights = None if law is None else law(scenes, train)
+        scores = score_intruders(artifact, scenes, structure, weights)
+        if len(scores.size):
+            altered[name] = scores
+    if not untouched or not altered:
+        return {}
+    alpha = chosen.popularity_weight if chosen else choose_alpha(untouched, altered)
+    entry = _fit_intruders(untouched, altered, alpha)
+    return {
+        "popularity_weight": alpha,
+        "outlier": entry,
+        "outlier_lines": AlarmLines(
+            **{name: fit_line(untouched, entry, alpha, share) for name, share in ALARMS.items()}
+        ),
+    }
+
+
+def score_lists(
+    artifact: Artifact, scenes: SceneTensors, parts: Parts, intruders: Tensor | None = None
+) -> ListScores:
+    """Return the scores of parts of scenes, each with an intruder (parts,) if these are given."""
+    popularity = np.array(artifact.calibration.popularity)
+    rows, log_odds, classes_of, is_intruder = [], [], [], []
+    for k, v in enumerate(parts.v):
+        classes = v.nonzero().squeeze(1).numpy()
+        if intruders is not None:
+            classes = np.sort(np.append(classes, int(intruders[k])))
+        values = Posterior(artifact, of_classes(classes.tolist())).log_odds_given_rest()
+        rows.append(np.full(len(classes), k))
+        log_odds.append(values)
+        classes_of.append(classes)
+        is_intruder.append(
+            np.zeros(len(classes), np.bool_) if intruders is None else classes == int(intruders[k])
+        )
+    empty: list[Floats] = [np.zeros(0)]
+    all_classes = np.concatenate(classes_of or empty).astype(np.int64)
+    return ListScores(
+        row=np.concatenate(rows or empty).astype(np.int64),
+        log_odds=np.concatenate(log_odds or empty).astype(np.float64),
+        popularity=popularity[all_classes],
+        intruder=np.concatenate(is_intruder or empty).astype(np.bool_),
+        size=np.array([len(classes) for classes in classes_of], np.int64),
+        weight=source_weights(scenes, parts.scene),
+    )
+
+
+def score_intruders(
+    artifact: Artifact, scenes: SceneTensors, structure: Tensor, weights: Tensor | None
+) -> ListScores:
+    """Return the scores of random parts of scenes, each with an intruder drawn by the weights."""
+    intruders = draw_intruders(scenes, structure, weights)
+    kept = (intruders >= 0).nonzero().squeeze(1)
+    usable = subset(scenes, kept)
+    parts = draw_parts(usable, structure, up_to_longest, _SEEDS)
+    return score_lists(artifact, usable, parts, intruders[kept][parts.scene])
+
+
+def choose_alpha(untouched: Mapping[int, ListScores], altered: Mapping[str, ListScores]) -> float:
+    """Return the alpha with the best mean of hit@1 and detected share over the intruder kinds."""
+    rates = {}
+    for alpha in ALPHAS:
+        limit = np.mean(
+            [
+                weighted_quantile(
+                    scores.extreme(-scores.score(alpha)), scores.weight, 1 - ALARMS["medium"]
+                )
+                for scores in untouched.values()
+            ]
+        )
+        rates[alpha] = float(
+            np.mean([_detection(s, alpha, float(limit)) for s in altered.values()])
+        )
+    return max(rates, key=lambda alpha: (rates[alpha], -alpha))
+
+
+def _detection(scores: ListScores, alpha: float, limit: float) -> float:
+    """Return the mean of hit@1 and of the share of intruders above a limit."""
+    values = -scores.score(alpha)
+    first = values >= scores.extreme(values)[scores.row]
+    is_intruder, weight = scores.intruder, scores.weight[scores.row]
+    hits = np.average(first[is_intruder], weights=weight[is_intruder])
+    caught = np.average(values[is_intruder] > limit, weights=weight[is_intruder])
+    return float(hits + caught) / 2
+
+
+def _fit_intruders(
+    untouched: Mapping[int, ListScores], altered: Mapping[str, ListScores], alpha: float
+) -> CountSlope:
+    """Fit the log-odds of being an intruder, with half of the lists altered."""
+    columns, truth, weights = [], [], []
+    for group in (list(untouched.values()), list(altered.values())):
+        for scores in group:
+            size = np.log(scores.size[scores.row])
+            columns.append(np.stack([scores.score(alpha), size], 1))
+            truth.append(scores.intruder)
+            weight = scores.weight[scores.row]
+            weights.append(weight / (len(group) * scores.weight.sum()))
+    total = np.concatenate(weights)
+    total *= len(total) / total.sum()
+    slope, count, intercept = logistic(np.concatenate(columns), np.concatenate(truth), total, RIDGE)
+    return CountSlope(intercept=intercept, slope=slope, log_count=count)
+
+
+def fit_line(
+    untouched: Mapping[int, ListScores], entry: CountSlope, alpha: float, share: float
+) -> AlarmLine:
+    """Return the line above which the given share of the untouched lists has an object.
+
+    The line is the least-squares line through the quantiles of all lengths. It is then raised until
+    the mean share over the lengths is right.
+    """
+    worst = {
+        n: scores.extreme(calibrated(entry, scores.score(alpha), scores.size[scores.row]))
+        for n, scores in untouched.items()
+    }
+    quantiles = [weighted_quantile(worst[n], untouched[n].weight, 1 - share) for n in worst]
+    logs = np.log(list(worst))
+    slope = 0.0
+    if len(worst) > 1:
+        slope = float(np.polyfit(logs, quantiles, 1)[0])
+    above = np.concatenate([worst[n] - slope * np.log(n) for n in worst])
+    weight = np.concatenate([untouched[n].weight / untouched[n].weight.sum() for n in worst])
+    return AlarmLine(intercept=weighted_quantile(above, weight, 1 - share), log_count=slope)
+
+
+def weighted_quantile(values: Floats, weight: Floats, share: float) -> float:
+    """Return the smallest value below or at which lies at least a share of the weight."""
+    order = np.argsort(values)
+    cumulative = np.cumsum(weight[order])
+    position = int(np.searchsorted(cumulative, share * cumulative[-1]))
+    return float(values[order[min(position, len(order) - 1)]])
+
+
+# ------------------------------------------------------------------------------------ generate
 
 
 def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
@@ -153,7 +395,7 @@ def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple
     with fewer than 20 scenes.
     """
     sizes = ((train.v > 0) & ~structure).sum(1).numpy()
-    limit = int(np.quantile(sizes, _SMALL))
+    limit = int(np.quantile(sizes, _SMALL)) if len(sizes) else 0
     by_room = [sizes[train.room.numpy() == t] for t in range(rooms)]
     quantiles = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else limit for n in by_room]
     return (*quantiles, limit)
@@ -166,331 +408,10 @@ def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
     """
     limits = []
     for t in range(artifact.spec.C):
-        room_scenes = train.v[train.room == t].numpy()
+        room_scenes = train.v[train.room == t]
         limit = -1e9
         if len(room_scenes) >= _ROOM_SCENES:
-            limit = float(np.quantile(room_fit(artifact.weights, room_scenes, t), _UNSUITED))
+            fits = [room_fit(artifact, v.nonzero().squeeze(1).tolist(), t) for v in room_scenes]
+            limit = float(np.quantile(fits, _UNSUITED))
         limits.append(round(limit, 4))
     return tuple(limits)
-
-
-@dataclass(frozen=True, eq=False)
-class _PartialList:
-    """A scene that lists only some of its classes. The remaining classes are hidden.
-
-    Attributes:
-        closed: log-odds of the unlisted classes if the list were complete, (unlisted classes,).
-        partial: log-odds that allow for an incomplete list, (unlisted classes,), by assumed
-            coverage.
-        hidden: True for unlisted classes that are in the scene, (unlisted classes,) bool.
-        share: share of listed classes as text, such as "75 %".
-        weight: number of scenes of the data source that this sampled scene represents.
-    """
-
-    closed: Floats
-    partial: dict[float, Floats]
-    hidden: Flags
-    listed: int
-    share: str
-    source: int
-    weight: float
-
-
-def fit_coverage(
-    artifact: Artifact,
-    scenes: SceneTensors,
-    structure: Tensor,
-    seed: int = 0,
-    chosen: Calibration | None = None,
-) -> dict[str, Any]:
-    """Fit the entries `coverage`, `coverage_weight` and `missing` of the calibration."""
-    cases = list(_draw_partial_lists(artifact, scenes, structure, seed))
-    if not cases:
-        return {}
-    if artifact.completions is None:
-        coverage, weight = artifact.calibration.coverage, 0.0
-    else:
-        coverage, weight = (
-            (chosen.coverage, chosen.coverage_weight) if chosen else _choose_coverage(cases)
-        )
-    rows = [_example_rows(case, coverage, weight) for case in cases]
-    examples = np.concatenate(rows)
-    weights = np.repeat([case.weight for case in cases], [len(case_rows) for case_rows in rows])
-    entry = CountSlope()
-    if len(np.unique(examples[:, 2])) == 2:
-        slope, count, intercept = logistic(examples[:, :2], examples[:, 2] > 0, weights)
-        entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
-    return {"coverage": coverage, "coverage_weight": weight, "missing": entry}
-
-
-def _choose_coverage(cases: Sequence[_PartialList]) -> tuple[float, float]:
-    """Return the coverage and the coverage weight with the best MRR of hidden classes.
-
-    On nearly complete lists, their MRR must be at most `_COMPLETE_LOSS` below the MRR of weight 0.
-    """
-    parts = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
-    limits = [_mrr(part, 0.5, 0.0) - _COMPLETE_LOSS for part in parts]
-    candidates = [(0.5, 0.0)] + [
-        pair
-        for pair in itertools.product(COVERAGES, WEIGHTS)
-        if all(_mrr(part, *pair) >= limit for part, limit in zip(parts, limits, strict=True))
-    ]
-    return max(candidates, key=lambda pair: _mrr(cases, *pair))
-
-
-def _draw_partial_lists(
-    artifact: Artifact, scenes: SceneTensors, structure: Tensor, seed: int
-) -> Iterable[_PartialList]:
-    """Hide classes of up to `_PARTIAL_SCENES` scenes of each data source, by each of `SHARES`."""
-    order = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(seed))
-    source = scenes.source[order]
-    rank = torch.zeros(len(order), dtype=torch.int64)
-    stands_for = torch.zeros(len(order))
-    for index in source.unique():
-        in_source = source == index
-        count = int(in_source.sum())
-        rank[in_source] = torch.arange(count)
-        total = scenes.weight[order][in_source].sum()
-        stands_for[in_source] = total / min(count, _PARTIAL_SCENES)
-    is_drawn = rank < _PARTIAL_SCENES
-    sample, weight = subset(scenes, order[is_drawn]), stands_for[is_drawn].tolist()
-    source_of = source[is_drawn].tolist()
-    whole = recalibrated(artifact, coverage_weight=1.0)
-    # If only one class is hidden, several hidden classes are tried to reduce the effect of chance.
-    draws = [
-        (name, share, seed + draw)
-        for name, share in SHARES.items()
-        for draw in range(1 if share else _DRAWS_OF_ONE)
-    ]
-    for name, share, draw in draws:
-        cases = hide(sample, structure, share, draw)
-        for k, v, hidden in zip(cases.scene, cases.v.numpy(), cases.hidden.numpy(), strict=True):
-            classes = np.flatnonzero(v)
-            absent = np.flatnonzero((v == 0) & ~structure.numpy())
-            posterior = Posterior(whole, of_classes(classes.tolist()))
-            partial = {}
-            if whole.completions is not None:
-                partial = {
-                    coverage: posterior.absent_posterior(absent, coverage).astype(np.float64)
-                    for coverage in COVERAGES
-                }
-            closed = posterior.absent_log_odds(absent).astype(np.float64)
-            listed = max(1, int((~structure.numpy()[classes]).sum()))
-            yield _PartialList(
-                closed=closed,
-                partial=partial,
-                hidden=hidden[absent],
-                listed=listed,
-                share=name,
-                source=source_of[int(k)],
-                weight=weight[int(k)] / (1 if share else _DRAWS_OF_ONE),
-            )
-
-
-def _mixed_log_odds(case: _PartialList, coverage: float, weight: float) -> Floats:
-    closed = case.closed + np.log1p(-coverage)
-    return (1 - weight) * closed + weight * case.partial[coverage] if weight else closed
-
-
-def _mrr(cases: Sequence[_PartialList], coverage: float, weight: float) -> float:
-    """Return the mean reciprocal rank of hidden classes. All data sources have the same weight."""
-    reciprocal: dict[int, list[Floats]] = {}
-    for case in cases:
-        z = _mixed_log_odds(case, coverage, weight)
-        others = np.sort(z[~case.hidden])
-        above = len(others) - np.searchsorted(others, z[case.hidden], side="right")
-        reciprocal.setdefault(case.source, []).append(1.0 / (1.0 + above.astype(np.float64)))
-    return float(np.mean([np.concatenate(ranks).mean() for ranks in reciprocal.values()]))
-
-
-def _example_rows(case: _PartialList, coverage: float, weight: float) -> Floats:
-    """Return the data for the fit, one row for each of the best classes, (classes, 3).
-
-    The columns are the log-odds, the log of the number of listed classes, and 1 for a hidden class.
-    """
-    z = _mixed_log_odds(case, coverage, weight)
-    first = np.argsort(-z, kind="stable")[:_LISTED]
-    size = np.full(len(first), np.log(case.listed))
-    return np.stack([z[first], size, case.hidden[first]], 1)
-
-
-def fit_outliers(
-    artifact: Artifact,
-    scenes: SceneTensors,
-    train: SceneTensors,
-    structure: Tensor,
-    seed: int = 0,
-    chosen: Calibration | None = None,
-) -> dict[str, Any]:
-    """Fit `popularity_weight`, `outlier`, `outlier_thresholds` and `short_list_thresholds`.
-
-    A robot that starts to explore a room lists few classes. The probability of an intruder is
-    fitted to whole scenes and is too high for short lists. For example, a stove without other
-    objects is rare in a generated room. Short lists therefore have separate thresholds, fitted by
-    the same rule to parts of the same scenes. The threshold never falls when the list gets shorter.
-    """
-    score = MachineScore(machine_of(artifact.weights))
-    prior = np.array(artifact.calibration.popularity)
-    laws = {
-        "uniform": None,
-        "popularity": by_popularity(scenes, train),
-        "signature": by_signature(scenes, train),
-    }
-    kinds = {
-        name: intruder_scores(scenes, structure, score, weights=weights, seed=seed)
-        for name, weights in laws.items()
-    }
-    kinds = {name: scores for name, scores in kinds.items() if scores.intruder.any()}
-    if not kinds:
-        return {}
-    alpha = chosen.popularity_weight if chosen else choose_alpha(kinds, prior)
-    all_scores = [scores.with_prior(alpha * prior) for scores in kinds.values()]
-    rng = np.random.default_rng(seed)
-    parts = []
-    for scores in all_scores:
-        clean_scene = rng.random(scores.scenes) < 0.5
-        used = scores.clean == clean_scene[scores.scene]
-        columns = scores.log_odds, np.log(scores.size), scores.intruder
-        parts.append(np.column_stack(columns)[used])
-    examples = np.concatenate(parts)
-    slope, size, intercept = logistic(examples[:, :2], examples[:, 2] > 0, C=RIDGE)
-    if slope >= 0:
-        return {}
-    entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
-    whole = [(all_scores[0], scenes)]
-    limits = thresholds(partial(limit_of, whole, entry, rng))
-    short: list[Thresholds] = []
-    for listed in range(1, _SHORT_LISTS + 1):
-        lists = [listing(scenes, structure, listed, rng)]
-        if not len(lists[0][0]):
-            break
-        while len(lists) * len(lists[0][0]) < _SHORTENED:
-            lists.append(listing(scenes, structure, listed, rng))
-        shortened = [
-            (clean_scores(lists_of, structure, score).with_prior(alpha * prior), sample)
-            for sample, lists_of in lists
-        ]
-        share = _ENOUGH * ALARMS["medium"]
-        if limit_of(shortened, entry, np.random.default_rng(seed), share) <= limits.medium:
-            break
-        length_limits = thresholds(partial(limit_of, shortened, entry, rng))
-        short.append(_clamp_thresholds(limits, length_limits, short[-1] if short else NEVER))
-    return {
-        "popularity_weight": alpha,
-        "outlier": entry,
-        "outlier_thresholds": limits,
-        "short_list_thresholds": tuple(short),
-    }
-
-
-def listing(
-    scenes: SceneTensors, structure: Tensor, listed: int, rng: Rng
-) -> tuple[SceneTensors, Tensor]:
-    """Return the scenes with more than `listed` classes, and shortened object lists.
-
-    A shortened list contains `listed` random classes and all structure classes of the scene. The
-    lists have the shape (scenes, classes).
-    """
-    is_thing = (scenes.v > 0) & ~structure
-    large = (is_thing.sum(1) > listed).nonzero().squeeze(1)
-    order = torch.from_numpy(rng.random(is_thing[large].shape)).masked_fill(~is_thing[large], 2.0)
-    drawn = order.argsort(1)[:, :listed]
-    structure_lists = scenes.v[large] * structure
-    return subset(scenes, large), structure_lists.scatter(1, drawn, 1.0)
-
-
-Scored = Sequence[tuple[IntruderScores, SceneTensors]]
-"""Scores of untouched scenes, and these scenes: one entry for each shortening of the scenes."""
-
-
-def thresholds(limit: Callable[[float], float]) -> Thresholds:
-    """Return the limits of the target shares of alarms, each at least the minimum."""
-    return Thresholds(**{name: max(LEAST[name], limit(share)) for name, share in ALARMS.items()})
-
-
-def limit_of(untouched: Scored, entry: CountSlope, rng: Rng, share: float) -> float:
-    """Return the probability that raises alarms in a share of the untouched scenes.
-
-    The function averages over the shortenings, because several shortenings of a scene are not
-    several scenes for `alarm_threshold`.
-    """
-    logits = [
-        alarm_threshold(
-            calibrated(entry, scores.log_odds, scores.size).astype(np.float64),
-            *(scores, scenes, rng, share),
-        )
-        for scores, scenes in untouched
-    ]
-    return float(1 / (1 + np.exp(-np.mean(logits))))
-
-
-def _clamp_thresholds(low: Thresholds, middle: Thresholds, high: Thresholds) -> Thresholds:
-    """Raise each threshold of `middle` to that of `low`, then lower it to that of `high`."""
-    raised = {name: max(getattr(middle, name), getattr(low, name)) for name in ALARMS}
-    return Thresholds(**{name: min(raised[name], getattr(high, name)) for name in ALARMS})
-
-
-def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
-    """Return the alpha with the best mean of hit@1 and detected share over all intruder kinds.
-
-    For uniformly drawn intruders, hit@1 may be at most .04 lower than with alpha 0, and the
-    detected share at most .06 lower.
-    """
-    rates = {
-        alpha: {name: _detection(s.with_prior(alpha * prior)) for name, s in kinds.items()}
-        for alpha in ALPHAS
-    }
-    floor = rates[0.0].get("uniform", np.zeros(2)) - _UNIFORM_LOSS
-    allowed = [alpha for alpha in ALPHAS if (rates[alpha].get("uniform", floor) >= floor).all()]
-    return max(allowed, key=lambda alpha: (sum(map(np.sum, rates[alpha].values())), -alpha))
-
-
-def _detection(scores: IntruderScores) -> Floats:
-    """Return hit@1 and the share of intruders that an alarm in 10 % of unaltered scenes detects."""
-    worst = np.full(scores.scenes, np.inf)
-    np.minimum.at(worst, scores.scene[scores.clean], scores.log_odds[scores.clean])
-    limit = np.quantile(worst[np.isfinite(worst)], ALARMS["medium"])
-    detected = (scores.log_odds[scores.intruder] <= limit).mean()
-    return np.array([scores.hit_at_1().figure().value, detected])
-
-
-def fit_evidence(
-    artifact: Artifact, validation: SceneTensors, structure: Tensor, seed: int = 0
-) -> EvidenceWeights:
-    """Choose the weights of relations and poses in answers about objects.
-
-    The criterion is the mean reciprocal rank (MRR) of removed objects. Evidence without validation
-    scenes has no effect on answers about objects.
-    """
-    mask = structure.numpy()
-    weights = EvidenceWeights(relations_on_objects=0.0, poses_on_objects=0.0)
-    scenes = complete_scenes(validation, seed)
-    related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
-    rng = np.random.default_rng(seed)
-    count = _EVIDENCE_SCENES if artifact.oracle is None else _EVIDENCE_SCENES_OF_DRAWS
-    index = rng.permutation(related)[:count].astype(np.int64)
-    sample = subset(scenes, torch.from_numpy(index))
-    for kind, name in (("relations", "relations_on_objects"), ("poses", "poses_on_objects")):
-        cases = list(removals(sample, mask, kind, seed)) if len(sample) else []
-        if not cases:
-            continue
-        scores = {}
-        for weight in EVIDENCE_WEIGHTS:
-            tested = recalibrated(artifact, evidence=weights.model_copy(update={name: weight}))
-            ranks = [_rank(tested, case.scenes[1], case.target, mask) for case in cases]
-            scores[weight] = float(np.mean([1 / rank for rank in ranks]))
-        weights = weights.model_copy(update={name: smallest_good_weight(scores)})
-    return weights
-
-
-def smallest_good_weight(scores: dict[float, float]) -> float:
-    """Return the smallest weight whose score is at most `_AS_GOOD` below the best score."""
-    least = max(scores.values()) - _AS_GOOD
-    return min(weight for weight, score in scores.items() if score >= least)
-
-
-def _rank(artifact: Artifact, scene: Scene, target: int, structure: Flags) -> int:
-    posterior = Posterior(artifact, scene)
-    absent = np.setdiff1d(np.flatnonzero(~structure), posterior.present.classes)
-    z = posterior.absent_posterior(absent, artifact.calibration.coverage)
-    return 1 + int((z > z[absent == target]).sum())

@@ -339,11 +339,26 @@ class ObjectFit:
 
 def served_base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
     """Return the weighted mean of a[q] over the sources q that show each class, (classes,)."""
-    weights = torch.tensor([config.served_sources.get(q, 0.0) for q in scenes.sources])
-    if not config.served_sources:
-        weights = torch.ones(len(scenes.sources))
-    weights = weights.unsqueeze(1) * scenes.shows
+    weights = _served_weights(scenes, config)
     return (weights * a).sum(0) / weights.sum(0).clamp(min=1e-9)
+
+
+def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
+    """Return the log-odds that a scene of the served mix has each class, (classes,)."""
+    total = torch.zeros(len(scenes.sources)).index_add_(0, scenes.source, scenes.weight)
+    count = torch.zeros(scenes.shows.shape)
+    count.index_add_(0, scenes.source, scenes.v * scenes.weight.unsqueeze(1))
+    share = (count + 0.5) / (total.unsqueeze(1) + 1)
+    weights = _served_weights(scenes, config)
+    mean = (weights * share).sum(0) / weights.sum(0).clamp(min=1e-9)
+    return torch.where(weights.sum(0) > 0, mean, share.amin()).logit()
+
+
+def _served_weights(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
+    """Return the weight of each source that shows a class in the served mix, (sources, classes)."""
+    served = config.served_sources or dict.fromkeys(scenes.sources, 1.0)
+    weights = torch.tensor([served.get(q, 0.0) for q in scenes.sources])
+    return weights.unsqueeze(1) * scenes.shows
 
 
 def start_objects(machine: BoltzmannMachine, scenes: ObjectScenes) -> None:
@@ -352,9 +367,7 @@ def start_objects(machine: BoltzmannMachine, scenes: ObjectScenes) -> None:
         machine.b.copy_(scenes.log_odds().clamp(min=_RARE))
 
 
-def fit_objects(
-    fit: ObjectFit, progress: Callable[[float], None] = lambda _: None
-) -> None:
+def fit_objects(fit: ObjectFit, progress: Callable[[float], None] = lambda _: None) -> None:
     """Run all remaining steps of a fit, and set the weights to their average."""
     while not fit.finished:
         fit.step()

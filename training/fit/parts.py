@@ -10,9 +10,7 @@ from training.machines import BoltzmannMachine
 
 
 @torch.no_grad()
-def means_of_parts(
-    machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
-) -> Tensor:
+def means_of_parts(machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
     """Return the means of h1 given a random subset of the objects, (scenes, H1).
 
     A class is listed with a chance that is drawn uniformly for each scene. Half of the scenes list

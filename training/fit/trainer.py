@@ -149,6 +149,13 @@ class Trainer:
             self._relation_fit.load_state(state["relations"])
         return True
 
+    @property
+    def position(self) -> str:
+        """The last checkpoint in words, such as "50 % of the objects"."""
+        if not self.curve:
+            return "0 % of the objects"
+        return f"{self.curve[-1].done:.0%} of the {self.curve[-1].phase}"
+
     def run(
         self, progress: Progress = lambda *_: None, passed: Passed = lambda _: None
     ) -> TrainingResult:

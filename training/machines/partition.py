@@ -112,9 +112,7 @@ def reverse_ais(
     return LogPartition.of_weights(log_base, log_weight, reverse=True)
 
 
-def _free_energy(
-    machine: BoltzmannMachine, state: Chains, beta: float, base: Tensor
-) -> Tensor:
+def _free_energy(machine: BoltzmannMachine, state: Chains, beta: float, base: Tensor) -> Tensor:
     """Return the free energy at beta, (chains,); see the module."""
     x = machine.c1 + state.v @ machine.W + state.h2 @ machine.J.T
     hidden = machine.log_states(beta * x) + beta * (state.h2 @ machine.c2)

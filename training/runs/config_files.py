@@ -99,7 +99,7 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
     """Return a configuration with changed entries.
 
     Args:
-        settings: maps the full name of an entry, such as "training.epochs", to its new value.
+        settings: maps the full name of an entry, such as "relations.epochs", to its new value.
 
     Raises:
         ConfigError: an entry does not exist, or a value is invalid.
@@ -120,9 +120,15 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
         ) from error
 
 
-def at_most(config: Config, epochs: int) -> Config:
-    """Return a configuration with at most this number of epochs."""
-    return with_settings(config, {"training.epochs": min(epochs, config.training.epochs)})
+def shortened(config: Config, factor: float) -> Config:
+    """Return a configuration whose training has a share of the steps and epochs, at least one."""
+    return with_settings(
+        config,
+        {
+            "objects.steps": max(1, round(factor * config.objects.steps)),
+            "relations.epochs": max(1, round(factor * config.relations.epochs)),
+        },
+    )
 
 
 def config_toml(config: Config) -> str:

@@ -1,10 +1,10 @@
 """The folder of a training run. It contains these files:
 
 config.json        the validated configuration
-checkpoint.pt      training state after the last finished epoch, to resume an interrupted run
-model.safetensors  weights of the best epoch; the header contains the sizes of the machine
-curve.csv, .png    reconstruction error of each epoch
-result.json        best epoch, duration in seconds, data folder and digest of the scenes
+checkpoint.pt      training state, to resume an interrupted run
+model.safetensors  trained weights; the header contains the sizes of the machine
+curve.csv, .png    loss and validation score of both phases of the training
+result.json        duration in seconds, data folder and digest of the scenes
 """
 
 from __future__ import annotations
@@ -33,8 +33,6 @@ class FinishedRun:
 
     config: Config
     machine: BoltzmannMachine
-    best_epoch: int
-    epochs: int
     seconds: float
     data: str = ""
     scenes: str = ""
@@ -63,8 +61,6 @@ def save_run(
     save_file(state, folder / "model.safetensors", metadata={"spec": spec})
     (folder / "config.json").write_text(config.model_dump_json(indent=1), encoding="utf-8")
     outcome = {
-        "best_epoch": result.best_epoch,
-        "epochs": len(result.epochs),
         "seconds": round(result.seconds, 1),
         "data": "" if data is None else str(data.resolve()),
         "scenes": scenes,

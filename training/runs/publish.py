@@ -9,9 +9,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import torch
-
-from app.inference.posterior import ClosedForm
 from app.registry import (
     Artifact,
     Calibration,
@@ -33,10 +30,9 @@ from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, DataConfig
 from training.fit.count_statistics import fit_counts
+from training.fit.draft import as_stored, draft_artifact
+from training.fit.objects import ObjectScenes
 from training.fit.offset_statistics import fit_offsets
-from training.fit.oracle.drawn import DrawnPosterior
-from training.machines import BoltzmannMachine
-from training.machines.arrays import weights_of
 from training.runs.config_files import load_config, shipped_configs
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
@@ -112,13 +108,15 @@ def publish_run(
         version=version,
         created=_now(),
         spec=machine.spec.to_dict(),
-        vocabulary=VocabularyEntry.of(with_room_aliases(scenes.vocabulary), machine.spec.A),
+        vocabulary=VocabularyEntry.of(
+            with_room_aliases(scenes.vocabulary),
+            machine.spec.A,
+            ObjectScenes.of(data.train, data.structure, run.config.objects).sources,
+        ),
         calibration=calibrated.calibration,
         training={
             **({} if measured is None else {"measured_split": measured[0].config.data.split}),
             "config": json.loads(run.config.model_dump_json()),
-            "best_epoch": run.best_epoch,
-            "epochs": run.epochs,
             "parameters": run.machine.parameter_count,
         },
         data=data_sources(scenes),
@@ -189,7 +187,9 @@ def refit(
         *rows,
     )
     changes = {"version": version, "created": _now(), "examples": examples}
-    changes["vocabulary"] = VocabularyEntry.of(with_aliases(artifact.vocabulary), artifact.spec.A)
+    changes["vocabulary"] = VocabularyEntry.of(
+        with_aliases(artifact.vocabulary), artifact.spec.A, manifest.vocabulary.profiles
+    )
     description = Description(**fields | changes)
     return _publish_rounded(store, description, with_statistics(artifact, scenes))
 
@@ -224,37 +224,12 @@ def calibrated_draft(
     machine = as_stored(run.machine)
     calibration = calibrate(
         draft_artifact(machine, vocabulary),
-        data.validation,
-        data.train,
+        data,
+        run.config.objects,
         run.config.training.seed,
         chosen,
     )
     return draft_artifact(machine, vocabulary, calibration)
-
-
-@torch.no_grad()
-def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
-    """Round the weight matrices to half precision, the precision of the store, in place."""
-    for parameter in machine.parameters():
-        if parameter.dim() > 1:
-            parameter.copy_(parameter.half().float())
-    return machine.requires_grad_(False).eval()
-
-
-def draft_artifact(
-    machine: BoltzmannMachine, vocabulary: Vocabulary, calibration: Calibration | None = None
-) -> Artifact:
-    """Return a model in memory, without files. The default calibration leaves log-odds as is."""
-    return Artifact(
-        manifest=None,  # type: ignore[arg-type]  # questions never read it
-        weights=weights_of(machine),
-        vocabulary=vocabulary,
-        calibration=calibration or Calibration.neutral(machine.spec.A),
-        digest="",
-        card="",
-        path=Path(),
-        oracle=None if ClosedForm.supports(weights_of(machine)) else DrawnPosterior,
-    )
 
 
 def _measure(

@@ -1,0 +1,36 @@
+"""Models in memory, for calibration and validation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from app.registry import Artifact, Calibration
+from app.scene import Vocabulary
+from training.machines import BoltzmannMachine
+from training.machines.arrays import weights_of
+
+
+@torch.no_grad()
+def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
+    """Round the weight matrices to half precision, the precision of the store, in place."""
+    for parameter in machine.parameters():
+        if parameter.dim() > 1:
+            parameter.copy_(parameter.half().float())
+    return machine.requires_grad_(False).eval()
+
+
+def draft_artifact(
+    machine: BoltzmannMachine, vocabulary: Vocabulary, calibration: Calibration | None = None
+) -> Artifact:
+    """Return a model in memory, without files. The default calibration leaves log-odds as is."""
+    return Artifact(
+        manifest=None,  # type: ignore[arg-type]  # questions never read it
+        weights=weights_of(machine),
+        vocabulary=vocabulary,
+        calibration=calibration or Calibration.neutral(machine.spec.A),
+        digest="",
+        card="",
+        path=Path(),
+    )
