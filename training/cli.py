@@ -103,22 +103,22 @@ def train(
     """Train a configuration. With --publish, also calibrate, evaluate and publish the model."""
     try:
         config = load_config(configuration, seed=seed)
+        if publish is not None:
+            Store(store).require_new(config.name, publish)
+        root = data_folder(configuration, config, data)
+        folder = runs / config.name / f"seed-{config.training.seed}"
+        measured = None
+        if final:
             if publish is not None:
-                Store(store).require_new(config.name, publish)
-            root = data_folder(configuration, config, data)
-            folder = runs / config.name / f"seed-{config.training.seed}"
-            measured = None
-            if final:
-                if publish is not None:
-                    with console.status("reading and encoding scenes"):
-                        measured = load_run(folder), prepare(config, root)
-                config = with_settings(config, {"data.split": "final"})
-                folder = folder.with_name(f"final-{folder.name}")
-            scenes = _prepare(config, root)
-            _train(config, scenes, folder, root, fresh, tensorboard)
-            if publish is None and not final:
-                next_steps(folder, console)
-        if publish is not None and first:
+                with console.status("reading and encoding scenes"):
+                    measured = load_run(folder), prepare(config, root)
+            config = with_settings(config, {"data.split": "final"})
+            folder = folder.with_name(f"final-{folder.name}")
+        scenes = _prepare(config, root)
+        _train(config, scenes, folder, root, fresh, tensorboard)
+        if publish is None and not final:
+            next_steps(folder, console)
+        if publish is not None:
             _publish(load_run(folder), scenes, store, publish, measured)
     except RefusedError as error:
         _exit_refused(error)

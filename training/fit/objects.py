@@ -310,8 +310,8 @@ class ObjectFit:
         machine = self.machine
         if machine.spec.profiles:
             mix = served_base_rates(machine.a, self.scenes, self.config)
-            machine.b += mix
-            machine.a -= mix
+            machine.b.add_(mix)
+            machine.a.sub_(mix)
         couplings = machine.couplings
         if couplings is not None:
             machine.L.copy_(couplings)
