@@ -72,6 +72,9 @@ def test_training_reads_the_vectors_beside_the_scenes(tmp_path: Path) -> None:
     # The mean of "coffee table" and of its aliases, whose only known word is "table".
     assert vectors["coffee table"] == pytest.approx([np.sin(np.pi / 8), np.cos(np.pi / 8)])
     assert vectors["pillow"] == [0, 0]
+    parents = scenes.training_data().parents
+    assert parents.tolist() == scenes.vocabulary.parents.tolist()
+    assert (parents >= 0).any()
 
 
 @pytest.mark.parametrize(
