@@ -45,8 +45,8 @@ from training.datasets.cases import (
     scene_of,
 )
 from training.datasets.sources import meaning_of
-from training.evaluation.outlier_tasks import kept_in_each_source
 from training.fit.calibrate_objects import calibrate_objects, recalibrated, thresholds
+from training.fit.intruder_scores import kept_in_each_source
 from training.fit.oracle.units import NO_UNIT
 
 _SCENES = 2500

@@ -33,21 +33,22 @@ from app.registry import NEVER, Artifact, Calibration, CountSlope, EvidenceWeigh
 from app.scene import Scene
 from training.datasets.array_types import Flags, Floats, Rng
 from training.datasets.batches import SceneTensors, subset
-from training.datasets.cases import RIDGE, logistic
+from training.datasets.cases import RIDGE, logistic, scene_rng
 from training.evaluation.alarms import ALARMS
 from training.evaluation.asking import of_classes
 from training.evaluation.evidence_tasks import removals
-from training.evaluation.intruders import (
+from training.evaluation.intruders import by_popularity, by_signature
+from training.fit.intruder_scores import (
     IntruderScores,
-    by_popularity,
-    by_signature,
+    alarm_threshold,
     clean_scores,
     intruder_scores,
 )
-from training.evaluation.missing_tasks import SHARES, MachineScore, hide
-from training.evaluation.outlier_tasks import alarm_threshold
+from training.fit.machine_scores import MachineScore
 from training.machines.arrays import machine_of
 
+SHARES: dict[str, float | None] = {"50 %": 0.5, "25 %": 0.25, "75 %": 0.75, "all but one": None}
+"""Share of the classes that a partial list shows. None hides one class."""
 COVERAGES = (0.3, 0.4, 0.5, 0.6, 0.7)
 WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
 # Tested exponents alpha. With 0.5, the detected share of uniformly drawn intruders in sunrgbd falls
@@ -221,6 +222,40 @@ def fit_coverage(
         slope, count, intercept = logistic(examples[:, :2], examples[:, 2] > 0, weights)
         entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
     return {"coverage": coverage, "coverage_weight": weight, "missing": entry}
+
+
+@dataclass(frozen=True, eq=False)
+class Partial:
+    """N scenes with their index in the set (N,), shown and hidden classes (N, V)."""
+
+    scene: Tensor
+    v: Tensor
+    hidden: Tensor
+    scenes: int
+
+
+def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int = 0) -> Partial:
+    """Hide classes of each scene with at least two: all but a share of them, or one (None)."""
+    is_thing = ~structure.numpy()
+    rows: list[int] = []
+    hidden = torch.zeros_like(scenes.v, dtype=torch.bool)
+    for k, scene in enumerate(scenes.scenes):
+        classes = scene.evidence.classes[is_thing[scene.evidence.classes]]
+        if len(classes) < 2:
+            continue
+        order = scene_rng(scene, seed).permutation(classes)
+        hidden[k, torch.from_numpy(order[shown_classes(len(order), share) :])] = True
+        rows.append(k)
+    index = torch.tensor(rows, dtype=torch.int64)
+    v = scenes.v.masked_fill(hidden, 0.0)
+    return Partial(index, v[index], hidden[index], len(scenes))
+
+
+def shown_classes(classes: int, share: float | None) -> int:
+    """Return the number of shown classes; at least one class is shown and one hidden."""
+    if share is None:
+        return classes - 1
+    return min(max(int(share * classes + 0.5), 1), classes - 1)
 
 
 def _choose_coverage(cases: Sequence[_PartialList]) -> tuple[float, float]:

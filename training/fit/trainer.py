@@ -20,9 +20,7 @@ from torch import Tensor, nn
 
 from app.inference.variants import VARIANTS
 from training.datasets.batches import Batch, SceneTensors, TrainingData, seen_triples, subset
-from training.evaluation.missing_tasks import MachineScore, leave_one_out
-from training.evaluation.reconstruction import reconstruction_error
-from training.evaluation.relation_tasks import machine_score as relation_score
+from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import rank_relations
 from training.fit.checkpoint import (
     Epoch,
@@ -33,8 +31,10 @@ from training.fit.checkpoint import (
     write_plot,
 )
 from training.fit.configuration import Config
+from training.fit.machine_scores import MachineScore, relation_score
 from training.fit.object_weights import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
 from training.fit.objectives import OBJECTIVES, Objective
+from training.fit.reconstruction import reconstruction_error
 from training.machines import BoltzmannMachine, MachineSpec, build, distributed
 from training.machines.bernoulli import log_odds_of
 from training.machines.edges import find_triples, triple_keys
@@ -348,12 +348,10 @@ class Trainer:
         self.epochs.append(Epoch(number, loss, *errors, mrr, precision, seconds))
 
     def _rank_objects(self, machine: BoltzmannMachine) -> tuple[float]:
-        """Return the MRR of removed objects on fixed validation scenes."""
-        generator = torch.Generator().manual_seed(0)
-        pick = torch.randperm(len(self.data.validation), generator=generator)[:_VALIDATION_SCENES]
-        sample = subset(self.data.validation, pick)
-        result = leave_one_out(sample, self.data.structure, MachineScore(machine))
-        return (float(result.reciprocal_rank().mean()) if len(result.target) else math.nan,)
+        """Return the validation score of objects, see `validation_score`."""
+        score = MachineScore(machine)
+        scenes, structure = self.data.validation, self.data.structure
+        return (validation_score(lambda v, _: score(v), scenes, structure),)
 
     def _rank_relations(self, machine: BoltzmannMachine) -> tuple[float]:
         """Return the R-precision of relations on fixed validation scenes."""

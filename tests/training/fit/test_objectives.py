@@ -20,9 +20,8 @@ from tests.enumeration.small_machines import (
     small_machine,
 )
 from training.datasets.batches import Batch, relation_units
-from training.evaluation.missing_tasks import MachineScore
-from training.evaluation.relation_tasks import machine_score as relation_score
 from training.fit.configuration import ObjectiveConfig
+from training.fit.machine_scores import MachineScore, relation_score
 from training.fit.objectives import OBJECTIVES
 from training.fit.objectives.composite import mask_one_class, unlisted_off
 from training.fit.objectives.contrastive import centre_gradients, energy_difference
