@@ -40,12 +40,11 @@ from training.evaluation.model import Model, ObjectDensity
 from training.evaluation.setting import Outcome, Setting
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.bernoulli import log_odds_of
-from training.machines.draws import fixed_uniforms
 from training.machines.gibbs import initial_state, run
-from training.machines.mean_field import Evidence, mean_field
 from training.machines.partition import LogPartition, ais, independent_base, reverse_ais
 
 _BLOCK = 16
+_MEAN_FIELD_STEPS = 30
 
 
 @dataclass(frozen=True)
@@ -169,8 +168,12 @@ def _log_unnormalised(machine: BoltzmannMachine, v: Tensor, draws: int) -> Tenso
     """
     if not machine.spec.H2:
         return -machine.free_energy(v)
-    y = mean_field(machine, Evidence(v)).y
-    uniforms = fixed_uniforms(draws, machine.spec.H1).to(y.dtype).unsqueeze(1)
+    bottom = machine.c1 + v @ machine.W
+    y = bottom
+    for _ in range(_MEAN_FIELD_STEPS):
+        y = bottom + machine.second_layer_logits(y.sigmoid()).sigmoid() @ machine.J.T
+    generator = torch.Generator().manual_seed(0)
+    uniforms = torch.rand(draws, 1, machine.spec.H1, generator=generator)
     h1 = (uniforms < y.sigmoid()).to(y.dtype)  # (draws, B, H1)
     log_q = (h1 * logsigmoid(y) + (1 - h1) * logsigmoid(-y)).sum(-1)
     log_h2 = softplus(machine.second_layer_logits(h1)).sum(-1)  # h2 summed out

@@ -36,6 +36,7 @@ _LOWER_IS_BETTER = (
     "mirrored",
     "on-top cycles",
     "alarms",
+    "change of p",
     "ECE",
     "error",
     "log-loss",

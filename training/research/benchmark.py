@@ -40,9 +40,8 @@ DEFAULT = ("indoor-triway", "indoor-gbm", "indoor-rbm")
 YARDSTICKS = {
     "T1a relations": ("relation popularity", "R-precision, distinct classes"),
     "T1 pairs": ("relation popularity", "accuracy"),
-    "T2 missing": ("popularity", "MRR"),
-    "T2 partial": ("popularity", "MRR, 50 %"),
-    "T3 signature": ("popularity", "hit@1"),
+    "T2 missing": ("popularity", "MRR, one removed"),
+    "T3 outliers": ("popularity", "hit@1, signature"),
 }
 """Reference baseline and metric of each task, for training on shuffled scenes.
 
@@ -83,6 +82,11 @@ class Domain:
     def leaks(self) -> bool:
         """True if the training part may contain near-duplicates of test scenes."""
         return self.configs[0].data.split == "random"
+
+    @property
+    def source_weights(self) -> dict[str, float]:
+        """Weights of the scenes of the data sources in the training of the first configuration."""
+        return self.configs[0].objective.source_weights
 
 
 @dataclass(frozen=True)
@@ -260,7 +264,9 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
     entries: list[Entry] = []
     for seed in range(options.seeds):
         entries += [machine_entry(config) for config in options.configs(domain, seed)]
-        entries += baseline_entries(seed, options.baselines, related=plan.data.related)
+        entries += baseline_entries(
+            seed, options.baselines, related=plan.data.related, source_weights=domain.source_weights
+        )
     entries += reference_entries()
     reports = _measure_all(plan, entries, options, domain.name)
     results = summarise(reports, domain.configs[0].name, plan.parameters(entries))
@@ -317,7 +323,10 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
     if options.baselines is not None:
         yardsticks = {YARDSTICKS[task][0] for task in tasks}
         names = [name for name in names if name in yardsticks | set(options.baselines)]
-    entries += baseline_entries(0, names, related=plan.data.related, whole=False)
+    entries += baseline_entries(
+        *(0, names),
+        related=plan.data.related, whole=False, source_weights=domain.source_weights,
+    )  # fmt: skip
     reports = _measure_all(plan, entries, options, f"{domain.name}, shuffled")
     weights = plan.parameters(entries)
     for task in tasks:

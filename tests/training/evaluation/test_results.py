@@ -47,7 +47,7 @@ def figure(value):
     [
         ("T1a relations", "R-precision, distinct classes", True),
         ("T1b completion", "R-precision", True),
-        ("T2 missing", "MRR", False),
+        ("T2 missing", "MRR, one removed", False),
     ],
 )
 def test_precision_of_relations_says_what_counts_as_wrong(task, metric, said):
@@ -62,7 +62,9 @@ def test_precision_of_relations_says_what_counts_as_wrong(task, metric, said):
         ("MRR", -0.1, 0.2, "undecided"),
         ("MRR", -0.2, -0.1, "worse"),
         ("MMD², free", -0.2, -0.1, "better"),
-        ("ECE, missing", 0.1, 0.2, "worse"),
+        ("ECE, missing, 2 classes", 0.1, 0.2, "worse"),
+        ("change of p", 0.1, 0.2, "worse"),
+        ("change of MRR, poses", 0.1, 0.2, "better"),
         ("mirrored relations, free", -0.2, -0.1, "better"),
         ("on-top cycles, free", 0.1, 0.2, "worse"),
     ],
