@@ -56,7 +56,6 @@ def artifact_model(
         false_relations=completion,
         generate=lambda _: sampler,
         density=None if machine.relations_act else lambda _: density(),
-        machine=machine,
         parameters=machine.parameter_count,
         alarm=calibrated_alarm(artifact.calibration) if calibrated else None,
         artifact=artifact if calibrated else None,

@@ -14,7 +14,6 @@ from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import Batch
 from training.evaluation.intruders import IntruderScores
 from training.evaluation.setting import Setting
-from training.machines import BoltzmannMachine
 
 # Function that takes presence (scenes, classes) and returns log-odds (scenes, classes).
 ObjectScore = Callable[[Tensor], Tensor]
@@ -149,7 +148,6 @@ class Model:
         density: function that takes the setting and returns the density of objects, or None.
         alarm: alarm of T3.
         artifact: model for Calibration and for all questions to the service.
-        machine: machine for the seed protocol.
         parameters: number of trained weights, or None if this number is not meaningful.
         trials: all settings that the tuning of a baseline tried, in order.
     """
@@ -165,7 +163,6 @@ class Model:
     density: Callable[[Setting], ObjectDensity | None] | None = None
     alarm: Alarm | None = None
     artifact: Artifact | None = None
-    machine: BoltzmannMachine | None = None
     parameters: int | None = None
     trials: tuple[Trial, ...] = ()
 
