@@ -61,7 +61,6 @@ def artifact_model(
         false_relations=completion,
         generate=lambda _: sampler,
         density=None if machine.relations_act else lambda _: density(),
-        machine=machine,
         parameters=machine.parameter_count,
         artifact=artifact if calibrated else None,
     )

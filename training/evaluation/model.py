@@ -13,7 +13,6 @@ from app.questions import Sensitivity
 from app.registry import Artifact
 from training.datasets.batches import Batch
 from training.evaluation.setting import Setting
-from training.machines import BoltzmannMachine
 
 # Function that takes presence (scenes, classes) and returns log-odds (scenes, classes).
 ObjectScore = Callable[[Tensor], Tensor]
@@ -126,7 +125,6 @@ class Model:
         generate: function that takes the setting and returns the sampler of T4, or None.
         density: function that takes the setting and returns the density of objects, or None.
         artifact: model for Calibration and for all questions to the service.
-        machine: machine for the seed protocol.
         parameters: number of trained weights, or None if this number is not meaningful.
         trials: all settings that the tuning of a baseline tried, in order.
     """
@@ -141,7 +139,6 @@ class Model:
     generate: Callable[[Setting], Sampler | None] | None = None
     density: Callable[[Setting], ObjectDensity | None] | None = None
     artifact: Artifact | None = None
-    machine: BoltzmannMachine | None = None
     parameters: int | None = None
     trials: tuple[Trial, ...] = ()
 

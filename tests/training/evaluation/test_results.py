@@ -1,41 +1,17 @@
-"""Tables and their remarks; splits that fill no table."""
+"""Tables and their remarks."""
 
 from __future__ import annotations
 
 import io
-import json
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from tests.training.commands import invoke, small_config, write_config
 from training.evaluation.metrics import Figure, Ratio
 from training.evaluation.report import SourceReport
 from training.evaluation.results import Asked, Cell, Difference, Results, remarks, summarise
 from training.evaluation.setting import Outcome
-
-
-def arguments(folder, *others):
-    config = small_config("rooms-rbm", "rbm", split="random")
-    path = write_config(folder / "random.toml", config, {"training.epochs": 1})
-    where = ("--folder", folder / "reports", "--quick", "--workers", "1")
-    return "benchmark", path, *where, "--task", "T2 missing", "--baseline", "popularity", *others
-
-
-def test_a_random_split_fills_no_table(tmp_path):
-    for others in ((), ("--shuffled",), ("--shuffled", "--seed-protocol")):
-        output = invoke(*arguments(tmp_path, *others), code=1)
-        assert "rooms-rbm: data.split" in output
-        assert "--seed-protocol" in output
-    assert not (tmp_path / "reports").exists()
-
-
-def test_a_random_split_is_asked_as_the_seed_paper_asks(tmp_path):
-    invoke(*arguments(tmp_path, "--seed-protocol"))
-    folder = tmp_path / "reports/rooms"
-    assert not (folder / "results.json").exists()
-    assert json.loads((folder / "seed-protocol/results.json").read_text())["cells"]
 
 
 def figure(value):

@@ -51,7 +51,7 @@ def finished(tmp_path_factory):
     arguments = (
         *(write(folder, variant=variant) for variant in ("triway", "rbm")),
         "--folder", where, "--quick",
-        "--seed-protocol", "--shuffled", *HERE,
+        "--shuffled", *HERE,
     )  # fmt: skip
     invoke("benchmark", *arguments)
     return arguments, where / "rooms"
@@ -96,18 +96,6 @@ def test_weights_are_counted(finished, results):
     assert results["parameters"]["rooms-rbm"] == machine.parameter_count
     assert results["parameters"]["popularity"] == machine.spec.V
     assert f"{machine.parameter_count:,}" in (finished[1] / "results.md").read_text()
-
-
-def test_the_seed_protocol_has_a_page_of_its_own(finished):
-    folder = finished[1] / "seed-protocol"
-    protocol = json.loads((folder / "results.json").read_text())
-    assert {cell["task"] for cell in protocol["cells"]} == {"Seed T1", "Seed T2", "Seed T3"}
-    assert {cell["row"] for cell in protocol["cells"]} == MACHINES
-    assert protocol["paper"]["T3 error measure"]["Triway"] == 0.0789
-    assert not protocol["differences"]
-    assert "# Seed protocol" in (folder / "results.md").read_text()
-    config = json.loads((folder / "rooms-rbm/seed-0/run/config.json").read_text())
-    assert config["data"]["split"] == "random"
 
 
 def shuffled(folder, task):
