@@ -305,8 +305,8 @@ class FreeUnits(RelationUnits):
 
     def _units(self, a: Indices, i: Indices, j: Indices) -> Indices:
         """Return the unit of each relation, or -1 for relations without a unit, (E,)."""
-        units: Indices = self._index[kernels.pair_rows(*self._table, i * self._V + j), a]
-        return units
+        rows = kernels.pair_rows(*self._table, i * self._V + j)
+        return self._index[rows, a].astype(np.int64)
 
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False

@@ -49,7 +49,7 @@ def artifact_model(
     """Return the answers of a trained model; only a `calibrated` model judges outliers."""
     machine = machine_of(artifact.weights)
     completion = relation_score(artifact, given=True)
-    sampler = machine_sampler(machine)
+    sampler = machine_sampler(artifact)
     density = cache(partial(machine_density, machine, train, settings, seed))
     return Model(
         missing=missing_score(artifact),
@@ -60,7 +60,7 @@ def artifact_model(
         completion=completion,
         false_relations=completion,
         generate=lambda _: sampler,
-        density=None if machine.relations_act else lambda _: density(),
+        density=lambda _: density(),
         parameters=machine.parameter_count,
         artifact=artifact if calibrated else None,
     )

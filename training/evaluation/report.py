@@ -193,7 +193,7 @@ def evaluate(
     structure: Tensor,
     train: SceneTensors,
     *,
-    limit: int | None = None,
+    limit: int = _LIMIT,
     everyday: Path | None = None,
     tasks: Collection[str] | None = None,
     progress: Progress = silent,
@@ -205,12 +205,9 @@ def evaluate(
     Args:
         train: training scenes. They show which generated scenes are copies, and which classes are
             typical of a room type.
-        limit: maximum number of scenes per data source in slow tasks, see `Setting`. None means 200
-            scenes, or 20 scenes for a machine that computes its answers by sampling.
+        limit: maximum number of scenes per data source in slow tasks; see `Setting`.
         tasks: names of the tasks to measure. None means all tasks of a model card.
     """
-    if limit is None:
-        limit = _LIMIT if artifact.oracle is None else _LIMIT_OF_DRAWS
     model = artifact_model(artifact, train)
     selected = [
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)

@@ -361,8 +361,9 @@ def fit_misplaced(
 ) -> dict[str, Any]:
     """Fit `misplaced` and `misplaced_thresholds` to log-odds given the rest of the scene.
 
-    Each scene takes part untouched and with one false relation. Both entries are None if fewer than `_JUDGED_SCENES` scenes have relations, or if
-    false relations are not less likely than true relations. The model then judges no relation.
+    Each scene takes part untouched and with one false relation. Both entries are None if fewer than
+    `_JUDGED_SCENES` scenes have relations, or if false relations are not less likely than true
+    relations. The model then judges no relation.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
