@@ -278,9 +278,15 @@ class ObjectFit:
             with torch.no_grad():
                 h2 = torch.bernoulli(machine.context(v, room)[1], generator=generator)
             chain_h2 = chains.h2
-        data = machine.free_energy(v, h2, room=room, source=source).mean()
-        drawn = machine.free_energy(chains.v, chain_h2, room=chains.room, source=chains.source)
-        return data - drawn.mean()
+        data = self._free_energy(v, h2, room, source)
+        return data - self._free_energy(chains.v, chain_h2, chains.room, chains.source)
+
+    def _free_energy(self, v: Tensor, h2: Tensor | None, room: Tensor, source: Tensor) -> Tensor:
+        """Return the mean free energy given the room types, which the chains do not draw."""
+        free = self.machine.free_energy(v, h2, room=room, source=source)
+        if self.machine.spec.C:
+            free = free + self.machine.e[room.clamp(min=0)] * (room >= 0)
+        return free.mean()
 
     def _prior(self) -> Tensor:
         """Return the negative log prior of the weights, divided by the number of scenes."""
