@@ -364,7 +364,9 @@ def fit_line(
     the mean share over the lengths is right.
     """
     worst = {
-        n: scores.extreme(calibrated(entry, scores.score(alpha), scores.size[scores.row]))
+        n: scores.extreme(
+            calibrated(entry, scores.score(alpha), scores.size[scores.row]).astype(np.float64)
+        )
         for n, scores in untouched.items()
     }
     quantiles = [weighted_quantile(worst[n], untouched[n].weight, 1 - share) for n in worst]
