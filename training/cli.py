@@ -45,6 +45,7 @@ from training.runs.folder import FinishedRun, load_run, save_run
 from training.runs.live import Display, next_steps, summarise
 from training.runs.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.runs.publish import RefusedError, publish_run, refit
+from training.seed.command import seed as seed_command
 
 app = typer.Typer(
     rich_markup_mode="markdown", add_completion=False, no_args_is_help=True, help=__doc__
@@ -55,6 +56,7 @@ app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
 app.command()(ablate)
+app.command(name="seed")(seed_command)
 console = Console()
 
 Data = Annotated[
@@ -103,22 +105,22 @@ def train(
     """Train a configuration. With --publish, also calibrate, evaluate and publish the model."""
     try:
         config = load_config(configuration, seed=seed)
+        if publish is not None:
+            Store(store).require_new(config.name, publish)
+        root = data_folder(configuration, config, data)
+        folder = runs / config.name / f"seed-{config.training.seed}"
+        measured = None
+        if final:
             if publish is not None:
-                Store(store).require_new(config.name, publish)
-            root = data_folder(configuration, config, data)
-            folder = runs / config.name / f"seed-{config.training.seed}"
-            measured = None
-            if final:
-                if publish is not None:
-                    with console.status("reading and encoding scenes"):
-                        measured = load_run(folder), prepare(config, root)
-                config = with_settings(config, {"data.split": "final"})
-                folder = folder.with_name(f"final-{folder.name}")
-            scenes = _prepare(config, root)
-            _train(config, scenes, folder, root, fresh, tensorboard)
-            if publish is None and not final:
-                next_steps(folder, console)
-        if publish is not None and first:
+                with console.status("reading and encoding scenes"):
+                    measured = load_run(folder), prepare(config, root)
+            config = with_settings(config, {"data.split": "final"})
+            folder = folder.with_name(f"final-{folder.name}")
+        scenes = _prepare(config, root)
+        _train(config, scenes, folder, root, fresh, tensorboard)
+        if publish is None and not final:
+            next_steps(folder, console)
+        if publish is not None:
             _publish(load_run(folder), scenes, store, publish, measured)
     except RefusedError as error:
         _exit_refused(error)

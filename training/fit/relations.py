@@ -53,6 +53,8 @@ _WITHOUT_PRIOR = frozenset({*OBJECT_WEIGHTS, "gamma", "B", "usual", "d"})
 # Factor of the prior precision for the map of word vectors. All classes share the map, so its prior
 # is weaker than the prior of the weights of a class.
 _MAP_PRIOR = 0.1
+# Random change of the log of the number of classes by which scenes are sorted into batches.
+_MIXING = 0.5
 SHARED_ROWS, SHARED_COLUMNS = ("S", "O"), ("s", "o")
 
 
@@ -146,6 +148,8 @@ class RelationFit:
     ) -> None:
         self.config, self.machine = config, machine
         self.train = with_annotations(train)
+        sizes = [len(scene.evidence.classes) for scene in self.train.scenes]
+        self._log_sizes = torch.tensor(sizes, dtype=torch.float32).clamp(min=1).log()
         self.epochs = 0
         self._generator = torch.Generator().manual_seed(seed)
         self.likelihood = RelationLikelihood(config, machine, train)
@@ -175,8 +179,7 @@ class RelationFit:
         Raises:
             FloatingPointError: the loss is infinite or NaN.
         """
-        order = torch.randperm(len(self.train), generator=self._generator)
-        batches = order.split(self.config.batch_size)
+        batches = self._batches()
         total = 0.0
         for number, index in enumerate(batches, 1):
             total += self._update(index, self.config.epochs * len(batches))
@@ -188,6 +191,18 @@ class RelationFit:
             )
         self.epochs += 1
         return total / len(batches)
+
+    def _batches(self) -> list[Tensor]:
+        """Return the scenes of an epoch in batches, in random order.
+
+        The scenes of a batch have similar numbers of classes, because the time of a batch grows
+        with the square of the largest number.
+        """
+        noise = torch.rand(len(self.train), generator=self._generator)
+        order = (self._log_sizes + _MIXING * noise).argsort()
+        batches = order.split(self.config.batch_size)
+        turn = torch.randperm(len(batches), generator=self._generator).tolist()
+        return [batches[k] for k in turn]
 
     def _update(self, index: Tensor, total: int) -> float:
         loss = self.likelihood(self.train.batch(index), self._generator)

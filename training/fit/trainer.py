@@ -120,7 +120,7 @@ class Trainer:
         """Let classes share weights with their parents and with similar words."""
         data, V = self.data, self.machine.spec.V
         words = torch.zeros(V, 0) if data.words is None else data.words
-        parents = torch.full((V,), -1) if data.parents is None else data.parents
+        parents = data.parents
         objects, relations = self.config.objects, self.config.relations
         share_weights(self.machine, words * objects.word_weight, parents, ["W"])
         words = words * relations.word_weight
@@ -183,7 +183,8 @@ class Trainer:
         """Run the rest of both phases. Yield a point of the curve at each checkpoint."""
         fit = self.objects
         while not fit.finished:
-            began, losses = time.perf_counter(), []
+            began = time.perf_counter()
+            losses: list[float] = []
             while len(losses) < _STEPS and not fit.finished:
                 fit.step()
                 losses.append(fit.loss)
