@@ -53,7 +53,7 @@ def to_log_odds(mean: Floats, spread: Floats) -> Floats:
 
     The smallest result is `NO_UNIT`. σ is the standard deviation of ℓ. For σ < 0.75, the quadrature
     has three nodes, 0 and ±√3 σ, with weights 4 : 1 : 1. The error in the probability is at most
-    0.0003. With u = e^-|mean| and q = e^spread, the sigmoids at the nodes are u/(1 + u),
+    0.0004. With u = e^-|mean| and q = e^spread, the sigmoids at the nodes are u/(1 + u),
     uq/(1 + uq) and u/(q + u). These forms cannot overflow. For σ of at least 0.75, the function
     uses the trapezoidal rule.
 

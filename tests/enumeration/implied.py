@@ -39,7 +39,7 @@ def features_by_hand(given: Tensor) -> Tensor:
 def implied_by_hand(
     machine: BoltzmannMachine, v: Tensor, given: Tensor, room: int | None = None
 ) -> Tensor:
-    """x (A, n, n) of a machine of one layer at v (V,), given relations (A, n, n)."""
+    """x (A, n, n) of a machine of binary units and one layer at v (V,), given relations."""
     spec = machine.spec
     gamma, B = machine.get_parameter("gamma"), machine.get_parameter("B")
     phi = features_by_hand(given)
@@ -67,8 +67,8 @@ def relation_by_definition(joint: Joint, unit: int, where: Tensor, given: Tensor
     e = joint.edges
     a, i, j = (int(end[0, unit]) for end in (e.relation, e.subject, e.object))
     v, h1 = joint.v[where], joint.h1[where]
-    room = None if joint.room is None else int(joint.room[0])
-    x = implied_by_hand(joint.machine, v[0], given, room)[a, i, j]
+    room = int(joint.room[0])
+    x = implied_by_hand(joint.machine, v[0], given, None if room < 0 else room)[a, i, j]
     logits = joint.machine.relation_logits(e, v, h1)[:, unit]
     weight = (-joint.energy[where]).softmax(0)
     return float((weight * (logits + x).sigmoid()).sum())

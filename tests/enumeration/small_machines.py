@@ -1,67 +1,59 @@
-"""The registry of small machines. It has every variant, so each takes every enumeration test."""
+"""Small machines of every variant, and all their states."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from app.inference.variants import VARIANTS
 from training.machines import BoltzmannMachine, MachineSpec, build
-from training.machines.machine import State
+from training.machines.edges import Edges
 
 TRIPLES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 1, 0)]
 
-
-def smallest(variant: str) -> MachineSpec:
-    """Two units of everything that a variant has."""
-    kind = VARIANTS[variant]
-    return MachineSpec(variant, V=2, A=2, H1=2, H2=2 * kind.two_layers, K=2 * kind.factorised, T=4)
-
-
 SMALL: dict[str, MachineSpec] = {
-    **{variant: smallest(variant) for variant in VARIANTS},
-    "rbm-three-classes": MachineSpec("rbm", V=3, A=2, H1=3, T=4, C=2),
-    "gbm-one-layer": MachineSpec("gbm", V=3, A=2, H1=2, T=4, C=2),
-    "rbm-local": MachineSpec("rbm", V=2, A=2, H1=2, T=4, C=3, form="local"),
-    "gbm-local": MachineSpec("gbm", V=2, A=2, H1=2, H2=2, T=4, form="local"),
-    "triway-seed": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, form="seed"),
-    "triway-local": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, C=3, form="local"),
-    "triway-implications": MachineSpec("triway", V=3, A=1, H1=2, K=2, T=2, C=3, G=2, form="local"),
-    "triway-local-two-layers": MachineSpec("triway", V=2, A=2, H1=2, H2=2, K=2, T=4, form="local"),
+    "rbm": MachineSpec("rbm", V=3, A=2, units=3, T=4, C=2),
+    "rbm-states": MachineSpec(
+        "rbm", V=3, A=2, units=2, states=3, C=2, T=4, profiles=2, coupled=True
+    ),
+    "gbm": MachineSpec("gbm", V=2, A=2, units=2, H2=2, T=4),
+    "gbm-one-layer": MachineSpec("gbm", V=3, A=2, units=2, T=4, C=2, coupled=True),
+    "gbm-states": MachineSpec("gbm", V=2, A=2, units=2, states=3, H2=2, T=4, C=2, profiles=2),
+    "triway": MachineSpec("triway", V=2, A=2, units=2, K=2, T=4),
+    "triway-states": MachineSpec(
+        "triway", V=3, A=1, units=2, states=3, C=2, K=2, T=2, profiles=2, coupled=True
+    ),
+    "triway-implications": MachineSpec("triway", V=3, A=1, units=2, C=3, K=2, T=2, G=2),
+    "triway-deep": MachineSpec(
+        "triway", V=2, A=2, units=2, states=3, H2=2, C=2, K=2, T=4, profiles=2
+    ),
 }
 ONE_LAYER = [name for name, spec in SMALL.items() if not spec.H2]
-SEED_FORM = [name for name, spec in SMALL.items() if spec.form == "seed"]
+TWO_LAYERS = [name for name, spec in SMALL.items() if spec.H2]
 
 
 def small_machine(name: str, seed: int = 0, scale: float = 0.8) -> BoltzmannMachine:
-    """A float64 machine with every parameter drawn from N(0, scale²), κ included."""
+    """A float64 machine with every parameter drawn from N(0, scale²), kappa included."""
     spec = SMALL[name]
-    generator = torch.Generator().manual_seed(seed)
     machine = build(spec).double()
     if spec.T:
         machine.set_triples(torch.tensor(TRIPLES[: spec.T]))
-    with torch.no_grad():
-        for parameter in machine.parameters():
-            noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
-            parameter.copy_(noise * scale)
-        if spec.variant == "triway" and spec.form == "local":
-            machine.kappa.zero_()
-    return machine.requires_grad_(False)
+    return random_weights(machine, torch.Generator().manual_seed(seed), scale)
 
 
+@torch.no_grad()
 def random_weights(
     machine: BoltzmannMachine, generator: torch.Generator, scale: float = 1.0
 ) -> BoltzmannMachine:
-    """The machine with every weight but κ drawn from N(0, scale²)."""
-    machine.requires_grad_(False)
-    for name, parameter in machine.named_parameters():
-        if name != "kappa":
-            parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
-    return machine
+    """The machine with every weight drawn from N(0, scale²)."""
+    for parameter in machine.parameters():
+        noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+        parameter.copy_(noise * scale)
+    return machine.requires_grad_(False)
 
 
 def binary(units: int) -> Tensor:
@@ -70,22 +62,34 @@ def binary(units: int) -> Tensor:
     return (codes >> torch.arange(units) & 1).double()
 
 
+def unit_states(spec: MachineSpec) -> Tensor:
+    """All Z^units states of h1, (Z^units, H1) float64. The first state of a unit is all 0."""
+    one = torch.eye(spec.states, dtype=torch.float64)[:, 1:]
+    return torch.stack(
+        [one[list(z)].flatten() for z in product(range(spec.states), repeat=spec.units)]
+    )
+
+
 @dataclass(frozen=True)
 class Joint:
-    """Every state of a small machine with its log-probability.
+    """Every state of a small machine, with its energy.
 
-    v, r, h1, h2: (N, units); log_p: (N,); edges: the frame of all classes that r is laid out on.
+    v, r, h1, h2: (N, units); room: (N,), -1 for "not listed"; energy: (N,); edges: the layout of r
+    between all classes.
     """
 
     machine: BoltzmannMachine
-    edges: object
+    edges: Edges
     v: Tensor
     r: Tensor
     h1: Tensor
     h2: Tensor
+    room: Tensor
     energy: Tensor
-    log_z: float
-    room: Tensor | None
+
+    @property
+    def log_z(self) -> float:
+        return float((-self.energy).logsumexp(0))
 
     @property
     def p(self) -> Tensor:
@@ -99,25 +103,28 @@ class Joint:
         """log p(on | given) - log p(not on | given)."""
         return self.log_sum(given & on) - self.log_sum(given & ~on)
 
+    def draw(self, count: int, generator: torch.Generator, given: Tensor | None = None) -> Tensor:
+        """Indices of exact samples, (count,), where `given` (N,) bool holds."""
+        p = self.p if given is None else torch.where(given, self.p, 0.0)
+        return torch.multinomial(p, count, replacement=True, generator=generator)
 
-def full_frame(machine: BoltzmannMachine) -> object:
-    """The relation units between all classes."""
-    return machine.edges(torch.arange(machine.spec.V).unsqueeze(0))
 
+def enumerate_joint(machine: BoltzmannMachine, *rooms: int | None, source: int = -1) -> Joint:
+    """All states with a finite energy; the room type t is a unit with the given states.
 
-def enumerate_joint(machine: BoltzmannMachine, room: int | None = None) -> Joint:
-    """All states (v, r, h1, h2) that have a finite energy."""
+    None and -1 mean "not listed". By default, it is the only state of t.
+    """
     spec = machine.spec
-    edges = full_frame(machine)
-    sizes = [spec.V, edges.shape[-1], spec.H1, spec.H2]
-    states = binary(sum(sizes))
-    v, r, h1, h2 = states.split(sizes, dim=1)
+    edges = machine.edges(torch.arange(spec.V).unsqueeze(0))
+    visible, E = binary(spec.V), edges.shape[-1]
+    t = torch.tensor([-1 if room is None else room for room in rooms or (-1,)])
+    blocks = [visible, binary(E), unit_states(spec), binary(spec.H2)]
+    index = torch.cartesian_prod(*(torch.arange(len(block)) for block in [*blocks, t]))
+    v, r, h1, h2 = (block[k] for block, k in zip(blocks, index.T, strict=False))
     allowed = (r <= machine.gate(edges, v)).all(1)
-    v, r, h1, h2 = v[allowed], r[allowed], h1[allowed], h2[allowed]
-    rooms = None if room is None else torch.full((len(v),), room)
-    energy = machine.energy(v, r, h1, h2, edges, rooms).detach()
-    log_z = float((-energy).logsumexp(0))
-    return Joint(machine, edges, v, r, h1, h2, energy, log_z, rooms)
+    v, r, h1, h2, room = (block[allowed] for block in (v, r, h1, h2, t[index[:, 4]]))
+    energy = machine.energy(v, r, h1, h2, edges, room, torch.full((len(v),), source))
+    return Joint(machine, edges, v, r, h1, h2, room, energy)
 
 
 def same(block: Tensor, value: Tensor) -> Tensor:
@@ -125,16 +132,14 @@ def same(block: Tensor, value: Tensor) -> Tensor:
     return (block == value).all(1)
 
 
-def draw_states(
-    joint: Joint, count: int, generator: torch.Generator, given: Tensor | None = None
-) -> State:
-    """Exact samples of the joint, where `given` (N,) bool holds."""
-    p = joint.p if given is None else torch.where(given, joint.p, 0.0)
-    pick = torch.multinomial(p, count, replacement=True, generator=generator)
-    edges = joint.edges
-    if joint.machine.spec.variant == "triway":
-        edges = joint.machine.edges(torch.arange(joint.machine.spec.V).expand(count, -1))
-    return State(joint.v[pick], joint.h1[pick], joint.h2[pick], joint.r[pick], edges)
+def left_out(joint: Joint):
+    """Every v and class i: (i, v without i, states with the other classes as in v)."""
+    V = joint.machine.spec.V
+    for v in binary(V):
+        for i in range(V):
+            if not v[i]:
+                others = torch.arange(V) != i
+                yield i, v, same(joint.v[:, others], v[others])
 
 
 def check_frequencies(codes: np.ndarray, keys: np.ndarray, p: np.ndarray) -> None:

@@ -1,140 +1,99 @@
-"""The Gibbs kernels leave p stationary, and a fully related object can leave the chain.
+"""Gibbs sweeps leave p stationary.
 
-Draw states exactly from the enumerated joint, run the kernel once, and compare the histogram with
-p. The yardstick is the total variation of as many exact draws (the Monte-Carlo floor), which
-separates a wrong kernel from slow mixing: a stationary kernel stays at the floor however slowly it
-mixes. Relations that imply each other are drawn in turn given all else, which no joint describes:
-there the histogram is that of v, h1 and h2.
+Draw states exactly from the enumerated joint, run one sweep, and compare the histogram with p. The
+yardstick is the total variation of as many exact draws (the Monte-Carlo floor), which separates a
+wrong kernel from slow mixing: a stationary kernel stays at the floor however slowly it mixes.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+import numpy as np
 import pytest
 import torch
 
 from tests.enumeration.small_machines import (
     SMALL,
     check_frequencies,
-    draw_states,
     enumerate_joint,
     small_machine,
 )
-from training.machines.edges import present_classes
-from training.machines.gibbs import FREE, Clamp, gibbs_step, initial_state
-from training.machines.machine import State
+from training.machines.gibbs import Chains, draw_states, start_chains, sweep
 
 CHAINS = 60_000
 
 
-def state_code(machine, state):
-    """One integer per chain from (v, r, h1, h2), with r laid out over all classes.
-
-    Without r in a machine whose relations imply each other.
-    """
-    spec = machine.spec
-    if spec.G:
-        dense = state.v[:, :0]
-    elif spec.variant == "triway":
-        dense = torch.zeros(len(state.v), spec.A, spec.V, spec.V).double()
-        e = state.edges
-        index = (e.relation * spec.V + e.subject) * spec.V + e.object
-        dense = dense.flatten(1).scatter_add(1, index, state.r * e.valid)
-    else:
-        dense = state.r
-    bits = torch.cat([state.v, dense, state.h1, state.h2], 1).long()
+def codes(v, h2):
+    """One integer for a state of v and h2."""
+    bits = torch.cat([v, h2], 1).long()
     return (bits << torch.arange(bits.shape[1])).sum(1)
 
 
-def check_stationary(joint, clamp, given, seed, **options):
-    generator = torch.Generator().manual_seed(seed)
-    machine = joint.machine
-    state = draw_states(joint, CHAINS, generator, given)
-    p = joint.p if given is None else torch.where(given, joint.p, 0.0)
-    p = p / p.sum()
-    all_states = State(joint.v, joint.h1, joint.h2, joint.r, joint.edges)
-    if machine.spec.variant == "triway":
-        frame = machine.edges(torch.arange(machine.spec.V).expand(len(joint.v), -1))
-        all_states = replace(all_states, edges=frame)
-    keys, which = state_code(machine, all_states).unique(return_inverse=True)
-    p = torch.zeros(len(keys)).double().scatter_add(0, which, p)
-    state = gibbs_step(machine, state, generator, clamp, **options)
-    check_frequencies(state_code(machine, state).numpy(), keys.numpy(), p.numpy())
+def conditions(spec):
+    """Room type, source and possible classes of each kind of chain."""
+    everything = torch.ones(spec.V, dtype=torch.bool)
+    yield -1, -1, everything
+    if spec.C:
+        yield 1, -1, everything
+    if spec.profiles:
+        yield -1, 0, everything
+        yield 0, 1, torch.arange(spec.V) != 1
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_kernel_is_stationary(name):
-    check_stationary(enumerate_joint(small_machine(name)), FREE, None, seed=5)
-
-
-@pytest.mark.parametrize("name", [n for n, s in SMALL.items() if s.form == "seed"])
-def test_plain_block_kernel_is_stationary(name):
+    """Chains under all conditions run side by side. Coupled classes: two random ones a sweep."""
     machine = small_machine(name)
-    if machine.spec.variant == "triway":
-        machine.kappa.zero_()
-    check_stationary(enumerate_joint(machine), FREE, None, seed=6, collapsed=False)
+    kinds = list(conditions(machine.spec))
+    each = CHAINS // len(kinds)
+    generator = torch.Generator().manual_seed(5)
+    laws, blocks = [], []
+    for kind, (room, source, possible) in enumerate(kinds):
+        joint = enumerate_joint(machine, room, source=source)
+        given = (joint.v <= possible.double()).all(1)
+        p = torch.where(given, joint.p, 0.0)
+        keys, which = (codes(joint.v, joint.h2) + 1000 * kind).unique(return_inverse=True)
+        law = torch.zeros(len(keys)).double().scatter_add(0, which, p / p.sum() / len(kinds))
+        laws.append((keys, law))
+        pick = joint.draw(each, generator, given)
+        constants = torch.full((each,), room), torch.full((each,), source)
+        blocks.append((joint.v[pick], joint.h2[pick], *constants, possible.expand(each, -1)))
+    chains = Chains(*(torch.cat(block) for block in zip(*blocks, strict=True)))
+    before = chains.v.clone()
+    sweep(machine, chains, generator, classes=2)
+    assert not torch.equal(chains.v, before)
+    keys, law = (torch.cat(part).numpy() for part in zip(*laws, strict=True))
+    kind = torch.arange(len(kinds)).repeat_interleave(each)
+    check_frequencies((codes(chains.v, chains.h2) + 1000 * kind).numpy(), keys, law)
 
 
-def test_plain_block_kernel_refuses_a_compensated_machine():
-    machine = small_machine("triway-seed")
-    generator = torch.Generator().manual_seed(0)
-    state = initial_state(machine, torch.ones(1, 2).double(), generator)
-    with pytest.raises(ValueError, match="κ = 0"):
-        gibbs_step(machine, state, generator, collapsed=False)
+@pytest.mark.parametrize("states", [2, 3, 5])
+def test_states_are_drawn_with_their_probabilities(states):
+    """One of two units has extreme logits: its last state has the probability 1."""
+    x = torch.tensor([0.3, -1.2, 0.8, 0.1][: states - 1] + [0.0] * (states - 2) + [800.0]).double()
+    h1 = draw_states(x.expand(CHAINS, -1), states, torch.Generator().manual_seed(0))
+    odds = np.exp([0.0, *x[: states - 1].tolist()])
+    first = h1[:, : states - 1]
+    assert set(first.sum(1).tolist()) == {0.0, 1.0}
+    drawn = torch.cat([1 - first.sum(1, keepdim=True), first], 1).argmax(1).numpy()
+    check_frequencies(drawn, np.arange(states), odds / odds.sum())
+    assert bool((h1[:, -1] == 1).all())
+    assert float(h1[:, states - 1 : -1].sum()) == 0
 
 
-@pytest.mark.parametrize("name", SMALL)
-def test_kernel_is_stationary_with_units_clamped_and_relations_observed(name):
-    """v_0 clamped on, one hidden unit clamped off, one relation observed on, the rest free."""
-    machine = small_machine(name)
-    joint = enumerate_joint(machine)
-    loop = (joint.edges.subject[0] == 0) & (joint.edges.object[0] == 0)
-    unit = int(loop.nonzero()[0]) if bool(loop.any()) else 0
-    held = [0] if bool(loop.any()) else [0, 1]
-    mask_v = torch.zeros(1, machine.spec.V, dtype=torch.bool)
-    mask_v[0, held] = True
-    mask_h = torch.zeros(1, machine.spec.H1, dtype=torch.bool)
-    mask_h[0, 1] = True
-    observed = torch.zeros(1, joint.r.shape[1], dtype=torch.bool)
-    observed[0, unit] = True
-    given = (joint.v[:, held] > 0).all(1) & (joint.h1[:, 1] == 0) & (joint.r[:, unit] > 0)
-    edges = joint.edges
-    if machine.spec.variant == "triway":
-        edges = machine.edges(torch.tensor([held]).expand(CHAINS, -1))
-        # The first relation of class 0 to itself.
-        observed = (torch.arange(edges.shape[1]) == 0).unsqueeze(0)
-    observed = observed.expand(CHAINS, -1)
-    clamp = Clamp(v=mask_v, h1=mask_h, edges=edges, r=observed.double(), observed=observed)
-    check_stationary(joint, clamp, given, seed=7)
-
-
-def test_a_fully_related_object_can_leave_the_chain():
-    """Seed form: with all its relations on, an object still leaves under the collapsed kernel."""
-    machine = small_machine("triway-seed")
-    machine.d.fill_(3.0)
-    machine.kappa.zero_()
-    rows = 2000
-    generator = torch.Generator().manual_seed(8)
-    v = torch.ones(rows, machine.spec.V).double()
-    state = initial_state(machine, v, generator)
-    state = replace(state, r=torch.ones_like(state.r))
-    plain = gibbs_step(machine, state, generator, collapsed=False)
-    assert bool((plain.v == 1).all())
-    machine.b.fill_(-40.0)
-    collapsed = gibbs_step(machine, state, generator)
-    assert float(collapsed.v.mean()) < 0.5
-
-
-def test_tempering_scales_the_energy_in_the_seed_form():
-    machine = small_machine("triway")
-    joint = enumerate_joint(machine)
-    cold = machine.scaled(0.5)
-    energy = cold.energy(joint.v, joint.r, joint.h1, joint.h2, joint.edges)
-    torch.testing.assert_close(energy, 0.5 * joint.energy)
-
-
-def test_present_classes_puts_leading_ones_first():
-    v = torch.tensor([[1.0, 0, 1, 1], [0, 0, 0, 1]])
-    assert present_classes(v).tolist() == [[0, 2, 3], [3, -1, -1]]
-    assert present_classes(v, torch.tensor([[3], [3]])).tolist() == [[3, 0, 2], [3, -1, -1]]
+def test_chains_start_at_scenes_without_impossible_classes():
+    machine = small_machine("gbm-states")
+    v = torch.ones(4000, 2).double()
+    chains = start_chains(
+        machine,
+        v,
+        torch.Generator().manual_seed(0),
+        room=torch.ones(4000, dtype=torch.int64),
+        possible=torch.tensor([True, False]).expand(4000, -1),
+    )
+    assert chains.v[:, 0].all()
+    assert not chains.v[:, 1].any()
+    assert set(chains.source.tolist()) == {-1}
+    # Five standard errors; fails by chance with probability < 2e-6.
+    _, m2 = machine.context(v[:1], torch.tensor([1]))
+    error = 5 * (m2 * (1 - m2) / 4000).sqrt()
+    assert bool(((chains.h2.mean(0) - m2).abs() <= error).all())

@@ -5,30 +5,37 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.enumeration.small_machines import SMALL, draw_states, enumerate_joint, small_machine
-from training.machines.partition import ais, base_log_partition, independent_base, reverse_ais
+from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+from training.machines.gibbs import start_chains
+from training.machines.partition import ais, base_log_partition, reverse_ais
 
 BETAS = torch.linspace(0, 1, 41).tolist()
 CHAINS = 2000
+BASE = torch.tensor([0.3, -0.7, 0.2]).double()
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_the_base_has_an_exact_partition_function(name):
-    machine = small_machine(name)
-    base = independent_base(machine, torch.tensor([0.3, -0.7, 0.2])[: machine.spec.V])
-    start = machine.scaled(0.0, base)
-    exact = enumerate_joint(start).log_z
+    machine = small_machine(name, scale=0)
+    base = BASE[: machine.spec.V]
+    machine.b.copy_(base)
+    exact = enumerate_joint(machine).log_z
     assert base_log_partition(machine, base) == pytest.approx(exact, abs=1e-9)
 
 
+@pytest.mark.parametrize("own_base", [False, True])
 @pytest.mark.parametrize("name", SMALL)
-def test_forward_and_reverse_bracket_log_z(name):
+def test_forward_and_reverse_bracket_log_z(name, own_base):
     """Both means of log w are bounds in expectation; 5 standard errors of slack each."""
     machine = small_machine(name)
     joint = enumerate_joint(machine)
     generator = torch.Generator().manual_seed(9)
-    forward = ais(machine, BETAS, CHAINS, generator)
-    reverse = reverse_ais(machine, BETAS, draw_states(joint, CHAINS, generator), generator)
+    base = BASE[: machine.spec.V] if own_base else None
+    forward = ais(machine, BETAS, CHAINS, generator, base)
+    pick = joint.draw(CHAINS, generator)
+    state = start_chains(machine, joint.v[pick], generator)
+    state.h2 = joint.h2[pick]
+    reverse = reverse_ais(machine, BETAS, state, generator, base)
     slack = 5 * max(forward.standard_error, reverse.standard_error)
     assert forward.bound <= joint.log_z + slack
     assert reverse.bound >= joint.log_z - slack

@@ -1,255 +1,289 @@
-"""Compiled chains draw from the machine: by enumeration of small machines, and beside the tensors.
+"""Compiled chains draw from the machine, by enumeration of small machines.
 
 Stationarity is tested as in `test_gibbs`: states drawn from the enumerated joint, one sweep, and
-the histogram against p. A class's relations to itself are left out, as the chains do.
+the histogram of v, h1 and h2 against p.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from itertools import product
 
 import numpy as np
 import pytest
 import torch
 
-from app.inference.chains import Conditions, SceneChains, random_stream
+from app.inference.chains import OTHER_ROOM, ChainState, Conditions, SceneChains, random_stream
 from app.inference.relations import ObservedRelations
+from app.inference.weights import pack_scenes
+from tests.enumeration.implied import implied_by_hand
 from tests.enumeration.small_machines import (
     SMALL,
+    binary,
     check_frequencies,
     enumerate_joint,
     random_weights,
+    same,
     small_machine,
 )
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
-from training.machines.chain_samples import ChainSamples, pack_scenes
-from training.machines.gibbs import Clamp, run, sample_relations
+from training.machines.machine import OBJECT_WEIGHTS
 
-CHAINS = 10_000
-NAMES = [name for name, spec in SMALL.items() if spec.form == "local"]
-NOTHING = np.zeros(0, dtype=np.int64)
+CHAINS, RELATION_DRAWS = 10_000, 4_000
 
 
-def conditions(classes=(), relations=(), held=(), room=None):
-    """Relations are (a, i, j, r), i and j places in classes."""
-    a, i, j, r = np.array(sorted(relations), dtype=np.int64).reshape(-1, 4).T.copy()
+def served_machine(name):
+    """A small machine whose couplings are symmetric, as the service has them."""
+    machine = small_machine(name)
+    if machine.spec.coupled:
+        machine.L.copy_(machine.couplings)
+    return machine
+
+
+def conditions(classes=(), relations=(), held=(), held2=(), **options):
+    """Relations are (a, i, j, r), i and j indices into classes."""
+    a, i, j, r = np.array(relations, dtype=np.int64).reshape(-1, 4).T.copy()
     return Conditions(
         classes=np.array(classes, dtype=np.int64),
         log_counts=np.zeros(len(classes), dtype=np.float32),
-        observed=ObservedRelations(a, i, j, r.astype(np.float32), np.ones(len(r), np.float32)),
-        held=np.array(held, dtype=np.int64),
-        held2=NOTHING,
-        room=room,
+        observed=ObservedRelations(a, i, j, r.astype(np.float32)) if relations else None,
+        held=np.array(held, dtype=np.int64).reshape(-1, 2),
+        held2=np.array(held2, dtype=np.int64),
+        **options,
     )
 
 
-def rounded(name):
-    """A small machine in float32, and the same weights in float64."""
-    single = copy.deepcopy(small_machine(name)).float().requires_grad_(False)
-    return single, copy.deepcopy(single).double()
+def one_hot(states, Z):
+    """h1 (..., H1) of the states (..., units)."""
+    return (states[..., None] == np.arange(1, Z)).reshape(*states.shape[:-1], -1).astype(float)
 
 
-def code(v, r, h1):
-    """One integer for a state; r (A, V, V), its diagonal left out."""
-    off = ~np.eye(r.shape[-1], dtype=bool)
-    bits = np.concatenate([v, r[..., off].reshape(*v.shape[:-1], -1), h1], -1).astype(np.int64)
+def code(*blocks):
+    """One integer for each row of binary blocks."""
+    bits = np.concatenate(blocks, -1).astype(np.int64)
     return (bits << np.arange(bits.shape[-1])).sum(-1)
 
 
-def unit(joint, a, i, j):
-    """(states,) whether a relation is on; None where it has no unit."""
-    e = joint.edges
-    found = (e.relation[0] == a) & (e.subject[0] == i) & (e.object[0] == j)
-    return joint.r[:, int(found.nonzero()[0])] > 0 if found.any() else None
+def at_temperature(machine, beta):
+    """The machine whose weights between objects and hidden units are multiplied by beta."""
+    scaled = copy.deepcopy(machine)
+    for name in set(OBJECT_WEIGHTS) & dict(machine.named_parameters()).keys():
+        scaled.get_parameter(name).mul_(beta)
+    return scaled
 
 
-def law(joint, given):
-    """Codes and probabilities of the states where given, without r in one that implies.
-
-    Relations of absent classes, which RBM and GBM have, are left out, as the chains do.
-    """
-    spec, e = joint.machine.spec, joint.edges
-    r = np.zeros((len(joint.v), spec.A, spec.V, spec.V))
-    if not spec.G:
-        r[:, e.relation[0], e.subject[0], e.object[0]] = joint.r * e.ends_present(joint.v)
-    codes = code(joint.v.numpy(), r, joint.h1.numpy())
-    p = np.where(given.numpy(), joint.p.numpy(), 0.0)
-    keys, which = np.unique(codes, return_inverse=True)
-    return keys, np.bincount(which, p / p.sum())
-
-
-def check_stationary(name, condition, given, room=None, beta=1.0):
-    single, double = rounded(name)
-    spec = double.spec
-    joint = enumerate_joint(double if beta == 1 else double.scaled(beta), room)
+def check_stationary(name, condition, given, beta=1.0):
+    single = served_machine(name).float()
+    spec, double = single.spec, at_temperature(copy.deepcopy(single).double(), beta)
+    source = -1 if condition.profile is None else condition.profile
+    joint = enumerate_joint(double, condition.room, source=source)
     where = given(joint)
-    keys, p = law(joint, where)
+    keys, which = np.unique(code(joint.v, joint.h1, joint.h2), return_inverse=True)
+    p = torch.where(where, joint.p, 0.0).numpy()
     chains = SceneChains(weights_of(single)).under(condition, 1 / beta)
-    q = torch.where(where, joint.p, 0.0)
-    picked = q.multinomial(CHAINS, True, generator=torch.Generator().manual_seed(1))
-    starts = (units[picked].numpy().astype(np.uint8) for units in (joint.v, joint.h1, joint.h2))
-    v, h1 = np.zeros((CHAINS, spec.V)), np.zeros((CHAINS, spec.H1))
-    r = np.zeros((CHAINS, spec.A, spec.V, spec.V))
-    stream = random_stream(5, 0)
-    for chain, start in enumerate(zip(*starts, strict=True)):
-        drawn = chains.move(*(units.copy() for units in start), 1, stream)
-        if not spec.G:
-            r[chain][:, drawn.classes[:, None], drawn.classes] = drawn.r
-        v[chain, drawn.classes], h1[chain, drawn.h1] = 1, 1
-    check_frequencies(code(v, r, h1), keys, p)
+    pick = joint.draw(CHAINS, torch.Generator().manual_seed(1), where)
+    v, h2 = (block[pick].numpy().astype(np.uint8) for block in (joint.v, joint.h2))
+    stream, h1 = random_stream(5, 0), np.zeros((CHAINS, spec.units), np.int64)
+    for row in range(CHAINS):
+        h1[row], second = chains.sweep(v[row], 1, stream, h2[row])
+        assert second is not None
+    drawn = code(v, one_hot(h1, spec.states), h2)
+    check_frequencies(drawn, keys, np.bincount(which, p / p.sum()))
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("beta", [pytest.param(1.0, marks=pytest.mark.slow), 0.5])
+@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("beta", [1.0, 0.5])
 def test_chains_are_stationary(name, beta):
-    check_stationary(name, conditions(room=1), lambda joint: joint.p >= 0, room=1, beta=beta)
+    check_stationary(name, conditions(), lambda joint: joint.p >= 0, beta)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "r"), [*((name, 1) for name in NAMES), ("triway-local", 0)])
-def test_chains_are_stationary_under_conditions(name, r):
-    """Two classes present, a unit held on, one relation between them seen on or off."""
+@pytest.mark.parametrize("state", [0, 1, 2])
+@pytest.mark.parametrize("name", SMALL)
+def test_chains_are_stationary_under_conditions(name, state):
+    """A class present, a unit of h1 in a state, a unit of h2 on, a room type and a profile."""
+    spec = SMALL[name]
+    state = min(state, spec.states - 1)
+    held2 = [1] if spec.H2 else []
+    room, profile = 1 if spec.C else None, 1 if spec.profiles else None
 
     def given(joint):
-        seen = unit(joint, 0, 0, 1) == (r > 0)
-        return (joint.v[:, :2] > 0).all(1) & (joint.h1[:, 1] > 0) & seen
+        unit = joint.h1[:, spec.states - 1 : 2 * (spec.states - 1)]
+        is_held = unit.sum(1) == 0 if state == 0 else unit[:, state - 1] > 0
+        return (joint.v[:, 1] > 0) & is_held & (joint.h2[:, held2] > 0).all(1)
 
-    check_stationary(name, conditions([0, 1], [(0, 0, 1, r)], [1]), given)
-
-
-# -- beside the tensors ------------------------------------------------------------------------
-
-WIDE = MachineSpec("triway", V=40, A=4, H1=70, K=6, T=900, C=3, G=3, N=24, form="local")
+    condition = conditions([1], held=[(1, state)], held2=held2, room=room, profile=profile)
+    check_stationary(name, condition, given)
 
 
-@pytest.fixture(scope="module")
-def wide():
-    """Random weights, some six classes a scene."""
-    generator = torch.Generator().manual_seed(0)
-    machine = build(WIDE).requires_grad_(False)
-    keys = torch.randperm(WIDE.A * WIDE.V**2, generator=generator)[: WIDE.T].sort().values
-    triples = [keys // WIDE.V**2, keys // WIDE.V % WIDE.V, keys % WIDE.V]
-    machine.set_triples(torch.stack(triples, 1))
-    for name, parameter in machine.named_parameters():
-        scale = {"W": 0.25, "M": 0.2, "gamma": 0.3, "B": 0.2}.get(name, 0.6)
-        parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
-    machine.kappa.zero_()
-    machine.b -= machine.W.sum(1) / 2 + 2
-    machine.d -= 1
-    machine.fantasies.copy_(pack_scenes((torch.rand(24, 40, generator=generator) < 0.15).float()))
-    machine.fantasy_rooms.copy_(torch.arange(24) % 3 - 1)
-    return machine.eval()
+# -- relations ---------------------------------------------------------------------------------
 
 
-def torch_clamp(machine, rows, condition):
-    classes = torch.from_numpy(condition.classes).expand(rows, -1)
-    mask = torch.zeros(machine.spec.V, dtype=torch.bool)
-    mask[classes[0]] = True
-    held = torch.zeros(machine.spec.H1, dtype=torch.bool)
-    held[torch.from_numpy(condition.held)] = True
-    room = None if condition.room is None else torch.full((rows,), condition.room)
-    observed = condition.observed
-    if not len(observed.a):
-        return mask, Clamp(v=mask, h1=held, room=room)
-    shape = (machine.spec.A, len(condition.classes), len(condition.classes))
-    seen, r = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape)
-    for a, i, j, on in zip(observed.a, observed.i, observed.j, observed.r, strict=True):
-        seen[a, i, j], r[a, i, j] = True, float(on)
-    seen, r = (table.view(1, -1).expand(rows, -1) for table in (seen, r))
-    edges = machine.edges(classes)
-    return mask, Clamp(v=mask, h1=held, edges=edges, r=r, observed=seen, room=room)
+def all_present(machine, temperature=1.0, relations=()):
+    """Chains in which all classes are present, and h1 stays in given states."""
+    spec = machine.spec
+    held = [(m, (m + 1) % spec.states) for m in range(spec.units)]
+    chains = SceneChains(weights_of(machine))
+    return chains.under(conditions(range(spec.V), relations, held), temperature), held
 
 
-CONDITIONS = {
-    "nothing": conditions(),
-    "classes": conditions([3, 17, 30]),
-    "relations": conditions([3, 17, 30], [(0, 0, 1, 1), (1, 1, 2, 1), (2, 2, 0, 0), (3, 0, 2, 1)]),
-    "context": conditions([5], held=[2, 44]),
-    "room": conditions([5], room=1),
-    "room without a sample": conditions([5], room=2),
-}
-
-
-@pytest.mark.parametrize("name", CONDITIONS)
-def test_samples_are_weighed_as_the_tensors_weigh_them(wide, name):
-    condition, chains = CONDITIONS[name], SceneChains(weights_of(wide))
-    mask, clamp = torch_clamp(wide, 1, condition)
-    expected = ChainSamples(wide).log_weight(mask.float().unsqueeze(0), clamp).softmax(1)[0]
-    np.testing.assert_allclose(chains.sample_weights(condition), expected, atol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "temperature"), [*((name, 1.0) for name in CONDITIONS), ("relations", 1.6)]
-)
-def test_long_chains_agree_with_those_of_tensors(wide, name, temperature):
-    """Means over 600 chains each, of every class, every unit and the number of relations of each
-    kind: 114 differences within 5.5 standard errors fail by chance with probability 5e-6."""
-    condition, rows = CONDITIONS[name], 600
-    mask, clamp = torch_clamp(wide, rows, condition)
-    generator = torch.Generator().manual_seed(0)
-    state = ChainSamples(wide).start(mask.float().repeat(rows, 1), generator, clamp)
-    tempered = wide.scaled(1 / temperature)
-    state = run(tempered, state, generator, 5, clamp, relations=False)
-    state = run(tempered, state, generator, 1, clamp)
-    grid = state.edges.unflatten(state.r * state.edges.ends_present(state.v))
-    off = state.edges.subjects.unsqueeze(2) != state.edges.subjects.unsqueeze(1)
-    counts = (grid * off.unsqueeze(1)).sum((2, 3))
-    expected = torch.cat([state.v, state.h1, counts], 1).double().numpy()
-    chains = SceneChains(weights_of(wide)).under(condition, temperature)
-    found = np.zeros_like(expected)
-    for chain, row in enumerate(found):
-        drawn = chains.draw(6, random_stream(9, chain))
-        row[drawn.classes] = 1
-        row[40 + drawn.h1] = 1
-        row[110:] = drawn.r.sum((1, 2)) - np.trace(drawn.r, axis1=1, axis2=2)
-    error = np.sqrt((found.var(0) + expected.var(0)) / rows) + 1e-9
-    assert (np.abs(found.mean(0) - expected.mean(0)) <= 5.5 * error + 1e-9).all()
-    assert (found[:, condition.classes] == 1).all()
-    assert (found[:, 40 + condition.held] == 1).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("layers", "temperature"), [(0, 1.0), (4, 1.6)])
-def test_relations_that_imply_each_other_are_drawn_as_by_tensors(layers, temperature):
-    """Three classes, one relation, strong implications: the law of its six units from 16,000 draws
-    each. Two samples: total variation within its mean and 1e-9 of McDiarmid.
-
-    How strictly implications hold is for the context to say, a second layer included.
-    """
-    rows = 16_000
-    spec = MachineSpec("triway", V=3, A=1, H1=3, H2=layers, K=2, G=2, form="local")
-    generator = torch.Generator().manual_seed(4)
-    machine = random_weights(build(spec), generator)
-    v, h1 = torch.ones(rows, 3), torch.tensor([[1.0, 0, 1]]).expand(rows, -1)
-    _, r = sample_relations(machine.scaled(1 / temperature), v, h1, generator)
-    chains = SceneChains(weights_of(machine)).under(conditions(), temperature)
-    on, second = np.array([1, 0, 1], np.uint8), np.zeros(layers, np.uint8)
-    off = ~np.eye(3, dtype=bool)
-    bits = 1 << np.arange(6)
-    expected = np.bincount(r.view(-1, 3, 3).numpy()[:, off].astype(int) @ bits, minlength=64) / rows
-    found = np.zeros(64)
-    for chain in range(rows):
-        # No sweep: relations are drawn where the chain stands.
-        stands = np.ones(3, np.uint8), on.copy(), second.copy()
-        drawn = chains.move(*stands, 0, random_stream(0, chain))
-        found[drawn.r[0][off] @ bits] += 1 / rows
-    mean = 0.5 * np.sqrt(4 * expected * (1 - expected) / (math.pi * rows)).sum()
-    slack = math.sqrt(9 * math.log(10) / rows)
-    assert 0.5 * np.abs(found - expected).sum() < 1.1 * mean + slack
-    # The test could not pass without implications.
-    alone = 1 / (1 + np.exp(-drawn.logits[0][off] / temperature))
-    independent = np.array(
-        [np.prod(np.where(row >> np.arange(6) & 1, alone, 1 - alone)) for row in range(64)]
+def drawn_relations(chains, classes):
+    """Codes of the relations between different classes of drawn states."""
+    off = ~np.eye(classes, dtype=bool)
+    return np.array(
+        [code(chains.draw(1, random_stream(0, k)).r[:, off].ravel()) for k in range(RELATION_DRAWS)]
     )
-    assert 0.5 * np.abs(found - independent).sum() > 3 * (mean + slack)
 
 
-def test_other_machines_are_refused():
-    for machine in (small_machine("triway-seed").float(), small_machine("triway-local")):
-        weights = weights_of(machine)
-        assert not SceneChains.supports(weights)
-        with pytest.raises(ValueError, match="local form with float32 weights"):
-            SceneChains(weights)
+@pytest.mark.parametrize("temperature", [1.0, 1.6])
+@pytest.mark.parametrize("name", [name for name, spec in SMALL.items() if not spec.G])
+def test_relations_are_drawn_given_objects_and_hidden_units(name, temperature):
+    machine = small_machine(name)
+    spec = machine.spec
+    chains, held = all_present(copy.deepcopy(machine).float(), temperature)
+    h1 = torch.from_numpy(one_hot(np.array(held)[:, 1], spec.states))[None]
+    edges = machine.edges(torch.arange(spec.V)[None])
+    logits = np.full((spec.A, spec.V, spec.V), -np.inf)
+    units = edges.relation[0], edges.subject[0], edges.object[0]
+    logits[units] = machine.relation_logits(edges, torch.ones(1, spec.V).double(), h1)[0]
+    on = 1 / (1 + np.exp(-logits[:, ~np.eye(spec.V, dtype=bool)].ravel() / temperature))
+    states = binary(len(on)).numpy()
+    law = np.where(states > 0, on, 1 - on).prod(1)
+    check_frequencies(drawn_relations(chains, spec.V), np.arange(len(states)), law)
+
+
+def implied_law(machine, observed):
+    """The law of r (64,) between three classes, drawn in groups, by a sum over all groups.
+
+    A group is drawn given the relations of all earlier groups. Observed relations come first.
+    """
+    off = [(i, j) for i in range(3) for j in range(3) if i != j]
+    v, h1 = torch.ones(1, 3).double(), torch.tensor([[1.0, 0, 1]]).double()
+    edges = machine.edges(torch.arange(3)[None])
+    logits = machine.relation_logits(edges, v, h1).view(1, 3, 3)
+    chance = np.zeros((64, 6))
+    for mask, row in enumerate(binary(6)):
+        grid = torch.zeros(1, 3, 3).double()
+        grid[0, [i for i, _ in off], [j for _, j in off]] = row
+        x = (logits + implied_by_hand(machine, v[0], grid))[0]
+        chance[mask] = [float(x[pair].sigmoid()) for pair in off]
+    # Of the relations a(i, j) and a(j, i), one is in the groups 0 to 3, and the other in 4 to 7.
+    choices = [
+        (4 * late + n, 4 * (1 - late) + k) for late in (0, 1) for n in range(4) for k in range(4)
+    ]
+    group = np.zeros((32**3, 6), np.int64)
+    for row, picked in zip(group, product(choices, repeat=3), strict=True):
+        for (i, j), (first, second) in zip([(0, 1), (0, 2), (1, 2)], picked, strict=True):
+            row[off.index((i, j))], row[off.index((j, i))] = first, second
+    for i, j in observed:
+        group[:, off.index((i, j))] = -1
+    law = np.zeros(64)
+    for mask, r in enumerate(binary(6).bool().tolist()):
+        p = np.ones(len(group))
+        for u, pair in enumerate(off):
+            earlier = sum((group[:, w] < group[:, u]) * (r[w] << w) for w in range(6))
+            on = chance[earlier, u] if pair not in observed else 1.0
+            p *= on if r[u] else 1 - on
+        law[mask] = p.mean()
+    return law
+
+
+@pytest.mark.parametrize("observed", [(), ((0, 2), (2, 1))])
+def test_relations_that_imply_each_other_are_drawn_in_groups(observed):
+    spec = MachineSpec("triway", V=3, A=1, units=3, K=2, G=2)
+    machine = random_weights(build(spec), torch.Generator().manual_seed(4), 0.7)
+    chains, _ = all_present(machine, relations=[(0, *pair, 1) for pair in observed])
+    law = implied_law(machine.double(), observed)
+    assert law.sum() == pytest.approx(1)
+    check_frequencies(drawn_relations(chains, 3), np.arange(64), law)
+    machine.gamma.zero_()
+    assert 0.5 * np.abs(implied_law(machine, observed) - law).sum() > 0.15
+
+
+# -- starts and scores -------------------------------------------------------------------------
+
+STORED = MachineSpec("triway", V=12, A=2, units=4, states=3, C=3, K=2, N=24, coupled=True)
+
+
+def log_weights_by_hand(machine, v, rooms, condition):
+    """The log weight of each stored scene, (N,), from the formula of the module."""
+    log_w = torch.zeros(len(v)).double()
+    h1 = machine.state_means(machine.c1 + v @ machine.W)
+    for i in condition.classes:
+        log_w += (machine.b[i] + h1 @ machine.W[i] + v @ machine.couplings[i]).sigmoid().log()
+    for unit, state in condition.held:
+        means = machine.by_unit(h1)[:, unit]
+        log_w += (means[:, state - 1] if state else 1 - means.sum(1)).log()
+    if condition.room is not None:
+        has_room = rooms == condition.room
+        log_w -= 0 if not has_room.any() else float(OTHER_ROOM) * ~has_room
+        log_w += 0 if has_room.any() else h1 @ machine.Q[condition.room]
+    return log_w
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [
+        conditions(),
+        conditions([3, 7]),
+        conditions([5], held=[(0, 0), (2, 2)]),
+        conditions([5], room=1),
+        conditions(room=2),  # no stored scene has this room type
+    ],
+)
+def test_starts_are_weighed_by_the_evidence(condition):
+    generator = torch.Generator().manual_seed(0)
+    machine = random_weights(build(STORED), generator)
+    machine.L.copy_(machine.couplings)
+    v = (torch.rand(24, 12, generator=generator) < 0.3).double()
+    rooms = torch.arange(24) % 3 - 1
+    machine.fantasies.copy_(torch.from_numpy(pack_scenes(v.numpy())))
+    machine.fantasy_rooms.copy_(rooms)
+    found = SceneChains(weights_of(machine)).sample_weights(condition)
+    expected = log_weights_by_hand(machine.double(), v, rooms, condition).softmax(0)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("room", [None, 1])
+@pytest.mark.parametrize("name", [name for name, spec in SMALL.items() if not spec.G])
+def test_log_score_is_the_log_probability(name, room):
+    """log p(v) + log Z + log p(r | v, h1) - e_t; with two layers, a bound from below."""
+    machine = served_machine(name)
+    spec = machine.spec
+    room = room if spec.C else None
+    joint = enumerate_joint(machine, room)
+    chains = SceneChains(weights_of(machine)).under(conditions(room=room))
+    every = np.arange(spec.V)
+    errors = []
+    for n in joint.draw(40, torch.Generator().manual_seed(0)).tolist():
+        v, r = joint.v[n].numpy() > 0, np.zeros((spec.A, spec.V, spec.V), bool)
+        e, is_on = joint.edges, joint.r[n] > 0
+        r[e.relation[0, is_on], e.subject[0, is_on], e.object[0, is_on]] = True
+        logits = np.full(r.shape, -1e4)
+        of_units = machine.relation_logits(e, joint.v[n][None], joint.h1[n][None])[0]
+        logits[e.relation[0], e.subject[0], e.object[0]] = of_units
+        state = ChainState(every, every, every, logits, r)
+        score = chains.log_score(state, v, r)
+        between = r[:, v][:, :, v], logits[:, v][:, :, v]
+        log_p = np.where(between[0], between[1], 0).sum() - np.logaddexp(0, between[1]).sum()
+        exact = joint.log_sum(same(joint.v, joint.v[n])) + log_p
+        errors.append(exact - score - (0 if room is None else float(machine.e[room])))
+    if spec.H2:
+        assert 0 < min(errors) <= max(errors) < 0.2
+    else:
+        assert max(map(abs, errors)) < 1e-5
+
+
+def test_a_sweep_draws_the_second_layer_from_its_mean_field():
+    """Without a state of h2; five standard errors, so chance fails with probability < 2e-6."""
+    machine = small_machine("gbm").float()
+    machine.b.fill_(-60.0)
+    chains = SceneChains(weights_of(machine)).under(conditions())
+    _, m2 = machine.context(torch.zeros(1, 2))
+    stream, total = random_stream(0, 0), np.zeros(2)
+    for _ in range(CHAINS):
+        total += chains.sweep(np.zeros(2, np.uint8), 0, stream)[1]
+    error = 5 * (m2[0] * (1 - m2[0]) / CHAINS).sqrt().numpy()
+    assert (np.abs(total / CHAINS - m2[0].numpy()) <= error).all()
+    assert math.isfinite(total.sum())

@@ -1,4 +1,4 @@
-"""The scorer against softplus differences in float64, for ordinary and for absurd weights."""
+"""Log-odds of classes and room types in the service, against the tensors in float64."""
 
 from __future__ import annotations
 
@@ -8,67 +8,188 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.inference.objects import ContextScorer
+from app.inference.objects import LARGEST_WEIGHT, Gains, ObjectScorer
+from app.inference.posterior import context_of
+from tests.enumeration.small_machines import random_weights
+from training.machines import MachineSpec, build
+from training.machines.arrays import weights_of
 
-SIZES = st.integers(1, 40)
 SEEDS = st.integers(0, 2**32)
-# The largest |W| decides how many factors share a log: 1, some, all of them, or no products at all.
-WEIGHTS = st.sampled_from([0.0, 1e-3, 1.0, 5.0, 12.0, 17.0, 40.0, 63.9, 64.1, 88.0, 200.0, 1e4])
-LOGITS = st.sampled_from([0.0, 1.0, 10.0, 17.0, 60.0, 88.0, 89.0, 95.0, 104.0, 1e4])
-
-
-def gains(W, x):
-    """Of rows x (B, H1), (B, V)."""
-    scorer = ContextScorer(W.numpy())
-    return torch.from_numpy(scorer.gain(x.numpy()))
+# The largest |w| decides how many factors share a log.
+WEIGHTS = st.sampled_from([0.0, 1e-3, 1.0, 3.0, 5.0, 12.0, 17.0, 39.9, LARGEST_WEIGHT])
+LOGITS = st.sampled_from([0.0, 1.0, 10.0, 17.0, 60.0, 88.0, 95.0, 104.0, 1e4])
 
 
 def uniform(shape, largest, generator):
     return (2 * torch.rand(shape, generator=generator) - 1) * largest
 
 
-def exact_gain(x, W):
-    """Softplus differences in float64, (B, V)."""
-    x, W = x.double().unsqueeze(1), W.double()
-    zero = torch.zeros((), dtype=torch.float64)
-    return (torch.logaddexp(zero, x + W) - torch.logaddexp(zero, x)).sum(-1)
+def exact_gain(x, w, states):
+    """sum_m log sum_z p_m(z) exp(w[m, z]) in float64, (B, rows)."""
 
+    def log_sum(logits):
+        by_unit = logits.unflatten(-1, (-1, states - 1))
+        return torch.cat([torch.zeros_like(by_unit[..., :1]), by_unit], -1).logsumexp(-1)
 
-def close_to_exact(gain, x, W):
-    # Each factor is good to some float32 roundings, and there are H1 of them.
-    torch.testing.assert_close(gain.double(), exact_gain(x, W), rtol=1e-5, atol=4e-7 * W.shape[1])
+    x, w = x.double().unsqueeze(1), w.double()
+    return (log_sum(x + w) - log_sum(x)).sum(-1)
 
 
 @given(
-    V=SIZES,
-    H1=SIZES,
-    rows=st.integers(1, 5),
+    rows=st.integers(1, 40),
+    units=st.integers(1, 40),
+    states=st.sampled_from([2, 3, 4, 5, 32]),
+    scenes=st.integers(1, 4),
     weight=WEIGHTS,
     logit=LOGITS,
     are_corners=st.booleans(),
     seed=SEEDS,
 )
-def test_gain_is_exact_to_float32_rounding(V, H1, rows, weight, logit, are_corners, seed):
+def test_gain_is_exact_to_float32_rounding(
+    rows, units, states, scenes, weight, logit, are_corners, seed
+):
     """At the corners every weight is ±weight and every logit ±logit, so that whole groups of
     factors are extreme at once."""
     generator = torch.Generator().manual_seed(seed)
-    W, x = uniform((V, H1), weight, generator), uniform((rows, H1), logit, generator)
+    shape = units * (states - 1)
+    w, x = uniform((rows, shape), weight, generator), uniform((scenes, shape), logit, generator)
     if are_corners:
-        W, x = W.sign() * weight, x.sign() * logit
-    for weights in (W, W.abs(), -W.abs()):
+        w, x = w.sign() * weight, x.sign() * logit
+    for weights in (w, w.abs(), -w.abs()):
+        gains = Gains(weights.numpy(), states)
         for logits in (x, x.abs(), -x.abs()):
-            close_to_exact(gains(weights, logits), logits, weights)
+            gain = torch.from_numpy(gains(logits.numpy())).double()
+            # Each factor is good to some float32 roundings, and there are as many as units.
+            close = {"rtol": 1e-5, "atol": 5e-7 * units}
+            torch.testing.assert_close(gain, exact_gain(logits, weights, states), **close)
 
 
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-def test_weights_that_are_not_finite_are_refused(value):
-    W = torch.zeros(2, 3)
-    W[1, 2] = value
-    with pytest.raises(ValueError, match="weights must be finite"):
-        ContextScorer(W.numpy())
+def test_many_rows_are_computed_alike():
+    """Rows beyond one tile of 800 have the bits that they have alone."""
+    generator = torch.Generator().manual_seed(0)
+    w, x = uniform((1700, 40), 2.0, generator).numpy(), uniform((3, 40), 2.0, generator).numpy()
+    gain = Gains(w, 5)(x)
+    for row in (0, 799, 800, 1599, 1600, 1699):
+        np.testing.assert_array_equal(Gains(w[row : row + 1], 5)(x)[:, 0], gain[:, row])
+    np.testing.assert_array_equal(Gains(w, 5)(x[1:2])[0], gain[1])
 
 
-@pytest.mark.parametrize("shape", [(4,), (3, 1), ()])
-def test_logits_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match=r"x must have the shape \(\.\.\., 3\)"):
-        ContextScorer(np.ones((2, 3), np.float32)).gain(np.zeros(shape))
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 40.1])
+def test_weights_that_float32_products_do_not_cover_are_refused(value):
+    weights = np.zeros((2, 3), np.float32)
+    weights[1, 2] = value
+    with pytest.raises(ValueError, match="weights must be between"):
+        Gains(weights, 2)
+
+
+# -- the answers about a scene -----------------------------------------------------------------
+
+V, C = 14, 3
+SPECS = {
+    "binary": MachineSpec("rbm", V=V, A=1, units=30, C=C, profiles=2),
+    "states": MachineSpec(
+        "triway", V=V, A=1, units=5, states=8, C=C, K=1, profiles=2, coupled=True
+    ),
+    "two-layers": MachineSpec("gbm", V=V, A=1, units=6, states=4, H2=5, C=C, profiles=2),
+}
+ONE_LAYER = ("binary", "states")
+
+
+class Case:
+    """A machine, some listed classes with probabilities, a room type and a profile."""
+
+    def __init__(self, name, seed):
+        generator = torch.Generator().manual_seed(seed)
+        self.machine = random_weights(build(SPECS[name]), generator)
+        if self.machine.spec.coupled:
+            self.machine.L.copy_(self.machine.couplings)
+        weights = weights_of(self.machine)
+        self.machine.double()
+        n = int(torch.randint(1, 9, (), generator=generator))
+        self.classes = torch.randperm(V, generator=generator)[:n].numpy()
+        self.presence = torch.rand(n, generator=generator).numpy()
+        self.room = int(torch.randint(-1, C, (), generator=generator))
+        self.source = int(torch.randint(-1, 2, (), generator=generator))
+        self.profile = None if self.source < 0 else self.source
+        self.scorer = ObjectScorer(weights)
+        room = None if self.room < 0 else self.room
+        context = context_of(weights, self.classes, self.presence, self.presence, room)
+        self.x, self.shares = context.x, context.shares
+
+    def log_odds(self, *without):
+        """By the tensors, (V,), with the classes but those at some rows."""
+        v = torch.zeros(1, V).double()
+        v[0, self.classes] = torch.from_numpy(self.presence).double()
+        v[0, self.classes[list(without)]] = 0
+        room, source = torch.tensor([self.room]), torch.tensor([self.source])
+        return self.machine.object_log_odds(v, room=room, source=source)[0].numpy()
+
+
+def close(found, expected, atol=2e-4):
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=atol)
+
+
+@given(name=st.sampled_from(sorted(SPECS)), seed=SEEDS)
+def test_log_odds_equal_the_tensors(name, seed):
+    """Of absent classes, and of each listed class given the others, computed without it."""
+    case = Case(name, seed)
+    scene, absent = (case.classes, case.presence), np.setdiff1d(np.arange(V), case.classes)
+    found = case.scorer.absent(case.x, *scene, case.profile, 0.15)
+    kappa = case.machine.kappa.numpy()
+    close(found[absent], (case.log_odds() + kappa[0])[absent])
+    found = case.scorer.given_rest(case.x, case.shares, *scene, case.profile)
+    rest = [case.log_odds(k)[i] + kappa[-1, i] for k, i in enumerate(case.classes)]
+    close(found, rest)
+    v = torch.zeros(1, V).double()
+    v[0, case.classes] = torch.from_numpy(case.presence).double()
+    if case.room < 0:
+        close(case.scorer.room_logits(case.x), case.machine.room_logits(v)[0])
+
+
+@given(name=st.sampled_from(ONE_LAYER), seed=SEEDS)
+def test_reasons_are_differences_of_log_odds(name, seed):
+    """With class j minus without class j, recomputed; of class i itself, 0."""
+    case = Case(name, seed)
+    scene = case.x, case.shares, case.classes, case.presence
+    rows = np.arange(len(case.classes))[::-2]
+    found, expected = case.scorer.reasons(*scene, rows), np.zeros((len(rows), len(case.classes)))
+    for row, k in enumerate(rows):
+        for j in set(range(len(case.classes))) - {k}:
+            i = case.classes[k]
+            expected[row, j] = case.log_odds(k)[i] - case.log_odds(k, j)[i]
+    close(found, expected)
+    candidates = np.setdiff1d(np.arange(V), case.classes)[::3]
+    found = case.scorer.reasons_for_absent(*scene, candidates)
+    each = [case.log_odds() - case.log_odds(j) for j in range(len(case.classes))]
+    close(found, np.array(each).T[candidates])
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.3])
+def test_reasons_of_two_layers_add_the_effects_through_the_second(scale):
+    """The effects of two classes through h2 are added, so the error is of second order."""
+    errors = []
+    for seed in range(20):
+        case = Case("two-layers", seed)
+        for weight in (case.machine.W, case.machine.J):
+            weight.mul_(scale)
+        weights = weights_of(case.machine.float())
+        context = context_of(weights, case.classes, case.presence, case.presence)
+        case.machine.double()
+        case.room = -1
+        rows = np.arange(len(case.classes))
+        scene = context.x, context.shares, case.classes, case.presence
+        found = ObjectScorer(weights).reasons(*scene, rows)
+        for k in rows:
+            for j in set(rows) - {k}:
+                i = case.classes[k]
+                errors.append(abs(found[k, j] - case.log_odds(k)[i] + case.log_odds(k, j)[i]))
+    assert max(errors) < {0.1: 1e-4, 0.3: 5e-3}[scale]
+
+
+@given(coverage=st.floats(0, 1))
+def test_kappa_is_interpolated_between_the_middles_of_the_bins(coverage):
+    machine = build(SPECS["binary"])
+    machine.kappa.data.copy_(torch.tensor([[0.0], [1.0], [4.0], [-2.0]]).expand(-1, V))
+    found = ObjectScorer(weights_of(machine)).kappa(coverage)
+    expected = np.interp(coverage, [0.15, 0.45, 0.8, 1.0], [0.0, 1.0, 4.0, -2.0])
+    np.testing.assert_allclose(found, np.full(V, expected), atol=1e-5)

@@ -1,4 +1,4 @@
-"""The compiled relation part against its formulas in double precision."""
+"""Relations in the service: moments of logits by enumeration of h1, and the quadrature."""
 
 from __future__ import annotations
 
@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from app.inference.relations import Ends, SharedUnits, to_log_odds
+from app.inference.objects import ObjectScorer
+from app.inference.posterior import ScenePosterior, context_of
+from app.inference.relations import NEVER, NO_UNIT, ends_of, relation_units, to_log_odds
+from tests.enumeration.small_machines import random_weights, unit_states
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
+
+V, A = 6, 2
 
 
 def sigmoid(x):
@@ -17,6 +22,7 @@ def sigmoid(x):
 
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 0.74, 0.8, 2.0, 10.0])
 def test_log_odds_of_normal_logits(sigma):
+    """The error in the probability is at most 0.0004."""
     mean = np.linspace(-25, 25, 201)
     found = to_log_odds(mean, np.full(len(mean), 3**0.5 * sigma, dtype=np.float32))
     t = np.linspace(-9, 9, 20_001)
@@ -29,19 +35,136 @@ def test_log_odds_of_normal_logits(sigma):
         np.testing.assert_allclose(found, mean, rtol=1e-6, atol=1e-6)
 
 
-def test_residuals_are_found_and_nothing_else():
-    machine = build(MachineSpec("triway", V=40, A=4, H1=70, K=2, T=500, form="local"))
+SPECS = {
+    "rbm": MachineSpec("rbm", V=V, A=A, units=4, states=3, T=40, C=2),
+    "gbm": MachineSpec("gbm", V=V, A=A, units=6, H2=3, T=40, C=2),
+    "triway": MachineSpec("triway", V=V, A=A, units=6, K=2, T=9, C=2),
+    "triway-states": MachineSpec("triway", V=V, A=A, units=4, states=4, K=2, T=9, C=2),
+    "triway-deep": MachineSpec("triway", V=V, A=A, units=3, states=5, H2=3, K=3, T=9, C=2),
+}
+CLASSES, LOG_COUNTS = np.array([4, 0, 3]), np.log([1, 3, 2]).astype(np.float32)
+
+
+def machine_of(name, scale=0.8):
+    """Float32 weights, and triples of random classes."""
+    generator = torch.Generator().manual_seed(3)
+    machine = build(SPECS[name])
+    keys = torch.randperm(A * V**2, generator=generator)[: machine.spec.T].sort().values
+    machine.set_triples(torch.stack([keys // V**2, keys // V % V, keys % V], 1))
+    return random_weights(machine, generator, scale)
+
+
+def exact_logits(machine, v, room):
+    """ℓ of every state of h1, (states, units), and p(state | v), (states,), by the tensors.
+
+    With a second layer, its means are those of the mean field given v.
+    """
+    h1 = unit_states(machine.spec)
+    x, _ = machine.context(v, torch.tensor([room]))
+    p = (h1 @ x[0]).softmax(0)
+    counts = torch.ones(V, dtype=torch.int64)
+    counts[CLASSES] = torch.from_numpy(np.exp(LOG_COUNTS)).round().long()
+    edges = machine.edges(torch.arange(V)[None], counts[None])
+    grid = torch.full((len(h1), A, V, V), float(NEVER)).double()
+    units = edges.relation[0], edges.subject[0], edges.object[0]
+    grid[:, *units] = machine.relation_logits(edges, v.expand(len(h1), -1), h1)
+    return grid, p
+
+
+def moments(grid, p):
+    mean = torch.einsum("s,saij->aij", p, grid)
+    variance = torch.einsum("s,saij->aij", p, (grid - mean) ** 2)
+    return mean.numpy(), variance.numpy()
+
+
+def scene_of(machine, room):
+    v = torch.zeros(1, V).double()
+    v[0, CLASSES] = 1
+    weights = weights_of(machine)
+    ones = np.ones(len(CLASSES), np.float32)
+    context = context_of(weights, CLASSES, ones, LOG_COUNTS, None if room < 0 else room)
+    return v, weights, context
+
+
+@pytest.mark.parametrize("room", [-1, 1])
+@pytest.mark.parametrize("name", SPECS)
+def test_mean_and_variance_are_those_over_all_states_of_h1(name, room):
+    """Of relations between listed classes, and of placements, in which a candidate is present."""
+    machine = machine_of(name)
+    v, weights, context = scene_of(machine, room)
+    units, machine = relation_units(weights), machine.double()
+    between = units.between(context)
+    grid = np.ix_(range(A), CLASSES, CLASSES)
+    mean, variance = (m[grid] for m in moments(*exact_logits(machine, v, room)))
+    np.testing.assert_allclose(between.mean, mean, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(between.spread**2 / 3, variance, rtol=1e-3, atol=1e-4)
+    if machine.spec.H2:
+        return  # a candidate leaves the means of h2 as they are
+    for candidate in (1, 5):
+        v[0, candidate] = 1
+        mean, variance = moments(*exact_logits(machine, v, room))
+        v[0, candidate] = 0
+        expected = to_log_odds(mean, np.sqrt(3 * variance).astype(np.float32))
+        out, back = units.placement_log_odds(context, np.array([candidate]), np.arange(3))
+        np.testing.assert_allclose(out[0], expected[:, candidate, CLASSES], atol=2e-3)
+        np.testing.assert_allclose(back[0], expected[:, CLASSES, candidate], atol=2e-3)
+        one, _ = units.placement_log_odds(context, np.array([candidate]), np.arange(3), only=1)
+        np.testing.assert_allclose(one[0, 0], out[0, 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_probabilities_are_close_to_the_sum_over_all_states(name):
+    """The logit of a few units is not normal: the probability has an error of at most .02."""
+    machine = machine_of(name, scale=0.6)
+    v, weights, context = scene_of(machine, 0)
+    scene = ScenePosterior(ObjectScorer(weights), relation_units(weights), context)
+    found = scene.relation_log_odds()
+    grid, p = exact_logits(machine.double(), v, 0)
+    exact = torch.einsum("s,saij->aij", p, grid.sigmoid())[np.ix_(range(A), CLASSES, CLASSES)]
+    assert float(np.abs(sigmoid(found.astype(float)) - exact.numpy()).max()) < 0.02
+    assert (found >= NO_UNIT).all()
+    if name in ("rbm", "gbm"):
+        assert (found == NO_UNIT).any()
+    r, i, j = (k.ravel() for k in np.indices(found.shape))
+    np.testing.assert_array_equal(scene.unit_log_odds(r, i, j), found.ravel())
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_context_weights_are_the_slopes_of_the_logits(name):
+    machine = machine_of(name)
+    units = relation_units(weights_of(machine))
+    edges = machine.double().edges(torch.arange(V)[None])
+    ends = [part[0].numpy() for part in (edges.relation, edges.subject, edges.object)]
+    h1 = torch.eye(machine.spec.H1).double()
+    v = torch.ones(len(h1), V).double()
+    slope = machine.relation_logits(edges, v, h1) - machine.relation_logits(edges, v, 0 * h1)
+    np.testing.assert_allclose(units.context_weights(*ends), slope.T, rtol=1e-4, atol=1e-5)
+
+
+def test_certain_states_have_the_logits_of_the_machine():
+    machine = machine_of("triway-states")
+    units, h1 = relation_units(weights_of(machine)), unit_states(machine.spec)[77:78].float()
+    n = np.arange(V)
+    pair = np.repeat(n, V)[None], np.tile(n, V)[None]
+    ends = ends_of(n, np.ones(V, np.float32), np.zeros(V, np.float32), *pair)
+    mean, spread = units.normal(h1.numpy(), ends, certain=True)
+    expected = machine.relation_logits(machine.edges(torch.arange(V)[None]), torch.ones(1, V), h1)
+    np.testing.assert_allclose(mean.ravel(), expected[0], rtol=1e-4, atol=1e-4)
+    assert not spread.any()
+
+
+def test_residuals_belong_to_their_triples():
+    machine = build(MachineSpec("triway", V=40, A=4, units=70, K=2, T=500)).requires_grad_(False)
     rng = np.random.default_rng(0)
     keys = np.sort(rng.choice(4 * 40 * 40, 500, replace=False))
     machine.set_triples(torch.tensor(np.stack([keys // 1600, keys // 40 % 40, keys % 40], 1)))
-    with torch.no_grad():
-        machine.residual.copy_(torch.arange(1.0, 501.0))
+    machine.residual.copy_(torch.arange(1.0, 501.0))
     expected = np.zeros(4 * 40 * 40)
     expected[keys] = np.arange(1.0, 501.0)
     # All other weights are zero.
-    for parameter in (machine.d, machine.s, machine.o, machine.S, machine.O):
-        parameter.detach().zero_()
-    a, i, j = (part.reshape(-1) for part in np.indices((4, 40, 40)))
-    none = np.zeros(len(a), np.float32)
-    units = SharedUnits(weights_of(machine)).select(a, Ends(i, j, none, none, none, none))
-    np.testing.assert_array_equal(units.base, expected)
+    n = np.arange(40)
+    pair = np.repeat(n, 40)[None], np.tile(n, 40)[None]
+    ends = ends_of(n, np.ones(40, np.float32), np.zeros(40, np.float32), *pair)
+    means = np.full((1, 70), 0.5, np.float32)
+    mean, _ = relation_units(weights_of(machine)).normal(means, ends)
+    np.testing.assert_array_equal(mean.ravel(), expected)
