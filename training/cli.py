@@ -45,6 +45,7 @@ from training.runs.folder import FinishedRun, load_run, save_run
 from training.runs.live import Display, next_steps, summarise
 from training.runs.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.runs.publish import RefusedError, publish_run, refit
+from training.seed.command import seed as seed_command
 
 app = typer.Typer(
     rich_markup_mode="markdown", add_completion=False, no_args_is_help=True, help=__doc__
@@ -55,6 +56,7 @@ app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
 app.command()(ablate)
+app.command(name="seed")(seed_command)
 console = Console()
 
 Data = Annotated[

@@ -115,8 +115,8 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
                 "aliases": ["trash can"],
                 "structure": False,
                 "anywhere": False,
-                "parent": "container",
                 "size": {"x": 0.3, "y": 0.3, "z": 0.5},
+                "parent": "container",
             },
             {"label": "container", "aliases": [], "structure": False, "anywhere": False},
             {"label": "floor", "aliases": [], "structure": True, "anywhere": False},
@@ -132,6 +132,21 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
                 },
             }
         ],
+    },
+    "show_word": {
+        "model": _MODEL,
+        "word": "standing lamp",
+        "class": {
+            "label": "floor lamp",
+            "aliases": ["standing lamp"],
+            "structure": False,
+            "anywhere": False,
+            "parent": "lamp",
+            "size": {"x": 0.4, "y": 0.4, "z": 1.6},
+        },
+        "rule": "alias",
+        "certain": True,
+        "suggestions": [],
     },
     "show_contexts": {
         "model": _MODEL,

@@ -16,6 +16,7 @@ from app.api.gateway import ADMIN_KEY
 from app.api.openapi import error_responses
 from app.registry import AliasTarget
 from app.scene.relations import opposite
+from app.scene.vocabulary import ObjectClass
 from app.serving.models import ServedModels
 from app.serving.runtime import Runtime
 from scene_client import schemas
@@ -28,6 +29,13 @@ Reference = Annotated[
     Path(
         description="an alias, `name` (the newest usable version of a model) or `name@version`",
         openapi_examples={"alias": {"summary": "the default model", "value": "default"}},
+    ),
+]
+Word = Annotated[
+    str,
+    Path(
+        description="a label of an object, as a detector writes it",
+        openapi_examples={"alias": {"summary": "an alias", "value": "bedside cabinet"}},
     ),
 ]
 Version = Annotated[str, Path(description="a version that GET /models lists")]
@@ -117,17 +125,7 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> schemas.Vocab
     names = (*canonical, *map(opposite, canonical))
     return schemas.VocabularyAnswer(
         model=served.reference,
-        objects=[
-            schemas.VocabularyEntry(
-                label=entry.label,
-                aliases=list(entry.aliases),
-                structure=entry.structure,
-                size=_size(entry.size),
-                parent=entry.parent,
-                anywhere=entry.anywhere,
-            )
-            for entry in served.vocabulary.objects
-        ],
+        objects=[_class(entry) for entry in served.vocabulary.objects],
         relations=[cast("schemas.RelationName", name) for name in names],
         room_types=list(served.vocabulary.room_types),
         profiles=list(served.artifact.manifest.vocabulary.profiles),
@@ -135,6 +133,31 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> schemas.Vocab
             schemas.ExampleScene(name=example.name, scene=example.request())
             for example in served.artifact.manifest.examples
         ],
+    )
+
+
+@router.get(
+    "/{name}/vocabulary/{word:path}",
+    summary="The class of a label",
+    responses=_LOADED_ERRORS,
+    response_model_exclude_none=True,
+)
+async def show_word(name: Reference, word: Word, runtime: RuntimeDep) -> schemas.WordAnswer:
+    """Return the class that a label of an object becomes, and by which rule."""
+    served = runtime.models.resolve(name)
+    vocabulary = served.vocabulary
+    # A guess compares the label with all names, which takes milliseconds.
+    reading = await asyncio.to_thread(vocabulary.look_up, word)
+    if reading is None:
+        matches = await asyncio.to_thread(vocabulary.nearest, word)
+        suggestions = [vocabulary.labels[match.entry] for match in matches]
+        return schemas.WordAnswer(model=served.reference, word=word, suggestions=suggestions)
+    return schemas.WordAnswer(
+        model=served.reference,
+        word=word,
+        class_=_class(vocabulary.objects[reading.entry]),
+        rule=reading.rule,
+        certain=reading.certain,
     )
 
 
@@ -188,6 +211,17 @@ async def move_alias(
     runtime: Runtime = http.app.state.runtime
     answer = await runtime.move_alias(alias, data, http.state.request_id)
     return answer.model_dump_json(exclude_none=True).encode()
+
+
+def _class(entry: ObjectClass) -> schemas.VocabularyEntry:
+    return schemas.VocabularyEntry(
+        label=entry.label,
+        aliases=list(entry.aliases),
+        structure=entry.structure,
+        size=_size(entry.size),
+        parent=entry.parent,
+        anywhere=entry.anywhere,
+    )
 
 
 def _size(extents: Sequence[float] | None) -> schemas.Size | None:

@@ -140,7 +140,9 @@ class ScenePosterior:
             i, j: (P,) indices of the two classes of each pair in the scene.
         """
         log_odds = self._units.log_odds(self._between, apart=True)
-        return log_odds[:, i, j], log_odds[:, j, i]
+        # The compiled functions of the questions need contiguous arrays.
+        forward, backward = np.ascontiguousarray(log_odds[:, [i, j], [j, i]].swapaxes(0, 1))
+        return forward, backward
 
     def placement_log_odds(
         self, candidates: Indices, anchors: Indices, only: int | None = None

@@ -305,8 +305,8 @@ class FreeUnits(RelationUnits):
 
     def _units(self, a: Indices, i: Indices, j: Indices) -> Indices:
         """Return the unit of each relation, or -1 for relations without a unit, (E,)."""
-        units: Indices = self._index[kernels.pair_rows(*self._table, i * self._V + j), a]
-        return units
+        rows = kernels.pair_rows(*self._table, i * self._V + j)
+        return self._index[rows, a].astype(np.int64)
 
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, certain: bool = False
@@ -335,7 +335,8 @@ class FreeUnits(RelationUnits):
         return mean, spread
 
     def _by_unit(self, rows: Floats) -> Floats:
-        return rows.reshape(len(rows), -1, self._states - 1)
+        others = self._states - 1
+        return rows.reshape(len(rows), rows.shape[1] // others, others)
 
 
 class SharedUnits(RelationUnits):
@@ -505,7 +506,7 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     rows = np.concatenate([weights["P"][:, None], weights["M"]], 1).astype(np.float64)
     frequency, means = np.ones(spec.V), np.full((1, spec.H1), 1 / spec.states)
     if spec.N:
-        frequency = weights.scenes.mean(0).astype(np.float64)
+        frequency = weights.scenes.mean(0).astype(np.float64) + 1e-6
         means = weights.state_means(weights["c1"] + weights.scenes @ weights["W"])
     p = (frequency / frequency.sum())[:, None]
     ones = np.ones((spec.V, 1))

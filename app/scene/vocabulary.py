@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.scene.labels import head_of, label_key, readings
+from app.scene.labels import Rule, head_of, label_key, readings
 from app.scene.nearest import Guess, Match, NameIndex
 
 Extents = tuple[float, float, float]
@@ -52,6 +52,14 @@ class ObjectClass:
             raise ValueError(
                 f"size of {self.label!r} must be three positive numbers (metres), not {self.size!r}"
             )
+
+
+class LookUp(NamedTuple):
+    """The index of the class that a label becomes, and the rule."""
+
+    entry: int
+    rule: Literal["label", "alias", "phrase"] | Rule
+    certain: bool
 
 
 class Vocabulary:
@@ -203,6 +211,22 @@ class Vocabulary:
         for rule, name in readings(label):
             if (index := index_of(name)) is not None:
                 return Guess(index, 1.0, rule)
+        return None
+
+    def look_up(self, label: str) -> LookUp | None:
+        """Return the class that a label becomes, and the rule, or None for an unknown label.
+
+        A label is accepted in every request by `index` or `read`, or needs `guess`.
+        """
+        key, index = label_key(label), self.index(label)
+        if index is not None:
+            if label_key(self.objects[index].label) == key:
+                return LookUp(index, "label", certain=True)
+            return LookUp(index, "alias" if key in self._by_key else "phrase", certain=True)
+        if (reading := self.read(label)) is not None:
+            return LookUp(reading.entry, reading.rule, certain=True)
+        if (guess := self.guess(label)) is not None:
+            return LookUp(guess.entry, guess.rule, certain=False)
         return None
 
     def room_index(self, room: str) -> int | None:

@@ -120,6 +120,7 @@ def test_offline_and_online_clients_list_models_alike(url: str, shared_store: Pa
             lambda client: client.model("home", "1.0.0"),
             lambda client: client.vocabulary(),
             lambda client: client.vocabulary("plain"),
+            lambda client: client.word("divan/couch"),
             lambda client: client.contexts("deep@0.1.0"),
             lambda client: client.is_live(),
         ):

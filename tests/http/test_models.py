@@ -13,6 +13,7 @@ import threading
 import weakref
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import httpx
 import pytest
@@ -86,6 +87,40 @@ async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> Non
     assert (await client.post("/missing", json=example["scene"])).status_code == 200
 
 
+@pytest.mark.parametrize(
+    ("word", "label", "rule", "certain"),
+    [
+        ("desk", "desk", "label", True),
+        ("Bedside_Tables", "nightstand", "alias", True),
+        ("pile of books", "book", "phrase", True),
+        ("divan/couch", "sofa", "alternative", True),
+        ("bed_2", "bed", "instance", True),
+        ("keybaord", "keyboard", "spelling", False),
+        ("office lamp", "lamp", "head", False),
+    ],
+)
+async def test_a_word_becomes_a_class(
+    client: httpx.AsyncClient, word: str, label: str, rule: str, certain: bool
+) -> None:
+    answer = (await client.get(f"/models/default/vocabulary/{quote(word)}")).json()
+    assert (answer["word"], answer["class"]["label"]) == (word, label)
+    assert (answer["rule"], answer["certain"]) == (rule, certain)
+    assert (answer["class"].get("parent") == "table") == (label == "desk")
+    # A request accepts the label by the same rule.
+    unknown_labels = "error" if certain else "nearest"
+    body = {"objects": [word], "unknown_labels": unknown_labels}
+    mapped = (await client.post("/missing", json=body)).json()["mapped"]
+    expected = [] if rule in ("label", "alias", "phrase") else [(label, rule)]
+    assert [(entry["class"], entry["rule"]) for entry in mapped] == expected
+
+
+async def test_an_unknown_word_has_suggestions(client: httpx.AsyncClient) -> None:
+    answer = (await client.get("/models/default/vocabulary/pillar")).json()
+    assert "class" not in answer
+    assert answer["suggestions"][0] == "pillow"
+    assert not answer["certain"]
+
+
 @pytest.mark.parametrize(("name", "layers"), [("home", {"h1": 6}), ("deep", {"h1": 6, "h2": 4})])
 async def test_contexts_name_every_hidden_unit(
     client: httpx.AsyncClient, name: str, layers: dict[str, int]
@@ -114,6 +149,7 @@ async def test_contexts_name_every_hidden_unit(
         "/models/home/versions/9.9.9",
         "/models/home/versions/nonsense",
         "/models/nobody/vocabulary",
+        "/models/nobody/vocabulary/bed",
         "/models/home@9.9.9/contexts",
         "/v2/models/nobody",
         "/v2/models/nobody/ready",

@@ -66,12 +66,11 @@ def test_an_artifact_loads_in_under_a_second(artifact):
 
 
 def test_the_structure_is_the_seed_paper_s_but_for_the_second_layer_of_the_triway(artifact):
-    """Why it has gone: docs/decisions/objective.md. The seed-* configurations keep it."""
+    """Why it has gone: docs/decisions/objective.md."""
     spec = artifact.spec
     assert spec.H1 == 200
     deep = spec.variant == "gbm" or artifact.manifest.name.endswith("deep")
     assert (100 if deep else 0) == spec.H2
-    assert load_config("seed-triway").machine.H2 == 100
     assert len(CANONICAL) == spec.A
 
 
@@ -100,7 +99,6 @@ def test_the_training_configuration_is_stored(artifact):
 
 
 def test_the_examples_of_its_configuration_fit_its_vocabulary(artifact):
-    from training.runs.config_files import load_config
     from training.runs.example_scenes import known_examples, read_examples
 
     examples = read_examples(load_config(artifact.manifest.name).examples, Path())

@@ -1,4 +1,4 @@
-"""Split scenes into training, test and validation parts by one of four protocols.
+"""Split scenes into training, test and validation parts by one of five protocols.
 
 The percentages are the shares of the training, test and validation part.
 
@@ -10,8 +10,9 @@ The percentages are the shares of the training, test and validation part.
   trained on the test scenes of an earlier version. This protocol does not stratify.
 - ``final`` (90 / 0 / 10 %) is ``group`` without a test part. The shipped weights are trained on the
   90 % and calibrated on the 10 %.
-- ``random`` (60 / 30 / 10 %) is the protocol of Bozcan et al. (ICRA 2018). Each scene is assigned
+- ``paper`` (60 / 30 / 10 %) is the protocol of Bozcan et al. (ICRA 2018). Each scene is assigned
   separately.
+- ``paper groups`` has the shares of ``paper`` and keeps groups together.
 
 All protocols except ``stable`` stratify by room type. Their parts depend on the seed and on the set
 of scenes, but not on the order of scenes. Data sources without a common group do not affect each
@@ -29,13 +30,14 @@ from training.datasets.names import curated_names
 from training.datasets.records import AnnotatedScene
 
 Part = Literal["train", "test", "validation"]
-Protocol = Literal["group", "stable", "random", "final"]
+Protocol = Literal["group", "stable", "final", "paper", "paper groups"]
 
 FRACTIONS: Final[dict[Protocol, dict[Part, float]]] = {
     "group": {"train": 0.75, "test": 0.15, "validation": 0.1},
     "stable": {"train": 0.75, "test": 0.15, "validation": 0.1},
     "final": {"train": 0.9, "test": 0.0, "validation": 0.1},
-    "random": {"train": 0.6, "test": 0.3, "validation": 0.1},
+    "paper": {"train": 0.6, "test": 0.3, "validation": 0.1},
+    "paper groups": {"train": 0.6, "test": 0.3, "validation": 0.1},
 }
 
 
@@ -55,7 +57,7 @@ def split(
         )
     # All scenes of a unit have the same part.
     units = [
-        f"{scene.source}/{scene.scene_id}" if protocol == "random" else scene.group
+        f"{scene.source}/{scene.scene_id}" if protocol == "paper" else scene.group
         for scene in scenes
     ]
     part_of: dict[str, Part] = {}

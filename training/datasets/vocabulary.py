@@ -148,7 +148,7 @@ def source_vocabulary(
 ) -> Vocabulary:
     """Build a vocabulary of the classes of one data source, without the base classes.
 
-    Because it has few classes, more specific names become aliases. For example, "dining table"
+    Because it has few classes, more specific names become aliases. For example, "coffee table"
     becomes an alias of "table".
     """
     names = curated_names()

@@ -66,8 +66,7 @@ class WordVectors:
         rows = [row for word in words if (row := self._row(word)) is not None]
         if not rows or 2 * len(rows) < len(words):
             return None
-        mean = np.mean([_unit(self.vectors[row] * np.float32(self.scale)) for row in rows], axis=0)
-        return _unit(mean) if np.linalg.norm(mean) > 0 else None
+        return _mean([_unit(self.vectors[row] * np.float32(self.scale)) for row in rows])
 
     def _row(self, word: str) -> int | None:
         forms = (word, word.removesuffix("s"), word.removesuffix("es"))
@@ -81,17 +80,27 @@ class WordVectors:
 def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, Flags]:
     """Return the unit vectors of the classes, (classes, dimensions), and a mask of known ones.
 
-    The vector of a class is the vector of its label. If the label has no vector, the vector of the
-    first alias with a vector is used. The vector of any other class is zero.
+    The vector of a class is the mean of two vectors, scaled to length 1: the vector of its label,
+    and the mean over its aliases. The aliases tell a saw from the past tense of "see". A class
+    without either has the vector of its parent, or zero.
     """
     vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
-    has_vector = np.zeros(len(vocabulary), dtype=np.bool_)
     for index, entry in enumerate(vocabulary.objects):
-        candidates = map(words.of, (entry.label, *entry.aliases))
-        vector = next((vector for vector in candidates if vector is not None), None)
+        of_aliases = [vector for x in entry.aliases if (vector := words.of(x)) is not None]
+        names = [words.of(entry.label), _mean(of_aliases)]
+        vector = _mean([vector for vector in names if vector is not None])
         if vector is not None:
-            vectors[index], has_vector[index] = vector, True
-    return vectors, has_vector
+            vectors[index] = vector
+    for index, parent in enumerate(vocabulary.parents):
+        if parent >= 0 and not vectors[index].any():
+            vectors[index] = vectors[parent]
+    return vectors, np.asarray(vectors.any(axis=1))
+
+
+def _mean(vectors: list[Vectors]) -> Vectors | None:
+    """Return the mean of unit vectors, scaled to length 1, or None if there is none."""
+    mean = np.sum(vectors, axis=0) if vectors else np.zeros(0)
+    return _unit(mean) if mean.any() else None
 
 
 def read_word_vectors(path: Path) -> WordVectors:

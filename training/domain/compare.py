@@ -25,8 +25,9 @@ from training.datasets.files import DATA
 from training.domain.candidates import BASELINES, Candidate, HeldOut, find, held_out
 from training.domain.init_command import fail
 from training.domain.translation import BEYOND, Translation, same_classes
-from training.evaluation.missing_tasks import leave_one_out
+from training.evaluation.asking import ask_rows
 from training.evaluation.model import Model, ObjectScore
+from training.evaluation.parts import all_but_one, draw_parts, rank_hidden
 from training.evaluation.report import Progress, measure, silent
 from training.evaluation.results import Difference, Results, only, summarise
 from training.evaluation.setting import Setting
@@ -36,9 +37,9 @@ from training.fit.configuration import ConfigError
 from training.runs.pipeline import read_sources, split_and_encode
 
 COMPARED: dict[str, tuple[str, ...]] = {
-    "T2 missing": ("MRR", "top-1", "top-10"),
+    "T2 missing": ("MRR, one removed", "MRR, 25 % shown", "top-1", "top-10"),
     "T2-at missing at a place": ("MRR",),
-    "T3 outliers, uniform": ("hit@1", "AUROC"),
+    "T3 outliers": ("hit@1, uniform", "hit@1, by popularity", "hit@1, signature"),
     "T1a relations": ("R-precision, instance counts", "R-precision, distinct classes"),
     "T1b completion": ("R-precision",),
     "T3b placement": ("hit@1",),
@@ -336,7 +337,8 @@ def changed_most(
     Each question removes one object from a scene. The result has at most `count` examples, and at
     most one example per group of near-duplicate scenes.
     """
-    first, second = (leave_one_out(scenes, structure, score) for score in (a, b))
+    parts = draw_parts(scenes, structure, all_but_one)
+    first, second = (rank_hidden(parts, structure, ask_rows(score, parts.v)) for score in (a, b))
     change = np.abs(first.reciprocal_rank() - second.reciprocal_rank())
     question_of: dict[str, int] = {}
     for question in np.argsort(-change, kind="stable").tolist():
@@ -346,8 +348,7 @@ def changed_most(
     questions = []
     for question in question_of.values():
         row, target = int(first.scene[question]), int(first.target[question])
-        scene, v = scenes.scenes[row], scenes.v[row].clone()
-        v[target] = 0.0
+        scene, v = scenes.scenes[row], parts.v[question]
         room = vocabulary.room_types[scene.room_type] if scene.room_type >= 0 else ""
         questions.append(
             Example(

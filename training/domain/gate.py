@@ -21,13 +21,13 @@ from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import some_scenes
 from training.domain.candidates import Candidate, stored_candidate
 from training.domain.compare import Comparison
+from training.evaluation.asking import missing_score
 from training.evaluation.baselines import EASE, POPULARITY
 from training.evaluation.metrics import FEWEST_GROUPS, Figure, Ratio, paired_difference
-from training.evaluation.missing_tasks import MachineScore, leave_one_out
+from training.evaluation.missing_tasks import rank_missing
 from training.evaluation.model import ObjectScore
 from training.evaluation.report import Progress
 from training.evaluation.tasks import in_words
-from training.machines.arrays import machine_of
 
 # Accepted loss of a primary metric when a new version replaces the served version.
 MARGIN = 0.02
@@ -119,9 +119,9 @@ def measure_usefulness(
     def mrr(score: ObjectScore | None) -> Ratio:
         if score is None:
             raise ValueError("the model has no score of missing objects")
-        return leave_one_out(scenes, data.structure, score).mrr()
+        return rank_missing(scenes, data.structure, score).mrr()
 
-    ours = mrr(MachineScore(machine_of(artifact.weights)))
+    ours = mrr(missing_score(artifact))
     theirs = {}
     for baseline in (POPULARITY, EASE):
         say(f"fitting {baseline.name}")

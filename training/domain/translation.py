@@ -54,13 +54,13 @@ class Translation:
     def translate(self, model: Model) -> Model:
         """Return the model with scores that take scenes and return values in the scene classes.
 
-        In T3 (outliers) and T3b (false relations), the lowest score ranks first. In other tasks,
-        the highest score ranks first. Unknown classes rank last in every task.
+        In T3b (false relations), the lowest score ranks first. In other tasks, the highest score
+        ranks first. Unknown classes rank last in every task.
         """
         reverse = replace(self, unknown=BEYOND)
         wrapper_of: dict[str, Callable[[Any], Any]] = {
             "missing": self._objects,
-            "outliers": reverse._objects,
+            "suspicion": self._objects,
             "at_place": self._placed,
             "relations": self._relations,
             "completion": self._relations,

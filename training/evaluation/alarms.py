@@ -1,7 +1,8 @@
-"""Alarms of `/outliers` in untouched scenes, compared with the promise of each sensitivity.
+"""Alarms of `/outliers` in untouched parts of scenes, against the promise of each sensitivity.
 
-Every object and relation of an untouched scene is right, so each alarm is false. A sensitivity
-promises a maximum share of untouched scenes with an alarm (`ALARMS`). A model is refused only if
+A part lists one to twelve random classes without structure, and their relations. Every object and
+relation of an untouched scene is right, so each alarm is false. A sensitivity promises a maximum
+share of parts with an alarm (`ALARMS`). A model is refused only if
 its share is certainly too large: the exact 95 % lower bound must exceed `EXCESS` times the promise.
 
 Source: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of
@@ -23,7 +24,10 @@ from app.questions.outliers import Sensitivity
 from app.registry import Artifact
 from app.scene import Scene
 from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Rng
 from training.datasets.cases import draw_true_relations, scene_of
+from training.evaluation.asking import thing_instances
+from training.evaluation.parts import LONGEST
 
 ALARMS: dict[Sensitivity, float] = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Maximum shares of unaltered scenes with an alarm, on the large source with the most alarms."""
@@ -63,7 +67,7 @@ class Alarms:
 
 
 def untouched_alarms(artifact: Artifact, scenes: Sequence[EncodedScene]) -> Iterator[Alarms]:
-    """Ask about untouched scenes with their relations, and count the scenes with an alarm.
+    """Ask about an untouched part of each scene, and count the scenes with an alarm.
 
     One random scene of each group takes part, because its scenes are not independent. Objects
     count only if the object list is complete. Sources of few scenes count together.
@@ -75,14 +79,28 @@ def untouched_alarms(artifact: Artifact, scenes: Sequence[EncodedScene]) -> Iter
         scene_of_group.setdefault((scenes[k].source, scenes[k].group), scenes[k])
     cases: dict[str, list[tuple[Scene, bool]]] = {}
     for scene in scene_of_group.values():
-        triples = draw_true_relations(scene, artifact.vocabulary.structure, rng) or ()
-        whole = scene_of(scene, range(len(scene.instance_classes)), triples)
+        listed = _random_part(scene, artifact.vocabulary.structure, rng)
         is_small = len(sizes) > 1 and sizes[scene.source] < SOURCE_SCENES
         source = "the smaller sources" if is_small else scene.source
-        cases.setdefault(source, []).append((replace(whole, room_type=None), scene.complete))
+        cases.setdefault(source, []).append((listed, scene.complete))
     for source, sensitivity in product(sorted(cases), ALARMS):
         alarms = [_has_alarm(artifact, *case, sensitivity) for case in cases[source]]
         yield Alarms(source, sensitivity, len(alarms), sum(alarms))
+
+
+def _random_part(encoded: EncodedScene, structure: Flags, rng: Rng) -> Scene:
+    """Return the instances of one to `LONGEST` random classes, with their relations."""
+    classes = encoded.evidence.classes
+    order = rng.permutation(classes[~structure[classes]])
+    hidden = order[rng.integers(1, min(LONGEST, max(len(order), 1)) + 1) :]
+    kept = thing_instances(encoded, structure, hidden)
+    index_of = {instance: index for index, instance in enumerate(kept)}
+    triples = [
+        (a, index_of[i], index_of[j])
+        for a, i, j in draw_true_relations(encoded, structure, rng) or ()
+        if i in index_of and j in index_of
+    ]
+    return replace(scene_of(encoded, kept, triples), room_type=None)
 
 
 def _has_alarm(artifact: Artifact, scene: Scene, complete: bool, sensitivity: Sensitivity) -> bool:

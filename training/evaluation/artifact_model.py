@@ -12,7 +12,13 @@ from app.questions.posterior import Posterior
 from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES, Scene
 from training.datasets.batches import Batch, SceneTensors
-from training.evaluation.asking import missing_probabilities, of_classes
+from training.evaluation.asking import (
+    missing_probabilities,
+    missing_score,
+    of_classes,
+    outlier_flags,
+    suspicion_score,
+)
 from training.evaluation.density_task import DensitySettings, independent_density, machine_density
 from training.evaluation.generation_task import (
     held_out_halves,
@@ -20,7 +26,6 @@ from training.evaluation.generation_task import (
     machine_sampler,
     scene_sampler,
 )
-from training.evaluation.missing_tasks import MachineScore
 from training.evaluation.model import (
     Model,
     ObjectDensity,
@@ -29,7 +34,6 @@ from training.evaluation.model import (
     RelationScore,
     Sampler,
 )
-from training.evaluation.outlier_tasks import calibrated_alarm
 from training.evaluation.setting import Setting
 from training.machines.arrays import machine_of
 
@@ -42,23 +46,22 @@ def artifact_model(
     *,
     calibrated: bool = True,
 ) -> Model:
-    """Return the scores of a trained model, and if `calibrated` its probabilities and alarm."""
+    """Return the answers of a trained model; only a `calibrated` model judges outliers."""
     machine = machine_of(artifact.weights)
-    missing, completion = MachineScore(machine), relation_score(artifact, given=True)
-    sampler = machine_sampler(machine)
+    completion = relation_score(artifact, given=True)
+    sampler = machine_sampler(artifact)
     density = cache(partial(machine_density, machine, train, settings, seed))
     return Model(
-        missing=missing,
-        missing_in_room=missing if machine.spec.C else None,
+        missing=missing_score(artifact),
+        suspicion=suspicion_score(artifact) if calibrated else None,
+        flags=outlier_flags(artifact) if calibrated else None,
         at_place=placed_score(artifact),
         relations=relation_score(artifact, given=False),
         completion=completion,
         false_relations=completion,
         generate=lambda _: sampler,
-        density=None if machine.relations_act else lambda _: density(),
-        machine=machine,
+        density=lambda _: density(),
         parameters=machine.parameter_count,
-        alarm=calibrated_alarm(artifact.calibration) if calibrated else None,
         artifact=artifact if calibrated else None,
     )
 

@@ -7,7 +7,7 @@ memorised scenes. Splits by group keep near-duplicates of test scenes out of tra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar, get_args
 
@@ -84,6 +84,15 @@ def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Sc
     return replace(scene_of(encoded, instances, ()), room_type=None)
 
 
+def thing_instances(
+    encoded: EncodedScene, structure: Flags, hidden: Collection[int] = ()
+) -> list[int]:
+    """Return the instances without structure, such as walls, and without hidden classes."""
+    classes = encoded.instance_classes
+    is_kept = ~structure[classes] & ~np.isin(classes, list(hidden))
+    return np.flatnonzero(is_kept).tolist()
+
+
 def of_classes(classes: Sequence[int]) -> Scene:
     """Return a scene with one object for each entry of `classes`."""
     return Scene(tuple(SceneObject(str(k), str(c), c) for k, c in enumerate(classes)))
@@ -93,13 +102,6 @@ def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
     """Return the scene with one more object, of the class `intruder`."""
     thing = SceneObject("intruder", artifact.vocabulary.labels[intruder], intruder)
     return replace(scene, objects=(*scene.objects, thing))
-
-
-def things(scene: Scene, structure: Flags) -> Flags:
-    """Return a mask (n,) that is False for structure, such as walls and floors."""
-    classes = [-1 if thing.class_index is None else thing.class_index for thing in scene.objects]
-    is_thing: Flags = ~structure[classes]
-    return is_thing
 
 
 def index_of_ids(scene: Scene) -> dict[str, int]:
@@ -154,6 +156,43 @@ def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium")
         values = entry["probability"], entry["log_odds"], entry["is_outlier"]
         columns[index[entry["object"]]] = values
     return columns
+
+
+def missing_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
+    """Return a function from lists (B, V) to the log-probabilities of `/missing`, (B, V)."""
+
+    def score(v: Tensor) -> Tensor:
+        p = np.stack([missing_probabilities(artifact, scene) for scene in _scenes(v)])
+        return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
+
+    return score
+
+
+def suspicion_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
+    """Return a function from lists (B, V) to the probabilities of `/outliers`, (B, V).
+
+    The value is -inf for unlisted classes.
+    """
+    return lambda v: _judged(artifact, v, 0, "medium", -torch.inf)
+
+
+def outlier_flags(artifact: Artifact) -> Callable[[Tensor, Sensitivity], Tensor]:
+    """Return a function from lists (B, V) and a sensitivity to the reported outliers, (B, V)."""
+    return lambda v, sensitivity: _judged(artifact, v, 2, sensitivity, 0.0) > 0
+
+
+def _judged(
+    artifact: Artifact, v: Tensor, column: int, sensitivity: Sensitivity, unlisted: float
+) -> Tensor:
+    values = torch.full(v.shape, unlisted, dtype=torch.float64)
+    for row, scene in enumerate(_scenes(v)):
+        answers = judge(artifact, scene, sensitivity)[:, column]
+        values[row, v[row] > 0] = torch.from_numpy(answers)
+    return values
+
+
+def _scenes(v: Tensor) -> Iterator[Scene]:
+    return (of_classes(row.nonzero().squeeze(1).tolist()) for row in v)
 
 
 def relation_probabilities(

@@ -5,15 +5,17 @@ An answer has a probability and a truth value. The answer to each question is tr
     relations    the relation holds between the two objects. In one variant, the relations of half
                  of the pairs are evidence. In another variant, one object was removed. Relations
                  with unknown truth are left out (see `training.datasets.cases.annotated_relations`)
-    missing      the class is in the scene and was hidden. A request lists 25, 50 or 75 % of the
-                 classes of the scene, or all classes but one. The share is drawn at random
-    at a place   the class is in the scene at the place of the request. A place is a relation to an
-                 object. The place is drawn from the places that hold an object
-    outliers     the object is an intruder, a random object added for the test. Half of the scenes
-                 contain one intruder
+    missing      the class is in the scene and was hidden. A request lists 2, 4 or 8 random classes
+                 of the scene. Classes that the data source cannot show are left out
+    at a place   the class is in the scene at the place of the request, which lists up to 12 random
+                 classes. A place is a relation to an object. The place is drawn from the places
+                 that hold an object
+    outliers     the object is an intruder, added to a random part of up to 12 classes. Half of the
+                 parts contain one intruder
     misplaced    the listed relation is false. Half of the scenes contain one altered relation
 
-The questions about hidden classes and intruders use scenes with complete object lists. Requests
+The questions about hidden classes and intruders use scenes with complete object lists, and list no
+structure. Requests
 contain no room type and use default parameters. Candidates that the service does not return are
 left out.
 """
@@ -26,6 +28,7 @@ from functools import partial
 from itertools import chain
 
 import numpy as np
+import torch
 
 from app.questions import misplaced, missing, outliers, relations
 from app.registry import NEVER, Artifact, Calibration, CountSlope, Slope
@@ -42,11 +45,18 @@ from training.datasets.cases import (
     scene_of,
     scene_rng,
 )
-from training.evaluation.asking import canonical_triple, index_of_ids, labels_alone, with_intruder
+from training.evaluation.asking import (
+    canonical_triple,
+    index_of_ids,
+    labels_alone,
+    of_classes,
+    thing_instances,
+    with_intruder,
+)
 from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.metrics import Items, Metric
-from training.evaluation.missing_tasks import SHARES, shown_classes
 from training.evaluation.model import Model
+from training.evaluation.parts import Size, draw_parts, exactly, up_to_longest
 from training.evaluation.setting import Outcome, Setting
 
 # Number of removed objects per scene in `ask_placements`. A removed object gives only 3 answers,
@@ -83,8 +93,12 @@ def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -
         scene_answers = ask(artifact, scene, scene_rng(scene, seed))
         skipped += scene_answers is None
         answers += [(k, probability, truth) for probability, truth in scene_answers or ()]
+    return _items(answers, len(scenes), skipped)
+
+
+def _items(answers: list[tuple[int, float, bool]], scenes: int, skipped: int) -> Items:
     index, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
-    return Items(index.astype(np.int64), probability, truth > 0, len(scenes), skipped)
+    return Items(index.astype(np.int64), probability, truth > 0, scenes, skipped)
 
 
 def ask_relations(
@@ -144,15 +158,19 @@ def _ask_one_placement(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> A
     return answers
 
 
-def ask_missing(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
-    """Ask for missing classes. A random share of the classes, or one class, is hidden."""
-    hidden = _draw_hidden(artifact, encoded, rng)
-    if hidden is None:
-        return None
-    labels = {artifact.vocabulary.labels[index] for index in hidden}
-    kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden)).tolist()
-    entries = missing(artifact, labels_alone(encoded, kept), details=False)["missing"]
-    return [(entry["probability"], entry["label"] in labels) for entry in entries]
+def collect_missing(artifact: Artifact, scenes: SceneTensors, listed: int, seed: int = 0) -> Items:
+    """Ask for the missing classes of random parts of so many classes, and collect the answers."""
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+    parts = draw_parts(scenes, structure, exactly(listed), (seed,))
+    able = scenes.annotated_classes[scenes.source[parts.scene]].numpy()
+    columns: list[tuple[int, float, bool]] = []
+    for row, (k, v) in enumerate(zip(parts.scene.tolist(), parts.v, strict=True)):
+        scene = of_classes(v.nonzero().squeeze(1).tolist())
+        for entry in missing(artifact, scene, details=False)["missing"]:
+            index = artifact.vocabulary.index(entry["label"])
+            if able[row, index]:
+                columns.append((k, entry["probability"], bool(parts.hidden[row, index])))
+    return _items(columns, len(scenes), parts.skipped)
 
 
 def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
@@ -163,12 +181,13 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered 
     hidden = _draw_hidden(artifact, encoded, rng)
     if hidden is None:
         return None
+    structure = artifact.vocabulary.structure
     is_hidden = np.isin(encoded.instance_classes, hidden)
-    place = occupied_place(encoded, artifact.vocabulary.structure, ~is_hidden, rng)
+    place = occupied_place(encoded, structure, ~is_hidden, rng)
     if place is None:
         return None
     relation, anchor = place
-    kept = np.flatnonzero(~is_hidden).tolist()
+    kept = thing_instances(encoded, structure, hidden)
     labels = np.array(artifact.vocabulary.labels, dtype=object)[encoded.instance_classes]
     placed = set(labels[encoded.instance_holds[relation, :, anchor] & is_hidden])
     is_annotated = annotated_relations(encoded)[relation, :, anchor]
@@ -179,16 +198,15 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered 
     return [(entry["probability"], entry["label"] in placed) for entry in annotated]
 
 
-def _draw_hidden(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Ints | None:
-    """Draw the classes of a scene to hide. The share of hidden classes is drawn for each scene."""
+def _draw_hidden(
+    artifact: Artifact, encoded: EncodedScene, rng: Rng, size: Size = up_to_longest
+) -> Ints | None:
+    """Draw the classes that a random part of a scene hides; None if the scene has no part."""
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
-    classes = classes[~structure[classes]]
-    if not encoded.complete or len(classes) < 2:
-        return None
-    share = list(SHARES.values())[rng.integers(len(SHARES))]
-    hidden: Ints = rng.permutation(classes)[shown_classes(len(classes), share) :]
-    return hidden
+    order: Ints = rng.permutation(classes[~structure[classes]])
+    listed = size(len(order), rng) if encoded.complete else 0
+    return order[listed:] if listed else None
 
 
 def ask_outliers(
@@ -197,7 +215,7 @@ def ask_outliers(
     rng: Rng,
     intruders: Mapping[tuple[str, str], Ints] | None = None,
 ) -> Answered | None:
-    """Ask for outliers. An intruder (an object of an absent class) is added to half of the scenes.
+    """Ask for the outliers of a random part. Half of the parts contain an intruder.
 
     Args:
         intruders: maps (source, scene id) to the classes from which the intruder is drawn, see
@@ -212,16 +230,15 @@ def ask_outliers(
         candidates = intruders[encoded.source, encoded.scene_id]
     if not len(candidates):
         return None
-    scene, intruder = labels_alone(encoded), -1
+    hidden = rng.permutation(classes[~structure[classes]])[up_to_longest(len(classes), rng) :]
+    scene, intruder = labels_alone(encoded, thing_instances(encoded, structure, hidden)), -1
     if rng.random() < 0.5:
         intruder = len(scene.objects)
         scene = with_intruder(artifact, scene, int(rng.choice(candidates)))
     index = index_of_ids(scene)
-    is_thing = [not structure[thing.class_index] for thing in scene.objects]
     return [
         (entry["probability"], index[entry["object"]] == intruder)
         for entry in outliers(artifact, scene, details=False)["outliers"]
-        if is_thing[index[entry["object"]]]
     ] or None
 
 
@@ -237,19 +254,25 @@ def ask_misplaced(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answer
     ] or None
 
 
+LISTED = (2, 4, 8)
+"""Numbers of listed classes in questions about missing classes."""
+
 QUESTIONS: dict[str, Ask] = {
     "relations": ask_relations,
     "relations, others given": ask_given,
     "placements": ask_placements,
-    "missing": ask_missing,
     "missing at a place": ask_placed,
     "outliers": ask_outliers,
     "misplaced": ask_misplaced,
 }
 
 
+NAMES = (*QUESTIONS, *(f"missing, {listed} classes" for listed in LISTED))
+"""Names of all questions in the metrics of the task."""
+
+
 def calibration_task(model: Model, setting: Setting) -> Outcome | None:
-    """Measure the calibration of the answers to all `QUESTIONS`, published and uncalibrated.
+    """Measure the calibration of the answers to all questions, published and uncalibrated.
 
     Questions about objects use scenes with complete object lists, the others scenes with relations.
     """
@@ -258,19 +281,26 @@ def calibration_task(model: Model, setting: Setting) -> Outcome | None:
     related = setting.some(related=True, share=3)
     complete = setting.complete.some(share=3)
     at_place = setting.complete.some(related=True, share=3)
-    scenes_of = {"missing": complete, "outliers": complete, "missing at a place": at_place}
+    scenes_of = {"outliers": complete, "missing at a place": at_place}
     metrics: dict[str, Metric] = {}
     skipped = 0
-    raw = uncalibrated(model.artifact)
     train = setting.complete.train
     intruders = draw_intruder_choices(complete, setting.structure, train, setting.seed)
     asks = QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
-    for name, ask in asks.items():
-        scenes = scenes_of.get(name, related)
-        answers = collect(model.artifact, scenes, ask, setting.seed)
+    collects = {
+        name: partial(collect, scenes=scenes_of.get(name, related), ask=ask, seed=setting.seed)
+        for name, ask in asks.items()
+    } | {
+        f"missing, {listed} classes": partial(
+            collect_missing, scenes=setting.complete.some(), listed=listed, seed=setting.seed
+        )
+        for listed in LISTED
+    }
+    for name, ask_all in collects.items():
+        answers = ask_all(model.artifact)
         skipped += answers.skipped
         if len(answers.scene):
-            raw_answers = collect(raw, scenes, ask, setting.seed)
+            raw_answers = ask_all(uncalibrated(model.artifact))
             for figure in ("ECE", "Brier skill"):
                 metrics[f"{figure}, {name}"] = answers.metric(figure)
                 metrics[f"{figure}, {name}, uncalibrated"] = raw_answers.metric(figure)

@@ -1,15 +1,14 @@
 """Density: log-likelihood of the objects of a scene.
 
 Annealed importance sampling (AIS) bounds the log partition function, log Z. All classes of the
-vocabulary count, including structure. A class that a scene does not list is absent, as in training.
-The room type is unobserved. In the local form, relations do not affect p(v), so AIS uses the
-machine without relation units. With h1 drawn from its mean field q given the scene,
+vocabulary count, including structure. A class that a scene does not list is absent. The room type
+is unobserved, and the base rates are those of the served mix. Relations do not affect p(v). For a
+machine with one hidden layer,
 
-    log p(v) = log mean_h [ exp(b·v + h·(c1 + v'W)) prod_l (1 + exp(c2 + h'J)_l) / q(h) ] - log Z
+    log p(v) = -F(v) - log Z
 
-The estimate of the mean is unbiased, so the log of this estimate is too low in expectation. The
-upper estimate of log Z lowers the log-likelihood further. The reported log-likelihood is therefore
-conservative.
+is exact up to log Z. The upper estimate of log Z lowers the log-likelihood. The reported
+log-likelihood is therefore conservative. Machines with two hidden layers are left out.
 
 The pairwise model is the fully visible Boltzmann machine (Ising model) of classes:
 p(v) = exp(b·v + v'Wv / 2) / Z with symmetric W and zero diagonal. The annealing path starts at
@@ -31,21 +30,16 @@ import numpy as np
 import torch
 from scipy.special import expit
 from torch import Tensor
-from torch.nn.functional import logsigmoid, softplus
+from torch.nn.functional import logsigmoid
 
 from training.datasets.array_types import Floats, Rng
 from training.datasets.batches import SceneTensors
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import Model, ObjectDensity
 from training.evaluation.setting import Outcome, Setting
-from training.machines import BoltzmannMachine, MachineSpec, build
-from training.machines.bernoulli import log_odds_of
-from training.machines.draws import fixed_uniforms
-from training.machines.gibbs import initial_state, run
-from training.machines.mean_field import Evidence, mean_field
-from training.machines.partition import LogPartition, ais, independent_base, reverse_ais
-
-_BLOCK = 16
+from training.machines import BoltzmannMachine
+from training.machines.gibbs import start_chains, sweep
+from training.machines.partition import LogPartition, ais, reverse_ais
 
 
 @dataclass(frozen=True)
@@ -56,13 +50,11 @@ class DensitySettings:
         chains: number of Gibbs chains of each AIS run.
         temperatures: number of inverse temperatures of each AIS run.
         burn_in: number of Gibbs sweeps from training scenes before the reverse AIS run.
-        draws: number of samples of the hidden units h1 per scene.
     """
 
     chains: int = 128
-    temperatures: int = 4000
-    burn_in: int = 2000
-    draws: int = 256
+    temperatures: int = 1000
+    burn_in: int = 500
 
     def betas(self) -> list[float]:
         """Return inverse temperatures from 0 to 1, denser near 1, where p(v) changes most."""
@@ -102,24 +94,16 @@ def machine_density(
     train: SceneTensors,
     settings: DensitySettings = DensitySettings(),
     seed: int = 0,
-) -> ObjectDensity:
-    """Return the density of a machine of the local form, in which relations do not affect p(v).
+) -> ObjectDensity | None:
+    """Return the density of a machine with one hidden layer, or None for two layers.
 
     Annealing starts at independent classes with the frequencies of the training scenes. The Gibbs
     chains of the reverse run start at these scenes.
-
-    Raises:
-        ValueError: the machine has the seed form, in which relations affect p(v).
     """
-    if machine.relations_act:
-        raise ValueError("the density of objects needs a machine of the local form")
-    objects = object_part(machine)
-    below, above = log_partition(objects, train, settings, seed)
-
-    def log_unnormalised(v: Tensor) -> Tensor:
-        return torch.cat([_log_unnormalised(objects, b, settings.draws) for b in v.split(_BLOCK)])
-
-    return _density(log_unnormalised, below, above)
+    if machine.spec.H2:
+        return None
+    below, above = log_partition(machine, train, settings, seed)
+    return _density(lambda v: -machine.free_energy(v), below, above)
 
 
 def _density(
@@ -135,51 +119,25 @@ def _density(
     return ObjectDensity(log_unnormalised, below.bound, above.bound, notes)
 
 
-def object_part(machine: BoltzmannMachine) -> BoltzmannMachine:
-    """Return the machine without relation units. A machine of the local form keeps its p(v)."""
-    spec = machine.spec
-    part = build(MachineSpec("gbm", V=spec.V, A=1, H1=spec.H1, H2=spec.H2, form="local"))
-    with torch.no_grad():
-        for name in ("b", "c1", "c2", "W", "J"):
-            part.get_parameter(name).copy_(machine.get_parameter(name))
-    return part.requires_grad_(False)
-
-
 @torch.no_grad()
 def log_partition(
     machine: BoltzmannMachine, train: SceneTensors, settings: DensitySettings, seed: int = 0
 ) -> tuple[LogPartition, LogPartition]:
-    """Run forward and reverse AIS for a machine without relation units."""
+    """Run forward and reverse AIS for the objects of a machine."""
     generator = torch.Generator().manual_seed(seed)
     betas = settings.betas()
-    base = independent_base(machine, _class_log_odds(train))
+    base = _class_log_odds(train)
     below = ais(machine, betas, settings.chains, generator, base)
     start = torch.randint(len(train), (settings.chains,), generator=generator)
-    state = initial_state(machine, train.v[start], generator)
-    state = run(machine, state, generator, settings.burn_in)
-    return below, reverse_ais(machine, betas, state, generator, base)
-
-
-@torch.no_grad()
-def _log_unnormalised(machine: BoltzmannMachine, v: Tensor, draws: int) -> Tensor:
-    """Return log p(v) + log Z, (B,), for presence (B, V).
-
-    The value is exact with one hidden layer. With two layers, it is the importance-sampling
-    estimate of the module, from `draws` samples of h1.
-    """
-    if not machine.spec.H2:
-        return -machine.free_energy(v)
-    y = mean_field(machine, Evidence(v)).y
-    uniforms = fixed_uniforms(draws, machine.spec.H1).to(y.dtype).unsqueeze(1)
-    h1 = (uniforms < y.sigmoid()).to(y.dtype)  # (draws, B, H1)
-    log_q = (h1 * logsigmoid(y) + (1 - h1) * logsigmoid(-y)).sum(-1)
-    log_h2 = softplus(machine.second_layer_logits(h1)).sum(-1)  # h2 summed out
-    log_joint = v @ machine.b + (h1 * (machine.c1 + v @ machine.W)).sum(-1) + log_h2
-    return (log_joint - log_q).logsumexp(0) - float(np.log(draws))
+    chains = start_chains(machine, train.v[start], generator)
+    for _ in range(settings.burn_in):
+        sweep(machine, chains, generator)
+    return below, reverse_ais(machine, betas, chains, generator, base)
 
 
 def _class_log_odds(train: SceneTensors) -> Tensor:
-    return log_odds_of(train.v.sum(0), torch.tensor(float(len(train))))
+    count = train.v.sum(0)
+    return ((count + 0.5) / (len(train) - count + 0.5)).log()
 
 
 def density_task(model: Model, setting: Setting) -> Outcome | None:

@@ -35,13 +35,12 @@ from training.evaluation.asking import (
     judge,
     missing_probabilities,
     relation_probabilities,
-    things,
+    thing_instances,
     with_intruder,
 )
 from training.evaluation.intruders import draw_intruders
 from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.model import Model
-from training.evaluation.outlier_tasks import share_of_first
 from training.evaluation.relation_tasks import expected_hits
 from training.evaluation.setting import Outcome, Setting
 
@@ -103,17 +102,17 @@ def removals(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -
         if len(removable) < 2:
             continue
         for target in scene_rng(encoded, seed).permutation(removable)[:_REMOVALS]:
-            kept = np.flatnonzero(encoded.instance_classes != target).tolist()
+            kept = thing_instances(encoded, structure, {int(target)})
             if (pair := with_evidence(encoded, kept, kind)) is not None:
                 yield Case(index, pair, int(target))
 
 
 def intrusions(
-    artifact: Artifact, scenes: SceneTensors, intruders: Ints, kind: str
+    artifact: Artifact, scenes: SceneTensors, structure: Flags, intruders: Ints, kind: str
 ) -> Iterator[Case]:
     """Generate the T3 questions: each scene with its intruder, (scenes,); -1 skips the scene."""
     for index, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
-        pair = with_evidence(encoded, list(range(len(encoded.instance_classes))), kind)
+        pair = with_evidence(encoded, thing_instances(encoded, structure), kind)
         if intruder < 0 or pair is None:
             continue
         bare, informed = (_add_intruder(artifact, scene, int(intruder)) for scene in pair)
@@ -173,11 +172,12 @@ def outliers_evidence_task(model: Model, setting: Setting) -> Outcome | None:
 
     def cases(artifact: Artifact, scenes: SceneTensors, kind: str) -> Iterator[Case]:
         intruders = draw_intruders(scenes, setting.structure, seed=setting.seed).numpy()
-        return intrusions(artifact, scenes, intruders, kind)
+        return intrusions(artifact, scenes, structure, intruders, kind)
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
-        p = np.where(things(scene, structure), judge(artifact, scene)[:, 0], -np.inf)
-        return share_of_first(p, case.target)
+        p = judge(artifact, scene)[:, 0]
+        is_highest = p == p.max()
+        return float(is_highest[case.target] / is_highest.sum())
 
     return _changes("hit@1", model, setting, cases, value)
 

@@ -28,7 +28,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from app.inference.chains import Conditions, random_stream
 from app.questions.generate import STEPS
+from app.registry import Artifact
 from training.datasets.array_types import Floats
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
@@ -36,17 +38,11 @@ from training.evaluation.contradictions import contradiction_metrics, count_cont
 from training.evaluation.metrics import Metric, Ratio, Resampled
 from training.evaluation.model import Drawn, Model, Sampler
 from training.evaluation.setting import Outcome, Setting
-from training.machines import BoltzmannMachine
-from training.machines.chain_samples import ChainSamples
-from training.machines.edges import present_classes
-from training.machines.gibbs import Clamp, gibbs_step, run
-from training.machines.machine import State
 
 _RESAMPLES = 200
 # Maximum number of held-out scenes for the bandwidth, and of classes for the covariances.
 _BANDWIDTH_SCENES = 1000
 _COMMON_CLASSES = 200
-_CHAINS = 256
 
 
 def drawn_of(scenes: SceneTensors) -> Drawn:
@@ -99,41 +95,33 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
     return sample
 
 
-def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler:
+def machine_sampler(artifact: Artifact, *, steps: int = STEPS) -> Sampler:
     """Return a sampler that runs the Gibbs chains of the service, and also samples relations.
 
     Of two contradictory relations a(x, y) and a(y, x), the service keeps only one. This sampler
     keeps both.
     """
-    samples = ChainSamples(machine)
+    chains = artifact.scene_chains
 
     def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
-        generator = torch.Generator().manual_seed(seed)
-        parts = []
-        for index in torch.arange(len(given)).split(_CHAINS):
-            clamp = Clamp(v=given[index], room=room[index] if machine.spec.C else None)
-            state = samples.start(given[index].to(machine.b.dtype), generator, clamp)
-            state = _sweep(machine, state, generator, clamp, steps)
-            parts.append((state.v, count_contradictions(_grid(machine, state))))
-        objects, counts = zip(*parts, strict=True)
-        return Drawn(torch.cat(objects), torch.cat(counts))
+        objects, contradictions = torch.zeros(given.shape), []
+        for row, (classes, room_type) in enumerate(zip(given, room.tolist(), strict=True)):
+            index = classes.nonzero().squeeze(1).numpy()
+            conditions = Conditions(
+                index,
+                np.zeros(len(index), np.float32),
+                observed=None,
+                held=np.zeros((0, 2), np.int64),
+                held2=np.zeros(0, np.int64),
+                room=room_type if room_type >= 0 and artifact.spec.C else None,
+            )
+            state = chains.under(conditions).draw(steps, random_stream(seed, row))
+            objects[row, torch.from_numpy(state.classes)] = 1.0
+            grid = torch.from_numpy(state.r).float().unsqueeze(0)
+            contradictions.append(count_contradictions(grid))
+        return Drawn(objects, torch.cat(contradictions))
 
     return sample
-
-
-def _sweep(
-    machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp, steps: int
-) -> State:
-    """Run Gibbs sweeps. If relations do not affect objects, only the last sweep samples them."""
-    always = machine.relations_act
-    state = run(machine, state, generator, steps - 1, clamp, relations=always)
-    return gibbs_step(machine, state, generator, clamp)
-
-
-def _grid(machine: BoltzmannMachine, state: State) -> Tensor:
-    """Return the relations between present classes, (scenes, relations, classes, classes)."""
-    r = state.r * state.edges.ends_present(state.v)
-    return machine.between(state.edges, r, present_classes(state.v)).clamp(min=0)
 
 
 def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:

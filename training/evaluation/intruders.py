@@ -1,10 +1,9 @@
 """Intruders: add one absent class to a scene, to test the detection of outliers.
 
-The class is drawn from one of four distributions over absent classes:
+The class is drawn from one of three distributions over absent classes:
 
     uniform     all classes have the same probability
     popularity  see `by_popularity`
-    room        see `by_room`
     signature   a class that is typical of another room type
 
 Structure classes such as walls are never intruders. Scenes with fewer than three other classes are
@@ -24,7 +23,6 @@ of these classes. Both draws are uniform.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,7 +31,6 @@ from torch import Tensor
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors
 from training.datasets.cases import scene_rng
-from training.evaluation.metrics import Items, Ratio
 
 SIGNATURE = 10
 """Maximum number of signature classes of a room type."""
@@ -50,16 +47,6 @@ Law = Callable[[SceneTensors, SceneTensors], Tensor]
 def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
     """Return weights (scenes, classes): the number of training scenes with each class."""
     return train.v.sum(0).expand(len(scenes), -1)
-
-
-def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Return 1 for classes that training scenes of the room type contain, (scenes, classes)."""
-    weights = torch.zeros_like(scenes.v)
-    for room in scenes.room.unique().tolist():
-        if room >= 0:
-            is_in_room = (train.v[train.room == room] > 0).any(0)
-            weights[scenes.room == room] = is_in_room.to(weights.dtype)
-    return weights
 
 
 def draw_intruders(
@@ -139,131 +126,3 @@ def draw_intruder_choices(
     rows = torch.stack(columns, 1).numpy()
     names = [(scene.source, scene.scene_id) for scene in scenes.scenes]
     return {name: row[row >= 0] for name, row in zip(names, rows, strict=True)}
-
-
-@dataclass(frozen=True, eq=False)
-class IntruderScores:
-    """Log-odds of each object given the other objects, for scenes without and with an intruder.
-
-    A scene is scored twice: once as it is (clean), and once with its intruder. The arrays have one
-    entry for each object of each scored scene.
-
-    Attributes:
-        scene: (objects,) index of the scene.
-        thing: (objects,) class of the object.
-        log_odds: (objects,) log-odds of the object.
-        intruder: (objects,) bool, True if the object is the intruder.
-        size: (objects,) number of distinct classes in the scored scene.
-        clean: (objects,) bool, True if the scored scene has no intruder.
-        skipped: number of scenes that are too small or have no possible intruder.
-    """
-
-    scene: Ints
-    thing: Ints
-    log_odds: Floats
-    intruder: Flags
-    size: Ints
-    clean: Flags
-    scenes: int
-    skipped: int
-
-    @property
-    def listed(self) -> Ints:
-        """(objects,) number of distinct classes in the scored scene, without structure classes."""
-        as_scored = 2 * self.scene + self.clean
-        counts: Ints = np.bincount(as_scored)[as_scored]
-        return counts
-
-    def with_prior(self, prior: Floats) -> IntruderScores:
-        """Subtract the prior log-odds that a class is an intruder, `prior` (classes,)."""
-        return replace(self, log_odds=self.log_odds - prior[self.thing])
-
-    @property
-    def dirty(self) -> Items:
-        """The objects of scenes with an intruder as items: negated log-odds, true for intruders."""
-        rows = ~self.clean
-        score, truth = -self.log_odds[rows], self.intruder[rows]
-        return Items(self.scene[rows], score, truth, self.scenes, self.skipped)
-
-    def hit_at_1(self) -> Ratio:
-        """Return the share of scenes whose intruder has the lowest log-odds; expected over ties."""
-        return self.dirty.hit_at_1()
-
-    def false_alarms(self, alarms: Flags) -> Ratio:
-        """Return the share of clean scenes with an alarm, for the alarms `alarms` (objects,)."""
-        return self._alarms(alarms, self.clean)
-
-    def caught(self, alarms: Flags) -> Ratio:
-        """Return the share of intruders with an alarm, for the alarms `alarms` (objects,)."""
-        return self._alarms(alarms, self.intruder)
-
-    def _alarms(self, alarms: Flags, judged: Flags) -> Ratio:
-        has_object = np.bincount(self.scene[judged], minlength=self.scenes) > 0
-        has_alarm = np.bincount(self.scene[judged & alarms], minlength=self.scenes) > 0
-        return Ratio.of_scenes(has_alarm, has_object)
-
-
-Score = Callable[[Tensor], Tensor]
-
-
-@torch.no_grad()
-def intruder_scores(
-    scenes: SceneTensors,
-    structure: Tensor,
-    score: Score,
-    *,
-    weights: Tensor | None = None,
-    seed: int = 0,
-) -> IntruderScores:
-    """Score every object of every scene, without an intruder and with an intruder.
-
-    All relations are unobserved.
-
-    Args:
-        score: function that takes presence (rows, classes) and returns log-odds (rows, classes).
-    """
-    added = draw_intruders(scenes, structure, weights, seed)
-    blocks = []
-    for index in (added >= 0).nonzero().squeeze(1).split(32):
-        clean, intruder = scenes.v[index], added[index]
-        blocks.append((clean, index, torch.full_like(intruder, -1)))
-        blocks.append((clean.scatter(1, intruder.unsqueeze(1), 1.0), index, intruder))
-    return _scores(blocks, structure, score, len(scenes), int((added < 0).sum()))
-
-
-@torch.no_grad()
-def clean_scores(v: Tensor, structure: Tensor, score: Score) -> IntruderScores:
-    """Score every object of the scenes `v` (scenes, classes), without intruders."""
-    blocks = [
-        (v[index], index, torch.full_like(index, -1)) for index in torch.arange(len(v)).split(64)
-    ]
-    return _scores(blocks, structure, score, len(v), 0)
-
-
-def _scores(
-    blocks: list[tuple[Tensor, Tensor, Tensor]],
-    structure: Tensor,
-    score: Score,
-    scenes: int,
-    skipped: int,
-) -> IntruderScores:
-    """Score the objects of blocks of (presence, scene indices, intruders or -1)."""
-    parts = []
-    for v, index, added in blocks:
-        row, things = ((v > 0) & ~structure).nonzero(as_tuple=True)
-        log_odds = torch.zeros(0)
-        if len(row):
-            other_objects = v[row].scatter(1, things.unsqueeze(1), 0.0)
-            log_odds = score(other_objects).gather(1, things.unsqueeze(1)).squeeze(1)
-        parts.append(
-            {
-                "scene": index[row],
-                "thing": things,
-                "log_odds": log_odds.double(),
-                "intruder": things == added[row],
-                "size": (v > 0).sum(1)[row],
-                "clean": added[row] < 0,
-            }
-        )
-    columns = {name: torch.cat([part[name] for part in parts]).numpy() for name in parts[0]}
-    return IntruderScores(**columns, scenes=scenes, skipped=skipped)

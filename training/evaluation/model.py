@@ -6,20 +6,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
-import numpy as np
+import torch
 from torch import Tensor
 
+from app.questions import Sensitivity
 from app.registry import Artifact
-from training.datasets.array_types import Flags, Floats
 from training.datasets.batches import Batch
-from training.evaluation.intruders import IntruderScores
 from training.evaluation.setting import Setting
-from training.machines import BoltzmannMachine
 
 # Function that takes presence (scenes, classes) and returns log-odds (scenes, classes).
 ObjectScore = Callable[[Tensor], Tensor]
-# Function that also takes room types (scenes,), with -1 for an unknown room type.
-RoomScore = Callable[[Tensor, Tensor], Tensor]
+# Function that takes lists (B, V) and a sensitivity, and returns the reported outliers (B, V) bool.
+Flagged = Callable[[Tensor, Sensitivity], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,28 +47,6 @@ class Places:
 PlacedScore = Callable[[Places], Tensor]
 # Function that returns scores (B, A, n, n) of the relations between the classes of a batch.
 RelationScore = Callable[[Batch], Tensor]
-
-
-@dataclass(frozen=True, eq=False)
-class Alarm:
-    """Alarm rule for objects.
-
-    Attributes:
-        suspicion: function that returns a score (N,) per object, higher = more likely an intruder.
-        threshold: suspicion from which an object raises the alarm.
-        short: thresholds for lists of 1, 2, ... classes; structure classes do not count.
-    """
-
-    suspicion: Callable[[IntruderScores], Floats]
-    threshold: float
-    short: tuple[float, ...] = ()
-
-    def raised(self, scores: IntruderScores) -> Flags:
-        """Return whether each scored object raises the alarm, (N,)."""
-        limits = np.array([*self.short, self.threshold])
-        limit = limits[np.minimum(scores.listed - 1, len(self.short))]
-        loud: Flags = self.suspicion(scores) >= limit
-        return loud
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,36 +115,55 @@ class Model:
 
     Attributes:
         missing: score of T2, missing objects.
-        missing_in_room: score of T2 with the room type as evidence.
         at_place: score of T2-at, missing objects at a place.
-        outliers: score of T3, intruders. By default it is `missing`.
+        suspicion: score of T3, intruders: it takes lists (B, V) and returns the suspicion of each
+            listed class (B, V), -inf for other classes. By default `suspicion_of(missing)`.
+        flags: outliers that a published model reports.
         relations: score of T1a, relations of a scene.
         completion: score of T1b; the batch observes the given triples.
         false_relations: score of T3b; the batch observes all triples, one of them false.
         generate: function that takes the setting and returns the sampler of T4, or None.
         density: function that takes the setting and returns the density of objects, or None.
-        alarm: alarm of T3.
         artifact: model for Calibration and for all questions to the service.
-        machine: machine for the seed protocol.
         parameters: number of trained weights, or None if this number is not meaningful.
         trials: all settings that the tuning of a baseline tried, in order.
     """
 
     missing: ObjectScore | None = None
-    missing_in_room: RoomScore | None = None
     at_place: PlacedScore | None = None
-    outliers: ObjectScore | None = None
+    suspicion: ObjectScore | None = None
+    flags: Flagged | None = None
     relations: RelationScore | None = None
     completion: RelationScore | None = None
     false_relations: RelationScore | None = None
     generate: Callable[[Setting], Sampler | None] | None = None
     density: Callable[[Setting], ObjectDensity | None] | None = None
-    alarm: Alarm | None = None
     artifact: Artifact | None = None
-    machine: BoltzmannMachine | None = None
     parameters: int | None = None
     trials: tuple[Trial, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.outliers is None:
-            object.__setattr__(self, "outliers", self.missing)
+        if self.suspicion is None and self.missing is not None:
+            object.__setattr__(self, "suspicion", suspicion_of(self.missing))
+
+
+def suspicion_of(
+    score: ObjectScore, log_popularity: Tensor | None = None, weight: float = 0.0
+) -> ObjectScore:
+    """Return the suspicion of each listed class: its negated score given the other classes.
+
+    An intruder is often a common class in the wrong room. So the suspicion adds `weight` times the
+    log popularity of the class, (V,), as `/outliers` does.
+    """
+
+    def suspicion(v: Tensor) -> Tensor:
+        row, listed = (v > 0).nonzero(as_tuple=True)
+        values = torch.full(v.shape, -torch.inf)
+        if len(row):
+            others = v[row].scatter(1, listed.unsqueeze(1), 0.0)
+            z = score(others).gather(1, listed.unsqueeze(1)).squeeze(1).to(values.dtype)
+            prior = 0.0 if log_popularity is None else weight * log_popularity[listed]
+            values[row, listed] = prior - z
+        return values
+
+    return suspicion

@@ -35,26 +35,12 @@ from training.datasets.cases import Triple, scene_rng
 from training.evaluation.metrics import Items, Metric, Ratio
 from training.evaluation.model import Model, RelationScore
 from training.evaluation.setting import Outcome, Setting
-from training.machines import BoltzmannMachine
 from training.machines.edges import triple_keys
-from training.machines.log_odds import relation_log_odds
-from training.machines.mean_field import Evidence
 
 FIRST = (1, 2, 5, 10, 20, 50, 100)
 """Numbers of predictions per scene for recall."""
 _RECALLS = (20, 50, 100)
 _TRIES = 50
-
-
-def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScore:
-    """Return a score: log-odds of every relation, with all relations unobserved."""
-
-    def score(batch: Batch) -> Tensor:
-        edges = machine.edges(batch.classes, batch.counts)
-        values, _ = relation_log_odds(machine, edges, Evidence(batch.v, edges), count=draws)
-        return machine.between(edges, values, batch.classes)
-
-    return score
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
@@ -28,7 +28,7 @@ from training.evaluation.everyday_task import SOURCE, facts_digest
 from training.evaluation.metrics import Macro, Metric, Ratio, Resampled, Scored
 from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
-from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET, Task
+from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
 # Maximum number of scenes per data source in slow tasks. The second limit is for machines that
 # compute their answers by sampling.
@@ -134,21 +134,20 @@ def measure(
     source: str,
     *,
     tasks: Iterable[str] = tuple(TASKS),
-    registry: Mapping[str, Task] = EVERY_TASK,
     path: Path | None = None,
     progress: Progress = silent,
 ) -> SourceReport:
     """Measure tasks. With `path`, skip the tasks in this file, and write it after every task.
 
     Args:
-        tasks: names of the tasks, which are keys of `registry`.
+        tasks: names of the tasks, which are keys of `EVERY_TASK`.
 
     Raises:
         ValueError: a task is unknown, or the file belongs to other scenes or questions.
     """
     names = list(tasks)
-    if unknown := sorted(set(names) - set(registry)):
-        raise ValueError(f"unknown tasks {unknown}: choose from {list(registry)}")
+    if unknown := sorted(set(names) - set(EVERY_TASK)):
+        raise ValueError(f"unknown tasks {unknown}: choose from {list(EVERY_TASK)}")
     report = SourceReport(source, digest(setting))
     if path is not None and path.exists():
         report = SourceReport.read(path, setting)
@@ -157,7 +156,7 @@ def measure(
             continue
         progress(f"{source}: {task}")
         began = time.perf_counter()
-        report.outcomes[task] = registry[task](model, setting)
+        report.outcomes[task] = EVERY_TASK[task](model, setting)
         report.seconds[task] = time.perf_counter() - began
         if path is not None:
             write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
@@ -194,7 +193,7 @@ def evaluate(
     structure: Tensor,
     train: SceneTensors,
     *,
-    limit: int | None = None,
+    limit: int = _LIMIT,
     everyday: Path | None = None,
     tasks: Collection[str] | None = None,
     progress: Progress = silent,
@@ -206,12 +205,9 @@ def evaluate(
     Args:
         train: training scenes. They show which generated scenes are copies, and which classes are
             typical of a room type.
-        limit: maximum number of scenes per data source in slow tasks, see `Setting`. None means 200
-            scenes, or 20 scenes for a machine that computes its answers by sampling.
+        limit: maximum number of scenes per data source in slow tasks; see `Setting`.
         tasks: names of the tasks to measure. None means all tasks of a model card.
     """
-    if limit is None:
-        limit = _LIMIT if artifact.oracle is None else _LIMIT_OF_DRAWS
     model = artifact_model(artifact, train)
     selected = [
         name for name, task in EVERY_TASK.items() if task.card and (tasks is None or name in tasks)

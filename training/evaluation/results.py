@@ -36,6 +36,7 @@ _LOWER_IS_BETTER = (
     "mirrored",
     "on-top cycles",
     "alarms",
+    "change of p",
     "ECE",
     "error",
     "log-loss",
@@ -140,17 +141,15 @@ class Results:
                 parts += [*tables, *remarks([entry for entry in self.asked if entry.task == task])]
         return "\n\n".join(parts) + "\n"
 
-    def tables(
-        self, shown: Shown = SHOWN, words: Callable[[str], str] = in_words
-    ) -> Iterator[Table]:
+    def tables(self, shown: Shown = SHOWN) -> Iterator[Table]:
         """Generate one table per task for the terminal, of the pooled sources if there are any.
 
-        A star has the meaning of `markdown`. `words` returns the title of the table of a task.
+        A star has the meaning of `markdown`.
         """
         sources = list(dict.fromkeys(cell.source for cell in self.cells))
         columns = [source for source in sources if "pooled" in source] or sources
         for task, metrics in shown.items():
-            table = Table("metric, model", *columns, title=words(task), box=box.SIMPLE_HEAD)
+            table = Table("metric, model", *columns, title=in_words(task), box=box.SIMPLE_HEAD)
             for metric in metrics:
                 texts = self._texts(task, metric)
                 rows = {row: cells for row, cells in texts.items() if cells.keys() & set(columns)}

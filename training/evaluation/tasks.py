@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 from training.evaluation import count_task as counts
 from training.evaluation import offset_task as offsets
 from training.evaluation.asking import SENSITIVITIES
-from training.evaluation.calibration_task import QUESTIONS, calibration_task
+from training.evaluation.calibration_task import NAMES, calibration_task
 from training.evaluation.density_task import density_task
 from training.evaluation.everyday_task import LINES, everyday_task
 from training.evaluation.evidence_tasks import (
@@ -22,16 +21,9 @@ from training.evaluation.evidence_tasks import (
     relations_evidence_task,
 )
 from training.evaluation.generation_task import generation_task
-from training.evaluation.intruders import by_popularity, by_room
-from training.evaluation.missing_tasks import (
-    SHARES,
-    missing_in_room_task,
-    missing_task,
-    partial_task,
-    placed_task,
-)
+from training.evaluation.missing_tasks import SIZES, missing_task, placed_task, structure_task
 from training.evaluation.model import Model
-from training.evaluation.outlier_tasks import outliers_task, sensitivity_task, signature_task
+from training.evaluation.outlier_tasks import LAWS, LENGTHS, alarms_task, outliers_task
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
 from training.evaluation.setting import Outcome, Setting
@@ -81,12 +73,6 @@ def _each(names: tuple[str, ...], kinds: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{name}, {kind}" for name in names for kind in kinds)
 
 
-_BY_SENSITIVITY = tuple(
-    f"{figure}, {name}"
-    for name in SENSITIVITIES
-    for figure in ("alarms", "caught, uniform", "caught, by popularity")
-)
-
 TASKS: dict[str, Task] = {
     "T1a relations": _carded(
         "relations of a scene",
@@ -109,16 +95,13 @@ TASKS: dict[str, Task] = {
     "T1b completion": _carded(
         "remaining relations", completion_task, ("R-precision",), of_objects=False
     ),
-    "T2 missing": _carded("missing object", missing_task, ("MRR", "top-1", "top-10")),
-    "T2 missing, room type given": _objects(
-        "missing object, room type known", missing_in_room_task, ("MRR", "MRR, room type withheld")
+    "T2 missing": _objects(
+        "missing objects",
+        missing_task,
+        (*_each(("MRR",), tuple(SIZES)), *(f"MRR, {size}, structure listed" for size in SIZES)),
+        (*_each(("MRR",), tuple(SIZES)), "top-1", "top-10"),
     ),
-    "T2 partial": _objects(
-        "missing objects of a partial scene",
-        partial_task,
-        (*_each(("MRR",), tuple(SHARES)), "precision@5, 50 %", "change of MRR, 50 %"),
-        ("MRR, 50 %", "precision@5, 50 %", "change of MRR, 50 %"),
-    ),
+    "Structure": _carded("floor, wall and ceiling listed", structure_task, ("change of p",)),
     "T2 with evidence": _carded(
         "missing object, with more evidence",
         missing_evidence_task,
@@ -127,25 +110,14 @@ TASKS: dict[str, Task] = {
     "T2-at missing at a place": _objects(
         "missing object at a place", placed_task, ("MRR", "MRR, on-top"), ("MRR",)
     ),
-    "T3 outliers, uniform": _objects(
-        "intruder",
-        outliers_task,
-        ("hit@1", "AUROC", "alarms in untouched scenes", "intruders caught"),
-        ("hit@1", "AUROC", "alarms in untouched scenes"),
+    "T3 outliers": _carded(
+        "intruder", outliers_task, (*_each(("hit@1",), LAWS), *_each(("flagged",), LAWS))
     ),
-    "T3 outliers, by popularity": _objects(
-        "intruder of a frequent class", partial(outliers_task, law=by_popularity), ("hit@1",)
+    "T3 alarms": _carded(
+        "alarms in untouched parts",
+        alarms_task,
+        tuple(f"alarms, {name}, {n} classes" for n in LENGTHS for name in SENSITIVITIES),
     ),
-    "T3 outliers, same room type": _objects(
-        "intruder of the same room type", partial(outliers_task, law=by_room), ("hit@1",)
-    ),
-    "T3 signature": _objects(
-        "intruder of another room type",
-        signature_task,
-        ("hit@1", "hit@1, log-odds alone", *_each(("caught",), SENSITIVITIES)),
-        ("hit@1", "caught, medium"),
-    ),
-    "T3 sensitivity": _carded("intruder, by sensitivity", sensitivity_task, _BY_SENSITIVITY),
     "T3 with evidence": _carded(
         "intruder, with more evidence", outliers_evidence_task, _each(("change of hit@1",), KINDS)
     ),
@@ -170,8 +142,8 @@ TASKS: dict[str, Task] = {
     "Calibration": Task(
         "calibration",
         calibration_task,
-        shown=_each(("ECE", "Brier skill"), tuple(QUESTIONS)),
-        card=tuple(f"{figure}, {name}" for name in QUESTIONS for figure in ("ECE", "Brier skill")),
+        shown=_each(("ECE", "Brier skill"), NAMES),
+        card=tuple(f"{figure}, {name}" for name in NAMES for figure in ("ECE", "Brier skill")),
     ),
     "Everyday": _carded("everyday facts", everyday_task, LINES, of_objects=False),
 }

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,8 +45,7 @@ from training.datasets.cases import (
     scene_of,
 )
 from training.datasets.sources import meaning_of
-from training.evaluation.alarms import ALARMS
-from training.evaluation.outlier_tasks import kept_in_each_source
+from training.evaluation.alarms import ALARMS, SOURCE_SCENES
 from training.fit.calibrate_objects import calibrate_objects, recalibrated
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_popularity
@@ -363,8 +361,9 @@ def fit_misplaced(
 ) -> dict[str, Any]:
     """Fit `misplaced` and `misplaced_thresholds` to log-odds given the rest of the scene.
 
-    Each scene takes part untouched and with one false relation. Both entries are None if fewer than `_JUDGED_SCENES` scenes have relations, or if
-    false relations are not less likely than true relations. The model then judges no relation.
+    Each scene takes part untouched and with one false relation. Both entries are None if fewer than
+    `_JUDGED_SCENES` scenes have relations, or if false relations are not less likely than true
+    relations. The model then judges no relation.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
@@ -387,13 +386,29 @@ def fit_misplaced(
     slope, intercept = logistic(examples[:, :1], examples[:, 1] > 0, C=RIDGE)
     if slope >= 0:
         return unfitted
-    group = np.array([encoded.group for encoded, _ in untouched])
-    _, source = np.unique([encoded.source for encoded, _ in untouched], return_inverse=True)
+    sources = np.array([encoded.source for encoded, _ in untouched], dtype=np.str_)
     worst = expit(intercept + slope * np.array([least for _, least in untouched]))
-    limit = partial(kept_in_each_source, worst, group, source, rng)
-    limits = Thresholds(**{name: max(_LEAST[name], limit(share)) for name, share in ALARMS.items()})
+    limits = Thresholds(
+        **{
+            name: max(_LEAST[name], _hardest_quantile(worst, sources, 1 - share))
+            for name, share in ALARMS.items()
+        }
+    )
     entry = Slope(intercept=intercept, slope=slope)
     return {"misplaced": entry, "misplaced_thresholds": limits}
+
+
+def _hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) -> float:
+    """Return the highest quantile of the values, (N,), over the large sources.
+
+    A robot sees scenes of one source. Small sources count as one. A value equal to the quantile is
+    below it.
+    """
+    names, sizes = np.unique(sources, return_counts=True)
+    small = np.isin(sources, names[sizes < SOURCE_SCENES])
+    parts = [sources == name for name in names[sizes >= SOURCE_SCENES]]
+    parts += [small] if small.any() else []
+    return float(np.nextafter(max(np.quantile(values[part], share) for part in parts), np.inf))
 
 
 def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:

@@ -43,7 +43,7 @@ class DataConfig(_Section):
     vocabulary: str = Field(
         default="indoor", description="indoor, source, rooms, or a file that ends in .json"
     )
-    split: Literal["group", "stable", "random", "final"] = "group"
+    split: Literal["group", "stable", "final"] = "group"
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
     limit: int | None = Field(default=None, ge=10, description="maximum scenes of each source")

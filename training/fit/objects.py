@@ -199,6 +199,7 @@ class ObjectFit:
             source = scenes.source[index]
             self._chains = start_chains(
                 *(machine, scenes.v[index], self._generator),
+                room=self._some_rooms(scenes.room[index]),
                 source=source,
                 possible=scenes.shows[source],
             )
@@ -237,7 +238,7 @@ class ObjectFit:
         v, room, source = scenes.v[index], scenes.room[index], scenes.source[index]
         loss = self._conditional_loss(v, room, source) + self._prior()
         if self._chains is not None:
-            difference = self._generative_loss(self._chains, v, source)
+            difference = self._generative_loss(self._chains, v, self._some_rooms(room), source)
             loss = loss + self.config.generative_weight * difference
         return loss
 
@@ -245,35 +246,47 @@ class ObjectFit:
         """Return the mean over scenes of the negative log-likelihood of what is not listed."""
         machine = self.machine
         parts = random_parts(v, self.config.leave_one_out, self._generator)
-        has_room = torch.rand(len(v), generator=self._generator) < self.config.room_share
+        listed_room = self._some_rooms(room)
         log_odds = machine.object_log_odds(
-            parts.listed,
-            room=torch.where(has_room, room, -1),
-            source=source,
-            share=parts.share,
+            parts.listed, room=listed_room, source=source, share=parts.share
         )
         hidden = v - parts.listed
         weight = self.scenes.shows[source] * (1 - parts.listed)
         weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
         loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum()
-        asked = ~has_room & (room >= 0)
+        asked = (listed_room < 0) & (room >= 0)
         if bool(asked.any()):
             logits = machine.room_logits(parts.listed[asked])
             loss = loss + cross_entropy(logits, room[asked], reduction="sum")
         return loss / len(v)
 
-    def _generative_loss(self, chains: Chains, v: Tensor, source: Tensor) -> Tensor:
-        """Return F(scenes) - F(chains), after a sweep of the chains."""
+    def _some_rooms(self, room: Tensor) -> Tensor:
+        """Return the room types, (scenes,), with those outside of `room_share` unknown (-1)."""
+        is_listed = torch.rand(len(room), generator=self._generator) < self.config.room_share
+        return torch.where(is_listed, room, -1)
+
+    def _generative_loss(self, chains: Chains, v: Tensor, room: Tensor, source: Tensor) -> Tensor:
+        """Return F(scenes) - F(chains), after a sweep of the chains.
+
+        The chains keep the room types of the scenes where they start.
+        """
         machine, generator = self.machine, self._generator
         sweep(machine, chains, generator, classes=self.config.classes_per_sweep)
         h2 = None
         chain_h2 = None
         if machine.spec.H2:
             with torch.no_grad():
-                h2 = torch.bernoulli(machine.context(v)[1], generator=generator)
+                h2 = torch.bernoulli(machine.context(v, room)[1], generator=generator)
             chain_h2 = chains.h2
-        data = machine.free_energy(v, h2, source=source).mean()
-        return data - machine.free_energy(chains.v, chain_h2, source=chains.source).mean()
+        data = self._free_energy(v, h2, room, source)
+        return data - self._free_energy(chains.v, chain_h2, chains.room, chains.source)
+
+    def _free_energy(self, v: Tensor, h2: Tensor | None, room: Tensor, source: Tensor) -> Tensor:
+        """Return the mean free energy given the room types, which the chains do not draw."""
+        free = self.machine.free_energy(v, h2, room=room, source=source)
+        if self.machine.spec.C:
+            free = free + self.machine.e[room.clamp(min=0)] * (room >= 0)
+        return free.mean()
 
     def _prior(self) -> Tensor:
         """Return the negative log prior of the weights, divided by the number of scenes."""

@@ -186,7 +186,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     def class_bias(self, source: Tensor | None) -> Tensor:
         """Return b + a[q], (scenes or 1, classes). A source q of -1 or None has a[q] = 0."""
-        if source is None:
+        if source is None or not self.spec.profiles:
             return self.b.unsqueeze(0)
         return self.b + self.a[source.clamp(min=0)] * (source >= 0).unsqueeze(-1)
 

@@ -4,7 +4,6 @@ Each machine or baseline is one row of the result tables. An interrupted run can
 command writes these files:
 
 <folder>/<domain>/results.*                  results of the comparison
-<folder>/<domain>/seed-protocol/results.*    results by the protocol of Bozcan et al. (2018)
 <folder>/<domain>/shuffled/<task>/results.*  results after training on shuffled scenes
 """
 
@@ -22,7 +21,7 @@ from training.datasets.batches import seen_triples
 from training.evaluation.baselines import RELATIONS
 from training.evaluation.everyday_task import EVERYDAY, facts_file
 from training.evaluation.report import settings_by_source
-from training.evaluation.results import Reports, Results, grid, only, summarise, write
+from training.evaluation.results import Reports, Results, only, summarise, write
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import TASKS
 from training.fit.configuration import Config, ConfigError, DataConfig
@@ -32,7 +31,6 @@ from training.research.measure import POOLED, Plan, measure_entries, resumable, 
 from training.research.plots import write_plots
 from training.runs.config_files import at_most, data_folder, load_config, with_settings
 from training.runs.pipeline import SplitScenes, prepare
-from training.seed.protocol import PAPER, SEED_TASKS
 
 DEFAULT = ("indoor-triway", "indoor-gbm", "indoor-rbm")
 """Configurations that the command measures if it is called without configurations."""
@@ -40,16 +38,14 @@ DEFAULT = ("indoor-triway", "indoor-gbm", "indoor-rbm")
 YARDSTICKS = {
     "T1a relations": ("relation popularity", "R-precision, distinct classes"),
     "T1 pairs": ("relation popularity", "accuracy"),
-    "T2 missing": ("popularity", "MRR"),
-    "T2 partial": ("popularity", "MRR, 50 %"),
-    "T3 signature": ("popularity", "hit@1"),
+    "T2 missing": ("popularity", "MRR, one removed"),
+    "T3 outliers": ("popularity", "hit@1, signature"),
 }
 """Reference baseline and metric of each task, for training on shuffled scenes.
 
 After training on shuffled scenes, no other model should exceed this baseline.
 """
 
-_SEED_SHOWN = {name: task.shown for name, task in SEED_TASKS.items()}
 _RELATION_TASKS = ("T1a relations", "T1 pairs")
 # Tasks that a quick run leaves out. The annealing that estimates log Z (the log of the partition
 # function) is slow even for a few scenes.
@@ -80,9 +76,9 @@ class Domain:
     configs: tuple[Config, ...]
 
     @property
-    def leaks(self) -> bool:
-        """True if the training part may contain near-duplicates of test scenes."""
-        return self.configs[0].data.split == "random"
+    def source_weights(self) -> dict[str, float]:
+        """Weights of the scenes of the data sources in the training of the first configuration."""
+        return self.configs[0].objects.source_weights
 
 
 @dataclass(frozen=True)
@@ -137,9 +133,6 @@ def benchmark(
         int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")
     ] = 300,
     workers: Annotated[int, typer.Option(min=1, help="processes with one thread each")] = 2,
-    seed_protocol: Annotated[
-        bool, typer.Option("--seed-protocol", help="also use the protocol of Bozcan et al. (2018)")
-    ] = False,
     shuffled: Annotated[
         bool, typer.Option("--shuffled", help="also train all models on shuffled scenes")
     ] = False,
@@ -148,9 +141,9 @@ def benchmark(
 ) -> None:
     """Train machines and baselines on the same scenes, and evaluate all on the same test scenes.
 
-    The command writes results.json, results.md and plots into one folder per domain. The options
-    --seed-protocol and --shuffled write into subfolders. After Ctrl-C, run the same command again:
-    it continues and skips finished tasks.
+    The command writes results.json, results.md and plots into one folder per domain. The option
+    --shuffled writes into a subfolder. After Ctrl-C, run the same command again: it continues and
+    skips finished tasks.
     """
     with resumable(console, ValueError, FloatingPointError):
         baseline_names = None if baseline is None else tuple(b for b in baseline if b != "none")
@@ -169,19 +162,8 @@ def benchmark(
         if shuffled:
             shuffled_tasks(options.tasks)  # report invalid tasks before hours of training
         for domain in domains:
-            if domain.leaks and (shuffled or not seed_protocol):
-                raise ConfigError(
-                    f"{', '.join(config.name for config in domain.configs)}: data.split = "
-                    '"random" leaves near-duplicates of test scenes in the training part. Set '
-                    'data.split = "group", or run only --seed-protocol, which uses a random split'
-                )
-        for domain in domains:
             results = folder / domain.name
-            # With a random split, only the seed protocol (Bozcan et al., 2018) is valid.
-            if not domain.leaks:
-                compare_domain(domain, results, options)
-            if seed_protocol:
-                compare_by_seed_protocol(domain, results / "seed-protocol", options)
+            compare_domain(domain, results, options)
             if shuffled:
                 compare_on_shuffled(domain, results / "shuffled", options)
             console.print(
@@ -260,7 +242,9 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
     entries: list[Entry] = []
     for seed in range(options.seeds):
         entries += [machine_entry(config) for config in options.configs(domain, seed)]
-        entries += baseline_entries(seed, options.baselines, related=plan.data.related)
+        entries += baseline_entries(
+            seed, options.baselines, related=plan.data.related, source_weights=domain.source_weights
+        )
     entries += reference_entries()
     reports = _measure_all(plan, entries, options, domain.name)
     results = summarise(reports, domain.configs[0].name, plan.parameters(entries))
@@ -268,22 +252,6 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
     console.print(*results.tables())
     names = {config.name for config in domain.configs}
     write_plots(plan, [entry for entry in entries if entry.name in names], reports, results)
-
-
-def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> None:
-    """Measure each machine, trained once on a random split, by the seed protocol."""
-    scenes = options.scenes(domain, split="random")
-    plan = replace(_plan(folder, scenes, options, tuple(SEED_TASKS)), registry=SEED_TASKS)
-    entries = [
-        machine_entry(with_settings(config, {"data.split": "random"}), calibrated=False)
-        for config in options.configs(domain, 0)
-    ]
-    reports = _measure_all(plan, entries, options, f"{domain.name}, seed protocol")
-    results = summarise(reports, domain.configs[0].name, plan.parameters(entries))
-    # The seed protocol does not rank the machines, so the results contain no paired differences.
-    results = replace(results, differences=())
-    _write(folder, scenes, results.to_dict() | {"paper": PAPER}, _protocol_text(results))
-    console.print(*results.tables(_SEED_SHOWN, lambda task: SEED_TASKS[task].words))
 
 
 def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
@@ -317,7 +285,10 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
     if options.baselines is not None:
         yardsticks = {YARDSTICKS[task][0] for task in tasks}
         names = [name for name in names if name in yardsticks | set(options.baselines)]
-    entries += baseline_entries(0, names, related=plan.data.related, whole=False)
+    entries += baseline_entries(
+        *(0, names),
+        related=plan.data.related, whole=False, source_weights=domain.source_weights,
+    )  # fmt: skip
     reports = _measure_all(plan, entries, options, f"{domain.name}, shuffled")
     weights = plan.parameters(entries)
     for task in tasks:
@@ -366,33 +337,6 @@ def _measure_all(plan: Plan, entries: Sequence[Entry], options: Options, title: 
 def _write(folder: Path, scenes: SplitScenes, values: dict[str, Any], text: str) -> None:
     """Write the results and the sha256 of each data source."""
     write(folder, {"contents": dict(scenes.digests)} | values, text)
-
-
-def _protocol_text(results: Results) -> str:
-    names = list(dict.fromkeys(name for values in PAPER.values() for name in values))
-    paper = grid(
-        ["", *names],
-        (
-            [figure, *(f"{values[name]:.4f}" if name in values else "" for name in names)]
-            for figure, values in PAPER.items()
-        ),
-    )
-    return f"""# Seed protocol
-
-This is the protocol of Bozcan et al. (2018). One random reconstruction of a scene gives each
-answer. Scenes are split at random into training, test and validation scenes (60 / 30 / 10 %). The
-figures cannot be compared with other tables:
-
-- The training part contains near-duplicates of test scenes.
-- Some T2 questions contain relations of the removed object, which force or reveal the object.
-- Switching on more relations can only improve T1.
-- A model of V classes that returns its input scores 1/V in T3.
-
-{results.markdown(_SEED_SHOWN)}
-Results of the paper on its own data:
-
-{paper}
-"""
 
 
 def shuffled_text(task: str, results: Results) -> str:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from app.registry import Calibration
-from training.datasets.batches import TrainingData
+from training.datasets.batches import SceneTensors, TrainingData, subset
+from training.datasets.cases import some_scenes
 from training.evaluation.artifact_model import artifact_model, floor_model, independent_model
+from training.evaluation.asking import ask_rows
 from training.evaluation.baselines import PLACED, placed_product
+from training.evaluation.baselines.classes import frequency
 from training.evaluation.baselines.fitting import Baseline
-from training.evaluation.model import Model
-from training.evaluation.outlier_tasks import fitted_alarm
+from training.evaluation.model import Model, ObjectScore, suspicion_of
+from training.evaluation.outlier_tasks import first_shares, intruder_weights, with_intruders
 from training.evaluation.report import Progress, write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
@@ -27,6 +30,11 @@ from training.runs.publish import as_stored, draft_artifact
 
 CALIBRATION = "calibration.json"
 """File name of a machine's calibration, in the folder of its run."""
+
+
+# Weights of log popularity in the ranking of intruders, and the scenes that choose one.
+_WEIGHTS = (0.0, 0.125, 0.25, 0.375, 0.5)
+_SCENES = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +55,12 @@ class Entry:
 
 
 def baseline_entries(
-    seed: int, names: Sequence[str] | None = None, *, related: bool = True, whole: bool = True
+    seed: int,
+    names: Sequence[str] | None = None,
+    *,
+    related: bool = True,
+    whole: bool = True,
+    source_weights: Mapping[str, float] | None = None,
 ) -> Iterator[Entry]:
     """Generate the entries of the baselines in `names`; None means all baselines.
 
@@ -55,7 +68,9 @@ def baseline_entries(
 
     Args:
         related: False leaves out relation baselines.
-        whole: True adds an outlier alarm and place scores to object baselines.
+        whole: True adds place scores to object baselines.
+        source_weights: weights of the scenes of a data source in the training of the machines, by
+            source name. The baselines use the same weights. By default, a weight is 1.
 
     Raises:
         ValueError: a name is not in `BASELINES`.
@@ -66,8 +81,9 @@ def baseline_entries(
         is_usable = related or not baseline.learns_relations
         is_selected = names is None or name in names
         if is_usable and is_selected and (baseline.stochastic or seed == 0):
-            make = partial(_baseline_model, baseline, seed, whole)
-            yield Entry(name, seed, f"{name}, seed {seed}", make)
+            weights = dict(source_weights or {})
+            make = partial(_baseline_model, baseline, seed, whole, weights)
+            yield Entry(name, seed, f"{name}, seed {seed}, {weights}", make)
 
 
 def reference_entries() -> Iterator[Entry]:
@@ -89,22 +105,58 @@ def machine_entry(config: Config, *, calibrated: bool = True) -> Entry:
 
 
 def _baseline_model(
-    baseline: Baseline, seed: int, whole: bool, data: TrainingData, folder: Path, say: Progress
+    baseline: Baseline,
+    seed: int,
+    whole: bool,
+    source_weights: Mapping[str, float],
+    data: TrainingData,
+    folder: Path,
+    say: Progress,
 ) -> Model:
-    """Fit a baseline.
+    """Fit a baseline to the scenes and weights of the machines.
 
-    An object baseline also supports T2-at (missing object at a place): its score is multiplied by a
-    frequency table of places.
+    An object baseline ranks intruders with a prior of popularity, as `/outliers` does. It also
+    supports T2-at (missing object at a place): its score is multiplied by a frequency table.
     """
+    data = replace(data, train=weighted(data.train, source_weights))
     model = _fit(baseline, data, seed, folder, say)
-    if not whole or model.missing is None:
+    if model.missing is None:
         return model
-    model = replace(model, alarm=fitted_alarm(model.missing, data.validation, data.structure, seed))
-    if not data.related:
+    model = replace(model, suspicion=tuned_suspicion(model.missing, data, seed))
+    if not whole or not data.related:
         return model
     table = _fit(PLACED, data, seed, folder, say)
     product = _fit(placed_product(baseline.name, model, table), data, seed, folder, say)
     return replace(model, at_place=product.at_place)
+
+
+def weighted(scenes: SceneTensors, source_weights: Mapping[str, float]) -> SceneTensors:
+    """Return the scenes with their weights multiplied by the weights of their data sources."""
+    if not source_weights:
+        return scenes
+    return replace(
+        scenes,
+        scenes=[
+            replace(scene, weight=scene.weight * source_weights.get(scene.source, 1.0))
+            for scene in scenes.scenes
+        ],
+    )
+
+
+def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> ObjectScore:
+    """Return the suspicion with the weight of popularity that finds most validation intruders."""
+    complete = subset(data.validation, data.validation.complete.nonzero().squeeze(1))
+    scenes = some_scenes(complete, _SCENES, seed)
+    log_popularity = frequency(data.train.v, data.train.weight).logit()
+    hits = dict.fromkeys(_WEIGHTS, 0.0)
+    for weights in intruder_weights(scenes, data.train).values():
+        _, v, intruder = with_intruders(scenes, data.structure, weights)
+        if len(v):
+            plain = ask_rows(suspicion_of(score), v, block=32)
+            for weight in _WEIGHTS:
+                values = plain + weight * log_popularity
+                hits[weight] += float(first_shares(values, intruder).mean())
+    return suspicion_of(score, log_popularity, max(hits, key=lambda weight: hits[weight]))
 
 
 def _fit(baseline: Baseline, data: TrainingData, seed: int, folder: Path, say: Progress) -> Model:

@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
@@ -42,7 +42,7 @@ from training.evaluation.model import Model
 from training.evaluation.report import SourceReport, digest, measure, pooled, write_whole
 from training.evaluation.results import Reports
 from training.evaluation.setting import Setting
-from training.evaluation.tasks import EVERY_TASK, ONCE, WHOLE_SET, Task
+from training.evaluation.tasks import ONCE, WHOLE_SET
 from training.fit.checkpoint import RunError
 from training.fit.configuration import ConfigError
 from training.research.entries import Entry
@@ -97,14 +97,13 @@ class Plan:
         folder: folder of the reports.
         data: scenes for training, validation and test.
         settings: evaluation setting by data source. The key `POOLED` is the union of all sources.
-        tasks: names of the tasks to measure, which are keys of `registry`.
+        tasks: names of the tasks to measure, which are keys of `EVERY_TASK`.
     """
 
     folder: Path
     data: TrainingData
     settings: Mapping[str, Setting]
     tasks: Sequence[str]
-    registry: Mapping[str, Task] = field(default_factory=lambda: EVERY_TASK)
 
     def folder_of(self, entry: Entry) -> Path:
         """Return the folder of an entry and its training seed."""
@@ -188,7 +187,6 @@ class Plan:
             measure(
                 *(model, setting, source),
                 tasks=self.tasks_on(source),
-                registry=self.registry,
                 path=folder / f"{source}.json",
                 progress=say,
             )

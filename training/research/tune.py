@@ -34,12 +34,11 @@ from rich.table import Table
 
 from training.datasets.batches import TrainingData
 from training.evaluation.metrics import Metric, paired_difference
-from training.evaluation.missing_tasks import MachineScore
 from training.evaluation.model import Model
-from training.evaluation.relation_tasks import machine_score
 from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
 from training.evaluation.tasks import in_words
 from training.fit.configuration import Config, ConfigError, first_error
+from training.fit.machine_scores import MachineScore, relation_score
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.measure import resumable
@@ -62,7 +61,7 @@ if TYPE_CHECKING:
 By: TypeAlias = Literal["mrr", "r-precision", "both"]
 
 FIGURES = {
-    "MRR": ("T2 missing", "MRR"),
+    "MRR": ("T2 missing", "MRR, one removed"),
     "R-precision": ("T1a relations", "R-precision, instance counts"),
 }
 """Metrics that rank the trials, by short name: (task, metric) of the evaluation."""
@@ -312,7 +311,7 @@ class Search:
         return sum(metrics[name].value for name in _BY[self.by] if name in metrics)
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> dict[str, Metric]:
-        model = Model(missing=MachineScore(machine), relations=machine_score(machine))
+        model = Model(missing=MachineScore(machine), relations=relation_score(machine))
         tasks = [task for task, _ in FIGURES.values()]
         for source, setting in settings_by_source(
             self.data.validation, self.data.structure, self.data.train, seen=None

@@ -14,12 +14,12 @@ from training.datasets.files import DATA
 from training.fit.configuration import Config, ConfigError, first_error
 
 _TRAINING = Path(__file__).resolve().parents[1]
-_CONFIGS = (_TRAINING / "runs" / "configs", _TRAINING / "seed" / "configs")
 
 
 def shipped_configs() -> dict[str, Path]:
     """Return the files of the shipped configurations by name."""
-    return {path.stem: path for folder in _CONFIGS for path in sorted(folder.glob("*.toml"))}
+    folder = _TRAINING / "runs" / "configs"
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def shipped_files(kind: str) -> dict[str, Path]:

@@ -1,236 +1,198 @@
-"""Seed protocol: the evaluation protocol of Bozcan et al. (2018), the paper behind this project.
+"""The four tasks of Bozcan et al. (2018), with the reference rows "frequency" and "nothing".
 
-One random reconstruction of a scene answers each question. First the hidden layer h1 is sampled
-once from its mean field, which is exact for a machine with one hidden layer. Then the queried units
-are sampled once given h1. The sample is the answer, without any ranking or threshold.
+A sampled reconstruction answers each question: the model gets a scene, samples the context and then
+the free units, and the sample is the answer. `ONE_PASS` is one sweep at temperature 1. `ANNEALED`
+cools the temperature from 2 to 1.
 
-    T1  share of labelled relations that the sample switches on, given all objects. Switching on
-        other relations costs nothing, so the number of all relations switched on is also reported
-    T2  share of removed objects that the sample switches on again. In the published protocol, the
-        relations of the removed object stay on. In a gated machine, these relations force the
-        object on. In other machines, these relations affect the hidden layer. In the GBM, two-way
-        weights between relations and objects also raise the object. A second variant of T2 deletes
-        these relations
-    T3  mean over classes of |reconstruction - scene| after a class was added. A model that returns
-        its input is wrong in one of V classes and scores 1/V
+    T1  relations  All objects are given, and no relation. Share of listed relations that are on
+    T2  missing    One random class is removed. Share of removed classes that are on again. In the
+                   published code, the listed relations of the removed class stay on. They force
+                   the class on in a gated machine and hint at it in the others. A second variant
+                   deletes these relations
+    T3  extra      One random absent class is added. Number of wrong objects after reconstruction,
+                   divided by V as in the paper, and by the objects of the scene as in the code of
+                   the authors. Returning the input makes one error in each scene
+    T4  generate   One hidden unit is on, and the others have their training mean or are 0
 
-Use these metrics only for comparison with the paper. They leak information and reward machines that
-switch on many units. The split is random by scene, so the training part contains near-duplicates of
-test scenes.
-
-Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
+Each share has its price beside it. More relations that are on raise T1, so precision is reported.
+More objects that are on raise T2, so false objects are reported.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
+from typing import Final
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from training.datasets.batches import Batch, SceneTensors, relation_units
-from training.datasets.cases import scene_rng
-from training.evaluation.intruders import draw_intruders
-from training.evaluation.metrics import Metric, Ratio
-from training.evaluation.model import Model
-from training.evaluation.setting import Outcome, Setting
-from training.evaluation.tasks import Task
-from training.machines import BoltzmannMachine
-from training.machines.bernoulli import bernoulli
-from training.machines.edges import Edges
-from training.machines.mean_field import Evidence, mean_field
+from app.scene import Vocabulary
+from training.seed.machines import Free, Machine, State, bernoulli
+from training.seed.scenes import Scenes
 
-PAPER: dict[str, dict[str, float]] = {
-    "T1 labelled relations switched on": {"RBM": 0.0560, "GBM": 0.1418, "Triway": 0.2335},
-    "T2 removed objects switched on, relations left on": {
-        "RBM": 0.3512,
-        "GBM": 0.4094,
-        "Triway": 0.4328,
-    },
-    "T3 error measure": {"RBM": 0.6446, "GBM": 0.1404, "Triway": 0.0789, "doing nothing": 1 / 417},
+ONE_PASS: Final = (1.0,)
+ANNEALED: Final = tuple(2.0 - step / 10 for step in range(11))
+
+PAPER: Final = {
+    "T1 on": {"rbm": 0.0560, "gbm": 0.1418, "triway": 0.2335},
+    "T2 on, relations left": {"rbm": 0.3512, "gbm": 0.4094, "triway": 0.4328},
+    "T3 error / V": {"rbm": 0.6446, "gbm": 0.1404, "triway": 0.0789},
 }
-"""Results of Bozcan et al. (2018) on their own data, by metric and machine."""
+"""Results of Bozcan et al. (2018) on their own data, by metric and variant."""
 
-_BLOCK = 32
+Visible = tuple[Tensor, Tensor]
+Answer = Callable[[Tensor, Tensor, Free, torch.Generator], Visible]
+"""Takes v, r, the free units and a generator. Returns reconstructed v and r."""
+
+_ROWS: Final = 3  # hidden units of T4
+_DRAWN: Final = 40  # scenes of each hidden unit
+_SHOWN: Final = 8  # most frequent classes of a hidden unit
 
 
-def relations_switched_on(model: Model, setting: Setting) -> Outcome | None:
-    """Measure T1: all relations are unobserved, and each relation is sampled once."""
-    if model.machine is None:
-        return None
-    scenes = setting.some(related=True)
+def machine_answer(machine: Machine, schedule: Sequence[float] = ONE_PASS) -> Answer:
+    """Return the reconstruction by Gibbs sweeps at these temperatures."""
+
+    @torch.no_grad()
+    def answer(v: Tensor, r: Tensor, free: Free, generator: torch.Generator) -> Visible:
+        state = State(v, r, *machine.hidden(v, r, generator))
+        for temperature in schedule:
+            state, _, _ = machine.sweep(state, free, temperature, generator)
+        return state.v, state.r
+
+    return answer
+
+
+def frequency_answer(triples: Tensor, train: Scenes) -> Answer:
+    """Return the reconstruction by frequencies in the training scenes, without any context.
+
+    p(v_i) is the share of scenes with class i. p(r_e) is the share of listed relations among the
+    annotated scenes with both classes.
+    """
+    ends = triples[:, 1], triples[:, 2]
+    both = train.v[:, ends[0]] * train.v[:, ends[1]] * train.annotated.unsqueeze(1)
+    object_p, relation_p = train.v.mean(0), train.r.sum(0) / both.sum(0).clamp(min=1)
+
+    def answer(v: Tensor, r: Tensor, free: Free, generator: torch.Generator) -> Visible:
+        v = torch.where(free.v, bernoulli(object_p.expand(v.shape), generator), v)
+        p = relation_p * v[:, ends[0]] * v[:, ends[1]]
+        return v, torch.where(free.r, bernoulli(p, generator), r)
+
+    return answer
+
+
+def nothing_answer(v: Tensor, r: Tensor, free: Free, generator: torch.Generator) -> Visible:  # noqa: ARG001
+    """Return the scene as it is."""
+    return v, r
+
+
+def measure(answer: Answer, triples: Tensor, test: Scenes, seed: int) -> dict[str, float]:
+    """Return all figures of T1 to T3. T1 is left out without listed relations."""
+    generator = torch.Generator().manual_seed(seed)
+    figures = relations_on(answer, test, generator)
+    for name, left in (("relations left", True), ("relations deleted", False)):
+        figures |= {
+            f"T2 {metric}, {name}": value
+            for metric, value in removed_on(answer, triples, test, left, generator).items()
+        }
+    return figures | extra_errors(answer, test, generator)
+
+
+def relations_on(answer: Answer, test: Scenes, generator: torch.Generator) -> dict[str, float]:
+    """Measure T1 over the scenes with listed relations."""
+    scenes = test.rows(test.labelled > 0)
     if not len(scenes):
-        return None
-    on, labelled, hit = (np.zeros(len(scenes)) for _ in range(3))
-    for index, batch, generator in _blocks(scenes, setting.seed):
-        total, grid = draw_relations(model.machine, batch, generator)
-        on[index] = total.double().numpy()
-        labelled[index] = batch.holds.sum((1, 2, 3)).double().numpy()
-        hit[index] = (batch.holds * grid).sum((1, 2, 3)).double().numpy()
-    metrics: dict[str, Metric] = {
-        "labelled relations switched on": Ratio(hit, labelled),
-        "relations switched on per scene": Ratio.of_scenes(on),
-        "labelled relations per scene": Ratio.of_scenes(labelled),
+        return {}
+    off = torch.zeros_like(scenes.r)
+    free = Free(
+        torch.zeros_like(scenes.v, dtype=torch.bool), torch.ones_like(off, dtype=torch.bool)
+    )
+    _, r = answer(scenes.v, off, free, generator)
+    hits, on, labelled = float((r * scenes.r).sum()), float(r.sum()), float(scenes.labelled.sum())
+    return {
+        "T1 on": hits / labelled,
+        "T1 precision": hits / max(on, 1.0),
+        "T1 relations on a scene": on / len(scenes),
+        "T1 listed relations a scene": labelled / len(scenes),
     }
-    return Outcome(metrics, len(scenes), 0)
 
 
-def removed_switched_on(model: Model, setting: Setting) -> Outcome | None:
-    """Measure T2: remove one random class from each scene, and sample the unit of this class."""
-    if model.machine is None:
-        return None
-    scenes = setting.some(related=True)
-    targets = _targets(scenes, setting.structure, setting.seed)
-    has_target = targets >= 0
-    if not bool(has_target.any()):
-        return None
-    metrics: dict[str, Metric] = {}
-    for name, left_on in (("relations left on", True), ("relations deleted", False)):
-        switched_on = torch.zeros(len(scenes))
-        for index, batch, generator in _blocks(scenes, setting.seed):
-            rows = has_target[index].nonzero().squeeze(1)
-            if len(rows):
-                classes = targets[index[rows]]
-                p = switch_on_probability(
-                    model.machine, batch.rows(rows), classes, left_on, generator
-                )
-                switched_on[index[rows]] = bernoulli(p, generator)
-        metrics[f"removed objects switched on, {name}"] = Ratio(
-            switched_on.double().numpy(), has_target.double().numpy()
-        )
-    return Outcome(metrics, len(scenes), int((~has_target).sum()))
+def removed_on(
+    answer: Answer, triples: Tensor, test: Scenes, left: bool, generator: torch.Generator
+) -> dict[str, float]:
+    """Measure T2 over the scenes of two or more classes.
 
-
-def reconstruction_after_addition(model: Model, setting: Setting) -> Outcome | None:
-    """Measure T3: add an absent class to each scene, and sample all objects once."""
-    if model.machine is None:
-        return None
-    machine, scenes = model.machine, setting.some()
-    added = draw_intruders(scenes, setting.structure, seed=setting.seed)
-    is_altered = (added >= 0).double().numpy()
-    if not is_altered.any():
-        return None
-    V = scenes.v.shape[1]
-    errors, switched_off, still_on, present = (np.zeros(len(scenes)) for _ in range(4))
-    for index, batch, generator in _blocks(scenes, setting.seed):
-        intruder = added[index].clamp(min=0).unsqueeze(1)
-        h1 = _draw_h1(machine, Evidence(batch.v.scatter(1, intruder, 1.0)), generator)
-        v = bernoulli(machine.object_logits(h1).sigmoid(), generator)
-        weight = is_altered[index]
-        errors[index] = (v - batch.v).abs().sum(1).double().numpy() * weight
-        switched_off[index] = (1 - v.gather(1, intruder).squeeze(1)).double().numpy() * weight
-        still_on[index] = (v * batch.v).sum(1).double().numpy() * weight
-        present[index] = batch.v.sum(1).double().numpy() * weight
-    metrics: dict[str, Metric] = {
-        "error measure": Ratio(errors, is_altered * V),
-        "error measure, doing nothing": Ratio(is_altered, is_altered * V),
-        "added objects switched off": Ratio(switched_off, is_altered),
-        "objects of the scene kept on": Ratio(still_on, present),
+    The remaining classes and the relations among them stay as they are. The absent classes and
+    their relations are free. With `left`, the relations between the removed class and the others
+    also stay as they are.
+    """
+    scenes = test.rows(test.v.sum(1) >= 2)
+    removed = torch.multinomial(scenes.v, 1, generator=generator)
+    shown = scenes.v.scatter(1, removed, 0.0)
+    known = scenes.v if left else shown
+    is_known = (known[:, triples[:, 1]] * known[:, triples[:, 2]]).bool()
+    free = Free(shown == 0, ~is_known & scenes.annotated.unsqueeze(1))
+    v, _ = answer(shown, scenes.r * is_known, free, generator)
+    return {
+        "on": float(v.gather(1, removed).mean()),
+        "false objects": float((v * (1 - scenes.v)).sum(1).mean()),
     }
-    return Outcome(metrics, len(scenes), int((is_altered == 0).sum()))
+
+
+def extra_errors(answer: Answer, test: Scenes, generator: torch.Generator) -> dict[str, float]:
+    """Measure T3. All units are free, and sampling starts at the scene with the added class."""
+    added = torch.multinomial(1 - test.v, 1, generator=generator)
+    altered = test.v.scatter(1, added, 1.0)
+    free_r = test.annotated.unsqueeze(1).expand(test.r.shape)
+    free = Free(torch.ones_like(altered, dtype=torch.bool), free_r)
+    v, _ = answer(altered, test.r, free, generator)
+    wrong = float((v - test.v).abs().sum())
+    return {
+        "T3 error / V": wrong / test.v.numel(),
+        "T3 error / objects": wrong / float(test.v.sum()),
+        "T3 extra off": 1 - float(v.gather(1, added).mean()),
+    }
 
 
 @torch.no_grad()
-def draw_relations(
-    machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Sample all relations once, given the objects.
+def generate(
+    machine: Machine, train: Scenes, vocabulary: Vocabulary, seed: int
+) -> tuple[dict[str, float], dict[str, list[str]]]:
+    """Measure T4 for the hidden units of h1 whose mean varies most over the training scenes.
+
+    Objects and then relations are sampled given h1 from an empty scene.
 
     Returns:
-        The number of relation units that are on (scenes,), and the sampled relations between
-        present classes (scenes, relations, classes, classes). Machines without gates also switch on
-        relations of absent objects. Only the number of units includes these relations.
+        Figures, and the most frequent classes by hidden unit. A pair of sampled classes is "seen"
+        if both classes are in one training scene.
     """
-    h1 = _draw_h1(machine, Evidence(batch.v), generator)
-    edges = machine.edges(batch.classes, batch.counts)
-    p = machine.relation_logits(edges, batch.v, h1).sigmoid() * machine.gate(edges, batch.v)
-    r = bernoulli(p, generator)
-    return r.sum(1), machine.between(edges, r, batch.classes).clamp(min=0)
-
-
-@torch.no_grad()
-def switch_on_probability(
-    machine: BoltzmannMachine,
-    batch: Batch,
-    target: Tensor,
-    left_on: bool,
-    generator: torch.Generator,
-) -> Tensor:
-    """Return the probability (scenes,) that the removed class i of each scene is switched on.
-
-    The probability is p(v_i = 1 | h1, relations), with one sample of the hidden layer h1.
-
-    The relations of the removed class, `target` (scenes,), are unobserved without `left_on`.
-    """
-    column = target.unsqueeze(1)
-    absent, present = batch.v.scatter(1, column, 0.0), batch.v.scatter(1, column, 1.0)
-    edges, r, observed = relation_units(machine, batch)
-    if not left_on:
-        touched = _contains_class(edges, target)
-        r, observed = r * ~touched, observed & ~touched
-    h1 = _draw_h1(machine, Evidence(absent, edges, r, observed), generator)
-    logit = machine.object_logits(h1).gather(1, column).squeeze(1)
-    for v, sign in ((present, 1.0), (absent, -1.0)):
-        logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
-        logit = logit + sign * machine.relation_term(logits, gate, r, observed).sum(-1)
-    # The gate of a relation is closed if one of its objects is absent. So a relation that is on
-    # forces object i on.
-    is_forced = (observed * r > machine.gate(edges, absent)).any(-1)
-    return torch.where(is_forced, torch.inf, logit).sigmoid()
-
-
-def _draw_h1(machine: BoltzmannMachine, evidence: Evidence, generator: torch.Generator) -> Tensor:
-    with torch.no_grad():
-        return bernoulli(mean_field(machine, evidence).y.sigmoid(), generator)
-
-
-def _contains_class(edges: Edges, target: Tensor) -> Tensor:
-    """Return a mask (scenes, units) of the relation units that contain the class `target`."""
-    i = target.unsqueeze(1)
-    return ((edges.subject == i) | (edges.object == i)) & edges.valid
-
-
-def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
-    """Draw a class to remove from each scene, (scenes,); -1 with fewer than two plain classes."""
-    targets = torch.full((len(scenes),), -1, dtype=torch.int64)
-    is_thing = ~structure.numpy()
-    for k, scene in enumerate(scenes.scenes):
-        removable = scene.evidence.classes[is_thing[scene.evidence.classes]]
-        if len(removable) >= 2:
-            targets[k] = int(scene_rng(scene, seed).choice(removable))
-    return targets
-
-
-def _blocks(scenes: SceneTensors, seed: int) -> Iterator[tuple[Tensor, Batch, torch.Generator]]:
-    """Iterate over blocks of scenes: yield (scene indices, batch, random generator)."""
     generator = torch.Generator().manual_seed(seed)
-    for index in torch.arange(len(scenes)).split(_BLOCK):
-        yield index, scenes.batch(index), generator
+    _, h2 = machine.hidden(train.v, train.r, generator)
+    mean = machine.h1_logits(train.v, train.r, h2).sigmoid()
+    units = mean.var(0).topk(min(_ROWS, mean.shape[1])).indices
+    seen = (train.v.T @ train.v) > 0
+    figures, classes = {}, {}
+    for name, rest in (("mean", mean.mean(0)), ("zero", torch.zeros_like(mean[0]))):
+        h1 = rest.repeat(len(units), 1)
+        h1[range(len(units)), units] = 1.0
+        v = _objects_given(machine, h1.repeat_interleave(_DRAWN, 0), generator)
+        pairs = torch.einsum("bi,bj->ij", v, v).fill_diagonal_(0)
+        figures[f"T4 objects a scene, others {name}"] = float(v.sum(1).mean())
+        figures[f"T4 pairs seen, others {name}"] = float(
+            (pairs * seen).sum() / pairs.sum().clamp(min=1)
+        )
+        for unit, drawn in zip(units.tolist(), v.split(_DRAWN), strict=True):
+            top = drawn.mean(0).topk(min(_SHOWN, v.shape[1])).indices.tolist()
+            labels = [vocabulary.objects[i].label for i in top]
+            classes[f"unit {unit}, others {name}"] = labels
+    return figures, classes
 
 
-SEED_TASKS: dict[str, Task] = {
-    "Seed T1": Task(
-        "relations, seed protocol",
-        relations_switched_on,
-        shown=(
-            "labelled relations switched on",
-            "relations switched on per scene",
-            "labelled relations per scene",
-        ),
-    ),
-    "Seed T2": Task(
-        "missing object, seed protocol",
-        removed_switched_on,
-        shown=(
-            "removed objects switched on, relations left on",
-            "removed objects switched on, relations deleted",
-        ),
-    ),
-    "Seed T3": Task(
-        "intruder, seed protocol",
-        reconstruction_after_addition,
-        shown=("error measure", "error measure, doing nothing"),
-    ),
-}
-"""Tasks of the seed protocol (Bozcan et al., 2018). Their results have separate tables."""
+def _objects_given(machine: Machine, h1: Tensor, generator: torch.Generator) -> Tensor:
+    """Sample objects given h1, (B, V), by ten alternations with relations."""
+    v, r = h1.new_zeros(len(h1), len(machine.b)), h1.new_zeros(len(h1), len(machine.d))
+    free = Free(torch.ones_like(v, dtype=torch.bool), torch.ones_like(r, dtype=torch.bool))
+    for _ in range(10):
+        state = State(v, r, h1, h1.new_zeros(len(h1), len(machine.c2)))
+        v, _ = machine.sample_objects(state, free, 1.0, generator)
+        r = bernoulli(machine.relation_logits(v, h1).sigmoid() * machine.gate(v), generator)
+    return v

@@ -167,6 +167,13 @@ class AsyncClient:
         path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
         return await self._call(Call("GET", path, schemas.VocabularyAnswer), timeout)
 
+    async def word(
+        self, word: str, name: str | None = None, *, timeout: float | None = None
+    ) -> schemas.WordAnswer:
+        """Return the class that a label becomes in a model, and by which rule."""
+        path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
+        return await self._call(Call("GET", f"{path}/{segment(word)}", schemas.WordAnswer), timeout)
+
     async def contexts(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> schemas.ContextsAnswer:

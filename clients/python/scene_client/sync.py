@@ -168,6 +168,13 @@ class Client:
         path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
         return self._call(Call("GET", path, schemas.VocabularyAnswer), timeout)
 
+    def word(
+        self, word: str, name: str | None = None, *, timeout: float | None = None
+    ) -> schemas.WordAnswer:
+        """Return the class that a label becomes in a model, and by which rule."""
+        path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
+        return self._call(Call("GET", f"{path}/{segment(word)}", schemas.WordAnswer), timeout)
+
     def contexts(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> schemas.ContextsAnswer:

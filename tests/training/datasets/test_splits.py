@@ -53,7 +53,11 @@ def tears_groups(scenes: list[AnnotatedScene], part_of: dict[str, str]) -> bool:
     return any(len(of) > 1 for of in parts.values())
 
 
-@given(st.integers(1, 60), st.integers(0, 5), st.sampled_from(["group", "stable", "final"]))
+@given(
+    st.integers(1, 60),
+    st.integers(0, 5),
+    st.sampled_from(["group", "stable", "final", "paper groups"]),
+)
 def test_groups_stay_whole_across_sources(groups: int, seed: int, protocol: Protocol) -> None:
     frames = collection("frames", groups, prefix="place")
     boxes = collection("boxes", groups // 2, seed=1, prefix="place")
@@ -70,7 +74,7 @@ def test_a_source_splits_alone_as_it_does_among_others() -> None:
     assert {key: part for key, part in together.items() if key in alone} == alone
 
 
-@pytest.mark.parametrize("protocol", ["group", "random", "final"])
+@pytest.mark.parametrize("protocol", ["group", "paper", "paper groups", "final"])
 def test_shares_hold_over_all_and_within_room_types(protocol: Protocol) -> None:
     scenes = collection("a", 400)
     parts = split(scenes, seed=1, protocol=protocol)
@@ -84,9 +88,9 @@ def test_shares_hold_over_all_and_within_room_types(protocol: Protocol) -> None:
             assert here[room] == pytest.approx(fraction * size, abs=8)
 
 
-def test_the_seed_protocol_tears_groups_apart() -> None:
+def test_the_split_of_the_paper_tears_groups_apart() -> None:
     scenes = collection("a", 60)
-    assert tears_groups(scenes, parts_of(scenes, seed=0, protocol="random"))
+    assert tears_groups(scenes, parts_of(scenes, seed=0, protocol="paper"))
 
 
 def test_a_stable_split_has_its_shares_and_moves_no_group_as_a_collection_grows() -> None:

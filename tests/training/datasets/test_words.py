@@ -40,14 +40,23 @@ def test_vectors_of_words(tmp_path: Path) -> None:
         assert found.of(text) is None, text
 
 
-def test_classes_have_the_vector_of_their_label_or_alias(tmp_path: Path) -> None:
-    classes = ObjectClass("settee", ("davenport", "sofa", "table")), ObjectClass("lamp")
-    vocabulary = Vocabulary([ObjectClass("coffee table"), *classes])
-    vectors, found = class_vectors(read_word_vectors(save(tmp_path)), vocabulary)
-    assert found.tolist() == [True, True, False]
+def test_classes_have_the_mean_vector_of_label_and_aliases(tmp_path: Path) -> None:
+    classes = (
+        ObjectClass("coffee table"),
+        ObjectClass("settee", ("davenport", "sofa", "table")),
+        ObjectClass("coffee", ("lectern",)),
+        ObjectClass("futon", parent="settee"),
+        ObjectClass("lamp"),
+    )
+    vectors, found = class_vectors(read_word_vectors(save(tmp_path)), Vocabulary(classes))
+    assert found.tolist() == [True] * 4 + [False]
     assert vectors.dtype == np.float32
-    assert vectors[1] == pytest.approx([0.6, -0.8])
-    assert np.linalg.norm(vectors, axis=1) == pytest.approx([1, 1, 0])
+    half = np.sqrt(0.5)
+    assert vectors[0] == pytest.approx([half, half])
+    assert vectors[1] == pytest.approx(np.array([0.6, 0.2]) / np.sqrt(0.4))
+    assert vectors[2] == pytest.approx([1, 0])
+    assert vectors[3].tolist() == vectors[1].tolist()
+    assert not vectors[4].any()
 
 
 def test_training_reads_the_vectors_beside_the_scenes(tmp_path: Path) -> None:
@@ -60,8 +69,12 @@ def test_training_reads_the_vectors_beside_the_scenes(tmp_path: Path) -> None:
     assert scenes.words is not None
     vectors = dict(zip(scenes.vocabulary.labels, scenes.words.tolist(), strict=True))
     assert vectors["sofa"] == pytest.approx([0.6, -0.8])
-    assert vectors["coffee table"] == pytest.approx([np.sqrt(0.5)] * 2)
+    # The mean of "coffee table" and of its aliases, whose only known word is "table".
+    assert vectors["coffee table"] == pytest.approx([np.sin(np.pi / 8), np.cos(np.pi / 8)])
     assert vectors["pillow"] == [0, 0]
+    parents = scenes.training_data().parents
+    assert parents.tolist() == scenes.vocabulary.parents.tolist()
+    assert (parents >= 0).any()
 
 
 @pytest.mark.parametrize(

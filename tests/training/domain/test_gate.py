@@ -35,27 +35,33 @@ def comparison(*rows: tuple[str, str, float, float]) -> Comparison:
 @pytest.mark.parametrize(
     ("metric", "low", "high", "margin", "worse"),
     [
-        ("MRR", -0.20, -0.03, 0.02, True),
-        ("MRR", -0.20, -0.03, 0.05, False),  # within the margin
-        ("MRR", -0.20, 0.01, 0.02, False),  # may be chance
-        ("MRR", -0.20, -0.01, 0.02, False),  # worse for sure, beyond the margin not for sure
+        ("MRR, one removed", -0.20, -0.03, 0.02, True),
+        ("MRR, one removed", -0.20, -0.03, 0.05, False),  # within the margin
+        ("MRR, one removed", -0.20, 0.01, 0.02, False),  # may be chance
+        (
+            "MRR, one removed",
+            -0.20,
+            -0.01,
+            0.02,
+            False,
+        ),  # worse for sure, beyond the margin not for sure
         ("top-10", -0.20, -0.10, 0.02, False),  # not the primary metric
-        ("MRR", -0.20, -0.01, 0.0, True),
+        ("MRR, one removed", -0.20, -0.01, 0.0, True),
     ],
 )
 def test_worse_is_what_lies_beyond_the_margin_entirely(metric, low, high, margin, worse) -> None:
     found = comparison(("T2 missing", metric, low, high), ("T2 missing", "top-1", 0.1, 0.2))
-    assert [row.metric for row in found.worse_by(margin)] == (["MRR"] if worse else [])
+    assert [row.metric for row in found.worse_by(margin)] == (["MRR, one removed"] if worse else [])
 
 
 def test_a_refusal_names_every_metric_that_is_worse() -> None:
     found = comparison(
-        ("T2 missing", "MRR", -0.3, -0.2),
-        ("T3 outliers, uniform", "hit@1", -0.3, -0.1),
+        ("T2 missing", "MRR, one removed", -0.3, -0.2),
+        ("T3 outliers", "hit@1, uniform", -0.3, -0.1),
         ("T1b completion", "R-precision", 0, 1),
     )
     (text,) = losses(found, 0.02)
-    assert "missing object, MRR -0.250" in text
+    assert "missing objects, MRR, one removed -0.250" in text
     assert "hit@1" in text
     assert "R-precision" not in text
     assert found.to_dict()["differences"][0]["verdict"] == "worse"

@@ -80,7 +80,7 @@ def test_aliases_are_understood_and_the_unknown_comes_last(model) -> None:
     assert proposed[0, 0] == shown[0, 1]
     assert proposed[0, 2] == -BEYOND
     # What it does not know it cannot suspect either.
-    assert translation.translate(model).outliers(v)[0, 2] == BEYOND
+    assert translation.translate(model).suspicion(v)[0, 2] == -BEYOND
     assert (
         translation.translate(model).false_relations(batch([0, 1, 2], 3, (0, 0, 2)))[0, 0, 0, 2]
         == BEYOND

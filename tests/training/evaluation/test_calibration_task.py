@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import torch
 
 from app.registry import CountSlope
 from tests.questions.answers import missing, relations
@@ -14,17 +15,27 @@ from tests.questions.artifacts import LARGER, artifact_of, calibration
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
 from training.datasets.cases import scene_of
-from training.evaluation.calibration_task import QUESTIONS, ask_outliers, collect, uncalibrated
+from training.evaluation.calibration_task import (
+    QUESTIONS,
+    ask_outliers,
+    collect,
+    collect_missing,
+    uncalibrated,
+)
 from training.evaluation.intruders import draw_intruder_choices
+from training.evaluation.parts import draw_parts, exactly
 
 ARTIFACT = artifact_of(larger_machine("triway-local"))
 V = LARGER["triway-local"].V
 DATA = tensors(random_scenes(30, V - 1), V)
 
 
-@pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.parametrize("question", [*QUESTIONS, 2])
 def test_every_question_is_asked_and_some_answers_are_true(question):
-    found = collect(ARTIFACT, DATA, QUESTIONS[question])
+    if question == 2:
+        found = collect_missing(ARTIFACT, DATA, 2)
+    else:
+        found = collect(ARTIFACT, DATA, QUESTIONS[question])
     assert found.scenes == 30
     assert 0 < found.truth.sum() < len(found.truth)
     assert found.score.min() >= 0
@@ -80,19 +91,27 @@ def test_places_are_asked_whether_something_is_hidden_there_or_not():
 
 
 def test_hidden_classes_are_true_and_nothing_else():
-    """All absent classes are answered here; of n classes 1 to n - 1 are hidden."""
-    found = collect(ARTIFACT, DATA, QUESTIONS["missing"])
-    hidden = np.bincount(found.scene, weights=found.truth)
+    """All unlisted classes are answered here; of n classes n - 2 are hidden."""
+    found = collect_missing(ARTIFACT, DATA, 2)
     sizes = np.array([(entry.evidence.classes < V - 1).sum() for entry in DATA.scenes])
-    assert bool(((hidden >= 1) & (hidden < sizes)).all())
-    assert len(set(hidden.tolist())) > 1
-    answered = np.bincount(found.scene)
-    assert answered.tolist() == (V - 1 - sizes + hidden).tolist()
-    again = collect(ARTIFACT, DATA, QUESTIONS["missing"])
+    hidden = np.bincount(found.scene, weights=found.truth, minlength=30)
+    assert hidden.tolist() == np.where(sizes > 2, sizes - 2, 0).tolist()
+    answered = np.bincount(found.scene, minlength=30)
+    assert answered.tolist() == np.where(sizes > 2, V - 1 - 2, 0).tolist()
+    assert found.skipped == (sizes <= 2).sum()
+    again = collect_missing(ARTIFACT, DATA, 2)
     assert again.truth.tolist() == found.truth.tolist()
 
 
-@pytest.mark.parametrize("question", ["missing", "missing at a place", "outliers"])
+def test_classes_that_a_source_cannot_show_are_left_out():
+    able = torch.arange(V).expand(1, -1) != 3
+    some = replace(DATA, annotated_classes=able)
+    every, found = collect_missing(ARTIFACT, DATA, 2), collect_missing(ARTIFACT, some, 2)
+    listed = draw_parts(DATA, torch.arange(V) == V - 1, exactly(2)).v[:, 3]
+    assert len(every.score) - len(found.score) == int((listed == 0).sum())
+
+
+@pytest.mark.parametrize("question", ["missing at a place", "outliers"])
 def test_scenes_with_incomplete_object_lists_are_not_asked_about_objects(question):
     """An unlisted class may be there all the same."""
     some = tensors([replace(entry, complete=False) for entry in DATA.scenes], V)

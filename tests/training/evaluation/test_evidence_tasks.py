@@ -82,7 +82,7 @@ def test_nothing_is_known_of_an_intruder_but_its_label(kind):
         [np.flatnonzero((one == 0) & ~PLAIN)[0] for one in DATA.v.numpy()], dtype=np.int64
     )
     intruders[0] = -1
-    cases = list(intrusions(room_model(), DATA, intruders, kind))
+    cases = list(intrusions(room_model(), DATA, PLAIN, intruders, kind))
     assert 0 not in {case.scene_index for case in cases}
     for case in cases:
         _, more = case.scenes

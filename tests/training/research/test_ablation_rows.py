@@ -38,11 +38,9 @@ def changed(before, after):
 def test_the_way_to_the_full_model_is_one_step_at_a_time():
     """Steps that bundle are those that the file's head names."""
     full = {row.name: row for row in load_rows(shipped_files("ablations")["indoor-triway"], FULL)}
-    way = ["seed-form-cd1", "seed-form", "local-form", "no-implications-two-layers", "two-layers"]
+    way = ["local-form", "no-implications-two-layers", "two-layers"]
     configs = [*(full[name] for name in way), FULL]
     assert [changed(a, b) for a, b in pairwise(configs)] == [
-        {"objective.name"},
-        {"machine.form"},
         {"objective.name", "objects.epochs", "machine.N"},
         {"machine.G"},
         {"machine.H2"},
@@ -56,7 +54,7 @@ def test_without_one_part_the_rest_is_as_shipped():
         row.name: found
         for row in rows
         if row.name not in own
-        and not row.name.startswith(("paper-", "seed-form", "local-form"))
+        and not row.name.startswith("local-form")
         and len(found := changed(FULL, row)) > 1
     }
     assert several == {"no-implications-two-layers": {"machine.H2", "machine.G"}}
@@ -74,14 +72,14 @@ def rows(tmp_path, text):
 def test_a_row_changes_what_it_names_and_nothing_else(tmp_path):
     text = (
         '[[row]]\nname = "deep"\nwhat = "two layers"\nchanges = { "machine.H2" = 50 }\n'
-        '[[row]]\nname = "old"\nwhat = "the paper"\nfrom = "seed-gbm"\n'
+        '[[row]]\nname = "open"\nwhat = "open-triway"\nfrom = "open-triway"\n'
     )
-    deep, old = rows(tmp_path, text)
+    deep, other = rows(tmp_path, text)
     assert (deep.name, deep.description, deep.machine.H2) == ("deep", "two layers", 50)
     assert (deep.objective, deep.training) == (FULL.objective, FULL.training)
-    paper = load_config("seed-gbm")
-    assert (old.machine, old.training) == (paper.machine, paper.training)
-    assert old.data == FULL.data != paper.data
+    start = load_config("open-triway")
+    assert (other.machine, other.training) == (start.machine, start.training)
+    assert other.data == FULL.data != start.data
 
 
 SEED = (
@@ -99,7 +97,7 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
         ('[[row]]\nname = "x"', "row.0.what: Field required"),
         (ONE.format(name="x", rest="change = {}"), "row.0.change: Extra inputs"),
         (ONE.format(name="x", rest=""), "x: the row has the same settings as indoor-triway"),
-        (ONE.format(name="x y", rest='from = "seed-rbm"'), "x y: String should match"),
+        (ONE.format(name="x y", rest='from = "indoor-rbm"'), "x y: String should match"),
         (ONE.format(name="x", rest='from = "nobody"'), "x: there is no configuration 'nobody'"),
         (ONE.format(name="x", rest='changes = { "a.b" = 1 }'), "x: there is no setting 'a.b'"),
         (ONE.format(name="x", rest='changes = { "machine.H1" = 0 }'), "x: .*machine.H1: Input"),
@@ -107,10 +105,10 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
         (SEED.format(settings='"machine.N" = 0'), "machine.G is defined for the local form"),
         (SEED.format(settings='"machine.G" = 0, "machine.N" = 9'), "machine.N is defined for the"),
         (
-            ONE.format(name="indoor-triway", rest='from = "seed-rbm"'),
+            ONE.format(name="indoor-triway", rest='from = "indoor-rbm"'),
             "the name indoor-triway occurs twice",
         ),
-        (ONE.format(name="x", rest='from = "seed-rbm"') * 2, "the name x occurs twice"),
+        (ONE.format(name="x", rest='from = "indoor-rbm"') * 2, "the name x occurs twice"),
     ],
 )
 def test_bad_rows_say_what_is_wrong(tmp_path, text, message):

@@ -3,10 +3,9 @@
 The baselines are the class frequencies, EASE, and frequency tables for relations and places.
 `training.research.baselines` has further baselines.
 
-A class that a data source never mentions counts as absent in all scenes of this source, as in our
-training objective. If the fit leaves such classes out, the validation MRR (mean reciprocal rank)
-falls: from .398 to .381 for EASE, from .397 to .335 for the denoising autoencoder, and from .152 to
-.145 for popularity. The reason is that a score must rank all classes without knowing the source.
+Baselines for objects learn from the same scenes as a machine: with its weights of scenes, without
+structure, and without classes that a data source cannot show. They are selected by the same
+`validation_score`.
 
 `v` is the presence of classes in the training scenes, (scenes, classes), and `structure` a mask of
 structure classes such as walls, (classes,) bool.

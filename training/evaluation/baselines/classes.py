@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -47,37 +48,83 @@ class LinearScore:
         return self.bias + v @ self.weights
 
 
-def frequency(v: Tensor) -> Tensor:
+@dataclass(frozen=True, eq=False)
+class Lists:
+    """Training scenes as the object part of a machine learns from them.
+
+    Attributes:
+        v: (scenes, classes) presence, without structure classes.
+        labelled: (scenes, classes) bool, False for classes that the data source cannot show.
+        weight: (scenes,) weight of each scene. The mean is 1.
+    """
+
+    v: Tensor
+    labelled: Tensor
+    weight: Tensor
+
+    def frequency(self) -> Tensor:
+        """Return the share of scenes with each class, (classes,), among the labelled scenes."""
+        return frequency(self.v, self.weight, self.labelled)
+
+    def filled(self) -> Tensor:
+        """Return the presence with unlabelled entries replaced by the frequency of the class."""
+        return torch.where(self.labelled, self.v, self.frequency())
+
+
+def training_lists(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, Lists]]:
+    """Yield sets of training scenes with their names: all scenes, and complete object lists only.
+
+    A baseline chooses between both sets. The other sources mention only some objects of a scene.
+    """
+    labelled = train.annotated_classes[train.source] & ~structure
+    v, weight = train.v * ~structure, train.weight
+    for name, mask in (("all", torch.ones_like(train.complete)), ("complete", train.complete)):
+        if mask.any() and (name == "all" or not mask.all()):
+            share = weight[mask] / weight[mask].mean()
+            yield name, Lists(v[mask], labelled[mask] | (v[mask] > 0), share)
+
+
+def frequency(v: Tensor, weight: Tensor | None = None, labelled: Tensor | None = None) -> Tensor:
     """Return the share of scenes with each class, (classes,), smoothed by 1/2 in both counts."""
-    return (v.sum(0) + 0.5) / (len(v) + 1.0)
+    weight = torch.ones(len(v)) if weight is None else weight
+    total = weight.sum().expand(v.shape[1])
+    if labelled is not None:
+        known = weight @ labelled.to(v.dtype)
+        total = torch.where(known > 0, known, total)
+    return (weight @ v + 0.5) / (total + 1.0)
 
 
-def popularity(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Yield a single score: the log-odds of the class frequencies."""
+def popularity(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+    """Yield the log-odds of the class frequencies."""
     V = train.v.shape[1]
-    yield {}, LinearScore(frequency(train.v).logit(), torch.zeros(V, V))
+    for name, lists in training_lists(train, structure):
+        yield {"scenes": name}, LinearScore(lists.frequency().logit(), torch.zeros(V, V))
 
 
 _EASE_L2 = (10.0, 30.0, 100.0, 300.0)
 
 
-def fit_ease(v: Tensor, l2: float) -> LinearScore:
+def fit_ease(v: Tensor, l2: float, weight: Tensor | None = None) -> LinearScore:
     """Fit EASE, a ridge regression of every class on all other classes with a free intercept.
 
     Source: Steck, "Embarrassingly Shallow Autoencoders for Sparse Data", WWW 2019, equation 8. With
     the centred presence X and P = (X'X + λI)⁻¹, the least-squares weights with zero diagonal are
-    -P[j,i] / P[i,i].
+    -P[j,i] / P[i,i]. `weight` (scenes,) weighs the squared errors of each scene.
     """
-    mean = v.double().mean(0)
-    centred = v.double() - mean
-    gram = centred.T @ centred
+    w = torch.ones(len(v)) if weight is None else weight
+    x, w = v.double(), w.double()
+    mean = w @ x / w.sum()
+    centred = x - mean
+    gram = (centred * w.unsqueeze(1)).T @ centred
     gram.diagonal().add_(l2)
     precision = torch.linalg.inv(gram)
     weights = (-precision / precision.diagonal()).fill_diagonal_(0.0)
     return LinearScore((mean - mean @ weights).float(), weights.float())
 
 
-def ease(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Yield a score for each ridge penalty."""
-    for l2 in _EASE_L2:
-        yield {"l2": l2}, fit_ease(train.v, l2)
+def ease(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
+    """Yield a score for each ridge penalty. Unlabelled classes have their mean."""
+    for name, lists in training_lists(train, structure):
+        v = lists.filled()
+        for l2 in _EASE_L2:
+            yield {"scenes": name, "l2": l2}, fit_ease(v, l2, lists.weight)

@@ -2,8 +2,8 @@
 
 A baseline is a generator function. It fits a model on the training scenes for each point of a
 hyperparameter grid, and yields pairs (parameters, score). A neural network yields a pair for each
-candidate number of epochs. `Baseline.fit` evaluates each score on the validation scenes of all data
-sources together, by the primary metric of the task. The generator function never sees the
+candidate number of steps. `Baseline.fit` evaluates each score on the validation scenes: objects by
+`validation_score`, others by the primary metric of the task. The generator function never sees the
 validation scenes.
 """
 
@@ -18,7 +18,7 @@ from typing import Any, TypeAlias, TypeVar
 from torch import Tensor
 
 from training.datasets.batches import SceneTensors
-from training.evaluation.missing_tasks import hide, leave_one_out, leave_one_out_at, rank_hidden
+from training.evaluation.missing_tasks import leave_one_out_at
 from training.evaluation.model import (
     Model,
     ObjectDensity,
@@ -28,6 +28,7 @@ from training.evaluation.model import (
     RelationScore,
     Trial,
 )
+from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import complete_scenes, rank, rank_relations
 
 Score = TypeVar("Score")
@@ -35,13 +36,15 @@ Proposals: TypeAlias = Iterator[tuple[Parameters, Score]]
 
 
 def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """Return the mean reciprocal rank (MRR) of removed objects (task T2)."""
-    return leave_one_out(scenes, structure, score).mrr().value
+    """Return the `validation_score` of missing objects.
 
-
-def partial_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """Return the mean reciprocal rank (MRR) of the hidden half of the objects (T2 partial)."""
-    return rank_hidden(hide(scenes, structure, 0.5), structure, score)[0].value
+    Raises:
+        ValueError: no scene has two classes.
+    """
+    value = validation_score(lambda v, _: score(v), scenes, structure)
+    if math.isnan(value):
+        raise ValueError("no scene has two classes, so no class can be hidden")
+    return value
 
 
 def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Final
 
 from training.evaluation.baselines import (
@@ -26,12 +25,6 @@ _EVERY: tuple[Baseline, ...] = (
     Baseline("scikit-learn BernoulliRBM", object_models.bernoulli_rbm, stochastic=True),
     Baseline("masked transformer", networks.transformer, stochastic=True),
     Baseline("denoising autoencoder", networks.autoencoder, stochastic=True),
-    Baseline(
-        "autoencoder, heavily masked",
-        partial(networks.autoencoder, course=networks.HEAVILY_MASKED),
-        fitting.partial_mrr,
-        stochastic=True,
-    ),
     Baseline(
         "relation popularity", relation_models.relation_popularity, fitting.r_precision, RELATIONS
     ),

@@ -3,31 +3,39 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Final
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.optim.lr_scheduler import OneCycleLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from training.datasets.batches import SceneTensors
-from training.evaluation.baselines.classes import frequency
+from training.evaluation.baselines.classes import Lists, training_lists
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import ObjectScore
 
-# Both networks learn to predict a removed class among all absent classes.
+# Both networks learn to predict the hidden classes of random parts of scenes, as a machine does.
 #
-# One present class of each scene is removed as the target. Each other class is also hidden, with a
-# probability (the noise) that is drawn for each scene. The loss is the cross-entropy of the target
-# under a softmax over the absent classes. This is a multinomial likelihood as in D. Liang et al.,
-# "Variational Autoencoders for Collaborative Filtering", WWW 2018. The optimiser is AdamW with one
-# learning-rate cycle and an exponential moving average of the weights. Several late epochs are
-# candidates, so that selection on validation scenes has the effect of early stopping.
+# A step draws scenes by their weights. In 30 % of the scenes, one class is hidden. In the others, a
+# share U(.05, 1) of the classes is listed; at least one is listed and one hidden. The loss is the
+# cross-entropy of the hidden classes under a softmax over the unlisted classes, or the binary
+# cross-entropy of every unlisted class. Classes that the data source cannot show are left out. The
+# optimiser is AdamW with one learning-rate cycle and an exponential moving average of the weights.
+# Several late steps are candidates, so that selection on validation scenes has the effect of early
+# stopping.
+#
+# Source of the softmax: D. Liang et al., "Variational Autoencoders for Collaborative Filtering",
+# WWW 2018.
 
 _AVERAGING = 0.998
 _WARM_UP = 0.1
+_ONE_HIDDEN = 0.3
+_LEAST_SHARE = 0.05
+LOSSES: Final = ("softmax", "binary")
 
 
 @dataclass(frozen=True)
@@ -36,21 +44,21 @@ class Course:
 
     Attributes:
         learning_rate: maximum learning rate of the cycle.
-        noise: maximum probability with which a class other than the target is hidden.
-        offers: epochs at which the network becomes a candidate, as shares of `epochs`.
+        loss: one of `LOSSES`.
+        offers: steps at which the network becomes a candidate, as shares of `steps`.
     """
 
-    epochs: int
     learning_rate: float
-    batch_size: int = 128
-    weight_decay: float = 0.01
-    noise: float = 0.3
+    weight_decay: float
+    loss: str = "softmax"
+    steps: int = 800
+    batch_size: int = 256
     offers: tuple[float, ...] = (0.6, 0.8, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkScore:
-    """The score log p(i) of each class i, from a softmax over absent non-structure classes.
+    """The score of each unlisted class: its logit, or log p under a softmax over these classes.
 
     Attributes:
         network: network from presence, (scenes, classes), to logits of the same shape.
@@ -58,6 +66,7 @@ class NetworkScore:
 
     network: nn.Module
     structure: Tensor
+    softmax: bool
 
     @property
     def parameter_count(self) -> int:
@@ -70,60 +79,70 @@ class NetworkScore:
 
         Present classes and structure classes have the score -inf.
         """
-        values: Tensor = self.network(v)
-        return values.masked_fill((v > 0) | self.structure, -torch.inf).log_softmax(1)
+        listed = v * ~self.structure
+        values: Tensor = self.network(listed)
+        values = values.masked_fill((v > 0) | self.structure, -torch.inf)
+        return values.log_softmax(1) if self.softmax else values
 
 
 def train_network(
-    network: nn.Module, v: Tensor, structure: Tensor, course: Course, seed: int
+    network: nn.Module, lists: Lists, structure: Tensor, course: Course, seed: int
 ) -> Iterator[tuple[int, NetworkScore]]:
-    """Train a network. At each candidate epoch, yield the epoch and the score of averaged weights.
+    """Train a network. At each candidate step, yield the step and the score of averaged weights.
 
-    Args:
-        v: presence in the training scenes, (scenes, classes). Scenes that contain only structure
-            classes are left out.
+    Scenes with fewer than two classes are left out.
 
     Raises:
-        ValueError: every scene contains only structure classes.
+        ValueError: every scene has fewer than two classes.
     """
-    v = v[(v * ~structure).any(1)]
-    if not len(v):
-        raise ValueError(
-            "every training scene contains only structure classes; training needs scenes with "
-            "other classes"
-        )
+    usable = lists.v.sum(1) > 1
+    if not usable.any():
+        raise ValueError("no training scene has two classes without structure")
+    v, labelled, weight = lists.v[usable], lists.labelled[usable], lists.weight[usable]
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=course.learning_rate, weight_decay=course.weight_decay
     )
-    steps = math.ceil(len(v) / course.batch_size)
     schedule = OneCycleLR(
-        optimiser, course.learning_rate, total_steps=steps * course.epochs + 1, pct_start=_WARM_UP
+        optimiser, course.learning_rate, total_steps=course.steps + 1, pct_start=_WARM_UP
     )
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(_AVERAGING))
-    candidate_epochs = {max(1, round(share * course.epochs)) for share in course.offers}
-    for epoch in range(1, course.epochs + 1):
+    candidates = {max(1, round(share * course.steps)) for share in course.offers}
+    for step in range(1, course.steps + 1):
         # Dropout uses the global random generator. The fork restores its state after the block.
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed * 1_000_003 + epoch)
+            torch.manual_seed(seed * 1_000_003 + step)
             network.train()
-            for index in torch.randperm(len(v)).chunk(steps):
-                optimiser.zero_grad()
-                removal_loss(network, v[index], structure, course.noise).backward()
-                optimiser.step()
-                schedule.step()
-                average.update_parameters(network)
-        if epoch in candidate_epochs:
-            yield epoch, NetworkScore(copy.deepcopy(average.module).eval(), structure)
+            index = weight.multinomial(course.batch_size, replacement=True)
+            optimiser.zero_grad()
+            hidden_loss(network, v[index], labelled[index], course.loss).backward()
+            optimiser.step()
+            schedule.step()
+            average.update_parameters(network)
+        if step in candidates:
+            trained = copy.deepcopy(average.module).eval()
+            yield step, NetworkScore(trained, structure, course.loss == "softmax")
 
 
-def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float) -> Tensor:
-    """Return the cross-entropy of one randomly removed class a scene, averaged over scenes."""
-    target = torch.multinomial(v * ~structure, 1)
-    remaining = v.scatter(1, target, 0.0)
-    hidden = torch.rand(v.shape) < noise * torch.rand(len(v), 1)
-    candidate = ((remaining == 0) & ~structure).scatter(1, target, True)
-    values = network(remaining * ~hidden).masked_fill(~candidate, -torch.inf)
-    return -values.log_softmax(1).gather(1, target).mean()
+def draw_lists(v: Tensor) -> Tensor:
+    """Return random parts of scenes (scenes, classes) with at least two classes."""
+    classes = v.sum(1)
+    share = _LEAST_SHARE + (1 - _LEAST_SHARE) * torch.rand(len(v))
+    listed = torch.where(torch.rand(len(v)) < _ONE_HIDDEN, classes - 1, (share * classes).round())
+    listed = listed.clamp(min=1).minimum(classes - 1)
+    rank = torch.rand(v.shape).masked_fill(v == 0, 2.0).argsort(1).argsort(1)
+    return v * (rank < listed.unsqueeze(1))
+
+
+def hidden_loss(network: nn.Module, v: Tensor, labelled: Tensor, loss: str) -> Tensor:
+    """Return the mean loss of the hidden classes of random parts of the scenes."""
+    listed = draw_lists(v)
+    candidate, hidden = (listed == 0) & labelled, v - listed
+    logits = network(listed)
+    if loss == "binary":
+        each = binary_cross_entropy_with_logits(logits, hidden, reduction="none")
+        return (each * candidate).sum() / len(v)
+    log_p = logits.masked_fill(~candidate, -torch.inf).log_softmax(1)
+    return -(log_p.masked_fill(hidden == 0, 0.0).sum(1) / hidden.sum(1)).mean()
 
 
 # Denoising autoencoder with two hidden layers and a softmax over classes.
@@ -133,14 +152,12 @@ def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float)
 
 _HIDDEN = 600
 _HIDDEN_DROPOUT = (0.15, 0.3)
-_AUTOENCODER = Course(epochs=24, learning_rate=3e-3, weight_decay=0.1)
-HEAVILY_MASKED = replace(_AUTOENCODER, noise=1.0)
-"""Training whose noise hides up to all classes except the target."""
+_AUTOENCODER = Course(learning_rate=3e-3, weight_decay=0.1)
 
 
-def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
-    """Return an untrained autoencoder; class frequencies in `v` initialise its output bias."""
-    V = v.shape[1]
+def build_autoencoder(popularity: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
+    """Return an untrained autoencoder; the class frequencies (V,) initialise its output bias."""
+    V = len(popularity)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         output = nn.Linear(width, V)
@@ -150,18 +167,19 @@ def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Se
             output,
         )  # fmt: skip
     with torch.no_grad():
-        output.bias.copy_(frequency(v).log())
+        output.bias.copy_(popularity.log())
     return network
 
 
-def autoencoder(
-    train: SceneTensors, structure: Tensor, seed: int, course: Course = _AUTOENCODER
-) -> Proposals[ObjectScore]:
-    """Yield the score of an autoencoder for each dropout rate and number of epochs."""
-    for dropout in _HIDDEN_DROPOUT:
-        network = build_autoencoder(train.v, _HIDDEN, dropout, seed)
-        for epoch, score in train_network(network, train.v, structure, course, seed):
-            yield {"dropout": dropout, "epochs": epoch}, score
+def autoencoder(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
+    """Yield the score of an autoencoder for each set of scenes, loss, dropout and step."""
+    for name, lists in training_lists(train, structure):
+        for loss in LOSSES:
+            course = replace(_AUTOENCODER, loss=loss)
+            for dropout in _HIDDEN_DROPOUT:
+                network = build_autoencoder(lists.frequency(), _HIDDEN, dropout, seed)
+                for step, score in train_network(network, lists, structure, course, seed):
+                    yield {"scenes": name, "loss": loss, "dropout": dropout, "steps": step}, score
 
 
 # Masked transformer. The classes of a scene are tokens, and one query token predicts the removed
@@ -173,7 +191,7 @@ def autoencoder(
 
 _WIDTH, _HEADS, _LAYERS = 64, 4, 2
 _DROPOUT = (0.0, 0.1)
-_TRANSFORMER = Course(epochs=20, learning_rate=5e-3, weight_decay=0.05, noise=0.1)
+_TRANSFORMER = Course(learning_rate=5e-3, weight_decay=0.05)
 
 
 class SetTransformer(nn.Module):
@@ -216,12 +234,13 @@ class SetTransformer(nn.Module):
 
 
 def transformer(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Yield the score of a transformer for each dropout rate and number of epochs."""
-    for dropout in _DROPOUT:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = SetTransformer(
-                frequency(train.v), width=_WIDTH, heads=_HEADS, layers=_LAYERS, dropout=dropout
-            )
-        for epoch, score in train_network(network, train.v, structure, _TRANSFORMER, seed):
-            yield {"dropout": dropout, "epochs": epoch}, score
+    """Yield the score of a transformer for each set of scenes, dropout rate and step."""
+    for name, lists in training_lists(train, structure):
+        for dropout in _DROPOUT:
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(seed)
+                network = SetTransformer(
+                    lists.frequency(), width=_WIDTH, heads=_HEADS, layers=_LAYERS, dropout=dropout,
+                )  # fmt: skip
+            for step, score in train_network(network, lists, structure, _TRANSFORMER, seed):
+                yield {"scenes": name, "dropout": dropout, "steps": step}, score

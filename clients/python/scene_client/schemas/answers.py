@@ -81,6 +81,10 @@ class ObservedRelation:
     object: str
 
 
+Rule = Literal["qualifier", "alternative", "article", "instance", "prompt", "spelling", "head"]
+"""how the service reads a label that the vocabulary does not list"""
+
+
 class Mapped(Reply):
     """A label that the vocabulary does not list, and the class that replaces it."""
 
@@ -93,7 +97,7 @@ class Mapped(Reply):
     similarity: Annotated[float, Field(ge=0, le=1)]
     """similarity of the label and the class. 1 means that the rule is certain"""
     rule: Annotated[
-        Literal["qualifier", "alternative", "article", "instance", "prompt", "spelling", "head"],
+        Rule,
         Field(
             description="how the service read the label. Certain rules: qualifier "
             "(`mouse_(computer_equipment)`), alternative (`sofa/couch`), article (`a chair`), "

@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
-from scene_client.schemas.answers import Failure, ModelReference, Reply
+from scene_client.schemas.answers import Failure, ModelReference, Reply, Rule
 from scene_client.schemas.requests import Finite, RelationName, Size
 
 # ------------------------------------------------------------------------------------ models
@@ -118,6 +118,27 @@ class VocabularyAnswer(Reply):
     """names of the data sources whose base rates a request can choose"""
     examples: list[ExampleScene] = []
     """example scenes; older models have none"""
+
+
+class WordAnswer(Reply):
+    """The class that a label becomes, or similar classes if the model does not know the label."""
+
+    model_config = ConfigDict(frozen=True, populate_by_name=True, serialize_by_alias=True)
+
+    model: ModelReference
+    word: str
+    class_: Annotated[VocabularyEntry | None, Field(alias="class")] = None
+    rule: Annotated[
+        Literal["label", "alias", "phrase"] | Rule | None,
+        Field(
+            description="how the service reads the label: label, alias or phrase "
+            "(`bottle of milk`) of the vocabulary, or a rule of `mapped`"
+        ),
+    ] = None
+    certain: bool = False
+    """true if every request accepts the label; false if it needs `unknown_labels: nearest`"""
+    suggestions: list[str] = []
+    """classes with similar names, if the model does not know the label"""
 
 
 class WeightedLabel(Reply):

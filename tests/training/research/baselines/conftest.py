@@ -1,9 +1,23 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import pytest
 
 from tests.training.research.baselines.furnished import furnished
 from training.datasets.batches import SceneTensors
+from training.research.baselines import networks
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _short_courses() -> Iterator[None]:
+    """A hundred steps suffice for two kinds of rooms."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("_AUTOENCODER", "_TRANSFORMER"):
+            course = replace(getattr(networks, name), steps=100, batch_size=64)
+            patch.setattr(networks, name, course)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -17,7 +19,13 @@ from tests.training.research.baselines.furnished import (
     scene,
     tensors,
 )
-from training.evaluation.baselines.classes import LinearScore, fit_ease, frequency
+from training.evaluation.baselines.classes import (
+    LinearScore,
+    Lists,
+    fit_ease,
+    frequency,
+    training_lists,
+)
 from training.evaluation.baselines.triples import (
     PlacedTable,
     TripleTable,
@@ -28,7 +36,7 @@ from training.evaluation.baselines.triples import (
 from training.evaluation.contradictions import transitive_closure
 from training.evaluation.model import Places
 from training.evaluation.relation_tasks import telling
-from training.research.baselines.networks import removal_loss
+from training.research.baselines.networks import draw_lists, hidden_loss
 from training.research.baselines.object_models import (
     bernoulli_rbm,
     evidence,
@@ -36,6 +44,11 @@ from training.research.baselines.object_models import (
     nearest_score,
 )
 from training.research.baselines.relation_models import ClosureScore, complex_logits, fit_complex
+
+
+def lists_of(v):
+    """Scenes of equal weight, of a source that can show every class."""
+    return Lists(v, torch.ones(v.shape, dtype=torch.bool), torch.ones(len(v)))
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +89,7 @@ def test_naive_bayes_by_counting(v):
 def test_nearest_scenes_are_scikit_learns(v, sharpness):
     train, query = v[:150], v[150:170]
     query = query[query.any(1)]
-    score = nearest_score(train, neighbours=150, sharpness=sharpness)
+    score = nearest_score(lists_of(train), neighbours=150, sharpness=sharpness)
     rows = train.any(1)  # scikit-learn knows no cosine of an empty scene; such scenes have no vote
     search = NearestNeighbors(n_neighbors=int(rows.sum()), metric="cosine").fit(train[rows])
     distance, place = search.kneighbors(query)
@@ -90,14 +103,14 @@ def test_nearest_scenes_are_scikit_learns(v, sharpness):
 def test_only_the_nearest_vote(v):
     """With one neighbour, equal to the query, its classes come first."""
     train = torch.eye(4)[:, [0, 1, 2, 3]] + torch.eye(4)[:, [1, 2, 3, 0]]
-    values = nearest_score(train, neighbours=1, sharpness=1.0)(train[:1])
+    values = nearest_score(lists_of(train), neighbours=1, sharpness=1.0)(train[:1])
     assert set(values[0].topk(2).indices.tolist()) == set(train[0].nonzero().flatten().tolist())
 
 
 def test_pairwise_weights_are_a_stationary_point(v):
     """The gradient of the penalised pseudo-likelihood, written out, vanishes."""
     l2 = 5.0
-    score = fit_pairwise(v, l2, iterations=200)
+    score = fit_pairwise(lists_of(v), l2, iterations=200)
     W, x = score.weights.double(), v.double()
     assert torch.equal(score.weights, score.weights.T)
     residual = torch.sigmoid(score.bias.double() + x @ W) - x
@@ -112,16 +125,15 @@ def test_the_rbms_log_odds_are_scikit_learns_free_energies(v):
     """F(v without i) - F(v with i), by scikit-learn's own function."""
     scenes = tensors([scene([k for k in range(6) if row[k]]) for row in v[:60]])
     *_, (_, score) = bernoulli_rbm(scenes, STRUCTURE, 0)
-    machine = score.machine
-    rbm = BernoulliRBM(n_components=machine.spec.H1)
-    rbm.components_ = machine.W.detach().T.numpy()
-    rbm.intercept_hidden_ = machine.c1.detach().numpy()
-    rbm.intercept_visible_ = machine.b.detach().numpy()
+    rbm = BernoulliRBM(n_components=len(score.c))
+    rbm.components_ = score.W.numpy()
+    rbm.intercept_hidden_ = score.c.numpy()
+    rbm.intercept_visible_ = score.b.numpy()
     for i in range(V):
         on, off = scenes.v[:5].clone(), scenes.v[:5].clone()
         on[:, i], off[:, i] = 1.0, 0.0
         expected = rbm._free_energy(off.numpy()) - rbm._free_energy(on.numpy())
-        values = score(off)[:, i].detach().numpy()
+        values = score(off)[:, i].numpy()
         assert values == pytest.approx(expected, abs=1e-3)
 
 
@@ -132,24 +144,60 @@ def test_weights_of_a_class_on_itself_are_refused():
         LinearScore(torch.zeros(2), torch.zeros(3, 3))
 
 
-def test_removal_loss_of_a_flat_network_is_the_log_of_the_candidates():
-    """{0, 1} with structure 2 of 5 classes: one is removed, 3 of the 5 remain candidates."""
-    v = torch.tensor([[1.0, 1, 1, 0, 0]]).expand(8, -1)
-    structure = torch.tensor([False, False, True, False, False])
-    loss = removal_loss(lambda x: torch.zeros_like(x), v, structure, noise=0.5)
-    assert float(loss) == pytest.approx(np.log(3), abs=1e-5)
+@pytest.mark.parametrize(("loss", "expected"), [("softmax", np.log(3)), ("binary", 3 * np.log(2))])
+def test_the_loss_of_a_flat_network(loss, expected):
+    """{0, 1} of 5 classes, one of which the source cannot show: three candidates remain."""
+    v = torch.tensor([[1.0, 1, 0, 0, 0]]).expand(8, -1)
+    labelled = torch.tensor([True, True, False, True, True]).expand(8, -1)
+    value = hidden_loss(lambda x: torch.zeros_like(x), v, labelled, loss)
+    assert float(value) == pytest.approx(expected, abs=1e-5)
 
 
-def test_the_network_never_sees_what_it_must_find():
-    seen = []
-    v = torch.tensor([[1.0, 1, 0]]).expand(50, -1)
+def test_networks_learn_from_short_lists():
+    """At least one class is listed and one hidden, every number of them and every class alike."""
+    torch.manual_seed(0)
+    v = torch.tensor([[1.0] * 8 + [0.0] * 3]).expand(4000, -1)
+    listed = draw_lists(v)
+    counts = listed.sum(1).int()
+    assert not (listed > v).any()
+    assert set(counts.tolist()) == set(range(1, 8))
+    # All but one: .3 of the draws, and shares above 6.5/8 of the others.
+    assert (counts == 7).float().mean() == pytest.approx(0.3 + 0.7 * 1.5 / 8 / 0.95, abs=0.04)
+    assert listed[:, :8].mean(0) == pytest.approx(float(listed[:, :8].mean()), abs=0.04)
+    assert draw_lists(torch.tensor([[1.0, 1, 0]]).expand(50, -1)).sum(1).tolist() == [1.0] * 50
 
-    def spy(x):
-        seen.append(x)
-        return torch.zeros_like(x)
 
-    removal_loss(spy, v, torch.zeros(3, dtype=torch.bool), noise=0.0)
-    assert seen[0].sum(1).tolist() == [1.0] * 50
+def test_scenes_have_their_weights_and_partial_labels():
+    """Class 1 is unlabelled in the second source; the third scene is incomplete and weighs 3."""
+    some = [scene([0, 1, 9]), scene([0], source="b"), scene([2], source="b")]
+    some[2] = replace(some[2], complete=False, weight=3.0)
+    able = torch.ones(2, V, dtype=torch.bool)
+    able[0, 1] = False
+    train = replace(tensors(some), annotated_classes=able)
+    assert train.source_names == ("b", "toy")
+    (_, every), (_, complete) = training_lists(train, STRUCTURE)
+    assert every.weight.tolist() == pytest.approx([0.6, 0.6, 1.8])
+    assert not every.v[:, 9].any()
+    assert not every.labelled[:, 9].any()
+    assert every.frequency()[1] == pytest.approx((0.6 + 0.5) / (0.6 + 1))
+    assert every.frequency()[2] == pytest.approx((1.8 + 0.5) / (3 + 1))
+    assert every.filled()[:, 1].tolist() == pytest.approx([1, 1.1 / 1.6, 1.1 / 1.6])
+    assert len(complete.v) == 2
+    assert complete.weight.tolist() == [1, 1]
+
+
+def test_a_scene_of_weight_two_counts_twice(v):
+    twice = torch.cat([v[:50], v])
+    weight = 1.0 + (torch.arange(len(v)) < 50)
+    for ours, theirs in (
+        (fit_ease(v, 7.0, weight), fit_ease(twice, 7.0)),
+        (
+            fit_pairwise(Lists(v, lists_of(v).labelled, weight), 5.0, iterations=200),
+            fit_pairwise(lists_of(twice), 5.0, iterations=200),
+        ),
+    ):
+        assert torch.allclose(ours.weights, theirs.weights, atol=2e-3)
+    assert torch.allclose(evidence(v, 2.0, weight), evidence(twice, 2.0), atol=1e-4)
 
 
 @pytest.fixture(scope="module")

@@ -18,13 +18,14 @@ from app.inference.variants import VARIANTS, Form, Variant
 from tests.training.research.baselines.furnished import STRUCTURE, A, furnished, tensors
 from training.datasets import shuffle_objects
 from training.datasets.batches import SceneTensors, TrainingData
-from training.evaluation import missing_tasks as missing
-from training.evaluation import relation_tasks as relations
 from training.evaluation.baselines import RELATIONS
-from training.evaluation.baselines.fitting import missing_mrr, partial_mrr
-from training.evaluation.model import RelationScore
+from training.evaluation.baselines.fitting import missing_mrr
+from training.evaluation.missing_tasks import rank_missing
+from training.evaluation.model import ObjectScore, RelationScore
+from training.evaluation.parts import one_quarter
 from training.evaluation.relation_tasks import rank, score_scenes
 from training.fit.configuration import Config
+from training.fit.machine_scores import MachineScore, relation_score
 from training.fit.trainer import Trainer
 from training.research.baselines import BASELINES
 
@@ -52,13 +53,13 @@ def held_out() -> SceneTensors:
     return furnished(100, seed=3)
 
 
-def mrr(score: missing.ObjectScore) -> float:
+def mrr(score: ObjectScore) -> float:
     return missing_mrr(held_out(), STRUCTURE, score)
 
 
-def partial(score: missing.ObjectScore) -> float:
-    """Half of the classes shown."""
-    return partial_mrr(held_out(), STRUCTURE, score)
+def partial(score: ObjectScore) -> float:
+    """A quarter of the classes listed."""
+    return rank_missing(held_out(), STRUCTURE, score, one_quarter).mrr().value
 
 
 def precision(score: RelationScore) -> float:
@@ -113,9 +114,9 @@ def test_machines_fall_to_popularity(variant, form):
     for labels in (False, True):
         machine = trained(variant, form, *parts(labels))
         figures[labels] = (
-            mrr(missing.MachineScore(machine)),
-            partial(missing.MachineScore(machine)),
-            precision(relations.machine_score(machine)),
+            mrr(MachineScore(machine)),
+            partial(MachineScore(machine)),
+            precision(relation_score(machine)),
         )
     levels = popular(), partly_popular(), relation_popular()
     for real, shuffled, level in zip(figures[False], figures[True], levels, strict=True):

@@ -1,0 +1,193 @@
+"""RBM, GBM and Triway of Bozcan et al. (2018): energies, conditionals and Gibbs sweeps.
+
+The units are binary: objects v (V,), relations r (T,), context h1 (H1,) and h2 (H2,). H2 is 0 in a
+machine of one hidden layer. Unit e of r is a triple (relation, subject class i, object class j) of
+the training scenes. The other triples have no unit: they are off with probability one.
+
+    E(v, r, h1, h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_e r_e l_e(v, h1)
+
+    RBM     l_e = d_e + U_e·h1
+    GBM     l_e = d_e + U_e·h1 + g_e1 v_i + g_e2 v_j
+    Triway  l_e = d_e + U_e·h1, on the states with r_e <= v_i v_j
+
+Three choices:
+
+- The published code multiplies only the tri-way weight by v_i v_j, and not U. Here a relation of an
+  absent object is impossible, so the gate covers both. RBM and GBM have no gate.
+- Each triple has free weights d_e and U_e, as in the later code of the authors. The paper shares
+  one weight among all triples of a relation and adds up their gradients, which diverges.
+- A sweep samples objects given h1 and the current relations, and then relations given objects and
+  h1, as the paper does. Under the gate, a relation that is on holds its objects on until the sweep
+  switches the relation off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+_SCALE: Final = 0.01  # standard deviation of the initial weights
+_ROUNDS: Final = 5  # sweeps over two hidden layers, given the visible units
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Values of all units of B scenes: v (B, V), r (B, T), h1 (B, H1), h2 (B, H2)."""
+
+    v: Tensor
+    r: Tensor
+    h1: Tensor
+    h2: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Free:
+    """Units that a sweep samples, bool: v (B, V) and r (B, T). The other units stay as they are."""
+
+    v: Tensor
+    r: Tensor
+
+
+def bernoulli(p: Tensor, generator: torch.Generator) -> Tensor:
+    """Sample units that are on with probability p, in the shape of p."""
+    return (torch.rand(p.shape, generator=generator, dtype=p.dtype) < p).to(p.dtype)
+
+
+class Machine(nn.Module):
+    """The parts that the three machines share. A subclass defines its relations and their effect.
+
+    Args:
+        triples: (T, 3) int64, the relation, subject class and object class of each unit of r.
+        V, H1, H2: number of classes and of hidden units.
+        generator: source of the initial weights W, J and U. The biases start at zero.
+    """
+
+    def __init__(
+        self, triples: Tensor, V: int, H1: int, H2: int, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        T = len(triples)
+        self.subject, self.object = triples[:, 1], triples[:, 2]
+
+        def weights(*shape: int) -> nn.Parameter:
+            return nn.Parameter(_SCALE * torch.randn(shape, generator=generator))
+
+        self.b, self.c1, self.c2 = (nn.Parameter(torch.zeros(n)) for n in (V, H1, H2))
+        self.W, self.J = weights(V, H1), weights(H1, H2)
+        self.d, self.U = nn.Parameter(torch.zeros(T)), weights(T, H1)
+
+    def gate(self, v: Tensor) -> Tensor:
+        """Return 1 for each relation that can be on given the objects, (B, T)."""
+        return v.new_ones(len(v), len(self.d))
+
+    def relation_logits(self, v: Tensor, h1: Tensor) -> Tensor:
+        """Return l_e, (B, T), the log-odds of each relation whose gate is 1."""
+        return self.d + h1 @ self.U.T
+
+    def energy(self, state: State) -> Tensor:
+        """Return E, (B,). It is linear in each unit, so a unit may be replaced by its mean."""
+        v, h1, h2 = state.v, state.h1, state.h2
+        context = self.c1 + v @ self.W + h2 @ self.J.T
+        relations = (state.r * self.relation_logits(v, h1)).sum(-1)
+        return -(v @ self.b + h2 @ self.c2 + (context * h1).sum(-1) + relations)
+
+    def h1_logits(self, v: Tensor, r: Tensor, h2: Tensor) -> Tensor:
+        """Return the log-odds of h1 given all other units, (B, H1)."""
+        return self.c1 + v @ self.W + r @ self.U + h2 @ self.J.T
+
+    def h2_logits(self, h1: Tensor) -> Tensor:
+        """Return the log-odds of h2 given h1, (B, H2)."""
+        return self.c2 + h1 @ self.J
+
+    def sample_objects(
+        self, state: State, free: Free, temperature: float, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Sample the free objects given h1 and r. Return v and p(v_i = 1), both (B, V)."""
+        p = ((self.b + state.h1 @ self.W.T + self.pull(state.r)) / temperature).sigmoid()
+        return torch.where(free.v, bernoulli(p, generator), state.v), p
+
+    def pull(self, r: Tensor) -> Tensor:
+        """Return what the relations r (B, T) add to the log-odds of objects, (B, V)."""
+        return r.new_zeros(len(r), len(self.b))
+
+    def hidden(self, v: Tensor, r: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Sample h1 and h2 given the visible units. Exact with one layer, else `_ROUNDS` sweeps."""
+        h1, h2 = v.new_zeros(len(v), len(self.c1)), v.new_zeros(len(v), len(self.c2))
+        for _ in range(_ROUNDS if len(self.c2) else 1):
+            h1 = bernoulli(self.h1_logits(v, r, h2).sigmoid(), generator)
+            h2 = bernoulli(self.h2_logits(h1).sigmoid(), generator)
+        return h1, h2
+
+    def sweep(
+        self, state: State, free: Free, temperature: float, generator: torch.Generator
+    ) -> tuple[State, Tensor, Tensor]:
+        """Sample h2, h1, the free objects and the free relations once, in this order.
+
+        Returns:
+            The new state, and the probabilities of objects (B, V) and relations (B, T) to be on.
+        """
+        h2 = bernoulli((self.h2_logits(state.h1) / temperature).sigmoid(), generator)
+        logits = self.h1_logits(state.v, state.r, h2)
+        h1 = bernoulli((logits / temperature).sigmoid(), generator)
+        state = State(state.v, state.r, h1, h2)
+        v, object_p = self.sample_objects(state, free, temperature, generator)
+        relation_p = (self.relation_logits(v, h1) / temperature).sigmoid() * self.gate(v)
+        r = torch.where(free.r, bernoulli(relation_p, generator), state.r)
+        return State(v, r, h1, h2), object_p, relation_p
+
+
+class RBM(Machine):
+    """Objects and relations are joined to the context only."""
+
+
+class GBM(Machine):
+    """The RBM with two-way edges g between each relation and its subject and object."""
+
+    def __init__(
+        self, triples: Tensor, V: int, H1: int, H2: int, generator: torch.Generator
+    ) -> None:
+        super().__init__(triples, V, H1, H2, generator)
+        self.g = nn.Parameter(_SCALE * torch.randn((2, len(triples)), generator=generator))
+
+    def relation_logits(self, v: Tensor, h1: Tensor) -> Tensor:
+        ends = self.g[0] * v[:, self.subject] + self.g[1] * v[:, self.object]
+        return super().relation_logits(v, h1) + ends
+
+    def pull(self, r: Tensor) -> Tensor:
+        pull = super().pull(r)
+        pull = pull.index_add(1, self.subject, r * self.g[0])
+        return pull.index_add(1, self.object, r * self.g[1])
+
+
+class Triway(Machine):
+    """Tri-way edges r_e v_i v_j: only objects that are present have relations."""
+
+    def gate(self, v: Tensor) -> Tensor:
+        return v[:, self.subject] * v[:, self.object]
+
+    def pull(self, r: Tensor) -> Tensor:
+        """Return infinity for the objects of relations that are on, and 0 for the others."""
+        pull = super().pull(r)
+        on = pull.index_add(1, self.subject, r).index_add(1, self.object, r)
+        return pull.masked_fill(on > 0, torch.inf)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A machine of the paper: its name in tables, its class and its hidden units."""
+
+    title: str
+    kind: type[Machine]
+    H1: int
+    H2: int
+
+
+VARIANTS: Final = {
+    "rbm": Variant("RBM", RBM, 200, 0),
+    "gbm": Variant("GBM", GBM, 200, 100),
+    "triway": Variant("Triway", Triway, 200, 100),
+    "triway-1": Variant("Triway, one layer", Triway, 200, 0),
+}

@@ -1,0 +1,132 @@
+"""Scenes as the machines of Bozcan et al. (2018) see them: classes and listed triples."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.scene import Vocabulary
+from training.datasets import (
+    AnnotatedScene,
+    EncodedScene,
+    encode,
+    read_scenes,
+    source_vocabulary,
+    split,
+)
+from training.datasets.splits import Protocol
+
+SPLITS: Final[dict[str, Protocol]] = {"scenes": "paper", "groups": "paper groups"}
+"""Splits by name. "scenes" is the split of the paper, "groups" keeps near-duplicates together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scenes:
+    """N scenes. In an annotated scene, an unlisted relation is false.
+
+    Attributes:
+        v: (N, V) presence of each class.
+        r: (N, T) listed triples, among the T triples of the training scenes.
+        labelled: (N,) number of listed triples, those without a unit included.
+        annotated: (N,) bool, False for a scene without annotation of relations.
+    """
+
+    v: Tensor
+    r: Tensor
+    labelled: Tensor
+    annotated: Tensor
+
+    def __len__(self) -> int:
+        return len(self.v)
+
+    def rows(self, index: Tensor) -> Scenes:
+        """Return the scenes at these indices, or the scenes where a mask is True."""
+        return Scenes(*(tensor[index] for tensor in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """The scenes of one split.
+
+    Attributes:
+        triples: (T, 3) int64 relation, subject and object class of each triple of `train`.
+        digest: sha256 of the scenes and their split.
+    """
+
+    vocabulary: Vocabulary
+    triples: Tensor
+    train: Scenes
+    validation: Scenes
+    test: Scenes
+    digest: str
+
+
+def read_material(source: str, folder: Path, splits: Sequence[str]) -> dict[str, Material]:
+    """Read the scenes of a source, and split them 60 / 30 / 10 % by each of the `splits`.
+
+    A source is a file, or the name of a file `<name>.jsonl.gz` in the folder. The vocabulary has
+    the classes of the source. Structure such as the floor is an ordinary class, as in the paper.
+
+    Raises:
+        DatasetError: the file is missing or invalid.
+    """
+    path = Path(source)
+    scenes = read_scenes(path if path.suffix else folder / f"{source}.jsonl.gz")
+    classes = source_vocabulary(scenes)
+    objects = [replace(entry, structure=False) for entry in classes.objects]
+    vocabulary = Vocabulary(objects, classes.room_types, classes.room_aliases)
+    encoded = {scene.scene_id: scene for scene in encode(scenes, vocabulary)}
+    return {name: _material(scenes, encoded, vocabulary, SPLITS[name]) for name in splits}
+
+
+def _material(
+    scenes: Sequence[AnnotatedScene],
+    encoded: dict[str, EncodedScene],
+    vocabulary: Vocabulary,
+    protocol: Protocol,
+) -> Material:
+    parts = split(scenes, seed=0, protocol=protocol)
+    V = len(vocabulary)
+    keys = {
+        part: [_keys(encoded[scene.scene_id], V) for scene in members]
+        for part, members in parts.items()
+    }
+    units = np.unique(np.concatenate([*keys["train"], np.zeros(0, np.int64)]))
+    tensors = {
+        part: _scenes([encoded[scene.scene_id] for scene in members], keys[part], units, V)
+        for part, members in parts.items()
+    }
+    sha = hashlib.sha256(repr([entry.label for entry in vocabulary.objects]).encode())
+    for part, members in parts.items():
+        sha.update(repr((part, members)).encode())
+    triples = np.stack([units // V // V, units // V % V, units % V], axis=1)
+    return Material(vocabulary, torch.from_numpy(triples), **tensors, digest=sha.hexdigest())
+
+
+def _keys(scene: EncodedScene, V: int) -> np.ndarray:
+    """Return the listed triples of a scene as sorted integers (relation * V + i) * V + j."""
+    relation, subject, object_ = scene.evidence.holds.nonzero()
+    classes = scene.evidence.classes
+    return np.sort((relation * V + classes[subject]) * V + classes[object_])
+
+
+def _scenes(
+    scenes: Sequence[EncodedScene], keys: Sequence[np.ndarray], units: np.ndarray, V: int
+) -> Scenes:
+    v, r = torch.zeros(len(scenes), V), torch.zeros(len(scenes), len(units))
+    for row, (scene, own) in enumerate(zip(scenes, keys, strict=True)):
+        v[row, torch.from_numpy(scene.evidence.classes)] = 1.0
+        r[row, torch.from_numpy(np.flatnonzero(np.isin(units, own)))] = 1.0
+    return Scenes(
+        v,
+        r,
+        torch.tensor([len(own) for own in keys]),
+        torch.tensor([bool(scene.evidence.observed.any()) for scene in scenes]),
+    )
