@@ -33,12 +33,14 @@ from rich.console import Console
 from rich.table import Table
 
 from training.datasets.batches import TrainingData
+from training.evaluation.artifact_model import relation_score
+from training.evaluation.asking import missing_score
 from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.model import Model
 from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
 from training.evaluation.tasks import in_words
 from training.fit.configuration import Config, ConfigError, first_error
-from training.fit.machine_scores import MachineScore, relation_score
+from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.measure import resumable
@@ -311,7 +313,9 @@ class Search:
         return sum(metrics[name].value for name in _BY[self.by] if name in metrics)
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> dict[str, Metric]:
-        model = Model(missing=MachineScore(machine), relations=relation_score(machine))
+        artifact = draft_artifact(machine, self.data.classes)
+        relations = relation_score(artifact, given=False)
+        model = Model(missing=missing_score(artifact), relations=relations)
         tasks = [task for task, _ in FIGURES.values()]
         for source, setting in settings_by_source(
             self.data.validation, self.data.structure, self.data.train, seen=None
