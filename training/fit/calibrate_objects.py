@@ -247,7 +247,7 @@ def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int
         hidden[k, torch.from_numpy(order[shown_classes(len(order), share) :])] = True
         rows.append(k)
     index = torch.tensor(rows, dtype=torch.int64)
-    v = scenes.v.masked_fill(hidden, 0.0)
+    v = scenes.v.masked_fill(hidden | structure, 0.0)
     return Partial(index, v[index], hidden[index], len(scenes))
 
 
