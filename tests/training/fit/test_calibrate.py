@@ -19,6 +19,7 @@ from training.datasets.cases import RIDGE, logistic
 from training.evaluation.alarms import ALARMS, untouched_alarms
 from training.evaluation.asking import of_classes
 from training.evaluation.calibration_task import collect_missing
+from training.evaluation.parts import up_to_longest
 from training.fit.calibrate import calibrate, fit_misplaced, fit_relations, rising_curve
 from training.fit.calibrate_objects import (
     ALPHAS,
@@ -288,7 +289,7 @@ def test_an_alarm_needs_a_probability_worth_an_alarm():
 def test_hidden_classes_are_as_likely_as_said(model, fitted):
     """On 200 other rooms."""
     artifact = replace(model, calibration=fitted)
-    found = collect_missing(artifact, rooms(200, 3), 4)
+    found = collect_missing(artifact, rooms(200, 3), up_to_longest)
     assert found.score.mean() == pytest.approx(found.truth.mean(), abs=0.05)
     assert found.metric("ECE").value < 0.08
     assert found.metric("Brier skill").value > 0
