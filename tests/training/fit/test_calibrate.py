@@ -8,8 +8,16 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from training.fit.intruder_scores import (
+    IntruderScores,
+    alarm_threshold,
+    clean_scores,
+    intruder_scores,
+)
+from training.fit.machine_scores import MachineScore
+from training.fit.object_weights import fit_objects, store_samples
 
-from app.questions.posterior import calibrated, Posterior
+from app.questions.posterior import Posterior, calibrated
 from app.registry import Calibration, CountSlope
 from tests.questions.answers import outliers
 from tests.questions.artifacts import artifact_of
@@ -41,14 +49,6 @@ from training.fit.calibrate_objects import (
     thresholds,
 )
 from training.fit.configuration import ObjectsConfig
-from training.fit.intruder_scores import (
-    IntruderScores,
-    alarm_threshold,
-    clean_scores,
-    intruder_scores,
-)
-from training.fit.machine_scores import MachineScore
-from training.fit.object_weights import fit_objects, store_samples
 from training.machines import MachineSpec, build
 from training.machines.arrays import machine_of
 from training.runs.publish import draft_artifact
