@@ -13,7 +13,7 @@ from training.machines import BoltzmannMachine, build
 
 
 def weights_of(machine: BoltzmannMachine) -> Weights:
-    """Return copies of the machine's tensors. Shared weights are summed (`training.fit.sharing`)."""
+    """Return copies of the machine's tensors, with shared weights summed."""
     arrays = {
         name: np.array(getattr(machine, name).detach().numpy(), order="C")
         for name in layout(machine.spec)
