@@ -71,8 +71,8 @@ class Gains:
         # The padding of the last tile is 1, which leaves the products near 1.
         factors = np.ones((tiles * width, weights.shape[1]), np.float32)
         np.exp(weights, out=factors[: self._rows])
-        by_state = factors.reshape(tiles, width, -1, states - 1).transpose(0, 2, 3, 1)
-        self._factors = np.ascontiguousarray(by_state)
+        by_state = factors.reshape(tiles, width, weights.shape[1] // (states - 1), states - 1)
+        self._factors = np.ascontiguousarray(by_state.transpose(0, 2, 3, 1))
 
     def __call__(self, x: Floats) -> Floats:
         """Return the gain of each row of weights, (B, rows), at the logits x of h1, (B, H1)."""

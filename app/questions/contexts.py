@@ -27,9 +27,10 @@ def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
     """Describe the states of the hidden units of each layer by their largest positive weights.
 
     The weights of a state of layer h1 are its columns in W (objects), U (relations that occur in
-    training) and Q (room types). State 0 of a unit has no weights and is left out. Layer h2 is connected to objects, relations and room types only
-    through h1. The weights of a unit of h2 are therefore its columns in W J, U J and Q J. Q is
-    empty for a machine without room types. Structural classes (floor, wall) are left out.
+    training) and Q (room types). State 0 of a unit has no weights and is left out. Layer h2 is
+    connected to objects, relations and room types only through h1. The weights of a unit of h2 are
+    therefore its columns in W J, U J and Q J. Q is empty for a machine without room types.
+    Structural classes (floor, wall) are left out.
 
     From the weight of each relation, the function subtracts the mean over the states of the layer.
     So a relation that every state favours, such as a faucet on a sink, is not in any description.
@@ -63,7 +64,8 @@ def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
         )
         others = weights.spec.states - 1 if layer == "h1" else 1
         descriptions[layer] = [
-            _description(*divmod(column, others), *names) for column, names in enumerate(units)
+            _description(column // others, column % others, *names)
+            for column, names in enumerate(units)
         ]
     return descriptions
 

@@ -158,10 +158,10 @@ def _ask_one_placement(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> A
     return answers
 
 
-def collect_missing(artifact: Artifact, scenes: SceneTensors, listed: int, seed: int = 0) -> Items:
-    """Ask for the missing classes of random parts of so many classes, and collect the answers."""
+def collect_missing(artifact: Artifact, scenes: SceneTensors, size: Size, seed: int = 0) -> Items:
+    """Ask for the missing classes of random parts of this size, and collect the answers."""
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    parts = draw_parts(scenes, structure, exactly(listed), (seed,))
+    parts = draw_parts(scenes, structure, size, (seed,))
     able = scenes.annotated_classes[scenes.source[parts.scene]].numpy()
     columns: list[tuple[int, float, bool]] = []
     for row, (k, v) in enumerate(zip(parts.scene.tolist(), parts.v, strict=True)):
@@ -292,7 +292,7 @@ def calibration_task(model: Model, setting: Setting) -> Outcome | None:
         for name, ask in asks.items()
     } | {
         f"missing, {listed} classes": partial(
-            collect_missing, scenes=setting.complete.some(), listed=listed, seed=setting.seed
+            collect_missing, scenes=setting.complete.some(), size=exactly(listed), seed=setting.seed
         )
         for listed in LISTED
     }

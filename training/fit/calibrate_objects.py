@@ -280,6 +280,8 @@ def score_lists(
         if intruders is not None:
             classes = np.sort(np.append(classes, int(intruders[k])))
         values = Posterior(artifact, of_classes(classes.tolist())).log_odds_given_rest()
+        kept = artifact.vocabulary.judged[classes]
+        classes, values = classes[kept], values[kept]
         rows.append(np.full(len(classes), k))
         log_odds.append(values)
         classes_of.append(classes)
@@ -293,7 +295,7 @@ def score_lists(
         log_odds=np.concatenate(log_odds or empty).astype(np.float64),
         popularity=popularity[all_classes],
         intruder=np.concatenate(is_intruder or empty).astype(np.bool_),
-        size=np.array([len(classes) for classes in classes_of], np.int64),
+        size=parts.v.sum(1).numpy().astype(np.int64) + (intruders is not None),
         weight=source_weights(scenes, parts.scene),
     )
 
@@ -302,7 +304,8 @@ def score_intruders(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, weights: Tensor | None
 ) -> ListScores:
     """Return the scores of random parts of scenes, each with an intruder drawn by the weights."""
-    intruders = draw_intruders(scenes, structure, weights)
+    unjudged = torch.from_numpy(~artifact.vocabulary.judged)
+    intruders = draw_intruders(scenes, unjudged, weights)
     kept = (intruders >= 0).nonzero().squeeze(1)
     usable = subset(scenes, kept)
     parts = draw_parts(usable, structure, up_to_longest, _SEEDS)
@@ -364,7 +367,9 @@ def fit_line(
     the mean share over the lengths is right.
     """
     worst = {
-        n: scores.extreme(calibrated(entry, scores.score(alpha), scores.size[scores.row]))
+        n: scores.extreme(
+            calibrated(entry, scores.score(alpha), scores.size[scores.row]).astype(np.float64)
+        )
         for n, scores in untouched.items()
     }
     quantiles = [weighted_quantile(worst[n], untouched[n].weight, 1 - share) for n in worst]

@@ -181,32 +181,36 @@ class Trainer:
 
     def _points(self, progress: Progress) -> Iterator[CurvePoint]:
         """Run the rest of both phases. Yield a point of the curve at each checkpoint."""
-        fit = self.objects
-        while not fit.finished:
-            began = time.perf_counter()
-            losses: list[float] = []
-            while len(losses) < _STEPS and not fit.finished:
-                fit.step()
-                losses.append(fit.loss)
-                progress("objects", fit.steps / fit.config.steps, float(np.mean(losses)))
-            if fit.finished:
-                fit.finish()
-            score = object_score(self.machine, self.data)
-            seconds = time.perf_counter() - began
-            done = fit.steps / fit.config.steps
-            if fit.finished:
-                self._begin_relations()
-            yield CurvePoint("objects", done, float(np.mean(losses)), score, seconds)
+        while not self.objects.finished:
+            yield self._train_objects(progress)
         if self._relations is None:
             self._begin_relations()
-        relations = self._relation_fit
-        while not relations.finished:
-            began = time.perf_counter()
-            loss = relations.epoch(partial(progress, "relations"))
-            with relations.averaged():
-                score = relation_score(self.machine, self.data)
-            seconds = time.perf_counter() - began
-            yield CurvePoint("relations", relations.done, loss, score, seconds)
+        while not self._relation_fit.finished:
+            yield self._train_relations(progress)
+
+    def _train_objects(self, progress: Progress) -> CurvePoint:
+        """Run the next steps of the first phase."""
+        fit, began = self.objects, time.perf_counter()
+        total, losses = fit.config.steps, []
+        for _ in range(min(_STEPS, total - fit.steps)):
+            fit.step()
+            losses.append(fit.loss)
+            progress("objects", fit.steps / total, float(np.mean(losses)))
+        if fit.finished:
+            fit.finish()
+        score = object_score(self.machine, self.data)
+        if fit.finished:
+            self._begin_relations()
+        seconds = time.perf_counter() - began
+        return CurvePoint("objects", fit.steps / total, float(np.mean(losses)), score, seconds)
+
+    def _train_relations(self, progress: Progress) -> CurvePoint:
+        """Run the next epoch of the second phase."""
+        fit, began = self._relation_fit, time.perf_counter()
+        loss = fit.epoch(partial(progress, "relations"))
+        with fit.averaged():
+            score = relation_score(self.machine, self.data)
+        return CurvePoint("relations", fit.done, loss, score, time.perf_counter() - began)
 
     def _begin_relations(self) -> None:
         """Fix the object weights, and start the second phase."""

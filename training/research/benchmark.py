@@ -29,7 +29,7 @@ from training.research.baselines import BASELINES
 from training.research.entries import Entry, baseline_entries, machine_entry, reference_entries
 from training.research.measure import POOLED, Plan, measure_entries, resumable, shown, slug
 from training.research.plots import write_plots
-from training.runs.config_files import at_most, data_folder, load_config, with_settings
+from training.runs.config_files import data_folder, load_config, shortened, with_settings
 from training.runs.pipeline import SplitScenes, prepare
 
 DEFAULT = ("indoor-triway", "indoor-gbm", "indoor-rbm")
@@ -52,7 +52,7 @@ _RELATION_TASKS = ("T1a relations", "T1 pairs")
 _SLOW_TASKS = ("Density",)
 # Settings of a quick run. A quick run only tests the command, so its results are meaningless.
 _QUICK_SCENES = 150
-_QUICK_EPOCHS = 2
+_QUICK = 0.1  # share of the training
 _QUICK_LIMIT = 30
 QUICK_BASELINES = (
     "popularity",
@@ -97,7 +97,7 @@ class Options:
     def configs(self, domain: Domain, seed: int) -> list[Config]:
         """Return the configurations of the domain with the given training seed."""
         configs = [with_settings(config, {"training.seed": seed}) for config in domain.configs]
-        return [at_most(config, _QUICK_EPOCHS) for config in configs] if self.quick else configs
+        return [shortened(config, _QUICK) for config in configs] if self.quick else configs
 
     def scenes(self, domain: Domain, **changes: Any) -> SplitScenes:
         """Read and split the scenes of the domain. `changes` replace values of its data section."""
@@ -298,7 +298,8 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
             for row, by_source in reports.items()
         }
         # A task without metrics needs data that these scenes lack, for example room types.
-        if any(report.outcomes[task] for report in task_reports[yardstick, 0].values()):
+        outcomes = [report.outcomes[task] for report in task_reports[yardstick, 0].values()]
+        if any(outcome and outcome.metrics for outcome in outcomes):
             results = summarise(task_reports, yardstick, weights)
             text = shuffled_text(task, results)
             _write(folder / slug(task), scenes, results.to_dict(), text)

@@ -22,11 +22,11 @@ from training.evaluation.report import Progress, write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config
+from training.fit.draft import as_stored, draft_artifact
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.baselines import BASELINES
 from training.runs.folder import load_run, save_run
-from training.runs.publish import as_stored, draft_artifact
 
 CALIBRATION = "calibration.json"
 """File name of a machine's calibration, in the folder of its run."""
@@ -185,7 +185,7 @@ def _machine_model(
     else:
         say("calibrating")
         draft = draft_artifact(machine, data.classes)
-        calibration = calibrate(draft, data.validation, data.train, seed)
+        calibration = calibrate(draft, data, config.objects, seed)
         write_whole(path, calibration.model_dump_json(indent=1))
     artifact = draft_artifact(machine, data.classes, calibration)
     return artifact_model(artifact, data.train, seed=seed)
@@ -198,7 +198,6 @@ def _train_once(config: Config, data: TrainingData, run: Path, say: Progress) ->
         run.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(config, data, run)
     trainer.resume()
-    epochs = config.training.epochs
-    result = trainer.run(lambda epoch, _, loss: say(f"epoch {epoch + 1}/{epochs}, {loss:.3f}"))
+    result = trainer.run(lambda phase, done, loss: say(f"{phase} {done:.0%}, {loss:.3f}"))
     save_run(run, config, result)
     return result.machine

@@ -8,11 +8,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from training.machines.chain_samples import pack_scenes
 
 from tests.questions.answers import missing
 from tests.questions.artifacts import LABELS, artifact_of, larger_artifact, scene_of
 from training.machines import MachineSpec, build
-from training.machines.chain_samples import pack_scenes
 
 SPECS = {
     "rbm": MachineSpec("rbm", V=9, A=4, H1=12, T=8, C=2, N=256, form="local"),
