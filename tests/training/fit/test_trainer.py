@@ -79,7 +79,7 @@ def test_a_run_resumes_to_the_same_bits_from_every_checkpoint(data, tmp_path, se
     """Interrupted right after each checkpoint, and once more between two."""
     config = small_config(**settings)
     expected = state(Trainer(config, data).run().machine)
-    folder, points = tmp_path / "run", 0
+    folder = tmp_path / "run"
 
     def after_a_point(_):
         raise KeyboardInterrupt
@@ -90,9 +90,9 @@ def test_a_run_resumes_to_the_same_bits_from_every_checkpoint(data, tmp_path, se
 
     with pytest.raises(KeyboardInterrupt):
         Trainer(config, data, folder).run(passed=after_a_point)
+    again = Trainer(config, data, folder)
+    assert again.resume()
     with pytest.raises(KeyboardInterrupt):
-        again = Trainer(config, data, folder)
-        assert again.resume()
         again.run(within)
     for points in range(2, 6):
         again = Trainer(config, data, folder)
@@ -102,7 +102,7 @@ def test_a_run_resumes_to_the_same_bits_from_every_checkpoint(data, tmp_path, se
             again.run(passed=after_a_point)
     last = Trainer(config, data, folder)
     assert last.resume()
-    assert last.position == "100 % of the relations" or last.position == "100% of the relations"
+    assert last.position == "100% of the relations"
     result = last.run()
     assert same(expected, state(result.machine))
     assert [(p.phase, p.done) for p in result.curve] == [
@@ -161,7 +161,7 @@ def test_a_checkpoint_that_is_broken_or_another_configuration_s_is_refused(data,
     assert not Trainer(small_config(), data, tmp_path / "empty").resume()
 
 
-@pytest.mark.parametrize("name", ["M", "n", "Q", "L"])
+@pytest.mark.parametrize("name", ["M", "n", "Q"])
 def test_weights_can_be_held_at_zero(data, name):
     """The others start as they would have: machines differ by these weights alone."""
     free, held = (
