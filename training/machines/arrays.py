@@ -12,11 +12,11 @@ from training.machines import BoltzmannMachine, build
 
 
 def weights_of(machine: BoltzmannMachine) -> Weights:
-    """Return copies of the machine's tensors."""
-    arrays = {
-        name: np.array(tensor.detach().numpy(), order="C")
-        for name, tensor in machine.state_dict().items()
-    }
+    """Return copies of the machine's tensors. Shared weights are the sum of their parts."""
+    keys = machine.state_dict()
+    names = {key.removeprefix("parametrizations.").partition(".")[0] for key in keys}
+    tensors = {name: getattr(machine, name).detach() for name in sorted(names)}
+    arrays = {name: np.array(tensor.numpy(), order="C") for name, tensor in tensors.items()}
     return Weights(machine.spec, arrays)
 
 
