@@ -315,7 +315,7 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         else "the scenes contain no relations or positions: the model learns objects only",
         "machine.states": f"states of a hidden unit: more do not help with {n} training scenes",
         "machine.coupled": f"couplings between classes help from {_MANY_SCENES} scenes on",
-        "objects.steps": "priors keep few scenes from being learnt by heart; more steps do not help",
+        "objects.steps": "more steps do not help, because priors limit the weights",
     }
     if facts.related:
         # An epoch has about eight updates or more, because validation after each epoch takes

@@ -409,7 +409,8 @@ def _hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) -
     small = np.isin(sources, names[sizes < SOURCE_SCENES])
     parts = [sources == name for name in names[sizes >= SOURCE_SCENES]]
     parts += [small] if small.any() else []
-    return float(np.nextafter(max(np.quantile(values[part], share) for part in parts), np.inf))
+    highest = max(float(np.quantile(values[part], share)) for part in parts)
+    return float(np.nextafter(highest, np.inf))
 
 
 def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
