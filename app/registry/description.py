@@ -80,7 +80,8 @@ class AlarmLine(Frozen):
 
     def threshold(self, n: int) -> float:
         """Return the minimum probability of an outlier in a list of n classes."""
-        return 1 / (1 + math.exp(-self.intercept - self.log_count * math.log(max(n, 1))))
+        # tanh cannot overflow.
+        return 0.5 + 0.5 * math.tanh((self.intercept + self.log_count * math.log(max(n, 1))) / 2)
 
 
 class AlarmLines(Frozen):
