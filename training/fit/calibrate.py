@@ -14,6 +14,7 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -352,7 +353,7 @@ def _instance_pairs(
     examples = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
     relation, i, j = np.nonzero(examples)
     truth = np.where(annotated, scene.instance_holds[: len(values)], _UNKNOWN)[examples]
-    size = np.log(max(1, np.count_nonzero(~structure[evidence.classes])))
+    size = math.log(max(1, int((~structure[evidence.classes]).sum())))
     columns = number, relation, log_odds[examples], logs[i] + logs[j], size, truth, source
     return np.stack(np.broadcast_arrays(*columns), 1)
 
