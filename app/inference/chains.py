@@ -298,7 +298,9 @@ class ConditionedChains:
         return r
 
     def log_score(self, state: ChainState, shown: Mask, kept: Mask) -> float:
-        """Return the log score of a sampled scene at temperature 1, up to a constant of the model.
+        """Return the log score of a sampled scene at temperature 1.
+
+        The score is a log-probability up to a constant of the model and the room type:
 
             b·v + v'Lv/2 + e_t + sum_m log sum_z exp(x_mz) + log p(kept | v, h1)
 

@@ -34,6 +34,8 @@ REASONS: Final = 3
 EXPLAINED: Final = 32
 """Maximum number of entries with reasons in an answer. The first entries have reasons."""
 
+_ROUNDING: Final = 1e-6  # a smaller change of log-odds is a rounding error
+
 # Upper bounds in bytes on the sizes of parts of an answer. Ids and labels are not included.
 RELATION_BYTES: Final = 120
 CAUSE_BYTES: Final = 60
@@ -83,13 +85,13 @@ def reasons(
             scene.
         rows: (N,) index of each explained class among the n classes. None means that the explained
             classes are absent.
-        least: minimum absolute value of a change. Changes of 0 are left out.
+        least: minimum absolute value of a change. Rounding errors of a change of 0 are left out.
 
     Returns:
         For each class, the fields of `scene_client.schemas.Because`.
     """
     columns, values = strongest(change, np.zeros(0, np.int64) if rows is None else rows, REASONS)
-    strong = (np.abs(values) >= least) & (values != 0)
+    strong = np.abs(values) >= max(least, _ROUNDING)
     entries: list[list[Fields]] = [[] for _ in change]
     rows_of_entries, _ = np.nonzero(strong)
     numbers, changes = present.first[columns[strong]].tolist(), significant(values[strong])

@@ -47,7 +47,6 @@ ATTEMPTS: Final = 8
 # On-top and above have the same direction, because both place the subject higher than the object.
 _DIRECTION: Final = np.array([{LEFT: 1, FRONT: 2}.get(a, 0) for a in range(len(CANONICAL))])
 
-
 DRAWN_SEED_BITS: Final = 53
 """Size in bits of a seed that the service chooses.
 
@@ -99,8 +98,7 @@ def generate(
         see `ConditionedChains.log_score`. Only scores of the same model can be compared.
 
     Raises:
-        ValueError: a number is out of range, or the machine does not have a layer or unit in
-            `context`.
+        ValueError: a number is out of range, or `context` has an invalid layer, unit or state.
         RequestError: the answer would exceed `size_limit`.
     """
     steps = STEPS if steps is None else steps
@@ -139,7 +137,7 @@ def _conditions(
     """Return the fixed part of each chain: classes, relations, room type and hidden units.
 
     Raises:
-        ValueError: the machine does not have a layer, unit or state in `context`.
+        ValueError: `context` has an invalid layer, unit or state.
     """
     spec, listing = artifact.spec, present(scene, artifact.spec)
     layers = _layers(spec)
@@ -148,7 +146,7 @@ def _conditions(
             raise ValueError(
                 f"the model has no layer {layer!r}; layers are h1, and h2 in two-layer models"
             )
-        if error := next(filter(None, (layers[layer].error(*pair) for pair in pairs)), None):
+        for _, error in layers[layer].errors(pairs):
             raise ValueError(f"context of {layer}: {error}")
     held = np.array(context.get("h1", ()), dtype=np.int64).reshape(-1, 2)
     # A unit of h2 is binary. It can be held in state 1 only; state 0 is its most common state.
@@ -167,13 +165,18 @@ class _Layer(NamedTuple):
     units: int
     states: range
 
-    def error(self, unit: int, state: int) -> str | None:
-        """Return the reason why a unit cannot be held in a state, or None."""
-        if not 0 <= unit < self.units:
-            return f"the hidden layer has only the units 0 to {self.units - 1}"
-        if state not in self.states:
-            return f"a unit has only the states {self.states[0]} to {self.states[-1]}"
-        return None
+    def errors(self, pairs: Sequence[tuple[int, int]]) -> Iterator[tuple[int, str]]:
+        """Yield the position of each invalid pair (unit, state), and the reason."""
+        first, last = self.states[0], self.states[-1]
+        states = f"states {first} to {last}" if first < last else f"state {first}"
+        held: dict[int, int] = {}
+        for position, (unit, state) in enumerate(pairs):
+            if not 0 <= unit < self.units:
+                yield position, f"the hidden layer has only the units 0 to {self.units - 1}"
+            elif state not in self.states:
+                yield position, f"a unit of this hidden layer can keep only {states}"
+            elif held.setdefault(unit, state) != state:
+                yield position, "the unit already keeps another state"
 
 
 def _layers(spec: MachineSpec) -> dict[str, _Layer]:
@@ -368,9 +371,8 @@ def _read(request: GenerateRequest, artifact: Artifact, _: Reading) -> Options:
             message = "the model lacks this hidden layer"
             errors.add(InvalidRequestError, ("context", layer), message, tuple(layers))
             continue
-        for position, pair in enumerate(pairs):
-            if error := layers[layer].error(*pair):
-                errors.add(InvalidRequestError, ("context", layer, position), error)
+        for position, error in layers[layer].errors(pairs):
+            errors.add(InvalidRequestError, ("context", layer, position), error)
     errors.raise_any()
     return {
         "count": request.count,

@@ -134,9 +134,8 @@ def _ranked(
     Returns:
         The class indices, their probabilities, and their log-odds before calibration, each (k,).
     """
-    structure, listed_classes = artifact.vocabulary.structure, posterior.present.classes
-    usable = ~structure
-    usable[listed_classes] = False
+    usable = ~artifact.vocabulary.structure
+    usable[posterior.present.classes] = False
     absent = np.flatnonzero(usable)
     chosen = np.ones(len(absent), np.bool_)
     if candidates is not None:
@@ -144,7 +143,7 @@ def _ranked(
     if not chosen.any():
         return absent[:0], np.zeros(0), np.zeros(0)
     log_odds = posterior.absent_log_odds(absent, coverage)
-    listed = max(1, int(np.count_nonzero(~structure[listed_classes])))
+    listed = max(1, posterior.listed)
     if place is None:
         logits = calibrated(artifact.calibration.missing, log_odds, listed)
     else:

@@ -43,7 +43,7 @@ from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Option
 from app.questions.ranking import best
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
-from app.registry.description import AlarmLine, AlarmLines, CountSlope
+from app.registry.description import AlarmLine, CountSlope
 from app.scene.relations import CANONICAL, opposite
 from app.scene.scene import Scene
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
@@ -105,8 +105,8 @@ def outliers(
     wrong: list[Fields] = []
     posterior = Posterior(artifact, scene) if scene.objects else None
     if lines is not None and threshold is None:
-        listed = 0 if posterior is None else _listed(artifact, posterior)
-        threshold = _line(lines, sensitivity).threshold(listed)
+        line: AlarmLine = getattr(lines, sensitivity)
+        threshold = line.threshold(0 if posterior is None else posterior.listed)
     if posterior is not None:
         wrong = _misplaced(artifact, posterior, scene, sensitivity, flipped)
         if entry is not None and threshold is not None:
@@ -135,7 +135,7 @@ def _judged(
     """
     present = posterior.present
     log_odds = posterior.log_odds_given_rest()
-    logits = _intruder_logits(artifact, entry, present.classes, log_odds)
+    logits = _intruder_logits(artifact, entry, posterior, log_odds)
     p = _probability(logits)
     is_outlier = p >= threshold
     labels = [artifact.vocabulary.labels[index] for index in present.classes.tolist()]
@@ -181,40 +181,30 @@ def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
     classes = posterior.present.classes
     if entry is None or lines is None:
         return classes[:0]
-    logits = _intruder_logits(artifact, entry, classes, posterior.log_odds_given_rest())
-    threshold = lines.medium.threshold(_listed(artifact, posterior))
+    logits = _intruder_logits(artifact, entry, posterior, posterior.log_odds_given_rest())
+    threshold = lines.medium.threshold(posterior.listed)
     return classes[_probability(logits) >= threshold]
 
 
 def _intruder_logits(
     artifact: Artifact,
     entry: CountSlope,
-    classes: NDArray[np.int64],
+    posterior: Posterior,
     log_odds: NDArray[np.floating[Any]],
 ) -> NDArray[np.float64]:
     """Return the logit of each class's probability of being an intruder, (n,).
 
     The logit of a class that is not judged is -inf. `entry` is `Calibration.outlier`.
     """
+    classes = posterior.present.classes
     adjusted = _adjusted(artifact, classes, log_odds).astype(np.float64)
-    listed = max(1, int((~artifact.vocabulary.structure[classes]).sum()))
-    logits = calibrated(entry, adjusted, listed).astype(np.float64)
+    logits = calibrated(entry, adjusted, max(1, posterior.listed)).astype(np.float64)
     logits[~artifact.vocabulary.judged[classes]] = -np.inf
     return logits
 
 
 def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isinf(logits), 0.0, sigmoid(logits))
-
-
-def _listed(artifact: Artifact, posterior: Posterior) -> int:
-    """Return the number of listed classes without structure."""
-    return int((~artifact.vocabulary.structure[posterior.present.classes]).sum())
-
-
-def _line(lines: AlarmLines, sensitivity: Sensitivity) -> AlarmLine:
-    line: AlarmLine = getattr(lines, sensitivity)
-    return line
 
 
 def _adjusted(

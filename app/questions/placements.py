@@ -83,7 +83,7 @@ def place_log_p(
         artifact.relation_slopes.asked_place[relation],
         posterior.placed_log_p(candidates, relation, row, outgoing=outgoing),
         log_count=float(present.log_counts[row]),
-        classes=len(present.classes) + 1,
+        classes=posterior.listed + 1,
     )
 
 
@@ -129,7 +129,7 @@ def placements(
             objects[column] = at.anchor
     slopes, log_counts = artifact.relation_slopes.placement, present.log_counts[anchors]
     rows, relations, outgoing, columns, p = likeliest_places(
-        slopes, forward, backward, log_counts, len(present.classes) + 1, PLACES, first
+        slopes, forward, backward, log_counts, posterior.listed + 1, PLACES, first
     )
     places = len(rows) // len(candidates)  # the same number for each candidate
     if first >= 0 and at is not None:

@@ -91,6 +91,7 @@ class Posterior(ScenePosterior):
 
     Attributes:
         present: the classes of the scene.
+        listed: number of distinct classes of the scene, without structural classes.
 
     Raises:
         ValueError: the machine does not know the class of an object, the room type or the profile.
@@ -98,6 +99,8 @@ class Posterior(ScenePosterior):
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
         self.present = listing = present(scene, artifact.spec)
+        is_structure = artifact.vocabulary.structure[listing.classes]
+        self.listed = len(listing.classes) - int(np.count_nonzero(is_structure))
         observed = given_relations(scene, listing, artifact.spec.A)
         context = context_of(
             artifact.weights,
@@ -130,7 +133,7 @@ def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int
         entry: (4 + 2K,) row of the relation in a table of `RelationSlopes`.
         log_p: (N,) log probability of the relation between the classes, not yet calibrated.
         log_count: log of the number of instances of the anchor's class.
-        classes: number of distinct classes in the scene, the candidate included.
+        classes: number of distinct classes in the scene without structure, the candidate included.
     """
     intercept, slope, count_weight, classes_weight = entry[:4]
     # log(p / (1 - p)). The limit avoids log(0) for p = 1.

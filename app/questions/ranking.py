@@ -46,7 +46,7 @@ def relation_probability(
         slopes: (A, 4 + 2K) table of `RelationSlopes`.
         log_odds: (B, A, N) log-odds of the relation between classes.
         log_count: (N,) log of the number of object pairs with these two classes.
-        classes: number of distinct classes in the scene.
+        classes: number of distinct classes in the scene without structure.
     """
     p = np.empty_like(log_odds)
     size = np.log(classes)
@@ -156,13 +156,16 @@ def likeliest_classes(logits, usable, count):
 
 
 @compiled
-def likeliest_relations(slopes, log_odds, log_counts, row, judged, least, opposites, count):
+def likeliest_relations(
+    slopes, log_odds, log_counts, classes, row, judged, least, opposites, count
+):
     """Return the `count` likeliest relations between N objects, likeliest first.
 
     Args:
         slopes: (A, 4 + 2K) table of `RelationSlopes`.
         log_odds: (A, n, n) log-odds of the A relations between the n classes of the scene.
         log_counts: (n,) log of the number of instances of each class.
+        classes: number of classes in the scene without structure.
         row: (N,) index of each object's class among the n classes.
         judged: (N, N) bool, True for the ordered pairs of objects to judge.
         least: minimum probability of a relation in the result.
@@ -178,8 +181,8 @@ def likeliest_relations(slopes, log_odds, log_counts, row, judged, least, opposi
     for i in range(n):
         for j in range(n):
             counts[i, j] = log_counts[i] + log_counts[j]
-    p = relation_probability(slopes, log_odds.reshape(1, A, n * n), counts.reshape(-1), n)
-    p = p.reshape(A, n, n)
+    log_odds = log_odds.reshape(1, A, n * n)
+    p = relation_probability(slopes, log_odds, counts.reshape(-1), classes).reshape(A, n, n)
     names = 2 * A if opposites else A
     grid, usable = np.zeros((size, size, names), p.dtype), np.zeros((size, size, names), np.bool_)
     for x in range(size):
@@ -212,7 +215,7 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
         backward: (N, A, m) log-odds of relations with an anchor as subject and a candidate as
             object.
         log_counts: (m,) log of the number of instances of each anchor's class.
-        classes: number of distinct classes in the scene, including the candidate.
+        classes: number of distinct classes in the scene without structure, including the candidate.
         count: maximum of k.
         first: number of a place that comes first even if other places are likelier. -1 means that
             the order depends only on the probabilities.
@@ -332,7 +335,7 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
         forward: (A, P) log-odds of the relations from subject to object.
         backward: (A, P) log-odds of the relations from object to subject.
         log_counts: (P,) log of the number of object pairs with these two classes.
-        classes: number of distinct classes in the scene.
+        classes: number of distinct classes in the scene without structure.
         holds, of_classes: (P,) bit sets of the relations of the pair and of its classes; see
             `observed_pairs`.
         least: minimum probability of an expected relation.

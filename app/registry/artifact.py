@@ -217,6 +217,8 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
         weights = Weights(spec, tensors)
     except ValueError as error:
         raise ArtifactError("invalid_tensor", str(error)) from None
+    if spec.coupled and (weights["L"].diagonal().any() or (weights["L"] != weights["L"].T).any()):
+        raise ArtifactError("invalid_tensor", "L must be symmetric with a diagonal of 0")
     largest = max(np.abs(weights[name]).max(initial=0) for name in ("W", "Q"))
     if not largest <= LARGEST_WEIGHT:
         raise ArtifactError("unsupported", _UNSUPPORTED)

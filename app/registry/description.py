@@ -22,8 +22,7 @@ Floats = NDArray[np.floating[Any]]
 class CountSlope(Frozen):
     """Calibration of a logit z: log-odds = intercept + slope·z + log_count·log n.
 
-    The attributes of `Calibration` define n for each question. For outliers, n is the number of
-    classes in the scene.
+    The attributes of `Calibration` define n for each question.
     """
 
     intercept: float = 0.0
@@ -35,9 +34,10 @@ class PairSlope(CountSlope):
     """Calibration of a relation between two objects.
 
     The calibration adds log_classes·log(number of classes in the scene) to the formula of
-    `CountSlope`, because annotators list a smaller share of the relations in a larger scene. n is
-    the number of object pairs with the two classes. The result x is then converted by a
-    piecewise-linear curve. Each bend (at, change) adds change·(x - at) if x is above ``at``.
+    `CountSlope`, because annotators list a smaller share of the relations in a larger scene.
+    Structural classes do not count. n is the number of object pairs with the two classes. The
+    result x is then converted by a piecewise-linear curve. Each bend (at, change) adds
+    change·(x - at) if x is above ``at``.
     """
 
     log_classes: float = 0.0
@@ -80,7 +80,8 @@ class AlarmLine(Frozen):
 
     def threshold(self, n: int) -> float:
         """Return the minimum probability of an outlier in a list of n classes."""
-        return 1 / (1 + math.exp(-self.intercept - self.log_count * math.log(max(n, 1))))
+        # tanh cannot overflow.
+        return 0.5 + 0.5 * math.tanh((self.intercept + self.log_count * math.log(max(n, 1))) / 2)
 
 
 class AlarmLines(Frozen):
@@ -95,15 +96,14 @@ class Calibration(Frozen):
     """The conversion of a machine's log-odds into probabilities.
 
     With the default values, the calibration changes nothing, and the model judges neither objects
-    nor relations. An intruder is an object that
-    does not belong to the scene. Structural classes are parts of the building (floor, wall) and
-    vague names (object).
+    nor relations. An intruder is an object that does not belong to the scene. Structural classes
+    are parts of the building (floor, wall) and vague names (object).
 
     Attributes:
         coverage: share of the classes of a scene that a request lists. A request may contain
             another value.
         missing: calibration of the log-odds that an unlisted class is present. n is the number of
-            listed classes.
+            listed classes without structure.
         popularity: (V,) log-odds that a training scene has each class. If the tuple is empty, all
             classes have the same popularity.
         popularity_weight: exponent alpha. The prior probability of an intruder's class is
@@ -119,8 +119,8 @@ class Calibration(Frozen):
             room type. 85 % of the real rooms reach this value. If the tuple is empty, there is no
             minimum.
         outlier: calibration that converts a class's log-odds of presence to the log-odds that its
-            object is an intruder. n is the number of classes in the scene. None means that training
-            had too few scenes for the fit: the model then judges no object.
+            object is an intruder. n is the number of classes in the scene without structure. None
+            means that training had too few scenes for the fit: the model then judges no object.
         relation: calibration of each canonical relation in scenes without observed relations.
         relation_given: calibration of each canonical relation in scenes with observed relations.
         placement: calibration of each canonical relation for a missing object at its most probable

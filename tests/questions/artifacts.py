@@ -6,82 +6,95 @@ from pathlib import Path
 
 import torch
 
-from app.inference.posterior import ClosedForm
 from app.registry.artifact import Artifact
-from app.registry.description import NEVER, Calibration, CountSlope, Slope
+from app.registry.description import (
+    NEVER,
+    AlarmLine,
+    AlarmLines,
+    Calibration,
+    CountSlope,
+    Slope,
+)
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL
-from training.fit.oracle.drawn import DrawnPosterior
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.arrays import weights_of
 
-# Few enough states to enumerate.
+# Few enough states to enumerate, with one hidden layer and three classes.
 EXACT: dict[str, MachineSpec] = {
-    "rbm": SMALL["rbm-three-classes"],
-    "gbm": SMALL["gbm-one-layer"],
-    "triway-seed": MachineSpec("triway", V=3, A=1, H1=2, K=2, T=2, form="seed"),
-    "triway-local": MachineSpec("triway", V=3, A=1, H1=3, K=2, T=2, C=2, form="local"),
-    "triway-implications": MachineSpec("triway", V=3, A=1, H1=3, K=2, T=2, C=2, G=2, form="local"),
+    name: SMALL[name]
+    for name in ("rbm", "rbm-states", "gbm-one-layer", "triway-states", "triway-implications")
 }
-# Too large to enumerate. With structure, four relations and two layers.
+# Too large to enumerate, with structure and four relations.
 LARGER: dict[str, MachineSpec] = {
-    "rbm": MachineSpec("rbm", V=9, A=4, H1=6, T=40, C=2, form="local"),
-    "gbm": MachineSpec("gbm", V=9, A=4, H1=6, H2=3, T=40, form="local"),
-    "triway-seed": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, form="seed"),
-    "triway-local": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, form="local"),
-    # Wide enough for nearly normal logits, so the closed form is exact without relations.
-    "triway-wide": MachineSpec("triway", V=9, A=4, H1=90, K=3, T=60, C=2, G=2, form="local"),
-    "triway-deep": MachineSpec("triway", V=9, A=4, H1=90, H2=20, K=3, T=60, C=2, form="local"),
-    "rbm-wide": MachineSpec("rbm", V=9, A=4, H1=90, T=200, C=2, form="local"),
-    "gbm-wide": MachineSpec("gbm", V=9, A=4, H1=90, H2=20, T=200, C=2, form="local"),
-    "triway-implications": MachineSpec(
-        "triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, G=2, form="local"
+    "rbm": MachineSpec("rbm", V=9, A=4, units=6, T=40, C=2),
+    "gbm": MachineSpec("gbm", V=9, A=4, units=6, H2=3, T=40),
+    "triway": MachineSpec("triway", V=9, A=4, units=6, H2=3, K=3, T=5, C=2, profiles=2),
+    "triway-states": MachineSpec(
+        "triway", V=9, A=4, units=5, states=4, K=3, T=60, C=2, profiles=2, coupled=True
     ),
+    "triway-implications": MachineSpec("triway", V=9, A=4, units=6, H2=3, K=3, T=5, C=2, G=2),
 }
 LABELS = ("bed", "lamp", "desk", "chair", "sofa", "vase", "shelf", "rug", "wall")
 STRUCTURE = {"wall"}
-ROOMS = ("bedroom", "office")
+ROOMS = ("bedroom", "office", "kitchen")
+
+
+def lines(low: float, medium: float, high: float, log_count: float = 0.0) -> AlarmLines:
+    """Alarm lines with these intercepts and one slope."""
+    levels = {"low": low, "medium": medium, "high": high}
+    return AlarmLines(
+        **{name: AlarmLine(intercept=z, log_count=log_count) for name, z in levels.items()}
+    )
+
+
+NO_ALARM = lines(1e3, 1e3, 1e3)
 
 
 def calibration(relations: int, **changes: object) -> Calibration:
     """A neutral calibration without outliers, so every generated scene is plausible."""
     line = {"outlier": CountSlope(slope=-1.0), "misplaced": Slope(intercept=0.0, slope=-1.0)}
-    never = {"outlier_thresholds": NEVER, "misplaced_thresholds": NEVER}
+    never = {"outlier_lines": NO_ALARM, "misplaced_thresholds": NEVER}
     return Calibration(**{**dict(Calibration.neutral(relations)), **line, **never, **changes})
 
 
 def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:
     """An artifact with a neutral calibration, except for the changed fields."""
-    spec, weights = machine.spec, weights_of(machine)
+    spec = machine.spec
     vocabulary = Vocabulary(
         [ObjectClass(label, structure=label in STRUCTURE) for label in LABELS[: spec.V]],
         ROOMS[: spec.C],
     )
     return Artifact(
         manifest=None,
-        weights=weights,
+        weights=weights_of(machine),
         vocabulary=vocabulary,
         calibration=calibration(spec.A, **changes),
         digest="",
         card="",
         path=Path(),
-        oracle=None if ClosedForm.supports(weights) else DrawnPosterior,
     )
 
 
-def exact_artifact(name: str, scale: float = 1.3, **changes: object) -> Artifact:
-    """An artifact in float64. All weights are random numbers from N(0, scale²)."""
-    return artifact_of(random_machine(EXACT[name], torch.float64, scale), **changes)
-
-
 def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> Artifact:
-    """An artifact in float32. All weights are random numbers from N(0, scale²)."""
-    return artifact_of(random_machine(LARGER[name], torch.float32, scale), **changes)
+    """An artifact with many states. All weights are random numbers from N(0, scale²).
+
+    Structure has no object weights, as in a trained machine.
+    """
+    machine = random_machine(LARGER[name], scale)
+    structure = [k for k, label in enumerate(LABELS) if label in STRUCTURE]
+    for weights, parameter in machine.named_parameters():
+        if weights in ("W", "L"):
+            parameter[structure] = 0
+    if machine.spec.coupled:
+        machine.L[:, structure] = 0
+    return artifact_of(machine, **changes)
 
 
-def random_machine(spec: MachineSpec, dtype: torch.dtype, scale: float) -> BoltzmannMachine:
+def random_machine(spec: MachineSpec, scale: float) -> BoltzmannMachine:
+    """A machine with symmetric couplings, as the service has them."""
     generator = torch.Generator().manual_seed(3)
-    machine = build(spec).to(dtype)
+    machine = build(spec)
     if spec.T:
         units = spec.A * spec.V**2
         keys = torch.randperm(units, generator=generator)[: spec.T].sort().values
@@ -92,8 +105,8 @@ def random_machine(spec: MachineSpec, dtype: torch.dtype, scale: float) -> Boltz
         for parameter in machine.parameters():
             noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
             parameter.copy_(noise * scale)
-        if hasattr(machine, "kappa"):
-            machine.kappa.zero_()
+        if spec.coupled:
+            machine.L.copy_(machine.couplings)
     return machine.eval().requires_grad_(False)
 
 
@@ -103,8 +116,9 @@ def scene_of(
     room: int | None = None,
     *,
     complete: bool = False,
+    profile: int | None = None,
 ) -> Scene:
     """A scene. The relations are canonical triples of a relation and two indices of objects."""
     objects = tuple(SceneObject(f"{LABELS[c]}_{k}", LABELS[c], c) for k, c in enumerate(classes))
     triples = None if relations is None else tuple(relations)
-    return Scene(objects, triples, complete, room)
+    return Scene(objects, triples, complete, room, profile=profile)

@@ -40,7 +40,7 @@ def test_a_line_bends_at_the_bends_of_its_entry(bends, log_odds):
 
 def test_scenes_with_relations_have_entries_of_their_own():
     alone, given = (PairSlope(intercept=b, slope=0.0, log_classes=-0.5) for b in (-1.0, 1.0))
-    artifact = larger_artifact("triway-local", relation=(alone,) * 4, relation_given=(given,) * 4)
+    artifact = larger_artifact("triway", relation=(alone,) * 4, relation_given=(given,) * 4)
     # At an intercept of 1, opposite relations exclude each other.
     for stated, p in ((None, sigmoid(-1 - 0.5 * math.log(3))), ([(0, 0, 1)], 0.5)):
         for entry in relations(artifact, scene_of([0, 1, 2], stated)):
@@ -51,7 +51,7 @@ def test_placements_have_entries_of_their_own():
     """A missing object is one more class. The place of `at` has an entry of its own, too."""
     placement = (PairSlope(intercept=-1.0, slope=0.0, log_classes=-0.5),) * 4
     at_place = (PairSlope(intercept=-0.5, slope=0.0),) * 4
-    artifact = larger_artifact("triway-local", placement=placement, asked_place=at_place)
+    artifact = larger_artifact("triway", placement=placement, asked_place=at_place)
     p = sigmoid(-1 - 0.5 * math.log(4))
     for entry in missing(artifact, scene_of([0, 1, 2])):
         assert [place.probability for place in entry.placements] == [pytest.approx(p, rel=1e-5)] * 3
@@ -68,7 +68,7 @@ def test_placements_have_entries_of_their_own():
 def test_instances_count_in_relations():
     """Three chairs and two lamps: log 6 for a pair of both classes, log 9 among the chairs."""
     entry = PairSlope(intercept=-2.0, slope=0.0, log_count=-0.5)
-    artifact = larger_artifact("triway-local", relation=(entry,) * 4)
+    artifact = larger_artifact("triway", relation=(entry,) * 4)
     entries = relations(artifact, scene_of([3, 3, 3, 1, 1]), top_k=100)
     p = {(entry.subject, entry.object): entry.probability for entry in entries}
     assert p[0, 3] == pytest.approx(sigmoid(-2 - 0.5 * math.log(6)), rel=1e-5)
@@ -77,9 +77,9 @@ def test_instances_count_in_relations():
 
 def test_false_relations():
     scene = scene_of([0, 1, 2], [(2, 1, 0), (0, 1, 2)])
-    plain = misplaced(larger_artifact("triway-local"), scene)
+    plain = misplaced(larger_artifact("triway"), scene)
     slope = Slope(intercept=0.4, slope=-0.5)
-    scaled = misplaced(larger_artifact("triway-local", misplaced=slope), scene)
+    scaled = misplaced(larger_artifact("triway", misplaced=slope), scene)
     for one, other in zip(plain, scaled, strict=True):
         assert one[:3] == other[:3]
         z = math.log(one.probability / (1 - one.probability))
@@ -92,7 +92,7 @@ def test_false_relations():
 def test_missing_classes_by_log_odds_and_number_of_listed_classes(classes, listed):
     """Structure and further instances do not count. The number is at least 1."""
     slope = CountSlope(intercept=0.4, slope=0.6, log_count=-0.5)
-    artifact = larger_artifact("triway-local", missing=slope)
+    artifact = larger_artifact("triway", missing=slope)
     for entry in missing(artifact, scene_of(classes), top_k=9):
         z = 0.4 + 0.6 * entry.log_odds - 0.5 * math.log(listed)
         assert entry.probability == pytest.approx(sigmoid(z), rel=1e-5)
@@ -104,7 +104,7 @@ def test_the_probability_at_a_place_is_a_product(relation):
     slope = CountSlope(intercept=-0.2, slope=0.8, log_count=0.3)
     # The intercept is so low that no relation excludes its opposite.
     slopes = (PairSlope(intercept=-3.0, slope=0.7, log_count=-0.4, bends=((-3.5, 0.5),)),) * 4
-    artifact = larger_artifact("triway-local", missing=slope, placement=slopes)
+    artifact = larger_artifact("triway", missing=slope, placement=slopes)
     scene = scene_of([0, 1, 1])
     present = {entry.label: entry.probability for entry in missing(artifact, scene, top_k=9)}
     entries = missing(artifact, scene, at=(relation, 1), top_k=9)

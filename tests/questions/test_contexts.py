@@ -16,13 +16,16 @@ OBJECTS = [{"label": label} for label in LABELS if label not in STRUCTURE]
 def relation_weights(machine):
     """The relations in training between classes without structure, and their rows of U, (n, H1)."""
     entries, rows = [], []
+    h1 = torch.eye(machine.spec.H1)
+    v = torch.ones(len(h1), machine.spec.V)
     for a, i, j in machine.triples.tolist():
         if not {LABELS[i], LABELS[j]} & STRUCTURE:
             edges = machine.edges(torch.tensor([[i, j]]))
+            none, each = (machine.relation_logits(edges, v, states) for states in (0 * h1, h1))
             ends = torch.stack([edges.relation[0], edges.subject[0], edges.object[0]], 1)
             unit = (ends == torch.tensor([a, i, j])).all(1).nonzero()[0, 0]
             entries.append({"subject": LABELS[i], "relation": CANONICAL[a], "object": LABELS[j]})
-            rows.append(machine.relation_context(edges)[0, unit])
+            rows.append((each - none)[:, unit])
     return entries, torch.stack(rows)
 
 
@@ -57,8 +60,10 @@ def test_a_unit_has_its_largest_positive_weights_and_a_name_of_them(name):
             triples = strongest(relations, U[:, k] - U.mean(1), 3)
             parts = [", ".join(entry["label"] for entry in objects[:3])]
             parts += [" ".join(list(entry.values())[:3]) for entry in triples[:1]]
+            others = machine.spec.states - 1 if layer == "h1" else 1
             assert unit.model_dump() == {
-                "unit": k,
+                "unit": k // others,
+                "state": k % others + 1,
                 "name": "; ".join(filter(None, parts)),
                 "objects": objects,
                 "relations": triples,
@@ -67,5 +72,7 @@ def test_a_unit_has_its_largest_positive_weights_and_a_name_of_them(name):
 
 
 def test_a_unit_without_positive_weights_has_its_number_as_name():
-    artifact = larger_artifact("triway-local", scale=0.0)
-    assert [unit.name for unit in contexts(artifact)["h2"]] == ["unit 0", "unit 1", "unit 2"]
+    artifact = larger_artifact("triway", scale=0.0)
+    assert [unit.name for unit in contexts(artifact)["h2"]] == [
+        f"unit {k}, state 1" for k in range(3)
+    ]

@@ -15,7 +15,7 @@ from app.registry import Counts
 from tests.questions.answers import more
 from tests.questions.artifacts import LABELS, LARGER, larger_artifact, scene_of
 
-SPEC = LARGER["triway-local"]
+SPEC = LARGER["triway"]
 V, C, M = SPEC.V, SPEC.C, 5
 LAMP, DESK, CHAIR, SHELF, WALL = 1, 2, 3, 6, 8
 MOST = np.array([M - 1, M - 1, 2, M - 1])
@@ -32,7 +32,7 @@ def counts(scale: float = 0.6, seed: int = 0) -> Counts:
 
 
 COUNTS = counts(seed=7)
-ARTIFACT = replace(larger_artifact("triway-local"), counts=COUNTS)
+ARTIFACT = replace(larger_artifact("triway"), counts=COUNTS)
 SCENE = scene_of([DESK, CHAIR, LAMP, CHAIR, WALL, WALL], room=1)
 EVERY = list(range(V))
 
@@ -128,7 +128,7 @@ def test_the_largest_weights_of_a_store_give_finite_numbers(sign, coverage):
     shares = np.full_like(huge.log_share, -64)
     shares[:, 0] = 0
     artifact = replace(
-        larger_artifact("triway-local", coverage=1.0),
+        larger_artifact("triway", coverage=1.0),
         counts=Counts(huge.classes, MOST, shares, weights),
     )
     scene = scene_of([index for index in range(WALL) for _ in range(M - 1)])

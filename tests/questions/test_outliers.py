@@ -6,23 +6,26 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-from app.registry.description import CountSlope, Thresholds
+from app.registry.description import AlarmLine, CountSlope, Thresholds
 from tests.questions.answers import misplaced, outliers
-from tests.questions.artifacts import LABELS, STRUCTURE, larger_artifact, scene_of
+from tests.questions.artifacts import LABELS, STRUCTURE, larger_artifact, lines, scene_of
 from training.machines.arrays import machine_of
 
 LINE = CountSlope(intercept=0.2, slope=-0.8, log_count=0.1)
 LEVELS = {"low": 0.9, "medium": 0.6, "high": 0.3}
 PRESETS = Thresholds(**LEVELS)
-VARIANTS = ["rbm", "gbm", "triway-local"]
+VARIANTS = ["rbm", "gbm", "triway-states"]
+SLOPE = -0.6
+LINES = lines(2.0, 0.9, -0.4, log_count=SLOPE)
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0])
 def test_the_popularity_of_a_class_counts_by_its_weight(alpha):
     popularity = tuple(np.linspace(-3, 2, len(LABELS)).tolist())
     artifact = larger_artifact(
-        "triway-local", outlier=LINE, popularity=popularity, popularity_weight=alpha
+        "triway", outlier=LINE, popularity=popularity, popularity_weight=alpha
     )
     entries = outliers(artifact, scene_of([0, 1, 1, 2])).outliers
     for entry in entries:
@@ -33,61 +36,72 @@ def test_the_popularity_of_a_class_counts_by_its_weight(alpha):
     assert probabilities == sorted(probabilities, reverse=True)
 
 
+def line(level: str, classes: int) -> float:
+    """The probability of the alarm line of a sensitivity at a number of listed classes."""
+    logit = {"low": 2.0, "medium": 0.9, "high": -0.4}[level] + SLOPE * math.log(max(1, classes))
+    return 1 / (1 + math.exp(-logit))
+
+
 @pytest.mark.parametrize("name", VARIANTS)
-def test_the_sensitivity_selects_the_thresholds(name):
-    """The threshold of a request replaces that of objects only."""
-    artifact = larger_artifact(
-        name, outlier=LINE, outlier_thresholds=PRESETS, misplaced_thresholds=PRESETS
-    )
+@pytest.mark.parametrize(
+    ("classes", "listed"),
+    [([], 1), ([0], 1), ([8], 1), ([0, 0, 8], 1), ([0, 1, 1], 2), ([0, 1, 2, 3, 4, 8], 5)],
+)
+def test_the_threshold_is_the_alarm_line_at_the_number_of_listed_things(name, classes, listed):
+    """Distinct classes without structure. The threshold of a request replaces it."""
+    artifact = larger_artifact(name, outlier=LINE, outlier_lines=LINES)
+    scene, flags = scene_of(classes), set()
+    for level in LEVELS:
+        answer = outliers(artifact, scene, sensitivity=level)
+        threshold = line(level, listed)
+        assert answer.threshold == pytest.approx(threshold, rel=1e-5)
+        for one in answer.outliers:
+            assert one.is_outlier == (one.probability >= threshold)
+            flags.add(one.is_outlier)
+        own = outliers(artifact, scene, sensitivity=level, threshold=0.5)
+        assert own.threshold == 0.5
+        assert all(one.is_outlier == (one.probability >= 0.5) for one in own.outliers)
+    assert outliers(artifact, scene) == outliers(artifact, scene, sensitivity="medium")
+    assert listed < 5 or flags == {True, False}
+
+
+@pytest.mark.parametrize("intercept", [-1e6, 1e6])
+def test_an_alarm_line_far_from_zero_is_a_probability(intercept):
+    assert AlarmLine(intercept=intercept).threshold(3) == float(intercept > 0)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_the_sensitivity_selects_the_threshold_of_misplaced_relations(name):
+    """The threshold of a request is for objects only."""
+    artifact = larger_artifact(name, misplaced_thresholds=PRESETS)
     scene = scene_of([0, 1, 2, 3], [(2, 1, 0), (0, 1, 2), (1, 3, 0)])
     for level, threshold in LEVELS.items():
         answer = outliers(artifact, scene, sensitivity=level)
-        assert answer.threshold == threshold
-        assert all(one.is_outlier == (one.probability >= threshold) for one in answer.outliers)
         assert all(one.is_misplaced == (one.probability >= threshold) for one in answer.misplaced)
         assert answer.misplaced == misplaced(artifact, scene, sensitivity=level)
         own = outliers(artifact, scene, sensitivity=level, threshold=0.5)
-        assert (own.threshold, own.misplaced) == (0.5, answer.misplaced)
-        assert {one.is_outlier == (one.probability >= 0.5) for one in own.outliers} == {True}
-    assert outliers(artifact, scene) == outliers(artifact, scene, sensitivity="medium")
-
-
-def test_a_list_of_few_classes_has_thresholds_of_its_own():
-    """The number counts distinct classes without structure."""
-    short = tuple(Thresholds(low=p, medium=p - 0.01, high=p - 0.02) for p in (0.99, 0.95))
-    artifact = larger_artifact(
-        "triway-local", outlier_thresholds=PRESETS, short_list_thresholds=short
-    )
-    wall = LABELS.index("wall")
-    for classes, high, medium in (
-        ([0], 0.97, 0.98),
-        ([0, 0, wall], 0.97, 0.98),
-        ([0, 1, 1], 0.93, 0.94),
-        ([0, 1, 2], 0.3, 0.6),
-        ([wall], 0.3, 0.6),
-    ):
-        scene = scene_of(classes)
-        assert outliers(artifact, scene).threshold == medium
-        assert outliers(artifact, scene, sensitivity="high").threshold == high
-        assert outliers(artifact, scene, threshold=0.5).threshold == 0.5
+        assert own.misplaced == answer.misplaced
 
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_companions_raise_the_log_odds_of_an_outlier_most(name):
     """In a scene with only the companion and the outlier."""
     artifact = larger_artifact(name)
-    machine = machine_of(artifact.weights)
-    W, c1 = machine.W.double(), machine.c1.double()
+    machine, none = machine_of(artifact.weights), torch.zeros(1, len(LABELS))
 
-    def gain(x, weights):
-        return (x + weights).exp().log1p().sum() - x.exp().log1p().sum()
+    def log_odds(j, *listed):
+        v = none.index_fill(1, torch.tensor(listed, dtype=torch.int64), 1.0)
+        if not machine.spec.H2:
+            return float(machine.object_log_odds(v)[0, j])
+        # The formula leaves out the second layer.
+        return float(machine.gain(machine.c1 + v @ machine.W, machine.W)[0, j])
 
     entries = outliers(artifact, scene_of([0, 1, 2]), threshold=0.0).outliers
     assert any(entry.usually_with for entry in entries)
     for entry in entries:
         i = LABELS.index(entry.label)
         increases = {
-            label: float(gain(c1 + W[j], W[i]) - gain(c1, W[i]))
+            label: log_odds(j, i) - log_odds(j)
             for j, label in enumerate(LABELS)
             if label not in {*STRUCTURE, *LABELS[:3]}
         }

@@ -21,7 +21,7 @@ from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP, canonicalise
 from tests.questions.answers import missing, without_minimums
 from tests.questions.artifacts import LARGER, larger_artifact, scene_of
 
-V = LARGER["triway-local"].V
+V = LARGER["triway"].V
 A = len(CANONICAL)
 
 
@@ -29,7 +29,7 @@ def test_only_likely_places_and_strong_reasons_are_listed():
     """Places with 3/4 of the first place's probability, and reasons that change odds threefold."""
     scene = scene_of([0, 1, 2, 3], [(2, 1, 0)])
     further_places, reasons = [], []
-    for artifact in map(larger_artifact, ("rbm", "triway-seed", "triway-wide")):
+    for artifact in map(larger_artifact, ("rbm", "triway", "triway-states")):
         with without_minimums():
             every = missing(artifact, scene)
         for entry, complete in zip(missing(artifact, scene), every, strict=True):
@@ -47,7 +47,7 @@ def test_only_likely_places_and_strong_reasons_are_listed():
 
 # On-top is likelier than all other relations.
 SLOPES = tuple(PairSlope(intercept=4.0 if a == ON_TOP else -4.0) for a in range(4))
-ARTIFACT = larger_artifact("triway-local", placement=SLOPES)
+ARTIFACT = larger_artifact("triway", placement=SLOPES)
 
 
 @pytest.mark.usefixtures("without_minimums")
@@ -142,7 +142,7 @@ def test_no_zero_is_negative_and_every_spread_is_positive():
     assert offset.std[0] == 0.001
 
 
-@pytest.mark.parametrize("name", ["rbm", "triway-wide", "triway-local"])
+@pytest.mark.parametrize("name", ["rbm", "triway-states", "triway"])
 def test_placements_have_the_offsets_of_their_classes(name):
     artifact = larger_artifact(name)
     scene = Scene(

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from app.registry import (
+    AlarmLine,
+    AlarmLines,
     ArtifactError,
     Calibration,
     CountSlope,
@@ -36,15 +38,28 @@ VOCABULARY = Vocabulary(
 
 # One of each variant; a new one is put through the round trip by an entry here.
 SPECS: dict[str, dict[str, Any]] = {
-    "rbm": {"variant": "rbm", "V": 3, "A": 4, "H1": 5, "C": 2, "T": 2, "form": "local"},
-    "gbm": {"variant": "gbm", "V": 3, "A": 4, "H1": 5, "H2": 2, "T": 2, "form": "local"},
-    "triway": {"variant": "triway", "V": 3, "A": 4, "H1": 5, "K": 2, "T": 2, "form": "local"},
+    "rbm": {"variant": "rbm", "V": 3, "A": 4, "units": 5, "C": 2, "T": 2},
+    "gbm": {"variant": "gbm", "V": 3, "A": 4, "units": 5, "H2": 2, "T": 2},
+    "triway": {
+        "variant": "triway",
+        "V": 3,
+        "A": 4,
+        "units": 2,
+        "states": 4,
+        "C": 2,
+        "K": 2,
+        "T": 2,
+        "profiles": 2,
+        "coupled": True,
+    },
 }
+PROFILES = {"rbm": (), "gbm": (), "triway": ("homes", "shops")}
 
 HALF = Thresholds(low=0.5, medium=0.5, high=0.5)
+EVEN = AlarmLine(intercept=0.0)
 JUDGING = {
     "outlier": CountSlope(slope=-1.0),
-    "outlier_thresholds": HALF,
+    "outlier_lines": AlarmLines(low=EVEN, medium=EVEN, high=EVEN),
     "misplaced": Slope(intercept=0.0, slope=-1.0),
     "misplaced_thresholds": HALF,
 }
@@ -70,7 +85,7 @@ def description(
             "version": version,
             "created": "2020-02-02T20:20:20+00:00",
             "spec": SPECS[variant],
-            "vocabulary": VocabularyEntry.of(VOCABULARY),
+            "vocabulary": VocabularyEntry.of(VOCABULARY, profiles=PROFILES[variant]),
             "calibration": Calibration.neutral(4).model_copy(update=JUDGING),
             "training": {"objective": "pcd", "seed": 7, "rate": 0.1},
             "data": [DATA],
@@ -92,6 +107,9 @@ def state(variant: str = "rbm", seed: int = 0) -> dict[str, np.ndarray]:
         drawn = generator.normal(size=tuple(tensor.shape)).astype(np.float32)
         tensors[name] = drawn if tensor.is_floating_point() else tensor.numpy().copy()
     tensors["triples"][:] = [(0, 0, 1), (2, 1, 0)]
+    if "L" in tensors:
+        tensors["L"] += tensors["L"].T
+        np.fill_diagonal(tensors["L"], 0)
     return tensors
 
 

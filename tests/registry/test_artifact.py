@@ -67,20 +67,36 @@ def test_round_trip_is_exact_in_float32(variant: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("more", [{}, {"H2": 2, "C": 3, "N": 4, "G": 1}])
-def test_the_layout_is_that_of_the_machines(variant: str, more: dict[str, int]) -> None:
-    takes = {"rbm": {"C", "N"}, "gbm": {"H2", "C", "N"}}
-    sizes = {name: n for name, n in more.items() if name in takes.get(variant, more)}
-    spec = MachineSpec(variant, V=40, A=4, H1=5, K=2, T=3, form="local", **sizes)
+@pytest.mark.parametrize(
+    "more",
+    [{}, {"H2": 2, "C": 3, "N": 4, "G": 1}, {"states": 3, "C": 3, "profiles": 2, "coupled": True}],
+)
+def test_the_layout_is_that_of_the_machines(variant: str, more: dict[str, Any]) -> None:
+    leaves = {"rbm": {"H2", "G"}, "gbm": {"G"}}
+    sizes = {name: n for name, n in more.items() if name not in leaves.get(variant, ())}
+    spec = MachineSpec(variant, V=40, A=4, units=5, K=2, T=3, **sizes)
     state = build(spec).state_dict()
     kinds = {torch.float32: float, torch.int32: int}
     assert layout(spec) == {name: (kinds[t.dtype], tuple(t.shape)) for name, t in state.items()}
 
 
-def test_the_seed_form_is_not_served(tmp_path: Path) -> None:
-    saying = description().model_copy(update={"spec": {**SPECS["rbm"], "form": "seed"}})
-    write_artifact(tmp_path / "a", saying, state("rbm"))
-    assert refusal(tmp_path / "a").code == "unsupported"
+@pytest.mark.parametrize("name", ["W", "Q"])
+def test_too_large_weights_are_not_served(name: str, tmp_path: Path) -> None:
+    weights = state("triway")
+    weights[name][0, 1] = -40.0
+    write_artifact(tmp_path / "a", description(variant="triway"), weights)
+    load_artifact(tmp_path / "a")
+    weights[name][0, 1] = -40.1
+    write_artifact(tmp_path / "b", description(variant="triway"), weights)
+    assert refusal(tmp_path / "b").code == "unsupported"
+
+
+@pytest.mark.parametrize("entry", [(0, 1), (2, 2)])
+def test_refuses_couplings_that_no_machine_has(entry: tuple[int, int], tmp_path: Path) -> None:
+    weights = state("triway")
+    weights["L"][entry] += 1.0
+    write_artifact(tmp_path / "a", description(variant="triway"), weights)
+    assert refusal(tmp_path / "a").code == "invalid_tensor"
 
 
 def test_half_precision_keeps_biases_and_integers_whole(tmp_path: Path) -> None:
@@ -313,12 +329,16 @@ def test_refuses_dtypes_that_artifacts_do_not_hold(dtype: Any, written: Path) ->
         {"variant": "transformer"},
         {"variant": ["rbm"]},
         {"surplus": 1},
-        {"H1": "5"},
-        {"H1": 5.5},
-        {"H1": -5},
+        {"units": "5"},
+        {"units": 5.5},
+        {"units": -5},
+        {"states": 1},
+        {"form": "local"},  # of an older format
+        {"H1": 5},
         {"H2": 1},  # an RBM has none
-        {"H1": 10**15},  # beyond any memory: must be refused before it is allocated
-        {"H1": 10**30},
+        {"profiles": 1},  # the vocabulary has none
+        {"units": 10**15},  # beyond any memory: must be refused before it is allocated
+        {"units": 10**30},
         {"T": 10**18},
     ],
 )

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from app.registry import (
+    AlarmLine,
+    AlarmLines,
     ArtifactError,
     Calibration,
     CountSlope,
     Description,
-    EvidenceWeights,
     Manifest,
     PairSlope,
     Slope,
@@ -53,6 +54,8 @@ pair_slopes = st.builds(
 )
 share = st.floats(0, 1)
 thresholds = st.builds(Thresholds, low=share, medium=share, high=share)
+alarm_line = st.builds(AlarmLine, intercept=number, log_count=number)
+alarm_lines = st.builds(AlarmLines, low=alarm_line, medium=alarm_line, high=alarm_line)
 count_slopes = st.builds(CountSlope, intercept=number, slope=number, log_count=number)
 changes = st.fixed_dictionaries(
     {},
@@ -67,15 +70,11 @@ changes = st.fixed_dictionaries(
         "calibration": st.builds(
             Calibration,
             coverage=share,
-            coverage_weight=share,
             missing=count_slopes,
-            evidence=st.builds(
-                EvidenceWeights, **dict.fromkeys(EvidenceWeights.model_fields, share)
-            ),
             popularity=st.just(()) | st.tuples(number, number, number),
             popularity_weight=share,
             outlier=count_slopes,
-            outlier_thresholds=thresholds,
+            outlier_lines=alarm_lines,
             misplaced=st.builds(Slope, intercept=number, slope=number),
             misplaced_thresholds=thresholds,
             **dict.fromkeys(
@@ -104,10 +103,10 @@ def test_reads_back_as_written(change: dict[str, Any]) -> None:
     read = Manifest.from_bytes(data)
     assert read == written
     assert read.to_bytes() == data
-    assert json.loads(data)["format"] == 3
+    assert json.loads(data)["format"] == 4
 
 
-@pytest.mark.parametrize("value", [2, 4, 3.0, "3", None, True])
+@pytest.mark.parametrize("value", [3, 5, 4.0, "4", None, True])
 def test_refuses_another_format(value: object) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"]
@@ -129,9 +128,9 @@ def test_refuses_another_format(value: object) -> None:
         (b"\xff\xfe", "truncated"),
         (b"[" * 200_000, "truncated"),
         (resign(b"{" + b'"a":[' * 100_000 + b"]" * 100_000 + b"}"), "invalid_manifest"),
-        (resign(b'{"format": 3, nonsense}'), "invalid_manifest"),
-        (b'{"format": 3}', "invalid_manifest"),
-        (resign(b'{"format": 3}'), "invalid_manifest"),
+        (resign(b'{"format": 4, nonsense}'), "invalid_manifest"),
+        (b'{"format": 4}', "invalid_manifest"),
+        (resign(b'{"format": 4}'), "invalid_manifest"),
     ],
 )
 def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
@@ -167,6 +166,8 @@ def change_nested(members: dict[str, Any], path: str, value: object) -> None:
         ("spec.V", 4),
         ("spec.A", 2),
         ("spec.C", 5),
+        ("spec.profiles", 1),
+        ("vocabulary.profiles", ["homes"]),
         ("vocabulary.relations", ["left", "front", "above", "on-top"]),
         ("vocabulary.objects.1.label", "beds"),  # the plural of another one
         ("vocabulary.objects.0.size", [1.0, 2.0]),
@@ -176,10 +177,12 @@ def change_nested(members: dict[str, Any], path: str, value: object) -> None:
         ("calibration.placed", {}),
         ("calibration.coverage", 1.5),
         ("calibration.popularity", [math.inf]),
-        ("calibration.evidence.poses_on_objects", 1.1),
-        ("calibration.outlier_thresholds.low", 1.5),
+        ("calibration.evidence", {"poses_on_objects": 1.0}),  # of an older format
+        ("calibration.misplaced_thresholds.low", 1.5),
+        ("calibration.outlier_lines.low.intercept", math.inf),
+        ("calibration.outlier_lines", None),  # the fit needs its lines
         ("calibration.outlier.slope", math.nan),
-        ("calibration.outlier", None),  # without a fit, there are no thresholds
+        ("calibration.outlier", None),  # without a fit, there are no lines
         ("training.rate", math.nan),
         ("data.0.digest", "xyz"),
         ("data.0.scenes", -1),
@@ -248,7 +251,6 @@ def test_neutral_calibration_changes_nothing() -> None:
     neutral = Calibration.neutral(4)
     assert neutral.relation == (PairSlope(intercept=0, slope=1, log_count=0, log_classes=0),) * 4
     assert neutral.missing == CountSlope(intercept=0, slope=1, log_count=0)
-    assert set(neutral.evidence.model_dump().values()) == {1.0}
     assert (neutral.popularity, neutral.popularity_weight) == ((), 0)
     assert neutral.misplaced is neutral.outlier is None
 
@@ -258,3 +260,4 @@ def test_a_vocabulary_is_kept_whole() -> None:
     assert entry.vocabulary() == VOCABULARY
     assert entry.relations == CANONICAL
     assert VocabularyEntry.of(VOCABULARY, 2).relations == CANONICAL[:2]
+    assert VocabularyEntry.of(VOCABULARY, 2, ("homes",)).profiles == ("homes",)

@@ -45,8 +45,8 @@ _MOST_CLASSES: Final = 2000
 _SPLIT_SEEDS: Final = 50
 # Accepted relative deviation of a part of the split from its target share of scenes.
 _TOLERANCE: Final = 0.2
-_RELATION_BATCH: Final = 16
-_RELATION_UPDATES: Final = 200
+# Number of training scenes from which a larger machine is proposed (docs/decisions/own-scenes.md).
+_MANY_SCENES: Final = 1000
 
 
 @dataclass(frozen=True)
@@ -298,18 +298,31 @@ def _is_informative(scenes: Sequence[AnnotatedScene]) -> bool:
 def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the sections of the configuration, and the reasons for some of their entries."""
     n = parts["train"]
-    related = facts.related
-    epochs = math.ceil(_RELATION_UPDATES / math.ceil(n / _RELATION_BATCH))
-    machine: dict[str, Any] = {"variant": "triway" if related else "rbm"}
-    machine |= {"units": 8, "states": 8, "coupled": True, "N": 128 if n < 1500 else 512}
-    machine |= {"K": 16, "G": 8, "min_triple_count": 2} if related else {"K": 0}
-    objects: dict[str, Any] = {"steps": 400, "batch_size": 64, "chains": 64}
-    values = {"machine": machine, "objects": objects}
-    if related:
-        values["relations"] = {"epochs": epochs, "batch_size": _RELATION_BATCH}
+    is_large = n >= _MANY_SCENES
+    machine: dict[str, Any] = {"variant": "triway" if facts.related else "rbm"}
+    machine |= {"units": 8, "states": 32 if is_large else 8, "coupled": is_large}
+    machine |= {"K": 32 if is_large else 16, "G": 8} if facts.related else {"K": 0}
+    machine |= {"N": 512 if is_large else 128, "min_triple_count": 2}
+    objects = {
+        "steps": 800 if is_large else 300,
+        "batch_size": 256 if is_large else 64,
+        "chains": 256 if is_large else 64,
+    }
+    values: dict[str, Any] = {"machine": machine, "objects": objects}
     reasons = {
         "machine.variant": "the scenes contain relations or positions"
-        if related
+        if facts.related
         else "the scenes contain no relations or positions: the model learns objects only",
+        "machine.states": f"states of a hidden unit: more do not help with {n} training scenes",
+        "machine.coupled": f"couplings between classes help from {_MANY_SCENES} scenes on",
+        "objects.steps": "more steps do not help, because priors limit the weights",
     }
+    if facts.related:
+        # An epoch has about eight updates or more, because validation after each epoch takes
+        # longer than an update.
+        batch = 64 if is_large else max(4, min(32, n // 8))
+        updates = 800 if is_large else 200
+        epochs = math.ceil(updates / math.ceil(n / batch))
+        values["relations"] = {"epochs": epochs, "batch_size": batch}
+        reasons["relations.epochs"] = f"{epochs} epochs of {math.ceil(n / batch)} updates"
     return values, reasons

@@ -15,9 +15,8 @@ An answer has a probability and a truth value. The answer to each question is tr
     misplaced    the listed relation is false. Half of the scenes contain one altered relation
 
 The questions about hidden classes and intruders use scenes with complete object lists, and list no
-structure. Requests
-contain no room type and use default parameters. Candidates that the service does not return are
-left out.
+structure. Requests contain no room type and use default parameters. Candidates that the service
+does not return are left out.
 """
 
 from __future__ import annotations
@@ -230,7 +229,8 @@ def ask_outliers(
         candidates = intruders[encoded.source, encoded.scene_id]
     if not len(candidates):
         return None
-    hidden = rng.permutation(classes[~structure[classes]])[up_to_longest(len(classes), rng) :]
+    order = rng.permutation(classes[~structure[classes]])
+    hidden = order[up_to_longest(len(order), rng) :]
     scene, intruder = labels_alone(encoded, thing_instances(encoded, structure, hidden)), -1
     if rng.random() < 0.5:
         intruder = len(scene.objects)

@@ -14,6 +14,7 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -177,7 +178,7 @@ def fit_placements(
         for values, ends in zip(tables, directions, strict=True):
             truth = np.where(annotated[:, *ends], holds[:, *ends], _UNKNOWN)
             a, anchor = map(np.ravel, np.indices(truth.shape))
-            count, size = np.log(present.counts[anchors])[anchor], np.log(len(present.classes) + 1)
+            count, size = np.log(present.counts[anchors])[anchor], np.log(posterior.listed + 1)
             columns = number, a, values[0].ravel(), count, size, truth.ravel()
             rows = np.broadcast_arrays(*columns, sources.index(encoded.source))
             blocks.append(np.stack(rows, 1).astype(np.float64))
@@ -335,8 +336,9 @@ def _instance_pairs(
     """Return the examples of a scene, (examples, 7).
 
     The columns are: scene, relation, log-odds between the classes, log n_i + log n_j of the
-    instance counts, log of the number of classes, truth value and data source. Relations without
-    annotation are examples only if their log-odds are high enough for the list of an answer.
+    instance counts, log of the number of classes without structure, truth value and data source.
+    Relations without annotation are examples only if their log-odds are high enough for the list of
+    an answer.
     """
     evidence = scene.evidence
     index = np.searchsorted(evidence.classes, scene.instance_classes)
@@ -351,7 +353,7 @@ def _instance_pairs(
     examples = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
     relation, i, j = np.nonzero(examples)
     truth = np.where(annotated, scene.instance_holds[: len(values)], _UNKNOWN)[examples]
-    size = np.log(len(evidence.classes))
+    size = math.log(max(1, int((~structure[evidence.classes]).sum())))
     columns = number, relation, log_odds[examples], logs[i] + logs[j], size, truth, source
     return np.stack(np.broadcast_arrays(*columns), 1)
 
@@ -408,7 +410,8 @@ def _hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) -
     small = np.isin(sources, names[sizes < SOURCE_SCENES])
     parts = [sources == name for name in names[sizes >= SOURCE_SCENES]]
     parts += [small] if small.any() else []
-    return float(np.nextafter(max(np.quantile(values[part], share) for part in parts), np.inf))
+    highest = max(float(np.quantile(values[part], share)) for part in parts)
+    return float(np.nextafter(highest, np.inf))
 
 
 def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:

@@ -151,9 +151,9 @@ class Trainer:
 
     @property
     def position(self) -> str:
-        """The last checkpoint in words, such as "50 % of the objects"."""
+        """The last checkpoint in words, such as "50% of the objects"."""
         if not self.curve:
-            return "0 % of the objects"
+            return "0% of the objects"
         return f"{self.curve[-1].done:.0%} of the {self.curve[-1].phase}"
 
     def run(
@@ -167,9 +167,9 @@ class Trainer:
             FloatingPointError: the training diverged.
         """
         for point in self._points(progress):
+            self._save([*self.curve, point], self.seconds + point.seconds)
             self.curve.append(point)
             self.seconds += point.seconds
-            self._save()
             passed(point)
         began = time.perf_counter()
         machine = self._relation_fit.finish()
@@ -234,7 +234,7 @@ class Trainer:
     def _digest(self) -> str:
         return f"{self.config.digest} {self.data.digest}"
 
-    def _save(self) -> None:
+    def _save(self, curve: list[CurvePoint], seconds: float) -> None:
         """Write the checkpoint and the curve."""
         if self.folder is None:
             return
@@ -246,11 +246,11 @@ class Trainer:
                 "machine": self.machine.state_dict(),
                 "objects": None if relations else self.objects.state(),
                 "relations": relations.state() if relations else None,
-                "curve": [asdict(point) for point in self.curve],
-                "seconds": self.seconds,
+                "curve": [asdict(point) for point in curve],
+                "seconds": seconds,
             },
         )
-        write_csv(self.folder / "curve.csv", self.curve)
+        write_csv(self.folder / "curve.csv", curve)
 
 
 def silence(machine: BoltzmannMachine, structure: Tensor) -> None:

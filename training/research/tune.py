@@ -53,6 +53,7 @@ from training.runs.config_files import (
     shortened,
     with_settings,
 )
+from training.runs.live import SCORES
 from training.runs.pipeline import prepare
 
 if TYPE_CHECKING:
@@ -75,7 +76,6 @@ _BY: dict[By, tuple[str, ...]] = {
 }
 # Settings that cannot be searched: trials are comparable only with the same scenes and seed.
 _FIXED = ("data.", "training.seed", "training.threads")
-_CURVES = {"objects": "MRR", "relations": "R-precision"}
 # Pruning stops a trial whose metric is below the median of earlier trials. It needs this number of
 # finished trials, and it starts after this percentage of the first phase of a trial.
 _RIVALS = 4
@@ -295,7 +295,7 @@ class Search:
             nonlocal reported
             for point in trainer.curve[reported:]:
                 reported += 1
-                scores[_CURVES[point.phase]] = point.score
+                scores[SCORES[point.phase]] = point.score
                 values = [scores[name] for name in _BY[self.by] if name in scores]
                 step = round(100 * point.done) + 100 * (point.phase == "relations")
                 trial.report(float(np.nansum(values)), step)

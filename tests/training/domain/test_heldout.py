@@ -19,8 +19,7 @@ def config(**data) -> Config:
         {
             "name": "rooms",
             "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 500, **data},
-            "machine": {"variant": "rbm", "H2": 0},
-            "objective": {"name": "composite"},
+            "machine": {"variant": "rbm"},
         }
     )
 
