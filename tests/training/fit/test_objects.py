@@ -108,6 +108,12 @@ def test_scenes_keep_classes_that_their_source_shows():
     torch.testing.assert_close(found.log_odds()[:4], expected)
     open_too = config.model_copy(update={"open_sources": ("procthor",)})
     assert ObjectScenes.of(data, torch.arange(5) == 4, open_too).shows[0].tolist()[:4] == [True] * 4
+    data.annotated_classes[data.source_names.index("sunrgbd"), 2] = False
+    left_out = ObjectScenes.of(data, torch.arange(5) == 4, config)
+    assert left_out.shows.tolist() == [
+        [False, True, True, True, False],
+        [True, True, False, True, False],
+    ]
     with pytest.raises(ValueError, match="two classes"):
         ObjectScenes.of(tensors([scene([1])]), torch.arange(5) == 4, config)
 

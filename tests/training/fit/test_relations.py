@@ -141,6 +141,35 @@ def test_unknown_units_do_not_change_the_loss(machine):
     assert loss_of(machine, known, scenes) != loss_of(machine, batch, scenes)
 
 
+def test_relations_have_the_layout_of_their_machine(machine):
+    """Units have the values of their triples. RBM: units of absent classes are observed off."""
+    generator = torch.Generator().manual_seed(0)
+    classes = torch.tensor([[4, 1, 3], [2, 1, -1]])
+    observed = (torch.rand(2, 2, 3, 3, generator=generator) < 0.7) & (
+        (classes >= 0).view(2, 1, 3, 1) & (classes >= 0).view(2, 1, 1, 3)
+    )
+    holds = observed & (torch.rand(2, 2, 3, 3, generator=generator) < 0.5)
+    edges, r, seen = machine.lay_out(classes, classes.clamp(max=1), holds.float(), observed)
+    for row in range(2):
+        table = {
+            (a, int(classes[row, x]), int(classes[row, y])): holds[row, a, x, y].item()
+            for a, x, y in observed[row].nonzero().tolist()
+        }
+        off = dict.fromkeys(map(tuple, TRIPLES.tolist()), False) if machine.spec.K == 0 else {}
+        off = {
+            (a, i, j): v for (a, i, j), v in off.items() if not {i, j} <= set(classes[row].tolist())
+        }
+        where = [
+            part.expand_as(r)[row].tolist()
+            for part in (edges.relation, edges.subject, edges.object)
+        ]
+        units = list(zip(*where, strict=True))
+        found = {unit: bool(r[row, e]) for e, unit in enumerate(units) if seen[row, e]}
+        expected = off | {unit: value for unit, value in table.items() if unit in set(units)}
+        assert found == expected
+        assert len(found) > 2
+
+
 def test_hidden_units_depend_on_a_random_part_of_the_objects():
     """W is such that x is the number of listed classes and the room type, minus 10.
 

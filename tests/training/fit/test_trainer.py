@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -113,6 +114,28 @@ def test_a_run_resumes_to_the_same_bits_from_every_checkpoint(data, tmp_path, se
         rows = list(csv.DictReader(file))
     assert [row["phase"] for row in rows] == ["objects"] * 3 + ["relations"] * 2
     assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_relation_biases_start_at_log_odds(data):
+    """Of a relation among all annotated ones, and of a triple among the scenes with annotations."""
+    for settings in ({}, {"machine.variant": "rbm", "machine.G": 0}):
+        machine = Trainer(small_config(**settings), data).machine
+        scenes = [s.evidence for s in data.train.scenes if s.evidence.observed.any()]
+        triples = [tuple(t) for t in machine.triples.tolist()]
+        for unit in range(min(8, len(machine.d))):
+            if machine.spec.variant == "rbm":
+                a, i, j = triples[unit]
+                total = len(scenes)
+                held = sum(
+                    bool(e.holds[a][np.ix_(e.classes == i, e.classes == j)].any()) for e in scenes
+                )
+            else:
+                total, held = (
+                    sum(int(table[unit].sum()) for table in tables)
+                    for tables in ([e.observed for e in scenes], [e.holds for e in scenes])
+                )
+            expected = np.log((held + 0.5) / (total - held + 0.5))
+            assert machine.d[unit].item() == pytest.approx(expected, abs=1e-4)
 
 
 def test_relations_leave_the_objects_as_they_are(data, whole):
