@@ -123,6 +123,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
         ],
         "relations": ["left", "front", "on-top", "above", "right", "behind", "under", "below"],
         "room_types": ["bedroom"],
+        "profiles": ["sunrgbd", "procthor"],
         "examples": [
             {
                 "name": "A bedroom",
@@ -154,6 +155,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
             "h1": [
                 {
                     "unit": 0,
+                    "state": 1,
                     "name": "bed, nightstand; pillow on-top bed",
                     "objects": [
                         {"label": "bed", "weight": 2.1},

@@ -148,7 +148,7 @@ def _conditions(
             )
         for _, error in layers[layer].errors(pairs):
             raise ValueError(f"context of {layer}: {error}")
-    held = np.array(context.get("h1", ()), dtype=np.int64).reshape(-1, 2)
+    held = np.unique(np.array(context.get("h1", ()), dtype=np.int64).reshape(-1, 2), axis=0)
     # A unit of h2 is binary. It can be held in state 1 only; state 0 is its most common state.
     held2 = np.unique(np.array([u for u, _ in context.get("h2", ())], dtype=np.int64))
     observed = given_relations(scene, listing, spec.A)

@@ -37,10 +37,13 @@ VOCABULARY = Vocabulary(
 V, A, C = len(VOCABULARY), len(CANONICAL), len(VOCABULARY.room_types)
 TRIPLES = torch.tensor([(0, 0, 1), (0, 1, 0), (1, 3, 5), (2, 2, 1), (2, 7, 5), (3, 2, 0)])
 SPECS = {
-    "triway": MachineSpec("triway", V=V, A=A, H1=6, C=C, K=3, form="local"),
-    "gbm": MachineSpec("gbm", V=V, A=A, H1=6, H2=4, C=C, form="local"),
-    "rbm": MachineSpec("rbm", V=V, A=A, H1=6, C=C, form="local"),
+    "triway": MachineSpec(
+        "triway", V=V, A=A, units=4, states=4, C=C, K=3, profiles=2, coupled=True
+    ),
+    "gbm": MachineSpec("gbm", V=V, A=A, units=6, H2=4, C=C),
+    "rbm": MachineSpec("rbm", V=V, A=A, units=6, C=C),
 }
+PROFILES = ("homes", "shops")
 
 
 def random_machine(variant: str, seed: int = 0, classes: int = V) -> BoltzmannMachine:
@@ -51,6 +54,8 @@ def random_machine(variant: str, seed: int = 0, classes: int = V) -> BoltzmannMa
     with torch.no_grad():
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
+        if machine.spec.coupled:
+            machine.L.copy_(machine.couplings)
     return machine.requires_grad_(False)
 
 
@@ -79,7 +84,7 @@ def publish(
             name,
             version,
             spec=machine.spec.to_dict(),
-            vocabulary=VocabularyEntry.of(vocabulary),
+            vocabulary=VocabularyEntry.of(vocabulary, profiles=PROFILES[: machine.spec.profiles]),
             calibration=Calibration.neutral(A).model_copy(update=JUDGING if judges else {}),
             examples=EXAMPLES if classes == V else (),
         ),

@@ -11,6 +11,7 @@ import os
 import shutil
 import threading
 import weakref
+from itertools import product
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -20,7 +21,7 @@ import pytest
 
 from app.registry import Store, StoreError
 from app.scene.relations import CANONICAL
-from tests.http.stores import VOCABULARY, corrupt, publish
+from tests.http.stores import PROFILES, VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
 from tests.services import ADMIN_KEY, Hold, Replace, defect, serve
 
@@ -80,6 +81,7 @@ async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> Non
         size = entry["size"]
         assert (size and tuple(size[axis] for axis in "xyz")) == known.size
     assert words["room_types"] == list(VOCABULARY.room_types)
+    assert words["profiles"] == list(PROFILES)
     assert len(set(words["relations"])) == 8
     assert words["model"]["version"] == "1.0.0"
     (example,) = words["examples"]
@@ -121,14 +123,20 @@ async def test_an_unknown_word_has_suggestions(client: httpx.AsyncClient) -> Non
     assert not answer["certain"]
 
 
-@pytest.mark.parametrize(("name", "layers"), [("home", {"h1": 6}), ("deep", {"h1": 6, "h2": 4})])
-async def test_contexts_name_every_hidden_unit(
-    client: httpx.AsyncClient, name: str, layers: dict[str, int]
+@pytest.mark.parametrize(
+    ("name", "layers"),
+    [("home", {"h1": (4, 4)}), ("deep", {"h1": (6, 2), "h2": (4, 2)})],
+)
+async def test_contexts_name_every_state_of_the_hidden_units(
+    client: httpx.AsyncClient, name: str, layers: dict[str, tuple[int, int]]
 ) -> None:
+    """All states but the first, which has no weights."""
     contexts = (await client.get(f"/models/{name}/contexts")).json()["layers"]
-    assert {layer: len(units) for layer, units in contexts.items()} == layers
-    for units in contexts.values():
-        assert [unit["unit"] for unit in units] == list(range(len(units)))
+    assert contexts.keys() == layers.keys()
+    for layer, units in contexts.items():
+        number, states = layers[layer]
+        pairs = [(unit["unit"], unit["state"]) for unit in units]
+        assert pairs == list(product(range(number), range(1, states)))
         for unit in units:
             assert unit["objects"]
             labels = {entry["label"] for entry in unit["objects"]}

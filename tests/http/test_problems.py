@@ -160,6 +160,8 @@ INVALID: dict[str, list[tuple[Any, ...]]] = {
         ({"viewpoint": {"x": 0, "y": 0}}, "viewpoint/yaw"),
         ({"unknown_labels": "maybe"}, "unknown_labels"),
         ({"model": 3}, "model"),
+        ({"profile": "home"}, "profile", "does not have", "homes", "shops"),
+        ({"profile": 1}, "profile"),
     ],
     "missing": [
         ({"top_k": 17}, "top_k"),
@@ -190,8 +192,13 @@ INVALID: dict[str, list[tuple[Any, ...]]] = {
         ({"temperature": 0}, "temperature"),
         ({"seed": 1.0}, "seed"),
         ({"seed": 2**63}, "seed"),
-        ({"context": {"h9": [0]}}, "context/h9", "", "h1", "h2"),
-        ({"context": {"h1": [6]}}, "context/h1/0"),
+        ({"context": {"h9": [[0, 1]]}}, "context/h9", "", "h1"),
+        ({"context": {"h1": [[0, 1], [4, 1]]}}, "context/h1/1", "units 0 to 3"),
+        ({"context": {"h1": [[0, 4]]}}, "context/h1/0", "states 0 to 3"),
+        ({"context": {"h1": [[2, 1], [2, 1], [2, 0]]}}, "context/h1/2", "another state"),
+        ({"context": {"h1": [[-1, 0]]}}, "context/h1/0/0", "0"),
+        ({"context": {"h1": [3]}}, "context/h1/0", "pair [unit, state]"),
+        ({"context": {"h1": [[3]]}}, "context/h1/0", "pair [unit, state]"),
     ],
 }  # fmt: skip
 

@@ -14,7 +14,7 @@ from app.questions import QUESTIONS
 from app.registry import Store
 from app.scene import Scene, SceneObject
 from app.scene.relations import CANONICAL, opposite
-from tests.http.stores import VOCABULARY, publish
+from tests.http.stores import PROFILES, VOCABULARY, publish
 from tests.services import serve
 
 
@@ -198,6 +198,41 @@ async def test_coverage_is_the_models_unless_given(client: httpx.AsyncClient) ->
     for wrong in (-0.1, 1.5, "0.5", True):
         response = await client.post("/missing", json=SCENE | {"coverage": wrong})
         assert response.status_code == 422
+
+
+async def test_a_profile_changes_base_rates_only(client: httpx.AsyncClient) -> None:
+    """Each class by the same amount in every scene. Relations stay as they are."""
+    changes: dict[str, list[float]] = {}
+    for objects in (["bed"], ["bed", "lamp", "desk"], ["toilet", "sink"]):
+        entries = [
+            (await ask(client, "missing", objects=objects, top_k=16, profile=profile))["missing"]
+            for profile in PROFILES
+        ]
+        homes, shops = ({entry["label"]: entry["log_odds"] for entry in one} for one in entries)
+        for label, log_odds in homes.items():
+            changes.setdefault(label, []).append(log_odds - shops[label])
+    for values in changes.values():
+        assert values == pytest.approx([values[0]] * len(values), abs=1e-4)
+    assert len({round(values[0], 3) for values in changes.values()}) == len(changes)
+    for question, part in (("outliers", "outliers"), ("relations", "relations")):
+        answers = [
+            (await ask(client, question, **SCENE, profile=profile))[part]
+            for profile in (None, *PROFILES)
+        ]
+        assert (answers[0] == answers[1] == answers[2]) == (question == "relations")
+    drawn = [
+        (await ask(client, "generate", count=4, seed=1, profile=profile))["scenes"]
+        for profile in (None, *PROFILES)
+    ]
+    assert drawn[0] != drawn[1] != drawn[2]
+
+
+async def test_a_model_without_profiles_refuses_a_profile(client: httpx.AsyncClient) -> None:
+    body = {"objects": ["bed"], "model": "plain", "profile": "homes"}
+    response = await client.post("/missing", json=body)
+    (error,) = response.json()["errors"]
+    assert (response.status_code, error["pointer"]) == (422, "#/profile")
+    assert not error.get("suggestions")
 
 
 async def test_sensitivity_is_medium_unless_given(client: httpx.AsyncClient) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
+from pydantic_core import PydanticCustomError
 
 from scene_client.schemas.answers import Answer, Reply
 from scene_client.schemas.requests import (
@@ -17,6 +18,17 @@ from scene_client.schemas.requests import (
     SceneRequest,
     UnitNumber,
 )
+
+
+def _as_pair(value: Any) -> tuple[Any, Any]:
+    # Strict validation refuses an array in place of a tuple, but JSON has only arrays.
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise PydanticCustomError("unit_state", "must be a pair [unit, state], such as [3, 1]")
+    return tuple(value)
+
+
+UnitState = Annotated[tuple[UnitNumber, UnitNumber], BeforeValidator(_as_pair)]
+"""A hidden unit and its state."""
 
 
 class GenerateRequest(SceneRequest):
@@ -40,8 +52,7 @@ class GenerateRequest(SceneRequest):
         ),
     ] = 1.0
     context: Annotated[
-        dict[Name, Annotated[list[tuple[UnitNumber, UnitNumber]], Field(max_length=4096)]] | None,
-        Field(max_length=8),
+        dict[Name, Annotated[list[UnitState], Field(max_length=4096)]] | None, Field(max_length=8)
     ] = None
     """states that hidden units keep: maps the name of each layer to pairs [unit, state]"""
 
