@@ -224,8 +224,7 @@ def fit_outliers(
     if len(scenes) < _LEAST_SCENES:
         return {}
     untouched = {
-        n: score_lists(artifact, scenes, draw_parts(scenes, structure, exactly(n), _SEEDS))
-        for n in LENGTHS
+        n: score_lists(artifact, draw_parts(scenes, structure, exactly(n), _SEEDS)) for n in LENGTHS
     }
     untouched = {n: scores for n, scores in untouched.items() if len(scores.size) >= _LEAST_SCENES}
     laws = {"uniform": None, "popularity": by_popularity, "signature": by_signature}
@@ -248,9 +247,7 @@ def fit_outliers(
     }
 
 
-def score_lists(
-    artifact: Artifact, scenes: SceneTensors, parts: Parts, intruders: Tensor | None = None
-) -> ListScores:
+def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = None) -> ListScores:
     """Return the scores of parts of scenes, each with an intruder (parts,) if these are given."""
     popularity = np.array(artifact.calibration.popularity)
     rows, log_odds, classes_of, is_intruder = [], [], [], []
@@ -287,7 +284,7 @@ def score_intruders(
     kept = (intruders >= 0).nonzero().squeeze(1)
     usable = subset(scenes, kept)
     parts = draw_parts(usable, structure, up_to_longest, _SEEDS)
-    return score_lists(artifact, usable, parts, intruders[kept][parts.scene])
+    return score_lists(artifact, parts, intruders[kept][parts.scene])
 
 
 def choose_alpha(untouched: Mapping[int, ListScores], altered: Mapping[str, ListScores]) -> float:
