@@ -105,7 +105,7 @@ def _copies_step(machine: BoltzmannMachine, v: Tensor, config: ObjectsConfig) ->
         weight = (1 - parts.listed) * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
         loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum() / len(v)
         optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimiser.step()
 
     return step
