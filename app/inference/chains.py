@@ -204,7 +204,7 @@ class ConditionedChains:
         if profile is not None:
             self._w = self._w._replace(b=self._w.b + chains.machine["a"][profile])
         self._beta = np.float32(1.0 / temperature)
-        self._bias = chains.machine.room_bias(conditions.room)
+        self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
         self._required_classes = _indicator(spec.V, conditions.classes)
         self._held = np.full(spec.units, -1, np.int64)
         self._held[conditions.held[:, 0]] = conditions.held[:, 1]
@@ -302,9 +302,10 @@ class ConditionedChains:
 
         The score is a log-probability up to a constant of the model and the room type:
 
-            b·v + v'Lv/2 + sum_m log sum_z exp(x_mz) + log p(kept | v, h1)
+            b·v + v'Lv/2 + e_t + sum_m log sum_z exp(x_mz) + log p(kept | v, h1)
 
-        The first terms are log p(v) + log Z. The last term is the log-probability of the relations
+        The first terms are log p(v, t) + log Z, where t is the room type. An unknown room type has
+        e_t = 0. The last term is the log-probability of the relations
         given the sampled h1. With a second layer, m is the mean field of h2. Then x contains J m,
         and the score also contains c2·m and the entropy of m. This score is a lower bound on the
         log of the sum over h2.
@@ -326,6 +327,8 @@ class ConditionedChains:
         score = self._w.b[listed].sum() - np.log(first).sum() + machine["c2"] @ m
         if machine.spec.coupled:
             score += 0.5 * machine["L"][np.ix_(listed, listed)].sum()
+        if self._room is not None and machine.spec.C:
+            score += machine["e"][self._room]
         return float(score + entropy + (on * logits - softplus(logits)).sum())
 
 

@@ -64,7 +64,8 @@ def contexts(artifact: Artifact) -> dict[str, list[ContextUnit]]:
         )
         others = weights.spec.states - 1 if layer == "h1" else 1
         descriptions[layer] = [
-            _description(*divmod(column, others), *names) for column, names in enumerate(units)
+            _description(column // others, column % others, *names)
+            for column, names in enumerate(units)
         ]
     return descriptions
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Collection
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -84,6 +85,8 @@ def more(
     usable = p_more >= LIKELY if candidates is None else np.isin(classes, list(candidates))
     order = np.flatnonzero(usable)
     order = order[np.argsort(-p_more[order], kind="stable")][:top_k]
+    if not len(order):
+        return []
     cumulative = cumulative[order]
     columns = (
         classes[order].tolist(),
@@ -149,7 +152,13 @@ def distribution(
     return rows, p / p.sum(axis=1, keepdims=True)
 
 
+@lru_cache(maxsize=8)
 def functions(M: int) -> Floats:
-    """Return log n and log n log(M/n) for n = 1, 2, ... M, (2, M). The exponents multiply them."""
+    """Return log n and log n log(M/n) for n = 1, 2, ... M, (2, M). The exponents multiply them.
+
+    The array is read-only.
+    """
     log = np.log(np.arange(1, M + 1))
-    return np.stack([log, log * (math.log(M) - log)])
+    values = np.stack([log, log * (math.log(M) - log)])
+    values.flags.writeable = False
+    return values

@@ -76,8 +76,9 @@ def outliers(
     same score. Intruders are often common objects in the wrong room. The prior of an intruder is
     therefore proportional to popularity^alpha. The popularity of a class is the odds that a
     training scene has the class. So the function subtracts alpha times the log of the popularity.
-    Structural classes, such as wall, always have the probability 0. A scene with few objects gives
-    little evidence, so its threshold is higher.
+    Structural classes, such as wall, and classes that belong anywhere, such as cat or bag, always
+    have the probability 0. A scene with few objects gives little evidence, so its threshold is
+    higher.
 
     Args:
         scene: the objects and stated relations to judge.
@@ -193,12 +194,12 @@ def _intruder_logits(
 ) -> NDArray[np.float64]:
     """Return the logit of each class's probability of being an intruder, (n,).
 
-    The logit of a structural class is -inf. `entry` is `Calibration.outlier`.
+    The logit of a class that is not judged is -inf. `entry` is `Calibration.outlier`.
     """
     classes = posterior.present.classes
     adjusted = _adjusted(artifact, classes, log_odds).astype(np.float64)
     logits = calibrated(entry, adjusted, max(1, posterior.listed)).astype(np.float64)
-    logits[artifact.vocabulary.structure[classes]] = -np.inf
+    logits[~artifact.vocabulary.judged[classes]] = -np.inf
     return logits
 
 

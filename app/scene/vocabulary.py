@@ -183,6 +183,13 @@ class Vocabulary:
         return mask
 
     @cached_property
+    def judged(self) -> NDArray[np.bool_]:
+        """(V,) True for classes that can be intruders: neither structure nor `anywhere`."""
+        mask: NDArray[np.bool_] = ~(self.structure | self.anywhere)
+        mask.flags.writeable = False
+        return mask
+
+    @cached_property
     def sizes(self) -> NDArray[np.float64]:
         """(V, 3) typical extents in metres, or NaN for classes of unknown size. Read-only array."""
         sizes = np.array([entry.size or (math.nan,) * 3 for entry in self.objects])

@@ -18,12 +18,12 @@ from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
 from training.machines.triway import implied
 
-V = 5
+V = 6
 
 
 @st.composite
 def relations(draw):
-    """(A, n, n) of one or two relations between up to 5 classes, from few to all of them."""
+    """(A, n, n) of one or two relations between up to 6 classes, from few to all of them."""
     A, n = draw(st.integers(1, 2)), draw(st.integers(0, V))
     density = draw(st.sampled_from([0.1, 0.4, 0.8, 1.0]))
     generator = torch.Generator().manual_seed(draw(st.integers(0, 2**32)))

@@ -129,6 +129,24 @@ def test_probabilities_are_close_to_the_sum_over_all_states(name):
     np.testing.assert_array_equal(scene.unit_log_odds(r, i, j), found.ravel())
 
 
+def test_the_neglected_directions_have_little_variance():
+    """At most .016, as a mean over all units, where all states are equally likely."""
+    spec = MachineSpec("triway", V=30, A=2, units=8, states=6, K=12)
+    machine = random_weights(build(spec), torch.Generator().manual_seed(0), 0.3)
+    machine.c1.zero_()
+    units, n = relation_units(weights_of(machine)), np.arange(30)
+    pair = np.repeat(n, 30)[None], np.tile(n, 30)[None]
+    ends = ends_of(n, np.ones(30, np.float32), np.zeros(30, np.float32), *pair)
+    _, spread = units.normal(np.full((1, spec.H1), 1 / 6, np.float32), ends)
+    a = np.repeat(np.arange(2), 900)
+    U = units.context_weights(a, np.tile(pair[0][0], 2), np.tile(pair[1][0], 2))
+    by_unit = U.reshape(len(U), 8, 5).astype(float)
+    variance = ((by_unit**2).sum(2) / 6 - (by_unit.sum(2) / 6) ** 2).sum(1)
+    neglected = (variance - spread.ravel() ** 2 / 3).reshape(2, -1).mean(1)
+    assert (neglected > 1e-4).all()
+    assert (neglected < 0.016).all()
+
+
 @pytest.mark.parametrize("name", SPECS)
 def test_context_weights_are_the_slopes_of_the_logits(name):
     machine = machine_of(name)

@@ -20,19 +20,19 @@ def invoke(*arguments: object, code: int = 0) -> str:
 
 
 def small_config(name: str = "rooms-triway", variant: str = "triway", **data: Any) -> Config:
-    """A local machine of one layer on 60 generated rooms."""
+    """A machine of one layer on 60 generated rooms."""
     return Config.model_validate(
         {
             "name": name,
             "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 60, **data},
-            "machine": {"variant": variant, "form": "local", "H1": 6, "H2": 0, "K": 2},
-            "objective": {"name": "composite"},
-            "training": {"epochs": 2},
+            "machine": {"variant": variant, "units": 3, "states": 3, "K": 2, "N": 32},
+            "objects": {"steps": 200, "batch_size": 32, "chains": 16},
+            "relations": {"epochs": 2, "batch_size": 16},
         }
     )
 
 
 def write_config(path: Path, config: Config, settings: dict[str, Any] | None = None) -> Path:
-    """Write a configuration with changed settings, such as "training.epochs"."""
+    """Write a configuration with changed settings, such as "objects.steps"."""
     path.write_text(config_toml(with_settings(config, settings or {})))
     return path

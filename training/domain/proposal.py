@@ -45,6 +45,8 @@ _MOST_CLASSES: Final = 2000
 _SPLIT_SEEDS: Final = 50
 # Accepted relative deviation of a part of the split from its target share of scenes.
 _TOLERANCE: Final = 0.2
+# Number of training scenes from which a larger machine is proposed (docs/decisions/own-scenes.md).
+_MANY_SCENES: Final = 1000
 
 
 @dataclass(frozen=True)
@@ -222,14 +224,19 @@ def _use_frequent_names(vocabulary: Vocabulary, scenes: Sequence[AnnotatedScene]
         if index is not None:
             key_counts.setdefault(index, Counter())[label_key(thing.label)] += 1
     objects = list(vocabulary.objects)
+    label_of = {entry.label: entry.label for entry in objects}
     for index, counts in key_counts.items():
         entry = objects[index]
         ((frequent_key, count),) = counts.most_common(1)
         frequent = [name for name in entry.aliases if label_key(name) == frequent_key]
         if frequent and 2 * count > counts.total():
-            label = frequent[0]
+            label = label_of[entry.label] = frequent[0]
             aliases = (entry.label, *(name for name in entry.aliases if name != label))
             objects[index] = replace(entry, label=label, aliases=aliases)
+    objects = [
+        replace(entry, parent=label_of[entry.parent]) if entry.parent else entry
+        for entry in objects
+    ]
     return Vocabulary(objects, vocabulary.room_types)
 
 
@@ -291,70 +298,31 @@ def _is_informative(scenes: Sequence[AnnotatedScene]) -> bool:
 def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the sections of the configuration, and the reasons for some of their entries."""
     n = parts["train"]
-    related = facts.related
-    H1 = _interpolate(n, (200, 50), (2000, 200))
-    # About eight updates an epoch or more: validation after each epoch takes longer than an update.
-    batch = max(4, min(32, n // 8)) if n < 1500 else 64
-    updates = _interpolate(n, (200, 600), (2500, 1800))
-    per_epoch = math.ceil(n / batch)
-    epochs = max(15, math.ceil(updates / per_epoch))
-    patience = max(10, epochs // 4)
-    machine: dict[str, Any] = {"variant": "triway" if related else "rbm", "form": "local"}
-    machine |= {"H1": H1, "H2": 0, "initial_c1": -1.0, "N": 128 if n < 1500 else 512}
-    if related:
-        machine |= {"K": 16 if n < 1500 else 32, "G": 8, "min_triple_count": 2}
-    else:
-        machine |= {"K": 0}
-    objective: dict[str, Any] = {
-        "name": "composite",
-        "presence_weight": 0.4,
-        "generative_weight": 0.05,
-        "k": 3,
-        "chains": 64 if n < 1500 else 128,
-        "object_dropout": 0.15,
+    is_large = n >= _MANY_SCENES
+    machine: dict[str, Any] = {"variant": "triway" if facts.related else "rbm"}
+    machine |= {"units": 8, "states": 32 if is_large else 8, "coupled": is_large}
+    machine |= {"K": 32 if is_large else 16, "G": 8} if facts.related else {"K": 0}
+    machine |= {"N": 512 if is_large else 128, "min_triple_count": 2}
+    objects = {
+        "steps": 800 if is_large else 300,
+        "batch_size": 256 if is_large else 64,
+        "chains": 256 if is_large else 64,
     }
-    if related:
-        objective |= {"count_dropout": 0.3, "unlisted": "off"}
-    training: dict[str, Any] = {
-        "optimiser": "adamw",
-        "learning_rate": 0.01,
-        "epochs": epochs,
-        "patience": patience,
-        "batch_size": batch,
-        "weight_decay": 0.06 if n < 3500 else 0.03,
-        "relation_rate": 0.1,
-        "relation_decay": 1.0,
-        "averaging": 0.99 if n < 1500 else 0.998,
-    }
+    values: dict[str, Any] = {"machine": machine, "objects": objects}
     reasons = {
         "machine.variant": "the scenes contain relations or positions"
-        if related
+        if facts.related
         else "the scenes contain no relations or positions: the model learns objects only",
-        "machine.H1": f"hidden units: many more would overfit the {n} training scenes",
-        "training.epochs": f"at most {epochs} epochs of {per_epoch} updates",
-        "training.patience": f"training stops after {patience} epochs without a better score on "
-        "validation scenes, and keeps the best epoch",
-        "training.weight_decay": "few scenes need a larger decay",
-        "objective.unlisted": "an unlisted relation counts as false: /relations then predicts the "
-        "relations that an annotator would list"
-        if facts.shares["relations"]
-        else "a relation counts as false unless positions, boxes or supports show it",
+        "machine.states": f"states of a hidden unit: more do not help with {n} training scenes",
+        "machine.coupled": f"couplings between classes help from {_MANY_SCENES} scenes on",
+        "objects.steps": "more steps do not help, because priors limit the weights",
     }
-    values = {
-        "machine": machine,
-        "objective": objective,
-        "training": training,
-        "polish": {"updates": 100 if n < 1500 else 300},
-    }
+    if facts.related:
+        # An epoch has about eight updates or more, because validation after each epoch takes
+        # longer than an update.
+        batch = 64 if is_large else max(4, min(32, n // 8))
+        updates = 800 if is_large else 200
+        epochs = math.ceil(updates / math.ceil(n / batch))
+        values["relations"] = {"epochs": epochs, "batch_size": batch}
+        reasons["relations.epochs"] = f"{epochs} epochs of {math.ceil(n / batch)} updates"
     return values, reasons
-
-
-def _interpolate(n: int, low: tuple[int, int], high: tuple[int, int]) -> int:
-    """Interpolate linearly in log(n) between two points (n, value); round to a multiple of ten.
-
-    Outside the two points, the value is constant.
-    """
-    (n0, x0), (n1, x1) = low, high
-    share = math.log(max(n, 1) / n0) / math.log(n1 / n0)
-    value = x0 + min(max(share, 0.0), 1.0) * (x1 - x0)
-    return round(value / 10) * 10

@@ -15,9 +15,8 @@ An answer has a probability and a truth value. The answer to each question is tr
     misplaced    the listed relation is false. Half of the scenes contain one altered relation
 
 The questions about hidden classes and intruders use scenes with complete object lists, and list no
-structure. Requests
-contain no room type and use default parameters. Candidates that the service does not return are
-left out.
+structure. Requests contain no room type and use default parameters. Candidates that the service
+does not return are left out.
 """
 
 from __future__ import annotations
@@ -158,10 +157,10 @@ def _ask_one_placement(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> A
     return answers
 
 
-def collect_missing(artifact: Artifact, scenes: SceneTensors, listed: int, seed: int = 0) -> Items:
-    """Ask for the missing classes of random parts of so many classes, and collect the answers."""
+def collect_missing(artifact: Artifact, scenes: SceneTensors, size: Size, seed: int = 0) -> Items:
+    """Ask for the missing classes of random parts of this size, and collect the answers."""
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    parts = draw_parts(scenes, structure, exactly(listed), (seed,))
+    parts = draw_parts(scenes, structure, size, (seed,))
     able = scenes.annotated_classes[scenes.source[parts.scene]].numpy()
     columns: list[tuple[int, float, bool]] = []
     for row, (k, v) in enumerate(zip(parts.scene.tolist(), parts.v, strict=True)):
@@ -230,7 +229,8 @@ def ask_outliers(
         candidates = intruders[encoded.source, encoded.scene_id]
     if not len(candidates):
         return None
-    hidden = rng.permutation(classes[~structure[classes]])[up_to_longest(len(classes), rng) :]
+    order = rng.permutation(classes[~structure[classes]])
+    hidden = order[up_to_longest(len(order), rng) :]
     scene, intruder = labels_alone(encoded, thing_instances(encoded, structure, hidden)), -1
     if rng.random() < 0.5:
         intruder = len(scene.objects)
@@ -292,7 +292,7 @@ def calibration_task(model: Model, setting: Setting) -> Outcome | None:
         for name, ask in asks.items()
     } | {
         f"missing, {listed} classes": partial(
-            collect_missing, scenes=setting.complete.some(), listed=listed, seed=setting.seed
+            collect_missing, scenes=setting.complete.some(), size=exactly(listed), seed=setting.seed
         )
         for listed in LISTED
     }

@@ -23,8 +23,8 @@ class Setting:
         structure: (V,) bool, True for structure classes.
         train: training scenes of the same sources. If None, tasks that need them are left out.
         seen: (T, 3) triples that the model may have learnt from.
-        limit: maximum number of scenes for slow tasks, which are all but T1a, T1b and T2. The
-            slowest tasks, T2-at and Calibration, use a third of the limit.
+        limit: maximum number of scenes for slow tasks, which are all but T1a and T1b. The slowest
+            tasks, T2-at and Calibration, use a third of the limit.
         seed: random seed of the questions.
         everyday: folder of the everyday facts. None skips the task.
     """

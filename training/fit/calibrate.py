@@ -14,6 +14,7 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -352,7 +353,7 @@ def _instance_pairs(
     examples = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
     relation, i, j = np.nonzero(examples)
     truth = np.where(annotated, scene.instance_holds[: len(values)], _UNKNOWN)[examples]
-    size = np.log(max(1, np.count_nonzero(~structure[evidence.classes])))
+    size = math.log(max(1, int((~structure[evidence.classes]).sum())))
     columns = number, relation, log_odds[examples], logs[i] + logs[j], size, truth, source
     return np.stack(np.broadcast_arrays(*columns), 1)
 
@@ -409,7 +410,8 @@ def _hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) -
     small = np.isin(sources, names[sizes < SOURCE_SCENES])
     parts = [sources == name for name in names[sizes >= SOURCE_SCENES]]
     parts += [small] if small.any() else []
-    return float(np.nextafter(max(np.quantile(values[part], share) for part in parts), np.inf))
+    highest = max(float(np.quantile(values[part], share)) for part in parts)
+    return float(np.nextafter(highest, np.inf))
 
 
 def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:

@@ -5,11 +5,11 @@ scenes, if there are any (`training.evaluation.parts.REAL_SOURCES`). Structure i
 
     coverage   Listed share that the answers assume: the share with the best rank of hidden classes.
     missing    Probability that an unlisted class is present, fitted to the first classes of parts
-               of 1 to 12 classes, and of all classes but one.
+               of each number of classes.
     outlier    Probability that a class is an intruder. Half of the parts contain an intruder.
     lines      An object is an outlier if its log-odds of being an intruder are above a line in the
                log of the number of listed classes. Each line raises alarms in a given share of the
-               untouched parts (`training.evaluation.alarms.ALARMS`), in the mean over the sources.
+               untouched parts (`training.evaluation.alarms.ALARMS`).
 
 The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
 logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
@@ -40,7 +40,6 @@ from training.evaluation.intruders import by_popularity, by_signature, draw_intr
 from training.evaluation.parts import (
     REAL_SOURCES,
     Parts,
-    all_but_one,
     draw_parts,
     exactly,
     up_to_longest,
@@ -126,17 +125,6 @@ def real_scenes(scenes: SceneTensors) -> SceneTensors:
     return subset(scenes, torch.tensor(sorted(kept), dtype=torch.int64))
 
 
-def source_weights(scenes: SceneTensors, index: Tensor) -> Floats:
-    """Return weights of parts, (parts,), so that all sources count alike.
-
-    Args:
-        index: index of the scene of each part, (parts,).
-    """
-    source = scenes.source[index].numpy()
-    counts = np.bincount(source, minlength=len(scenes.source_names))
-    return len(source) / (np.count_nonzero(counts) * counts[source])
-
-
 # ------------------------------------------------------------------------------------ missing
 
 
@@ -147,23 +135,19 @@ def fit_missing(
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
     """Fit the entries `coverage` and `missing` of the calibration."""
-    parts = [
-        draw_parts(scenes, structure, size, seeds)
-        for size, seeds in ((up_to_longest, _SEEDS), (all_but_one, _SEEDS[:1]))
-    ]
+    parts = [draw_parts(scenes, structure, exactly(n)) for n in LENGTHS]
     v, hidden = (torch.cat([getattr(part, name) for part in parts]) for name in ("v", "hidden"))
     if not len(v):
         return {}
-    weight = source_weights(scenes, torch.cat([part.scene for part in parts]))
     candidates = (v == 0) & ~structure
     coverages = COVERAGES if chosen is None else (chosen.coverage,)
     log_odds = {c: unlisted_log_odds(artifact, v, c) for c in coverages}
     masks = candidates.numpy(), hidden.numpy()
-    coverage = max(coverages, key=lambda c: _mean_rank(log_odds[c], *masks, weight))
-    examples, weights = _first_classes(log_odds[coverage], *masks, v.sum(1).numpy(), weight)
+    coverage = max(coverages, key=lambda c: _mean_rank(log_odds[c], *masks))
+    examples = _first_classes(log_odds[coverage], *masks, v.sum(1).numpy())
     entry = CountSlope()
     if len(np.unique(examples[:, 2])) == 2:
-        slope, count, intercept = logistic(examples[:, :2], examples[:, 2] > 0, weights)
+        slope, count, intercept = logistic(examples[:, :2], examples[:, 2] > 0, C=RIDGE)
         entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
     return {"coverage": coverage, "missing": entry}
 
@@ -175,20 +159,18 @@ def unlisted_log_odds(artifact: Artifact, v: Tensor, coverage: float) -> Floats:
     return np.stack([posterior.absent_log_odds(every, coverage) for posterior in rows])
 
 
-def _mean_rank(z: Floats, candidates: Flags, hidden: Flags, weight: Floats) -> float:
-    """Return the weighted mean reciprocal rank of hidden classes among the other candidates."""
-    total = 0.0
-    for row, usable, truth, w in zip(z, candidates, hidden, weight, strict=True):
+def _mean_rank(z: Floats, candidates: Flags, hidden: Flags) -> float:
+    """Return the mean reciprocal rank of hidden classes among the other candidates."""
+    ranks = []
+    for row, usable, truth in zip(z, candidates, hidden, strict=True):
         others = np.sort(row[usable & ~truth])
         above = len(others) - np.searchsorted(others, row[truth], side="right")
-        total += w * float((1.0 / (1.0 + above)).mean())
-    return total / weight.sum()
+        ranks.append((1.0 / (1.0 + above)).mean())
+    return float(np.mean(ranks))
 
 
-def _first_classes(
-    z: Floats, candidates: Flags, hidden: Flags, listed: Floats, weight: Floats
-) -> tuple[Floats, Floats]:
-    """Return the examples of the fit, (examples, 3), and their weights: the first of each part.
+def _first_classes(z: Floats, candidates: Flags, hidden: Flags, listed: Floats) -> Floats:
+    """Return the examples of the fit, (examples, 3): the first classes of each part.
 
     The columns are the log-odds, the log of the number of listed classes, and 1 for a hidden class.
     """
@@ -196,8 +178,7 @@ def _first_classes(
     rows = np.arange(len(z))[:, None]
     size = np.broadcast_to(np.log(np.maximum(listed, 1))[:, None], first.shape)
     columns = z[rows, first], size, hidden[rows, first]
-    examples = np.stack([np.asarray(column, np.float64).ravel() for column in columns], 1)
-    return examples, np.repeat(weight, first.shape[1])
+    return np.stack([np.asarray(column, np.float64).ravel() for column in columns], 1)
 
 
 # ----------------------------------------------------------------------------------- outliers
@@ -213,7 +194,6 @@ class ListScores:
         popularity: log-odds of each class in the served mix, (n,).
         intruder: True for intruders, (n,) bool.
         size: number of listed classes of each list, (N,).
-        weight: weight of each list, (N,).
     """
 
     row: Ints
@@ -221,7 +201,6 @@ class ListScores:
     popularity: Floats
     intruder: Flags
     size: Ints
-    weight: Floats
 
     def score(self, alpha: float) -> Floats:
         """Return log-odds with the prior of intruders, (n,); low values mean intruders."""
@@ -245,8 +224,7 @@ def fit_outliers(
     if len(scenes) < _LEAST_SCENES:
         return {}
     untouched = {
-        n: score_lists(artifact, scenes, draw_parts(scenes, structure, exactly(n), _SEEDS))
-        for n in LENGTHS
+        n: score_lists(artifact, draw_parts(scenes, structure, exactly(n), _SEEDS)) for n in LENGTHS
     }
     untouched = {n: scores for n, scores in untouched.items() if len(scores.size) >= _LEAST_SCENES}
     laws = {"uniform": None, "popularity": by_popularity, "signature": by_signature}
@@ -269,9 +247,7 @@ def fit_outliers(
     }
 
 
-def score_lists(
-    artifact: Artifact, scenes: SceneTensors, parts: Parts, intruders: Tensor | None = None
-) -> ListScores:
+def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = None) -> ListScores:
     """Return the scores of parts of scenes, each with an intruder (parts,) if these are given."""
     popularity = np.array(artifact.calibration.popularity)
     rows, log_odds, classes_of, is_intruder = [], [], [], []
@@ -280,6 +256,8 @@ def score_lists(
         if intruders is not None:
             classes = np.sort(np.append(classes, int(intruders[k])))
         values = Posterior(artifact, of_classes(classes.tolist())).log_odds_given_rest()
+        kept = artifact.vocabulary.judged[classes]
+        classes, values = classes[kept], values[kept]
         rows.append(np.full(len(classes), k))
         log_odds.append(values)
         classes_of.append(classes)
@@ -293,8 +271,7 @@ def score_lists(
         log_odds=np.concatenate(log_odds or empty).astype(np.float64),
         popularity=popularity[all_classes],
         intruder=np.concatenate(is_intruder or empty).astype(np.bool_),
-        size=np.array([len(classes) for classes in classes_of], np.int64),
-        weight=source_weights(scenes, parts.scene),
+        size=parts.v.sum(1).numpy().astype(np.int64) + (intruders is not None),
     )
 
 
@@ -302,11 +279,12 @@ def score_intruders(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, weights: Tensor | None
 ) -> ListScores:
     """Return the scores of random parts of scenes, each with an intruder drawn by the weights."""
-    intruders = draw_intruders(scenes, structure, weights)
+    unjudged = torch.from_numpy(~artifact.vocabulary.judged)
+    intruders = draw_intruders(scenes, unjudged, weights)
     kept = (intruders >= 0).nonzero().squeeze(1)
     usable = subset(scenes, kept)
     parts = draw_parts(usable, structure, up_to_longest, _SEEDS)
-    return score_lists(artifact, usable, parts, intruders[kept][parts.scene])
+    return score_lists(artifact, parts, intruders[kept][parts.scene])
 
 
 def choose_alpha(untouched: Mapping[int, ListScores], altered: Mapping[str, ListScores]) -> float:
@@ -315,9 +293,7 @@ def choose_alpha(untouched: Mapping[int, ListScores], altered: Mapping[str, List
     for alpha in ALPHAS:
         limit = np.mean(
             [
-                weighted_quantile(
-                    scores.extreme(-scores.score(alpha)), scores.weight, 1 - ALARMS["medium"]
-                )
+                np.quantile(scores.extreme(-scores.score(alpha)), 1 - ALARMS["medium"])
                 for scores in untouched.values()
             ]
         )
@@ -331,10 +307,8 @@ def _detection(scores: ListScores, alpha: float, limit: float) -> float:
     """Return the mean of hit@1 and of the share of intruders above a limit."""
     values = -scores.score(alpha)
     first = values >= scores.extreme(values)[scores.row]
-    is_intruder, weight = scores.intruder, scores.weight[scores.row]
-    hits = np.average(first[is_intruder], weights=weight[is_intruder])
-    caught = np.average(values[is_intruder] > limit, weights=weight[is_intruder])
-    return float(hits + caught) / 2
+    hits = first[scores.intruder].mean()
+    return float(hits + (values[scores.intruder] > limit).mean()) / 2
 
 
 def _fit_intruders(
@@ -347,8 +321,7 @@ def _fit_intruders(
             size = np.log(scores.size[scores.row])
             columns.append(np.stack([scores.score(alpha), size], 1))
             truth.append(scores.intruder)
-            weight = scores.weight[scores.row]
-            weights.append(weight / (len(group) * scores.weight.sum()))
+            weights.append(np.full(len(size), 1 / (len(group) * len(scores.size))))
     total = np.concatenate(weights)
     total *= len(total) / total.sum()
     slope, count, intercept = logistic(np.concatenate(columns), np.concatenate(truth), total, RIDGE)
@@ -364,25 +337,17 @@ def fit_line(
     the mean share over the lengths is right.
     """
     worst = {
-        n: scores.extreme(calibrated(entry, scores.score(alpha), scores.size[scores.row]))
+        n: scores.extreme(
+            calibrated(entry, scores.score(alpha), scores.size[scores.row]).astype(np.float64)
+        )
         for n, scores in untouched.items()
     }
-    quantiles = [weighted_quantile(worst[n], untouched[n].weight, 1 - share) for n in worst]
-    logs = np.log(list(worst))
+    quantiles = [np.quantile(values, 1 - share) for values in worst.values()]
     slope = 0.0
     if len(worst) > 1:
-        slope = float(np.polyfit(logs, quantiles, 1)[0])
-    above = np.concatenate([worst[n] - slope * np.log(n) for n in worst])
-    weight = np.concatenate([untouched[n].weight / untouched[n].weight.sum() for n in worst])
-    return AlarmLine(intercept=weighted_quantile(above, weight, 1 - share), log_count=slope)
-
-
-def weighted_quantile(values: Floats, weight: Floats, share: float) -> float:
-    """Return the smallest value below or at which lies at least a share of the weight."""
-    order = np.argsort(values)
-    cumulative = np.cumsum(weight[order])
-    position = int(np.searchsorted(cumulative, share * cumulative[-1]))
-    return float(values[order[min(position, len(order) - 1)]])
+        slope = float(np.polyfit(np.log(list(worst)), quantiles, 1)[0])
+    above = np.concatenate([values - slope * np.log(n) for n, values in worst.items()])
+    return AlarmLine(intercept=float(np.quantile(above, 1 - share)), log_count=slope)
 
 
 # ------------------------------------------------------------------------------------ generate

@@ -166,7 +166,7 @@ def random_parts(v: Tensor, leave_one_out: float, generator: torch.Generator) ->
     keys = torch.rand(v.shape, generator=generator) + 2 * (1 - v)
     rank = keys.argsort(1).argsort(1)
     listed = v * (rank < count.unsqueeze(1))
-    bins = torch.where(hides_one, ALL_BUT_ONE, share_bin(count / n))
+    bins = torch.where(count == n - 1, ALL_BUT_ONE, share_bin(count / n))
     return Parts(listed, bins, torch.where(hides_one, n, 1.0))
 
 

@@ -151,9 +151,9 @@ class Trainer:
 
     @property
     def position(self) -> str:
-        """The last checkpoint in words, such as "50 % of the objects"."""
+        """The last checkpoint in words, such as "50% of the objects"."""
         if not self.curve:
-            return "0 % of the objects"
+            return "0% of the objects"
         return f"{self.curve[-1].done:.0%} of the {self.curve[-1].phase}"
 
     def run(
@@ -167,9 +167,9 @@ class Trainer:
             FloatingPointError: the training diverged.
         """
         for point in self._points(progress):
+            self._save([*self.curve, point], self.seconds + point.seconds)
             self.curve.append(point)
             self.seconds += point.seconds
-            self._save()
             passed(point)
         began = time.perf_counter()
         machine = self._relation_fit.finish()
@@ -181,32 +181,36 @@ class Trainer:
 
     def _points(self, progress: Progress) -> Iterator[CurvePoint]:
         """Run the rest of both phases. Yield a point of the curve at each checkpoint."""
-        fit = self.objects
-        while not fit.finished:
-            began = time.perf_counter()
-            losses: list[float] = []
-            while len(losses) < _STEPS and not fit.finished:
-                fit.step()
-                losses.append(fit.loss)
-                progress("objects", fit.steps / fit.config.steps, float(np.mean(losses)))
-            if fit.finished:
-                fit.finish()
-            score = object_score(self.machine, self.data)
-            seconds = time.perf_counter() - began
-            done = fit.steps / fit.config.steps
-            if fit.finished:
-                self._begin_relations()
-            yield CurvePoint("objects", done, float(np.mean(losses)), score, seconds)
+        while not self.objects.finished:
+            yield self._train_objects(progress)
         if self._relations is None:
             self._begin_relations()
-        relations = self._relation_fit
-        while not relations.finished:
-            began = time.perf_counter()
-            loss = relations.epoch(partial(progress, "relations"))
-            with relations.averaged():
-                score = relation_score(self.machine, self.data)
-            seconds = time.perf_counter() - began
-            yield CurvePoint("relations", relations.done, loss, score, seconds)
+        while not self._relation_fit.finished:
+            yield self._train_relations(progress)
+
+    def _train_objects(self, progress: Progress) -> CurvePoint:
+        """Run the next steps of the first phase."""
+        fit, began = self.objects, time.perf_counter()
+        total, losses = fit.config.steps, []
+        for _ in range(min(_STEPS, total - fit.steps)):
+            fit.step()
+            losses.append(fit.loss)
+            progress("objects", fit.steps / total, float(np.mean(losses)))
+        if fit.finished:
+            fit.finish()
+        score = object_score(self.machine, self.data)
+        if fit.finished:
+            self._begin_relations()
+        seconds = time.perf_counter() - began
+        return CurvePoint("objects", fit.steps / total, float(np.mean(losses)), score, seconds)
+
+    def _train_relations(self, progress: Progress) -> CurvePoint:
+        """Run the next epoch of the second phase."""
+        fit, began = self._relation_fit, time.perf_counter()
+        loss = fit.epoch(partial(progress, "relations"))
+        with fit.averaged():
+            score = relation_score(self.machine, self.data)
+        return CurvePoint("relations", fit.done, loss, score, time.perf_counter() - began)
 
     def _begin_relations(self) -> None:
         """Fix the object weights, and start the second phase."""
@@ -230,7 +234,7 @@ class Trainer:
     def _digest(self) -> str:
         return f"{self.config.digest} {self.data.digest}"
 
-    def _save(self) -> None:
+    def _save(self, curve: list[CurvePoint], seconds: float) -> None:
         """Write the checkpoint and the curve."""
         if self.folder is None:
             return
@@ -242,11 +246,11 @@ class Trainer:
                 "machine": self.machine.state_dict(),
                 "objects": None if relations else self.objects.state(),
                 "relations": relations.state() if relations else None,
-                "curve": [asdict(point) for point in self.curve],
-                "seconds": self.seconds,
+                "curve": [asdict(point) for point in curve],
+                "seconds": seconds,
             },
         )
-        write_csv(self.folder / "curve.csv", self.curve)
+        write_csv(self.folder / "curve.csv", curve)
 
 
 def silence(machine: BoltzmannMachine, structure: Tensor) -> None:

@@ -8,14 +8,15 @@ import numpy as np
 import torch
 
 from app.inference import Weights
+from app.inference.weights import layout
 from training.machines import BoltzmannMachine, build
 
 
 def weights_of(machine: BoltzmannMachine) -> Weights:
-    """Return copies of the machine's tensors."""
+    """Return copies of the machine's tensors, with shared weights summed."""
     arrays = {
-        name: np.array(tensor.detach().numpy(), order="C")
-        for name, tensor in machine.state_dict().items()
+        name: np.array(getattr(machine, name).detach().numpy(), order="C")
+        for name in layout(machine.spec)
     }
     return Weights(machine.spec, arrays)
 

@@ -120,6 +120,7 @@ def _draw_coupled(
     v, logits, L = chains.v.T.numpy().copy(), field.T.numpy(), couplings.numpy()
     possible = chains.possible.T.numpy()
     for row, i in zip(uniform, order, strict=True):
-        present = row * (1 + np.exp(-(logits[i] + L[i] @ v))) < 1
+        logit = np.maximum(logits[i] + L[i] @ v, -80)  # e^89 overflows float32
+        present = row * (1 + np.exp(-logit)) < 1
         v[i] = present & possible[i]
     return torch.from_numpy(v.T.copy())

@@ -19,11 +19,11 @@ from training.fit.configuration import Config, ConfigError, first_error
 from training.research.entries import Entry, machine_entry
 from training.research.measure import Plan, measure_entries, resumable, shown
 from training.runs.config_files import (
-    at_most,
     data_folder,
     load_config,
     own_or_shipped,
     read_toml,
+    shortened,
     with_settings,
 )
 from training.runs.folder import load_run
@@ -55,7 +55,9 @@ def ablate(
     asked: Annotated[
         int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")
     ] = 300,
-    epochs: Annotated[int | None, typer.Option(min=1, help="maximum epochs per model")] = None,
+    length: Annotated[
+        float, typer.Option(min=0.001, max=1, help="share of the steps and epochs of a training")
+    ] = 1.0,
     workers: Annotated[int, typer.Option(min=1, help="number of single-threaded processes")] = 2,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="folder for runs and results")] = Path(
@@ -67,10 +69,10 @@ def ablate(
 
     The command writes results.json and results.md into FOLDER/CONFIGURATION. If the training of
     an ablation diverges, the results contain the error in place of its metrics. After Ctrl-C, run
-    the same command again: it continues from the last finished epoch or task.
+    the same command again: it continues from the last checkpoint or task.
     """
     with resumable(console):
-        configs = _configs(configuration, rows, row, limit, epochs)
+        configs = _configs(configuration, rows, row, limit, length)
         results_folder = folder / configs[0].name
         with console.status("reading and encoding scenes"):
             root = data_folder(configuration, configs[0], data)
@@ -119,7 +121,7 @@ def _configs(
     path: Path | None,
     names: Sequence[str] | None,
     limit: int | None,
-    epochs: int | None,
+    length: float,
 ) -> list[Config]:
     """Return the configurations of the full model and of the selected ablations."""
     full = load_config(reference)
@@ -131,7 +133,7 @@ def _configs(
     if unknown := sorted(set(names or ()) - set(rows)):
         raise ConfigError(f"unknown rows {unknown}: choose from {', '.join(rows)}")
     configs = [full, *(row for name, row in rows.items() if not names or name in names)]
-    return configs if epochs is None else [at_most(config, epochs) for config in configs]
+    return [shortened(config, length) for config in configs]
 
 
 def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
@@ -166,9 +168,9 @@ def _costs(plan: Plan, entries: Sequence[Entry]) -> tuple[dict[str, int], dict[s
             runs = [load_run(plan.folder_of(e) / "run") for e in entries if e.name == name]
         except RunError:
             continue
-        zero_weights = {"kappa", *runs[0].config.machine.without}
-        parameters = runs[0].machine.named_parameters()
-        weights[name] = sum(p.numel() for key, p in parameters if key not in zero_weights)
+        machine, zero_weights = runs[0].machine, runs[0].config.machine.without
+        held = sum(machine.get_parameter(key).numel() for key in zero_weights)
+        weights[name] = machine.parameter_count - held
         seconds[name] = sum(run.seconds for run in runs) / len(runs)
     return weights, seconds
 

@@ -298,7 +298,8 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
             for row, by_source in reports.items()
         }
         # A task without metrics needs data that these scenes lack, for example room types.
-        if any(report.outcomes[task] for report in task_reports[yardstick, 0].values()):
+        outcomes = [report.outcomes[task] for report in task_reports[yardstick, 0].values()]
+        if any(outcome and outcome.metrics for outcome in outcomes):
             results = summarise(task_reports, yardstick, weights)
             text = shuffled_text(task, results)
             _write(folder / slug(task), scenes, results.to_dict(), text)

@@ -22,11 +22,11 @@ from training.evaluation.report import Progress, write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config
+from training.fit.draft import as_stored, draft_artifact
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.baselines import BASELINES
 from training.runs.folder import load_run, save_run
-from training.fit.draft import as_stored, draft_artifact
 
 CALIBRATION = "calibration.json"
 """File name of a machine's calibration, in the folder of its run."""

@@ -14,7 +14,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from training.evaluation.calibration_task import QUESTIONS
+from training.evaluation.calibration_task import NAMES
 from training.evaluation.item_statistics import reliability
 from training.evaluation.metrics import Scored
 from training.evaluation.results import Reports, Results
@@ -88,7 +88,7 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
     Each bin holds the same number of answers. The axes are logarithmic because most probabilities
     are small.
     """
-    questions = [name for name in QUESTIONS if f"ECE, {name}" in outcome.metrics]
+    questions = [name for name in NAMES if f"ECE, {name}" in outcome.metrics]
     figure = Figure(figsize=(3.2 * max(len(questions), 1), 3.6), layout="constrained")
     figure.suptitle(title)
     for axis, name in zip(_axes(figure, len(questions)), questions, strict=True):

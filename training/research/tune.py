@@ -9,8 +9,8 @@ machines, --folder is on a shared file system.
 
 A search space is a TOML file of settings with choices or intervals:
 
-    "machine.H1" = [100, 200, 400]
-    "training.weight_decay" = { low = 0.01, high = 0.1, log = true }
+    "machine.states" = [8, 16, 32]
+    "objects.weight_prior" = { low = 0.5, high = 5.0, log = true }
 
 Source: Akiba et al., "Optuna: a next-generation hyperparameter optimization framework" (2019).
 """
@@ -26,18 +26,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
+import numpy as np
 import typer
 from pydantic import BaseModel, ConfigDict, ValidationError
 from rich.console import Console
 from rich.table import Table
 
 from training.datasets.batches import TrainingData
+from training.evaluation.artifact_model import relation_score
+from training.evaluation.asking import missing_score
 from training.evaluation.metrics import Metric, paired_difference
 from training.evaluation.model import Model
 from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
 from training.evaluation.tasks import in_words
 from training.fit.configuration import Config, ConfigError, first_error
-from training.fit.machine_scores import MachineScore, relation_score
+from training.fit.draft import draft_artifact
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.measure import resumable
@@ -47,8 +50,10 @@ from training.runs.config_files import (
     load_config,
     own_or_shipped,
     read_toml,
+    shortened,
     with_settings,
 )
+from training.runs.live import SCORES
 from training.runs.pipeline import prepare
 
 if TYPE_CHECKING:
@@ -72,9 +77,9 @@ _BY: dict[By, tuple[str, ...]] = {
 # Settings that cannot be searched: trials are comparable only with the same scenes and seed.
 _FIXED = ("data.", "training.seed", "training.threads")
 # Pruning stops a trial whose metric is below the median of earlier trials. It needs this number of
-# finished trials, and it starts after this share of the epochs of a trial.
+# finished trials, and it starts after this percentage of the first phase of a trial.
 _RIVALS = 4
-_WARM_UP = 1 / 3
+_WARM_UP = 33
 
 console = Console()
 
@@ -97,7 +102,9 @@ def tune(
     ] = 20,
     by: Annotated[By, typer.Option(help="metric to maximise")] = "both",
     seed: Annotated[int, typer.Option(help="seed of the sampler")] = 0,
-    epochs: Annotated[int | None, typer.Option(min=1, help="epochs of a trial")] = None,
+    length: Annotated[
+        float, typer.Option(min=0.001, max=1, help="share of the steps and epochs of a trial")
+    ] = 1.0,
     study: Annotated[
         Path | None,
         typer.Option(help="journal of the trials, which processes share; default: in the folder"),
@@ -123,7 +130,7 @@ def tune(
         if fresh:
             shutil.rmtree(results, ignore_errors=True)
             journal.unlink(missing_ok=True)
-        config = with_settings(original, {"training.epochs": epochs} if epochs else {})
+        config = shortened(original, length)
         with console.status("reading and encoding scenes"):
             scenes = prepare(config, data_folder(configuration, config, data))
         search = Search(results, config, scenes.training_data(), distributions, by, journal)
@@ -203,13 +210,12 @@ class Search:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.journal.parent.mkdir(parents=True, exist_ok=True)
         backend = JournalFileBackend(str(self.journal))
-        warm_up = math.ceil(self.config.training.epochs * _WARM_UP) - 1
         study = optuna.create_study(
             storage=optuna.storages.JournalStorage(backend),
             study_name=self.config.name,
             direction="maximize",
             load_if_exists=True,
-            pruner=optuna.pruners.MedianPruner(_RIVALS, warm_up)
+            pruner=optuna.pruners.MedianPruner(_RIVALS, _WARM_UP)
             if prune
             else optuna.pruners.NopPruner(),
         )
@@ -274,7 +280,7 @@ class Search:
         """Train the machine of one trial, and return its metric on validation scenes.
 
         Raises:
-            optuna.TrialPruned: the best epoch is below the median of earlier trials.
+            optuna.TrialPruned: the best score is below the median of earlier trials.
         """
         import optuna
 
@@ -283,29 +289,33 @@ class Search:
         trainer = Trainer(config, self.data, folder)
         trainer.resume()
         reported = 0
+        scores: dict[str, float] = {}
 
         def report(*_: object) -> None:
             nonlocal reported
-            for epoch in trainer.epochs[reported:]:
-                scores = {"MRR": epoch.mrr_validation, "R-precision": epoch.r_precision_validation}
-                value = sum(scores[name] for name in _BY[self.by] if not math.isnan(scores[name]))
-                trial.report(value, reported)
+            for point in trainer.curve[reported:]:
                 reported += 1
+                scores[SCORES[point.phase]] = point.score
+                values = [scores[name] for name in _BY[self.by] if name in scores]
+                step = round(100 * point.done) + 100 * (point.phase == "relations")
+                trial.report(float(np.nansum(values)), step)
                 if trial.should_prune():
                     raise optuna.TrialPruned
 
         try:
-            trainer.run(ended=report)
+            machine = trainer.run(passed=report).machine
         except (FloatingPointError, optuna.TrialPruned):
             (folder / "checkpoint.pt").unlink(missing_ok=True)
             raise
-        metrics = self._measure(trainer.machine, folder)
+        metrics = self._measure(machine, folder)
         (folder / "checkpoint.pt").unlink(missing_ok=True)
         trial.set_user_attr("figures", {name: str(m.figure()) for name, m in metrics.items()})
         return sum(metrics[name].value for name in _BY[self.by] if name in metrics)
 
     def _measure(self, machine: BoltzmannMachine, folder: Path) -> dict[str, Metric]:
-        model = Model(missing=MachineScore(machine), relations=relation_score(machine))
+        artifact = draft_artifact(machine, self.data.classes)
+        relations = relation_score(artifact, given=False)
+        model = Model(missing=missing_score(artifact), relations=relations)
         tasks = [task for task, _ in FIGURES.values()]
         for source, setting in settings_by_source(
             self.data.validation, self.data.structure, self.data.train, seen=None
@@ -398,7 +408,7 @@ def _table(study: Study, title: str) -> Table:
 
 
 def _write_best(search: Search, study: Study, original: Config) -> None:
-    """Write the best configuration to best.toml, with the original number of epochs."""
+    """Write the best configuration to best.toml, with the original number of steps."""
     best = study.best_trial
     first = next((t for t in _finished(study) if not t.user_attrs["settings"]), None)
     settings = best.user_attrs["settings"]
@@ -406,7 +416,7 @@ def _write_best(search: Search, study: Study, original: Config) -> None:
     figures = ", ".join(f"{name} {text}" for name, text in best.user_attrs["figures"].items())
     comment = [
         f"{original.name}, {shown(settings)}.",
-        f"Metrics on validation scenes, {search.config.training.epochs} epochs: {figures}.",
+        f"Metrics on validation scenes, {search.config.objects.steps} steps: {figures}.",
     ]
     if settings and first is not None:
         ours, theirs = (search.metrics(search.folder / _folder(trial)) for trial in (best, first))

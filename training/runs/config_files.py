@@ -155,5 +155,8 @@ def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None =
 
 
 def _entry(name: str, value: Any) -> str:
-    # JSON and TOML write these values in the same way.
+    if isinstance(value, Mapping):
+        entries = ", ".join(_entry(json.dumps(key), entry) for key, entry in value.items())
+        return f"{name} = {{ {entries} }}"
+    # JSON and TOML write all other values in the same way.
     return f"{name} = {json.dumps(value, ensure_ascii=False)}"

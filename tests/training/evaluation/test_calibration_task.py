@@ -33,7 +33,7 @@ DATA = tensors(random_scenes(30, V - 1), V)
 @pytest.mark.parametrize("question", [*QUESTIONS, 2])
 def test_every_question_is_asked_and_some_answers_are_true(question):
     if question == 2:
-        found = collect_missing(ARTIFACT, DATA, 2)
+        found = collect_missing(ARTIFACT, DATA, exactly(2))
     else:
         found = collect(ARTIFACT, DATA, QUESTIONS[question])
     assert found.scenes == 30
@@ -92,21 +92,24 @@ def test_places_are_asked_whether_something_is_hidden_there_or_not():
 
 def test_hidden_classes_are_true_and_nothing_else():
     """All unlisted classes are answered here; of n classes n - 2 are hidden."""
-    found = collect_missing(ARTIFACT, DATA, 2)
+    found = collect_missing(ARTIFACT, DATA, exactly(2))
     sizes = np.array([(entry.evidence.classes < V - 1).sum() for entry in DATA.scenes])
     hidden = np.bincount(found.scene, weights=found.truth, minlength=30)
     assert hidden.tolist() == np.where(sizes > 2, sizes - 2, 0).tolist()
     answered = np.bincount(found.scene, minlength=30)
     assert answered.tolist() == np.where(sizes > 2, V - 1 - 2, 0).tolist()
     assert found.skipped == (sizes <= 2).sum()
-    again = collect_missing(ARTIFACT, DATA, 2)
+    again = collect_missing(ARTIFACT, DATA, exactly(2))
     assert again.truth.tolist() == found.truth.tolist()
 
 
 def test_classes_that_a_source_cannot_show_are_left_out():
     able = torch.arange(V).expand(1, -1) != 3
     some = replace(DATA, annotated_classes=able)
-    every, found = collect_missing(ARTIFACT, DATA, 2), collect_missing(ARTIFACT, some, 2)
+    every, found = (
+        collect_missing(ARTIFACT, DATA, exactly(2)),
+        collect_missing(ARTIFACT, some, exactly(2)),
+    )
     listed = draw_parts(DATA, torch.arange(V) == V - 1, exactly(2)).v[:, 3]
     assert len(every.score) - len(found.score) == int((listed == 0).sum())
 

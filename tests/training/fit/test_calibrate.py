@@ -8,8 +8,16 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from training.fit.intruder_scores import (
+    IntruderScores,
+    alarm_threshold,
+    clean_scores,
+    intruder_scores,
+)
+from training.fit.machine_scores import MachineScore
+from training.fit.object_weights import fit_objects, store_samples
 
-from app.questions.posterior import calibrated, Posterior
+from app.questions.posterior import Posterior, calibrated
 from app.registry import Calibration, CountSlope
 from tests.questions.answers import outliers
 from tests.questions.artifacts import artifact_of
@@ -19,6 +27,7 @@ from training.datasets.cases import RIDGE, logistic
 from training.evaluation.alarms import ALARMS, untouched_alarms
 from training.evaluation.asking import of_classes
 from training.evaluation.calibration_task import collect_missing
+from training.evaluation.parts import up_to_longest
 from training.fit.calibrate import calibrate, fit_misplaced, fit_relations, rising_curve
 from training.fit.calibrate_objects import (
     ALPHAS,
@@ -40,14 +49,6 @@ from training.fit.calibrate_objects import (
     thresholds,
 )
 from training.fit.configuration import ObjectsConfig
-from training.fit.intruder_scores import (
-    IntruderScores,
-    alarm_threshold,
-    clean_scores,
-    intruder_scores,
-)
-from training.fit.machine_scores import MachineScore
-from training.fit.object_weights import fit_objects, store_samples
 from training.machines import MachineSpec, build
 from training.machines.arrays import machine_of
 from training.runs.publish import draft_artifact
@@ -288,7 +289,7 @@ def test_an_alarm_needs_a_probability_worth_an_alarm():
 def test_hidden_classes_are_as_likely_as_said(model, fitted):
     """On 200 other rooms."""
     artifact = replace(model, calibration=fitted)
-    found = collect_missing(artifact, rooms(200, 3), 4)
+    found = collect_missing(artifact, rooms(200, 3), up_to_longest)
     assert found.score.mean() == pytest.approx(found.truth.mean(), abs=0.05)
     assert found.metric("ECE").value < 0.08
     assert found.metric("Brier skill").value > 0

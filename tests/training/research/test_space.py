@@ -26,8 +26,8 @@ def test_shipped_spaces_fit_their_configurations(name):
 def test_choices_and_intervals_are_read(tmp_path):
     space = read(
         tmp_path,
-        '"machine.H1" = { low = 4, high = 6 }\n"training.averaging" = [0.0, 0.9]\n'
-        '"objective.presence_weight" = { low = 0.01, high = 1.0, log = true }\n',
+        '"machine.units" = { low = 4, high = 6 }\n"relations.averaging" = [0.0, 0.9]\n'
+        '"objects.weight_prior" = { low = 0.01, high = 1.0, log = true }\n',
     )
     sizes, averages, weights = space.values()
     assert (sizes.low, sizes.high) == (4, 6)
@@ -38,18 +38,18 @@ def test_choices_and_intervals_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('"training.rate" = [0.1]', "no setting 'training.rate': training has optimiser"),
+        ('"objects.rate" = [0.1]', "no setting 'objects.rate': objects has steps"),
         ('"epochs" = [3]', "no setting 'epochs': name it section.entry"),
-        ('"training.epochs" = [0]', "training.epochs: Input should be greater"),
+        ('"objects.steps" = [0]', "objects.steps: Input should be greater"),
         ('"training.seed" = [0, 1]', "'training.seed' must be equal in all trials"),
         ('"data.limit" = [20]', "'data.limit' must be equal in all trials"),
-        ('"machine.H1" = [', "is not TOML"),
-        ('"machine.H1" = 3', "write a list of choices, or"),
-        ('"machine.H1" = []', "write a list of choices, or"),
-        ('"machine.H1" = { low = 3 }', "machine.H1: high: Field required"),
-        ('"machine.H1" = { low = 3, high = 2 }', "low must be below high"),
-        ('"machine.H1" = { low = 0, high = 2, log = true }', "low"),
-        ('"machine.H1" = { low = "a", high = 2 }', "machine.H1: low"),
+        ('"machine.units" = [', "is not TOML"),
+        ('"machine.units" = 3', "write a list of choices, or"),
+        ('"machine.units" = []', "write a list of choices, or"),
+        ('"machine.units" = { low = 3 }', "machine.units: high: Field required"),
+        ('"machine.units" = { low = 3, high = 2 }', "low must be below high"),
+        ('"machine.units" = { low = 0, high = 2, log = true }', "low"),
+        ('"machine.units" = { low = "a", high = 2 }', "machine.units: low"),
         ("", "contains no settings"),
     ],
 )
@@ -64,6 +64,7 @@ def test_a_missing_space_is_named(tmp_path):
 
 
 def test_changed_settings_leave_the_rest_alone():
-    changed = with_settings(CONFIG, {"machine.H1": 5, "training.patience": 2})
-    assert (changed.machine.H1, changed.training.patience) == (5, 2)
-    assert with_settings(changed, {"machine.H1": 6, "training.patience": None}) == CONFIG
+    changed = with_settings(CONFIG, {"machine.units": 5, "objects.steps": 2})
+    assert (changed.machine.units, changed.objects.steps) == (5, 2)
+    before = {"machine.units": CONFIG.machine.units, "objects.steps": CONFIG.objects.steps}
+    assert with_settings(changed, before) == CONFIG

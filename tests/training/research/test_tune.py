@@ -13,22 +13,22 @@ from optuna.distributions import CategoricalDistribution
 from optuna.storages.journal import JournalFileBackend
 
 from tests.training.commands import invoke, small_config, write_config
+from training.fit.relations import RelationFit
 from training.fit.trainer import Trainer
 from training.research.tune import Search
 from training.runs.config_files import load_config
 from training.runs.pipeline import prepare
 
 ROOT = Path(__file__).resolve().parents[3]
-TWO_EPOCHS = ("--epochs", "2", "--no-prune")
-SPACE = '"training.learning_rate" = [0.03, 1e30]\n"machine.H1" = { low = 3, high = 5 }\n'
+SHORT = ("--length", "0.5", "--no-prune")
+SPACE = '"objects.learning_rate" = [0.03, 1e30]\n"machine.units" = { low = 4, high = 5 }\n'
 
 
 def arguments(folder, *, rooms=60, space=SPACE):
     path = folder / "space.toml"
     path.write_text(space)
-    settings = {"training.epochs": 7}
-    config = write_config(folder / "config.toml", small_config(rooms=rooms), settings)
-    return "tune", config, "--space", path, "--folder", folder / "tuning", *TWO_EPOCHS
+    config = write_config(folder / "config.toml", small_config(rooms=rooms))
+    return "tune", config, "--space", path, "--folder", folder / "tuning", *SHORT
 
 
 def recorded(place):
@@ -56,15 +56,15 @@ def test_every_trial_is_recorded(finished):
     assert first.user_attrs["settings"] == {}
     assert len(others) == 6
     for trial in (first, *others):
-        diverges = trial.user_attrs["settings"].get("training.learning_rate") == 1e30
+        diverges = trial.user_attrs["settings"].get("objects.learning_rate") == 1e30
         assert trial.state.name == ("FAIL" if diverges else "COMPLETE")
         assert bool(trial.user_attrs["reason"]) == diverges
         if not diverges:
             assert set(trial.user_attrs["figures"]) == {"MRR", "R-precision"}
-            assert len(trial.intermediate_values) == 2
+            assert set(trial.intermediate_values) == {100, 200}
 
 
-def test_the_best_configuration_loads_and_keeps_its_own_epochs(finished):
+def test_the_best_configuration_loads_and_keeps_its_own_steps(finished):
     best = max(
         (trial for trial in recorded(finished) if trial.value is not None),
         key=lambda trial: trial.value,
@@ -72,8 +72,8 @@ def test_the_best_configuration_loads_and_keeps_its_own_epochs(finished):
     path = finished / "tuning/rooms-triway/best.toml"
     config = load_config(str(path))
     assert config.name == "rooms-triway-tuned"
-    assert config.training.epochs == 7
-    assert best.user_attrs["settings"].get("machine.H1", 6) == config.machine.H1
+    assert config.objects.steps == small_config().objects.steps
+    assert best.user_attrs["settings"].get("machine.units", 3) == config.machine.units
     assert path.read_text().startswith("# rooms-triway, ")
 
 
@@ -85,29 +85,29 @@ def test_the_same_command_runs_nothing_again(finished, monkeypatch):
 
 
 def test_an_interrupted_search_goes_on_within_its_trial(tmp_path, monkeypatch):
-    whole, epochs = Trainer._epoch, []
+    epoch, epochs = RelationFit.epoch, []
 
     def interrupted(self, progress):
-        if len(epochs) == 3:  # the second epoch of the second trial
+        if len(epochs) == 1:  # the relations of the second trial
             epochs.append(None)
             raise KeyboardInterrupt
-        epochs.append((self.config.machine.H1, len(self.epochs)))
-        whole(self, progress)
+        epochs.append(self.machine.spec.units)
+        return epoch(self, progress)
 
-    space = '"machine.H1" = [4]\n'
-    monkeypatch.setattr(Trainer, "_epoch", interrupted)
+    space = '"machine.units" = [4]\n'
+    monkeypatch.setattr(RelationFit, "epoch", interrupted)
     search = (*arguments(tmp_path, space=space), "--trials", "1")
     assert "to continue" in invoke(*search, code=130)
     assert settings_of(tmp_path) == [{}]
     invoke(*search)
-    assert epochs == [(6, 0), (6, 1), (4, 0), None, (4, 1)]
-    assert settings_of(tmp_path) == [{}, {"machine.H1": 4}]
+    assert epochs == [3, None, 4]
+    assert settings_of(tmp_path) == [{}, {"machine.units": 4}]
     assert not list(tmp_path.rglob("checkpoint.pt"))
 
 
 def test_bad_requests_are_refused_before_anything_runs(tmp_path):
-    unknown = arguments(tmp_path, space='"training.rate" = [0.1]')
-    assert "no setting 'training.rate'" in invoke(*unknown, code=1)
+    unknown = arguments(tmp_path, space='"objects.rate" = [0.1]')
+    assert "no setting 'objects.rate'" in invoke(*unknown, code=1)
     assert not (tmp_path / "tuning").exists()
     _, config, *_ = arguments(tmp_path)
     assert "Pass a TOML file with --space" in invoke("tune", config, code=1)
@@ -123,7 +123,7 @@ def test_other_scenes_are_another_search(finished, tmp_path):
 @pytest.mark.system
 def test_two_processes_share_a_study(tmp_path):
     """Together they run as many trials as asked, each trial once."""
-    space = '"training.learning_rate" = { low = 0.001, high = 0.1, log = true }\n'
+    space = '"objects.learning_rate" = { low = 0.001, high = 0.1, log = true }\n'
     command = (sys.executable, "-m", "training", *map(str, arguments(tmp_path, space=space)))
     journal = tmp_path / "shared.log"
     both = [
@@ -133,7 +133,7 @@ def test_two_processes_share_a_study(tmp_path):
     assert [process.wait(timeout=300) for process in both] == [0, 0]
     trials = recorded(journal)
     assert [trial.user_attrs["settings"] == {} for trial in trials] == [True, *[False] * 5]
-    rates = [trial.user_attrs["settings"].get("training.learning_rate") for trial in trials]
+    rates = [trial.user_attrs["settings"].get("objects.learning_rate") for trial in trials]
     assert len(set(rates)) == 6
     assert len({trial.user_attrs["process"] for trial in trials}) == 2
     assert (tmp_path / "tuning/rooms-triway/best.toml").exists()
@@ -145,14 +145,14 @@ def test_a_trial_below_the_median_is_given_up(tmp_path):
     arguments(tmp_path)
     config = load_config(str(tmp_path / "config.toml"))
     data = replace(prepare(config, tmp_path).training_data(), test=None)
-    space = {"training.learning_rate": CategoricalDistribution([0.03])}
+    space = {"objects.learning_rate": CategoricalDistribution([0.03])}
     search = Search(tmp_path / "study", config, data, space, "both", tmp_path / "study.log")
     study = search.open("scenes", 0, prune=True)
     search.run(study, 5)
-    search.space = {"training.learning_rate": CategoricalDistribution([1e-6])}
+    search.space = {"objects.learning_rate": CategoricalDistribution([1e-6])}
     again = search.open("scenes", 0, prune=True)
     again.sampler = optuna.samplers.RandomSampler(0)
     trial = again.ask()
     with pytest.raises(optuna.TrialPruned):
-        search.value_of(trial, {"training.learning_rate": 1e-6})
-    assert 3 <= len(again.trials[-1].intermediate_values) < 7
+        search.value_of(trial, {"objects.learning_rate": 1e-6})
+    assert 1 <= len(again.trials[-1].intermediate_values) < 4

@@ -12,6 +12,7 @@ from training.runs.config_files import (
     data_folder,
     load_config,
     shipped_configs,
+    shortened,
     with_settings,
 )
 from training.runs.pipeline import prepare
@@ -33,34 +34,45 @@ def test_the_indoor_variants_learn_from_the_same_scenes() -> None:
     assert len({config.data.model_dump_json() for config in variants}) == 1
 
 
-def phases(objective="relations", form="local", epochs=3):
+def small(variant="triway", **machine):
     return {
-        "name": "phases",
+        "name": "small",
         "data": {"sources": ["rooms"], "rooms": 10},
-        "machine": {"variant": "triway", "form": form},
-        "objective": {"name": objective},
-        "objects": {"epochs": epochs},
+        "machine": {"variant": variant, **machine},
+        "objects": {"steps": 300},
     }
 
 
-def test_the_object_phase_needs_the_local_form() -> None:
-    """In the seed form relations act on the objects."""
-    assert Config.model_validate(phases()).objects.epochs == 3
-    with pytest.raises(ValueError, match=r"objects\.epochs is defined for the local form only"):
-        Config.model_validate(phases("composite", form="seed"))
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (small("gbm", H2=4, coupled=True), "machine.coupled must be false"),
+        (small("rbm", H2=4), "machine.H2 must be 0"),
+        (small("rbm", G=2), "machine.G is defined for the Triway only"),
+        (small("rbm", without=["S"]), "a rbm has no weights S"),
+        (small() | {"data": {"sources": ["rooms"]}}, "data.rooms must be at least 1"),
+    ],
+)
+def test_settings_that_exclude_each_other_are_refused(values, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        Config.model_validate(values)
 
 
-def test_the_relation_objective_needs_the_object_phase() -> None:
-    assert Config.model_validate(phases("composite", epochs=0)).objects.epochs == 0
-    with pytest.raises(ValueError, match="trains no objects"):
-        Config.model_validate(phases(epochs=0))
-
-
-def test_the_phases_are_written_and_read_back(tmp_path) -> None:
-    path = tmp_path / "phases.toml"
-    config = with_settings(Config.model_validate(phases()), {"objective.word_weight": 0.5})
+def test_a_configuration_is_written_and_read_back(tmp_path) -> None:
+    path = tmp_path / "small.toml"
+    changes = {"objects.source_weights": {"rooms": 0.5}, "objects.open_sources": ("rooms",)}
+    config = with_settings(Config.model_validate(small()), changes)
     path.write_text(config_toml(config))
     assert load_config(str(path)) == config
+
+
+def test_a_shortened_training_keeps_at_least_one_step() -> None:
+    config = Config.model_validate(small())
+    tenth = shortened(config, 0.1)
+    assert (tenth.objects.steps, tenth.relations.epochs) == (30, 1)
+    changes = {"objects.steps": 300, "relations.epochs": config.relations.epochs}
+    assert with_settings(tenth, changes) == config
+    assert shortened(config, 1e-6).objects.steps == 1
 
 
 FILES = """
@@ -70,9 +82,6 @@ sources = {sources}
 vocabulary = "vocabulary.json"
 [machine]
 variant = "rbm"
-H2 = 0
-[objective]
-name = "composite"
 """
 
 

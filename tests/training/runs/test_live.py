@@ -26,8 +26,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def small(epochs: int) -> Config:
-    settings = {"training.epochs": epochs, "training.batch_size": 16}
-    return with_settings(small_config("live", "rbm"), settings)
+    return with_settings(small_config("live", "rbm"), {"relations.epochs": epochs})
 
 
 def test_a_line_of_blocks_rises_with_its_values() -> None:
@@ -43,23 +42,27 @@ def test_a_run_shows_its_scores_and_what_to_do_next(tmp_path) -> None:
     trainer = Trainer(config, prepare(config, tmp_path).training_data(), tmp_path)
     console = Console(file=io.StringIO(), width=200, force_terminal=True)
     with Display(trainer, console, tmp_path / "logs") as display:
-        result = trainer.run(display.progress, display.ended)
+        result = trainer.run(display.progress, display.passed)
     summarise(result, trainer, tmp_path, console)
     next_steps(tmp_path, console)
     shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", console.file.getvalue())
-    assert "epoch 4/4" in shown
-    assert f"MRR {result.epochs[result.best_epoch].mrr_validation:.3f}" in shown
-    assert f"best epoch {result.best_epoch + 1} of 4" in shown
+    objects = [point for point in result.curve if point.phase == "objects"]
+    assert [point.done for point in objects] == [0.5, 1.0]
+    last = result.curve[-1]
+    assert f"relations 100%, R-precision {result.curve[-2].score:.3f}" in shown
+    assert re.search(rf"relations, R-precision.* {last.score:.3f} ", shown)
+    assert f"trained in {result.seconds:.0f} s" in shown
     assert f"compare {tmp_path}" in shown
     assert f"publish {tmp_path}" in shown
 
     events = EventAccumulator(str(tmp_path / "logs" / "live" / "seed-0"))
     events.Reload()
-    logged = events.Scalars("validation/MRR")
-    assert [point.step for point in logged] == [trainer.steps_per_epoch * k for k in (1, 2, 3, 4)]
+    logged = events.Scalars("objects/score")
+    assert [point.step for point in logged] == [500, 1000]
     assert [point.value for point in logged] == pytest.approx(
-        [epoch.mrr_validation for epoch in result.epochs], abs=1e-6
+        [point.score for point in objects], abs=1e-6
     )
+    assert len(events.Scalars("relations/loss")) == 4
 
 
 @pytest.mark.slow
@@ -68,9 +71,11 @@ def test_tensorboard_is_imported_only_for_logs() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
-@pytest.mark.parametrize("kept", [0, 2])
-def test_ctrl_c_while_an_epoch_is_kept_counts_those_that_were(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int
+@pytest.mark.parametrize(
+    ("kept", "position"), [(0, "0% of the objects"), (3, "25% of the relations")]
+)
+def test_ctrl_c_during_a_checkpoint_names_the_last_complete_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int, position: str
 ) -> None:
     config = write_config(tmp_path / "live.toml", small(4))
     saved: list[Path] = []
@@ -83,4 +88,4 @@ def test_ctrl_c_while_an_epoch_is_kept_counts_those_that_were(
 
     monkeypatch.setattr("training.fit.trainer.save_checkpoint", save)
     output = invoke("train", config, "--runs", tmp_path, code=130)
-    assert f"stopped after epoch {kept};" in output
+    assert f"stopped after {position};" in output

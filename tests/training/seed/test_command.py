@@ -50,6 +50,7 @@ def finished(tmp_path_factory):
     return arguments, folder / "out" / "rooms"
 
 
+@pytest.mark.slow
 def test_the_page_has_every_row_and_the_figures_of_the_paper(finished):
     results = json.loads((finished[1] / "results.json").read_text())
     assert set(results["splits"]) == set(SPLITS)
@@ -69,6 +70,7 @@ def test_the_page_has_every_row_and_the_figures_of_the_paper(finished):
     assert "0.0560 / 0.1418 / 0.2335" in text
 
 
+@pytest.mark.slow
 def test_finished_machines_are_kept(finished, monkeypatch):
     """Ctrl-C stops the command, and the next call trains only the machines without a file."""
     arguments, folder = finished
@@ -95,6 +97,7 @@ def test_finished_machines_are_kept(finished, monkeypatch):
     assert [line for line in after if "seconds" not in line] == kept
 
 
+@pytest.mark.slow
 def test_errors_are_named(finished, tmp_path):
     arguments, _ = finished
     assert "other scenes or settings" in invoke(*arguments, 3, code=1)

@@ -13,6 +13,7 @@ from functools import cache
 from typing import get_args
 
 import pytest
+from training.fit.machine_scores import MachineScore, relation_score
 
 from app.inference.variants import VARIANTS, Form, Variant
 from tests.training.research.baselines.furnished import STRUCTURE, A, furnished, tensors
@@ -25,7 +26,6 @@ from training.evaluation.model import ObjectScore, RelationScore
 from training.evaluation.parts import one_quarter
 from training.evaluation.relation_tasks import rank, score_scenes
 from training.fit.configuration import Config
-from training.fit.machine_scores import MachineScore, relation_score
 from training.fit.trainer import Trainer
 from training.research.baselines import BASELINES
 

@@ -1,0 +1,432 @@
+"""The fit of object weights, by sums over all states of small machines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.nn.functional import softplus
+
+from app.inference.weights import unpack_scenes
+from tests.enumeration.small_machines import binary, random_weights, unit_states
+from tests.training.evaluation.scenes import scene, tensors
+from training.fit import objects
+from training.fit.configuration import ObjectsConfig
+from training.fit.objects import ALL_BUT_ONE, ObjectFit, ObjectScenes, fit_objects, random_parts
+from training.fit.samples import store_samples
+from training.machines import MachineSpec, build
+from training.machines.gibbs import Chains
+
+V = 4
+EVERY = binary(V)
+CONFIG = ObjectsConfig(steps=400, batch_size=128, learning_rate=0.05, warm_up=20, chains=64)
+SPECS = {
+    "binary": MachineSpec("rbm", V=V, A=1, units=3, C=2, profiles=2),
+    "coupled": MachineSpec(
+        "triway", V=V, A=1, units=2, states=3, C=2, K=1, profiles=2, coupled=True
+    ),
+    "two layers": MachineSpec("gbm", V=V, A=1, units=2, states=3, H2=2, C=2, profiles=2),
+}
+ONE_LAYER = ("binary", "coupled")
+
+
+def machine_of(name, scale=0.05, seed=0, **changes):
+    machine = build(replace(SPECS[name], **changes))
+    random_weights(machine, torch.Generator().manual_seed(seed), scale)
+    return machine.requires_grad_(True)
+
+
+def log_weight(machine, v, room=-1, source=-1):
+    """-E(v, h1, h2, t) without relations, (rows of v, states of h1, states of h2)."""
+    h1, h2 = unit_states(machine.spec).to(v.dtype), binary(machine.spec.H2).to(v.dtype)
+    b = machine.b + (machine.a[source] if source >= 0 else 0)
+    c1 = machine.c1 + (machine.Q[room] if room >= 0 else 0)
+    objects_ = v @ b + (machine.e[room] if room >= 0 else 0)
+    if machine.spec.coupled:
+        L = (machine.L + machine.L.T) / 2
+        pairs = v.unsqueeze(2) * v.unsqueeze(1) * (1 - torch.eye(V))
+        objects_ = objects_ + 0.5 * (pairs * L).sum((1, 2))
+    hidden = (h1 @ c1).unsqueeze(1) + h1 @ machine.J @ h2.T + h2 @ machine.c2
+    return objects_.view(-1, 1, 1) + (v @ machine.W @ h1.T).unsqueeze(2) + hidden
+
+
+def log_sum(machine, v, *conditions):
+    return log_weight(machine, v, *conditions).logsumexp((1, 2))
+
+
+def log_p(machine, *conditions):
+    """log p(v | room, source) of every v, (2^V,)."""
+    return log_sum(machine, EVERY.to(machine.b.dtype), *conditions).log_softmax(0)
+
+
+def scenes_of(shows):
+    """Scenes of two sources and three room types, each with two classes or more."""
+    v = EVERY[EVERY.sum(1) >= 2].float().repeat(2, 1)
+    source = torch.arange(2).repeat_interleave(len(v) // 2)
+    room = torch.arange(len(v)) % 3 - 1
+    v = v * shows[source]
+    kept = v.sum(1) >= 2
+    blocks = (block[kept] for block in (v, room, source, torch.ones(len(v))))
+    return ObjectScenes(*blocks, shows, ("sunrgbd", "procthor"))
+
+
+def target_scenes():
+    """One source, whose scenes have the probabilities TARGET."""
+    v = EVERY[EVERY.sum(1) >= 2].float()
+    weight, source = (
+        1000 * TARGET[EVERY.sum(1) >= 2].float(),
+        torch.zeros(len(v), dtype=torch.int64),
+    )
+    return ObjectScenes(v, source - 1, source, weight, ALL[:1], ("sunrgbd",))
+
+
+ALL = torch.ones(2, V, dtype=torch.bool)
+PARTIAL = torch.tensor([[True, True, True, False], [True, True, True, True]])
+
+# -- scenes and parts --------------------------------------------------------------------------
+
+
+def test_scenes_keep_classes_that_their_source_shows():
+    """procthor shows class 0 twice only; sunrgbd has an open vocabulary and shows all; of the
+    structure (class 4) nothing is learned; a scene of one class and a source of weight 0 go."""
+    rows = [*[([0, 1, 4], "procthor")] * 2, *[([1, 2, 3], "procthor")] * 3, ([1, 4], "procthor")]
+    rows += [([0, 3], "sunrgbd"), ([0, 2], "bddl")]
+    data = tensors([scene(classes, source=source) for classes, source in rows])
+    config = CONFIG.model_copy(update={"source_weights": {"bddl": 0.0, "procthor": 0.5}})
+    found = ObjectScenes.of(data, torch.arange(5) == 4, config)
+    assert found.sources == ("procthor", "sunrgbd")
+    assert found.shows.tolist() == [[False, True, True, True, False], [True] * 4 + [False]]
+    assert found.v.tolist() == [[0, 1, 1, 1, 0]] * 3 + [[1, 0, 0, 1, 0]]
+    assert found.source.tolist() == [0, 0, 0, 1]
+    assert found.weight.tolist() == [0.5] * 3 + [1]
+    count, total = torch.tensor([1.0, 1.5, 1.5, 2.5]), torch.tensor([1.0, 2.5, 2.5, 2.5])
+    expected = ((count + 0.5) / (total - count + 0.5)).log()
+    torch.testing.assert_close(found.log_odds()[:4], expected)
+    open_too = config.model_copy(update={"open_sources": ("procthor",)})
+    assert ObjectScenes.of(data, torch.arange(5) == 4, open_too).shows[0].tolist()[:4] == [True] * 4
+    data.annotated_classes[data.source_names.index("sunrgbd"), 2] = False
+    left_out = ObjectScenes.of(data, torch.arange(5) == 4, config)
+    assert left_out.shows.tolist() == [
+        [False, True, True, True, False],
+        [True, True, False, True, False],
+    ]
+    with pytest.raises(ValueError, match="two classes"):
+        ObjectScenes.of(tensors([scene([1])]), torch.arange(5) == 4, config)
+
+
+@given(st.integers(0, 2**32), st.floats(0, 1), st.integers(2, 30), st.floats(0.1, 1))
+def test_parts_list_and_hide_at_least_one_class(seed, leave_one_out, classes, density):
+    generator = torch.Generator().manual_seed(seed)
+    v = (torch.rand(40, classes, generator=generator) < density).float()
+    v[:, :2] = 1
+    parts = random_parts(v, leave_one_out, generator)
+    n, listed = v.sum(1), parts.listed.sum(1)
+    assert bool((parts.listed <= v).all())
+    assert bool(((listed >= 1) & (listed <= n - 1)).all())
+    one = parts.share == ALL_BUT_ONE
+    assert torch.equal(listed[one], n[one] - 1)
+    assert torch.equal(parts.weight, torch.where(one, n, 1.0))
+    share = listed / n
+    bins = (share > 0.3 + 1e-5).int() + (share > 0.6 + 1e-5).int()
+    assert torch.equal(bins[~one], parts.share[~one].int())
+
+
+def test_shares_of_random_parts():
+    """Of 40,000 scenes of 40 classes: five standard errors, so chance fails with p < 1e-5."""
+    count, n = 40_000, 40
+    v = torch.zeros(count, 50)
+    v[:, 5:45] = 1
+    parts = random_parts(v, 0.3, torch.Generator().manual_seed(0))
+    one = parts.share == ALL_BUT_ONE
+    assert float(one.float().mean()) == pytest.approx(0.3, abs=5 * (0.21 / count) ** 0.5)
+    listed = parts.listed[~one].sum(1)
+    # A share of U(.05, 1), rounded, at most 39 of 40: every number has the same chance but the
+    # first, of half a step, and the last, of one and a half.
+    frequency = torch.bincount(listed.long(), minlength=n)[2:] / len(listed)
+    expected = torch.full((n - 2,), 1 / 38)
+    expected[0], expected[-1] = 0.5 / 38, 1.5 / 38
+    assert bool(((frequency - expected).abs() <= 5 * (expected / len(listed)).sqrt()).all())
+    of_class = parts.listed[one].mean(0)[5:45]
+    error = 5 * (1 / 40 * 39 / 40 / float(one.sum())) ** 0.5
+    assert float((of_class - 39 / 40).abs().max()) <= error
+
+
+# -- the losses and their gradients ------------------------------------------------------------
+
+
+def masked_loss(machine, scenes, parts, index, listed_room):
+    """The loss of a batch, with each probability as a sum over all states of the hidden units."""
+    total = torch.zeros((), dtype=torch.float64)
+    for row, k in enumerate(index.tolist()):
+        source, room = int(scenes.source[k]), int(listed_room[row])
+        x, v = parts.listed[row], scenes.v[k]
+        for i in range(V):
+            if x[i] or not scenes.shows[source, i]:
+                continue
+            both = torch.stack([x, x.index_fill(0, torch.tensor(i), 1.0)])
+            off, on = log_sum(machine, both, room, source)
+            log_odds = on - off + machine.kappa[parts.share[row], i]
+            weight = float(parts.weight[row]) if v[i] else 1.0
+            total = total + weight * softplus(-log_odds if v[i] else log_odds)
+        true = int(scenes.room[k])
+        if room < 0 <= true:
+            every = torch.cat([log_sum(machine, x[None], t, source) for t in range(2)])
+            total = total - every.log_softmax(0)[true]
+    return total / len(index)
+
+
+@pytest.mark.parametrize("name", ONE_LAYER)
+def test_the_masked_loss_and_its_gradient(name, monkeypatch):
+    """Equal to a formula of its own, with the weights of hidden classes and partial labels."""
+    machine = machine_of(name, scale=0.7).double()
+    scenes = scenes_of(PARTIAL)
+    scenes = replace(scenes, v=scenes.v.double())
+    fit = ObjectFit(machine, scenes, CONFIG, seed=3)
+    kept = {}
+
+    def parts_of(v, leave_one_out, generator):
+        kept["parts"] = random_parts(v, leave_one_out, generator)
+        return kept["parts"]
+
+    def rooms(v, *, room, **options):
+        kept["room"] = room
+        return type(machine).object_log_odds(machine, v, room=room, **options)
+
+    monkeypatch.setattr(objects, "random_parts", parts_of)
+    monkeypatch.setattr(machine, "object_log_odds", rooms)
+    index = scenes.draw(60, torch.Generator().manual_seed(1))
+    batch = scenes.v[index], scenes.room[index], scenes.source[index]
+    loss = fit._conditional_loss(*batch)
+    names = [n for n in ("b", "c1", "e", "W", "Q", "L", "a", "kappa") if hasattr(machine, n)]
+    weights = [machine.get_parameter(n) for n in names]
+    found = torch.autograd.grad(loss, weights)
+    assert 10 < int((kept["room"] >= 0).sum()) < 35
+    by_hand = masked_loss(machine, scenes, kept["parts"], index, kept["room"])
+    assert loss.item() == pytest.approx(by_hand.item(), rel=1e-6)
+    expected = torch.autograd.grad(by_hand, weights)
+    for gradient, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(gradient, other, rtol=1e-5, atol=1e-8)
+        assert gradient.abs().max() > 1e-3
+    # Source 0 does not show class 3.
+    assert found[names.index("a")][0, 3] == 0
+    assert found[names.index("a")][1, 3] != 0
+
+
+KINDS = [(-1, 0), (-1, 1), (1, 0), (0, 1)]
+"""Room types and sources of chains."""
+
+
+@pytest.mark.parametrize("name", ONE_LAYER)
+def test_the_generative_gradient_is_that_of_the_likelihood(name):
+    """-log p(v | room type, source) of the classes that a source shows.
+
+    With 40,000 chains of each kind, drawn exactly: every entry is a difference of means of values
+    in [-1, 1], so six standard errors are below .02; fails by chance with p < 1e-6.
+    """
+    machine = machine_of(name, scale=0.8)
+    fit = ObjectFit(machine, scenes_of(PARTIAL), CONFIG, seed=0)
+    machine.double()
+    generator, count = torch.Generator().manual_seed(1), 40_000
+    drawn, exact, data = [], torch.zeros((), dtype=torch.float64), EVERY[[7, 13, 3, 6]]
+    for v, (room, source) in zip(data, KINDS, strict=True):
+        possible = EVERY[(PARTIAL[source] >= EVERY).all(1)]
+        log_q = log_sum(machine, possible, room, source).log_softmax(0)
+        pick = log_q.detach().exp().multinomial(count, replacement=True, generator=generator)
+        drawn.append(possible[pick])
+        v *= PARTIAL[source]
+        exact = exact - log_q[(possible == v).all(1)][0] / len(KINDS)
+    room, source = torch.tensor(KINDS).T
+    many = source.repeat_interleave(count)
+    nothing = torch.zeros(len(many), 0).double()
+    rooms = room.repeat_interleave(count)
+    chains = Chains(torch.cat(drawn), nothing, rooms, many, PARTIAL[many])
+    names = [n for n in ("b", "c1", "W", "Q", "L", "a", "e") if hasattr(machine, n)]
+    weights = [machine.get_parameter(n) for n in names]
+    found = torch.autograd.grad(fit._generative_loss(chains, data, room, source), weights)
+    expected = torch.autograd.grad(exact, weights, allow_unused=True, materialize_grads=True)
+    for weight, gradient, other in zip(names, found, expected, strict=True):
+        torch.testing.assert_close(gradient, other, rtol=0, atol=0.02)
+        assert (gradient.abs().max() > 0.02) == (weight != "e")
+
+
+def test_the_prior_is_divided_by_the_scenes():
+    machine = machine_of("coupled", scale=1.0)
+    scenes = scenes_of(ALL)
+    fit = ObjectFit(machine, scenes, CONFIG, seed=0)
+    squares = {name: (w**2).sum().item() for name, w in machine.named_parameters()}
+    expected = 0.75 * sum(squares[name] for name in "WQ") + 1.25 * squares["L"]
+    expected += 3.75 * (squares["a"] + squares["kappa"])
+    assert fit._prior().item() == pytest.approx(expected / float(scenes.weight.sum()), rel=1e-5)
+
+
+# -- training ----------------------------------------------------------------------------------
+
+
+def context(likely):
+    """Independent classes with these probabilities, (2^V,)."""
+    p = torch.tensor(likely).double()
+    return torch.where(EVERY > 0, p, 1 - p).prod(1)
+
+
+TARGET = 0.6 * context((0.9, 0.9, 0.1, 0.15)) + 0.4 * context((0.1, 0.1, 0.9, 0.85))
+TARGET = torch.where(EVERY.sum(1) >= 2, TARGET, 0) / TARGET[EVERY.sum(1) >= 2].sum()
+"""Two contexts, in scenes of at least two classes."""
+
+
+def masked_divergence(log_odds):
+    """Excess of the expected leave-one-out loss over its minimum, in nats, for log_odds(x) (V,).
+
+    Class j is present beside the list x with the mass p(x + j), as its weight is the number of
+    classes, and absent with the mass sum_{i != j} p(x + i) / n(x + i).
+    """
+    code = EVERY @ torch.tensor([1.0, 2, 4, 8]).double()
+    p = TARGET[code.argsort()]
+    total, alone = 0.0, torch.zeros(V, 2).double()
+    for x in EVERY[EVERY.sum(1) <= V - 1]:
+        mass = [
+            0.0 if x[i] else float(p[int(x @ (2.0 ** torch.arange(V)).double()) + 2**i])
+            for i in range(V)
+        ]
+        for j in range(V):
+            if x[j] or not x.any():
+                continue
+            on, off = mass[j], sum(mass[i] for i in range(V) if i != j) / (float(x.sum()) + 1)
+            alone[j] += torch.tensor([on, off])
+            if on and off:
+                best = math.log(on / off)
+                total -= loss(on, off, best)
+            total += loss(on, off, float(log_odds(x)[j]))
+    return total
+
+
+def loss(on, off, log_odds):
+    return on * math.log1p(math.exp(-log_odds)) + off * math.log1p(math.exp(log_odds))
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_training_brings_the_conditional_divergence_down(name):
+    """Far below that of classes that do not depend on the list.
+
+    No machine reaches 0, because its log-odds are those of one joint: larger machines reach .33.
+    """
+    changes = {"leave_one_out": 1.0, "rate_prior": 0.0, "generative_weight": 0.0, "steps": 600}
+    config = CONFIG.model_copy(update=changes)
+
+    def trained(without):
+        machine, scenes = machine_of(name, profiles=1), target_scenes()
+        for weight in without:
+            machine.get_parameter(weight).data.zero_()
+            machine.get_parameter(weight).requires_grad_(False)
+        fit_objects(ObjectFit(machine, scenes, config, seed=0))
+        share = torch.tensor([ALL_BUT_ONE])
+        return masked_divergence(
+            lambda x: machine.object_log_odds(x[None].float(), share=share)[0].detach()
+        )
+
+    coupled = ["L"] if SPECS[name].coupled else []
+    reached, alone = trained([]), trained(["W", *coupled])
+    assert alone > 1.5
+    assert reached < 0.6
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_the_generative_share_brings_samples_near_the_scenes(name):
+    """By the divergence of the enumerated p(v) from the scenes, in nats."""
+
+    def divergence(weight):
+        config = CONFIG.model_copy(update={"generative_weight": weight, "rate_prior": 1e4})
+        machine = machine_of(name, scale=0.1, profiles=1)
+        fit_objects(ObjectFit(machine, target_scenes(), config, seed=0))
+        q = log_p(machine.double()).detach()
+        seen = TARGET > 0
+        return float((TARGET[seen] * (TARGET[seen].log() - q[seen])).sum())
+
+    assert divergence(2.0) < 0.6 * divergence(0.0)
+
+
+def test_only_object_weights_are_trained_and_divergence_is_an_error():
+    machine = machine_of("coupled", scale=0.3)
+    before = {name: w.detach().clone() for name, w in machine.named_parameters()}
+    fit = ObjectFit(machine, scenes_of(ALL), CONFIG, seed=0)
+    fit.step()
+    for name, weight in machine.named_parameters():
+        is_changed = not torch.equal(weight, before[name])
+        assert is_changed == (name in objects.OBJECT_WEIGHTS and weight.numel() > 0), name
+    fit = ObjectFit(
+        machine, scenes_of(ALL), CONFIG.model_copy(update={"learning_rate": 1e30}), seed=0
+    )
+    with pytest.raises(FloatingPointError, match=r"objects\.learning_rate"):
+        fit_objects(fit)
+
+
+# -- the served mix ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("served", [{}, {"sunrgbd": 1.0, "procthor": 0.25}])
+def test_the_served_mix_moves_into_b_and_keeps_the_rates_of_each_source(served):
+    config = CONFIG.model_copy(update={"steps": 30, "served_sources": served})
+    machine, scenes = machine_of("coupled"), scenes_of(PARTIAL)
+    fit = ObjectFit(machine, scenes, config, seed=0)
+    while not fit.finished:
+        fit.step()
+    rates, average = fit._average["b"] + fit._average["a"], fit._average["a"].clone()
+    fit.finish()
+    torch.testing.assert_close(machine.b + machine.a, rates)
+    weight = torch.tensor([1.0, served.get("procthor", 1.0)])
+    mix = (weight @ average) / weight.sum()
+    mix[3] = average[1, 3]  # of the one source that shows class 3
+    torch.testing.assert_close(machine.b, fit._average["b"] + mix)
+    torch.testing.assert_close(machine.L, machine.L.T)
+    assert not machine.L.diagonal().any()
+
+
+def test_weights_are_averaged_over_the_last_steps():
+    """The last 30 % of 10 steps are 3."""
+    machine = machine_of("binary")
+    fit = ObjectFit(machine, scenes_of(ALL), CONFIG.model_copy(update={"steps": 10}), seed=0)
+    steps = []
+    while not fit.finished:
+        fit.step()
+        steps.append(machine.W.detach().clone())
+    fit.finish()
+    torch.testing.assert_close(machine.W.detach(), torch.stack(steps[-3:]).mean(0))
+
+
+def test_popularity_of_the_served_mix():
+    scenes = scenes_of(PARTIAL)
+    config = CONFIG.model_copy(update={"served_sources": {"sunrgbd": 1.0, "procthor": 0.5}})
+    share = []
+    for q in range(2):
+        own = scenes.v[scenes.source == q]
+        share.append((own.sum(0) + 0.5) / (len(own) + 1))
+    expected = (share[0] + 0.5 * share[1]) / 1.5
+    expected[3] = share[1][3]
+    torch.testing.assert_close(objects.served_popularity(scenes, config), expected.logit())
+
+
+# -- stored samples ----------------------------------------------------------------------------
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", SPECS)
+def test_stored_samples_follow_the_machine_under_their_room_types(name):
+    """3,000 chains: each of 3 x 16 shares within five standard errors (p < 3e-5 by chance)."""
+    machine, scenes = machine_of(name, scale=0.8, N=3000), scenes_of(ALL)
+    if machine.spec.coupled:
+        machine.L.copy_(machine.couplings)
+    store_samples(machine, scenes, seed=0)
+    found, rooms = (
+        torch.from_numpy(unpack_scenes(machine.fantasies.numpy(), V)),
+        machine.fantasy_rooms,
+    )
+    sets = (found @ torch.tensor([1.0, 2, 4, 8])).long()
+    assert set(rooms.tolist()) == {-1, 0, 1}
+    for room in (-1, 0, 1):
+        own = sets[rooms == room]
+        share = torch.bincount(own, minlength=16).double() / len(own)
+        p = log_p(machine.double(), room).exp()
+        assert bool(((share - p).abs() <= 5 * (p * (1 - p) / len(own)).sqrt()).all())
