@@ -30,7 +30,7 @@ import numpy as np
 import torch
 
 from app.questions import misplaced, missing, outliers, relations
-from app.registry import NEVER, Artifact, Calibration, CountSlope, Slope
+from app.registry import NEVER, AlarmLine, AlarmLines, Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, canonicalise
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Ints, Rng
@@ -62,6 +62,7 @@ from training.evaluation.setting import Outcome, Setting
 # while a scene has about 20 relations. With one removed object per scene, chance alone gives an
 # expected calibration error (ECE) of .02 to .03.
 _REMOVALS = 4
+_NO_ALARM = AlarmLine(intercept=1e3)
 # (probability, truth) of each answer about one scene.
 Answered = list[tuple[float, bool]]
 Ask = Callable[[Artifact, EncodedScene, Rng], Answered | None]
@@ -76,7 +77,7 @@ def uncalibrated(artifact: Artifact) -> Artifact:
     neutral = Calibration.neutral(artifact.spec.A).model_copy(
         update={
             "outlier": CountSlope(slope=-1.0),
-            "outlier_thresholds": NEVER,
+            "outlier_lines": AlarmLines(low=_NO_ALARM, medium=_NO_ALARM, high=_NO_ALARM),
             "misplaced": Slope(intercept=0.0, slope=-1.0),
             "misplaced_thresholds": NEVER,
         }

@@ -6,11 +6,12 @@ from functools import cache
 
 import torch
 
-from app.registry import Artifact, Calibration, CountSlope, Thresholds
+from app.registry import Artifact, Calibration, CountSlope
+from tests.questions.artifacts import lines
 from training.datasets import annotated_classes, encode, generate_rooms, rooms_vocabulary
 from training.datasets.batches import SceneTensors, scene_tensors
+from training.fit.draft import draft_artifact
 from training.machines import MachineSpec, build
-from training.runs.publish import draft_artifact
 
 VOCABULARY = rooms_vocabulary()
 STRUCTURE = torch.from_numpy(VOCABULARY.structure.copy())
@@ -25,9 +26,7 @@ def rooms(count: int, seed: int) -> SceneTensors:
 @cache
 def room_model() -> Artifact:
     """An untrained machine with random weights."""
-    spec = MachineSpec(
-        "triway", V=len(VOCABULARY), A=4, H1=6, K=3, T=0, C=len(VOCABULARY.room_types), form="local"
-    )
+    spec = MachineSpec("triway", V=len(VOCABULARY), A=4, units=6, K=3, C=len(VOCABULARY.room_types))
     machine = build(spec)
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
@@ -36,7 +35,7 @@ def room_model() -> Artifact:
     calibration = Calibration.neutral(4).model_copy(
         update={
             "outlier": CountSlope(slope=-1.0),
-            "outlier_thresholds": Thresholds(low=0.5, medium=0.5, high=0.5),
+            "outlier_lines": lines(0.0, 0.0, 0.0),
         }
     )
     return draft_artifact(machine.eval().requires_grad_(False), VOCABULARY, calibration)

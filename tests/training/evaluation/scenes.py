@@ -10,10 +10,8 @@ import numpy as np
 import torch
 
 from app.scene import pool_instances
-from tests.questions.artifacts import LARGER
 from training.datasets import EncodedScene
 from training.datasets.batches import SceneTensors, scene_tensors
-from training.machines import build
 
 V = 5
 NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
@@ -121,17 +119,3 @@ def knowing(scenes: SceneTensors):
 def flat(batch):
     """A relation score that knows nothing."""
     return torch.zeros(batch.holds.shape)
-
-
-def larger_machine(name):
-    """A machine of `LARGER` with random weights."""
-    spec = LARGER[name]
-    generator = torch.Generator().manual_seed(3)
-    machine = build(spec)
-    keys = torch.randperm(spec.A * spec.V**2, generator=generator)[: spec.T].sort().values
-    V = spec.V
-    table = torch.stack([keys // V // V, keys // V % V, keys % V], 1)
-    machine.set_triples(table.int()).initialise(generator, 0.7)
-    with torch.no_grad():
-        machine.b.copy_(torch.randn(V, generator=generator))
-    return machine.requires_grad_(False)

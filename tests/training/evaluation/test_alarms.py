@@ -31,7 +31,7 @@ def test_the_first_alarms_are_accepted_and_too_many_refused():
 def test_a_model_that_judges_upside_down_is_refused():
     """One scene of each group counts; relations count where object lists are incomplete."""
     artifact, scenes = room_model(), rooms(60, 3).scenes
-    calm = recalibrated(artifact, outlier=None, outlier_thresholds=None)
+    calm = recalibrated(artifact, outlier=None, outlier_lines=None)
     entry = artifact.calibration.outlier
     turned = recalibrated(artifact, outlier=entry.model_copy(update={"intercept": 50.0}))
     groups = len({scene.group for scene in scenes})

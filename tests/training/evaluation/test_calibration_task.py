@@ -11,9 +11,9 @@ import torch
 
 from app.registry import CountSlope
 from tests.questions.answers import missing, relations
-from tests.questions.artifacts import LARGER, artifact_of, calibration
+from tests.questions.artifacts import LARGER, calibration, larger_artifact
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
-from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
+from tests.training.evaluation.scenes import random_scenes, scene, tensors
 from training.datasets.cases import scene_of
 from training.evaluation.calibration_task import (
     QUESTIONS,
@@ -25,8 +25,8 @@ from training.evaluation.calibration_task import (
 from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.parts import draw_parts, exactly
 
-ARTIFACT = artifact_of(larger_machine("triway-local"))
-V = LARGER["triway-local"].V
+ARTIFACT = larger_artifact("triway")
+V = LARGER["triway"].V
 DATA = tensors(random_scenes(30, V - 1), V)
 
 

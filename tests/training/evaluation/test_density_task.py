@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from tests.enumeration.small_machines import binary, enumerate_joint, same, small_machine
+from tests.enumeration.small_machines import (
+    ONE_LAYER,
+    TWO_LAYERS,
+    binary,
+    enumerate_joint,
+    same,
+    small_machine,
+)
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.density_task import (
     DensitySettings,
@@ -17,40 +24,43 @@ from training.evaluation.density_task import (
     independent_density,
     log_partition,
     machine_density,
-    object_part,
 )
 
-LOCAL = ["rbm-local", "gbm-local", "triway-local", "triway-local-two-layers"]
 TRAIN = tensors([scene([0]), scene([0, 1]), scene([1]), scene([0, 1])], 2)
-SETTINGS = DensitySettings(chains=200, temperatures=200, burn_in=50, draws=1024)
+SETTINGS = DensitySettings(chains=200, temperatures=200, burn_in=50)
 
 
-@pytest.mark.parametrize("name", LOCAL)
+def one_layer(name: str):
+    """A machine with one hidden layer, and training scenes of its classes."""
+    machine = small_machine(name).float()
+    return machine, tensors([scene([0]), scene([0, 1]), scene([1])], machine.spec.V)
+
+
+@pytest.mark.parametrize("name", ONE_LAYER)
 def test_log_likelihoods_are_those_of_the_joint(name):
-    """Every v, within .03 nats."""
-    machine = small_machine(name)
-    joint = enumerate_joint(machine)
-    density = machine_density(machine, TRAIN, SETTINGS)
-    for v in binary(2):
+    machine, train = one_layer(name)
+    joint = enumerate_joint(small_machine(name))
+    density = machine_density(machine, train, SETTINGS)
+    for v in binary(machine.spec.V):
         exact = joint.log_sum(same(joint.v, v))
         ours = density.log_unnormalised(v.float().unsqueeze(0))
-        assert float(ours) == pytest.approx(exact, abs=0.03)
+        assert float(ours) == pytest.approx(exact, abs=1e-4)
 
 
-@pytest.mark.parametrize("name", LOCAL)
+@pytest.mark.parametrize("name", ONE_LAYER)
 def test_the_partition_function_lies_between_its_estimates(name):
     """Within 5 standard errors; the bounds are in expectation, so each is allowed .02 of slack."""
-    machine = small_machine(name)
-    exact = enumerate_joint(machine).log_z
-    below, above = log_partition(object_part(machine), TRAIN, SETTINGS)
+    machine, train = one_layer(name)
+    exact = enumerate_joint(small_machine(name)).log_z
+    below, above = log_partition(machine, train, SETTINGS)
     assert below.log_z == pytest.approx(exact, abs=5 * below.standard_error + 1e-3)
     assert above.log_z == pytest.approx(exact, abs=5 * above.standard_error + 1e-3)
     assert below.bound - 0.02 <= exact <= above.bound + 0.02
 
 
-def test_the_seed_form_has_no_density_of_objects_here():
-    with pytest.raises(ValueError, match="local form"):
-        machine_density(small_machine("triway-seed"), TRAIN)
+@pytest.mark.parametrize("name", TWO_LAYERS)
+def test_machines_with_two_layers_have_no_density_here(name):
+    assert machine_density(small_machine(name), TRAIN, SETTINGS) is None
 
 
 def test_independent_classes_by_hand():

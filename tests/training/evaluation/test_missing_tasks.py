@@ -9,13 +9,12 @@ import torch
 from app.registry import CountSlope, PairSlope
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
 from tests.questions.answers import missing as ask_missing
-from tests.questions.artifacts import artifact_of
+from tests.questions.artifacts import larger_artifact
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
     WIDE,
     WIDE_STRUCTURE,
-    larger_machine,
     random_scenes,
     scene,
     tensors,
@@ -219,14 +218,12 @@ def test_structure_and_equal_classes_are_not_asked():
 
 
 @pytest.mark.parametrize("outgoing", [True, False])
-@pytest.mark.parametrize("name", ["rbm", "triway-local"])
+@pytest.mark.parametrize("name", ["rbm", "triway"])
 def test_the_question_names_the_place_as_a_robot_does(name, outgoing):
     """On-top of the first of two objects of class 2, by the relation as the missing object's."""
     slope = PairSlope(intercept=0.2, slope=0.7, log_count=0.3, log_classes=-0.4)
     counts = CountSlope(intercept=-0.3, slope=0.8, log_count=0.4)
-    artifact = artifact_of(
-        larger_machine(name), missing=counts, placement=(slope,) * 4, coverage=0.7
-    )
+    artifact = larger_artifact(name, missing=counts, placement=(slope,) * 4, coverage=0.7)
     v = torch.zeros(2, artifact.spec.V)
     v[:, [0, 2, 5]] = 1.0
     number = v.clone()

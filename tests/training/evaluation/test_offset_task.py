@@ -19,12 +19,12 @@ from training.evaluation.report import evaluate
 from training.evaluation.setting import Setting
 from training.fit.offset_statistics import fit_offsets
 
-V = LARGER["triway-local"].V
+V = LARGER["triway"].V
 NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
 
 
 def model(train):
-    artifact = larger_artifact("triway-local")
+    artifact = larger_artifact("triway")
     return Model(artifact=replace(artifact, offsets=fit_offsets(train, V)))
 
 
@@ -89,7 +89,7 @@ def test_the_card_s_figures_are_those_of_each_source():
     assert len(vocabulary) > V
     scenes = encode(generate_rooms(400, seed=0), vocabulary)
     train, test = scenes[:300], scenes[300:]
-    artifact = larger_artifact("triway-local")
+    artifact = larger_artifact("triway")
     known = replace(artifact, offsets=fit_offsets(train, len(vocabulary)))
     setting = Setting(
         tensors([replace(one, source="rooms") for one in test], len(vocabulary)),

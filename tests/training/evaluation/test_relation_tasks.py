@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from app.scene import ObjectClass, Vocabulary
-from tests.questions.artifacts import artifact_of
+from tests.questions.artifacts import larger_artifact
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
     WIDE,
@@ -17,7 +17,6 @@ from tests.training.evaluation.scenes import (
     V,
     flat,
     knowing,
-    larger_machine,
     random_scenes,
     scene,
     tensors,
@@ -191,7 +190,7 @@ def test_the_split_depends_on_the_scene_alone():
 
 def test_classes_related_both_ways_are_stated_of_different_instances():
     """Two lamps on either side of a bed: left(lamp, bed) and left(bed, lamp) hold of classes."""
-    artifact = artifact_of(larger_machine("triway-local"))
+    artifact = larger_artifact("triway-implications")
     both = scene([0, 1, 1], [(0, 0, 1), (0, 1, 0)])
     data = tensors([both, scene([0, 1, 1], [(0, 0, 1)])], artifact.spec.V)
     batch = data.batch(torch.arange(2))

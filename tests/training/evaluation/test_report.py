@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import NEVER
-from tests.questions.artifacts import LARGER, artifact_of
+from tests.questions.artifacts import LARGER, larger_artifact, lines
 from tests.training.evaluation.scenes import (
     flat,
     knowing,
-    larger_machine,
     random_scenes,
     scene,
     tensors,
@@ -39,14 +37,14 @@ from training.evaluation.report import (
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import EVERY_TASK, TASKS, WHOLE_SET
 
-V = LARGER["triway-local"].V
+V = LARGER["triway"].V
 NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
 TRAIN = tensors(random_scenes(30, V, seed=1), V)
 DATA = tensors(random_scenes(40, V), V)
 SEEN = seen_triples(TRAIN.scenes, V)
 SETTING = Setting(DATA, NO_STRUCTURE, TRAIN, SEEN)
-EFFORT = DensitySettings(chains=8, temperatures=10, burn_in=5, draws=8)
-ARTIFACT = artifact_of(larger_machine("triway-local"))
+EFFORT = DensitySettings(chains=8, temperatures=10, burn_in=5)
+ARTIFACT = larger_artifact("triway-states")
 MODEL = artifact_model(ARTIFACT, TRAIN, EFFORT)
 OF_OBJECTS = {name for name, task in TASKS.items() if task.of_objects}
 
@@ -115,7 +113,7 @@ def test_reports_are_stored_and_resumed(tmp_path):
 @pytest.mark.parametrize("name", LARGER)
 def test_every_machine_can_be_evaluated(name):
     """Scenes without relations, of one class: nothing is asked, nothing fails."""
-    machine = artifact_of(larger_machine(name))
+    machine = larger_artifact(name)
     model = artifact_model(machine, TRAIN, EFFORT, calibrated=False)
     some = ("T1a relations", "T1b completion", "T2 missing", "T3 outliers")
     found = values_of(report_of(model, replace(SETTING, limit=8), some))
@@ -192,17 +190,17 @@ def test_publishing_measures_the_tasks_of_a_card_on_every_source():
 
 
 def test_published_figures_are_those_of_the_calibrated_artifact():
-    """Another default threshold, other alarms; and no more scenes than the limit allows."""
+    """Other lines, other alarms; and no more scenes than the limit allows."""
 
     def alarms(threshold, limit=100):
-        limits = {"outlier_thresholds": NEVER.model_copy(update={"medium": threshold})}
+        limits = {"outlier_lines": lines(threshold, threshold, threshold)}
         artifact = replace(ARTIFACT, calibration=ARTIFACT.calibration.model_copy(update=limits))
         rows = evaluate(*(artifact, DATA, NO_STRUCTURE, TRAIN), limit=limit, tasks=("T3 alarms",))
         assert {row.source for row in rows} == {"toy"}
         (row,) = (row for row in rows if row.metric == "alarms, medium, 2 classes")
         return row
 
-    every, none = alarms(0.0), alarms(1.0, limit=7)
+    every, none = alarms(-1e3), alarms(1e3, limit=7)
     assert (every.value, none.value) == (1.0, 0.0)
     assert (every.n, none.n) == (40, 7)
 
