@@ -123,8 +123,8 @@ def test_a_scene_may_come_from_a_file_or_a_pipe_and_options_go_before_it(
     ("line", "words"),
     [
         ("models", ("home@1.0.0", "default", "triway", "ready")),
-        ("vocabulary", ("garbage bin", "trash can, waste basket", "structure")),
-        ("contexts", ("layer", "unit")),
+        ("vocabulary", ("garbage bin", "trash can, waste basket", "structure", "homes, shops")),
+        ("contexts", ("layer", "unit", "state")),
         ("outliers bed toilet", ("toilet", "because")),
     ],
 )

@@ -300,7 +300,7 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
     n = parts["train"]
     is_large = n >= _MANY_SCENES
     machine: dict[str, Any] = {"variant": "triway" if facts.related else "rbm"}
-    machine |= {"units": 8, "states": 32 if is_large else 8, "coupled": is_large}
+    machine |= {"units": 8, "states": 32 if is_large else 8}
     machine |= {"K": 32 if is_large else 16, "G": 8} if facts.related else {"K": 0}
     machine |= {"N": 512 if is_large else 128, "min_triple_count": 2}
     objects = {
@@ -314,8 +314,7 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         if facts.related
         else "the scenes contain no relations or positions: the model learns objects only",
         "machine.states": f"states of a hidden unit: more do not help with {n} training scenes",
-        "machine.coupled": f"couplings between classes help from {_MANY_SCENES} scenes on",
-        "objects.steps": "more steps do not help, because priors limit the weights",
+        "objects.steps": "priors keep few scenes from being learnt by heart; more steps do not help",
     }
     if facts.related:
         # An epoch has about eight updates or more, because validation after each epoch takes
