@@ -147,8 +147,16 @@ def distribution(
 
 @compiled
 def _distributions(
-    log_share, weights, entry, listed, has_others, classes, first, room, log_unlisted
-):
+    log_share: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    entry: Ints,
+    listed: Ints,
+    has_others: NDArray[np.bool_],
+    classes: Ints,
+    first: int,
+    room: int,
+    log_unlisted: float,
+) -> Floats:
     """Return the distributions of `distribution`, (k, M).
 
     Args:
