@@ -314,7 +314,7 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         if facts.related
         else "the scenes contain no relations or positions: the model learns objects only",
         "machine.states": f"states of a hidden unit: more do not help with {n} training scenes",
-        "objects.steps": "priors keep few scenes from being learnt by heart; more steps do not help",
+        "objects.steps": "more steps do not help, because priors limit the weights",
     }
     if facts.related:
         # An epoch has about eight updates or more, because validation after each epoch takes
