@@ -1,8 +1,7 @@
 """Propose a vocabulary and a training configuration for scenes, with a reason for each entry.
 
-The rules interpolate between configurations that a search found for data sets of different sizes
-(docs/decisions/objective.md, docs/decisions/own-scenes.md). The command `training tune` searches
-for a better configuration.
+Few scenes get a small machine, and many scenes a larger one (docs/decisions/own-scenes.md). The
+command `training tune` searches for a better configuration.
 """
 
 from __future__ import annotations
