@@ -392,7 +392,7 @@ def fit_misplaced(
     worst = expit(intercept + slope * np.array([least for _, least in untouched]))
     limits = Thresholds(
         **{
-            name: max(_LEAST[name], _hardest_quantile(worst, sources, 1 - share))
+            name: max(_LEAST[name], hardest_quantile(worst, sources, 1 - share))
             for name, share in ALARMS.items()
         }
     )
@@ -400,7 +400,7 @@ def fit_misplaced(
     return {"misplaced": entry, "misplaced_thresholds": limits}
 
 
-def _hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) -> float:
+def hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) -> float:
     """Return the highest quantile of the values, (N,), over the large sources.
 
     A robot sees scenes of one source. Small sources count as one. A value equal to the quantile is

@@ -178,7 +178,8 @@ def _first_classes(z: Floats, candidates: Flags, hidden: Flags, listed: Floats) 
     rows = np.arange(len(z))[:, None]
     size = np.broadcast_to(np.log(np.maximum(listed, 1))[:, None], first.shape)
     columns = z[rows, first], size, hidden[rows, first]
-    return np.stack([np.asarray(column, np.float64).ravel() for column in columns], 1)
+    usable = candidates[rows, first]  # a small vocabulary has fewer candidates
+    return np.stack([np.asarray(column, np.float64)[usable] for column in columns], 1)
 
 
 # ----------------------------------------------------------------------------------- outliers

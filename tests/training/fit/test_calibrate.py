@@ -1,4 +1,4 @@
-"""Calibration: what is chosen on validation, and what the fitted entries keep."""
+"""Calibration: the choices on validation scenes, and the judgements of the fitted entries."""
 
 from __future__ import annotations
 
@@ -8,106 +8,117 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from training.fit.intruder_scores import (
-    IntruderScores,
-    alarm_threshold,
-    clean_scores,
-    intruder_scores,
-)
-from training.fit.machine_scores import MachineScore
-from training.fit.object_weights import fit_objects, store_samples
 
 from app.questions.posterior import Posterior, calibrated
 from app.registry import Calibration, CountSlope
-from tests.questions.answers import outliers
-from tests.questions.artifacts import artifact_of
+from app.scene import Vocabulary
+from tests.questions.artifacts import larger_artifact
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, rooms
-from tests.training.evaluation.scenes import WIDE, larger_machine, random_scenes, scene, tensors
+from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
+from training.datasets.batches import TrainingData
 from training.datasets.cases import RIDGE, logistic
 from training.evaluation.alarms import ALARMS, untouched_alarms
 from training.evaluation.asking import of_classes
-from training.evaluation.calibration_task import collect_missing
-from training.evaluation.parts import up_to_longest
-from training.fit.calibrate import calibrate, fit_misplaced, fit_relations, rising_curve
+from training.evaluation.calibration_task import ask_outliers, collect, collect_missing
+from training.evaluation.intruders import draw_intruder_choices
+from training.evaluation.parts import draw_parts, exactly, up_to_longest
+from training.fit import calibrate_objects as of_objects
+from training.fit.calibrate import (
+    calibrate,
+    fit_misplaced,
+    fit_relations,
+    hardest_quantile,
+    rising_curve,
+)
 from training.fit.calibrate_objects import (
     ALPHAS,
     COVERAGES,
-    EVIDENCE_WEIGHTS,
-    LEAST,
-    WEIGHTS,
-    calibrate_objects,
+    LENGTHS,
+    ListScores,
     choose_alpha,
     complete_scenes,
-    fit_coverage,
-    fit_evidence,
-    limit_of,
-    listing,
-    popularity,
+    fit_line,
+    fit_missing,
+    fit_outliers,
+    real_scenes,
     recalibrated,
-    smallest_good_weight,
+    score_intruders,
+    score_lists,
     smallest_scenes,
-    thresholds,
 )
 from training.fit.configuration import ObjectsConfig
+from training.fit.draft import draft_artifact
+from training.fit.objects import (
+    ObjectFit,
+    ObjectScenes,
+    fit_objects,
+    served_popularity,
+    start_objects,
+)
 from training.machines import MachineSpec, build
-from training.machines.arrays import machine_of
-from training.runs.publish import draft_artifact
 
 ROOM_COUNT = 400
+CONFIG = ObjectsConfig(steps=150, batch_size=64, learning_rate=0.03, generative_weight=0)
 
 
-def with_intruders(clean, beside, intruder, size):
-    """Log-odds of one object a scene, untouched and beside an intruder, and of the intruder."""
-    count = len(clean)
-    return IntruderScores(
-        scene=np.repeat(np.arange(count), 3),
-        log_odds=np.stack([clean, beside, intruder], 1).ravel(),
-        intruder=np.tile([False, False, True], count),
-        size=np.full(3 * count, size),
-        clean=np.tile([True, False, False], count),
-        thing=np.tile([0, 0, 1], count),
-        scenes=count,
-        skipped=0,
+@pytest.fixture(scope="module")
+def model():
+    """A machine whose object weights are fitted to furnished rooms."""
+    spec = MachineSpec(
+        "triway", V=len(VOCABULARY), A=4, units=6, states=8, K=3, C=len(VOCABULARY.room_types)
     )
+    machine = build(spec).initialise(torch.Generator().manual_seed(0), 0.05)
+    scenes = ObjectScenes.of(rooms(ROOM_COUNT, 2), STRUCTURE, CONFIG)
+    start_objects(machine, scenes)
+    fit_objects(ObjectFit(machine, scenes, CONFIG, seed=0))
+    return draft_artifact(machine.eval().requires_grad_(False), VOCABULARY)
 
 
-def scores_of(levels):
-    """One object a scene, log-odds spread by `levels` per scene; and the same with an intruder."""
-    rng = np.random.default_rng(0)
-    clean = 3.0 + rng.normal(0.0, 1.0, len(levels)) * levels
-    return with_intruders(clean, clean, rng.normal(-4.0, 1.0, len(levels)), 4)
+def data_of(validation) -> TrainingData:
+    train = rooms(ROOM_COUNT, 2)
+    return TrainingData(train, validation, validation, STRUCTURE, 4, len(VOCABULARY.room_types))
 
 
-def alarms(sizes, spread, share):
-    """Share of untouched scenes over the threshold, per source."""
-    source = np.repeat(["a", "b"][: len(sizes)], sizes)
-    scenes = tensors(
-        [scene([0, 1], source=name, group=f"g{k // 4}") for k, name in enumerate(source)], WIDE
-    )
-    scores = scores_of(np.repeat(spread, sizes))
-    rng = np.random.default_rng(0)
-    threshold = alarm_threshold(-scores.log_odds, scores, scenes, rng, share)
-    over = -scores.log_odds >= threshold
-    return [float(over[scores.clean][source == name].mean()) for name in np.unique(source)]
+@pytest.fixture(scope="module")
+def fitted(model):
+    return calibrate(model, data_of(rooms(300, 1)), CONFIG)
 
 
-@pytest.mark.parametrize("share", ALARMS.values())
-def test_alarms_are_kept_in_each_source_alike(share):
-    """The second source's scenes are far more varied: one quantile over both would let it alarm in
-    about twice the promised share."""
-    quiet, varied = alarms([400, 400], [1.0, 3.0], share)
-    assert share / 4 < varied <= share + 0.015
-    assert quiet <= varied
+@pytest.fixture(scope="module")
+def judging(model, fitted):
+    return replace(model, calibration=fitted)
 
 
-@pytest.mark.parametrize("sizes", [[400, 30], [150, 100]])
-def test_a_small_source_is_judged_with_the_rest(sizes):
-    """A few scenes that are odd do not move the threshold to where nothing alarms."""
-    shares = alarms(sizes, [1.0, 8.0], 0.1)
-    assert shares[1] > 0
+def test_every_entry_is_fitted(fitted):
+    neutral = Calibration.neutral(4)
+    entries = set(Calibration.model_fields) - {"popularity_weight"}
+    assert {name for name in entries if getattr(fitted, name) == getattr(neutral, name)} == set()
+    assert fitted.popularity_weight in ALPHAS
+    assert fitted.coverage in COVERAGES
+    # The likelier a class, the likelier it is missing, and the less likely it is an intruder.
+    assert fitted.missing.slope > 0
+    assert fitted.outlier.slope < 0
+    assert fitted.misplaced.slope < 0
+    limits = fitted.misplaced_thresholds
+    assert 1 >= limits.low >= limits.medium >= limits.high >= 0.2
+    scenes = ObjectScenes.of(rooms(ROOM_COUNT, 2), STRUCTURE, CONFIG)
+    popularity = served_popularity(scenes, CONFIG).numpy()
+    assert fitted.popularity == pytest.approx(popularity, abs=1e-4)
 
 
-# ------------------------------------------------------------------------------ which scenes count
+def test_chosen_values_are_copied(model, fitted):
+    chosen = fitted.model_copy(update={"coverage": 0.15, "popularity_weight": 0.25})
+    again = calibrate(model, data_of(rooms(60, 1)), CONFIG, chosen=chosen)
+    assert (again.coverage, again.popularity_weight) == (0.15, 0.25)
+    assert again.missing != fitted.missing
+
+
+@pytest.mark.slow
+def test_a_seed_gives_the_same_calibration(model, fitted):
+    assert calibrate(model, data_of(rooms(300, 1)), CONFIG) == fitted
+
+
+# ------------------------------------------------------------------------------- scenes of the fits
 
 
 def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
@@ -122,6 +133,22 @@ def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
     assert 60 <= first.count(4) <= 140
 
 
+def test_photographs_alone_are_calibrated_on_photographs():
+    """There no scene lists all of its objects."""
+    cut = tensors([replace(scene([0, 1]), complete=False) for _ in range(20)], WIDE)
+    assert len(complete_scenes(cut)) == 20
+
+
+def test_real_rooms_come_before_generated_ones():
+    """At most 400 scenes of each source; sources of the user count if no room is real."""
+    made = [scene([0, 1], source="procthor") for _ in range(500)]
+    real = [scene([0, 1], source=name) for name in ["3dssg"] * 30 + ["sunrgbd"] * 450]
+    kept = real_scenes(tensors([*made, *real], WIDE))
+    sources = [one.source for one in kept.scenes]
+    assert {name: sources.count(name) for name in set(sources)} == {"3dssg": 30, "sunrgbd": 400}
+    assert len(real_scenes(tensors(made, WIDE))) == 400
+
+
 def test_the_smallest_scenes_are_those_of_their_room_type():
     """Of a type of 20 scenes its own size, of fewer that of all; structure does not count."""
     large, small = scene([0, 1, 2, 3, 4], room=0), scene([1, 2, 3], room=1)
@@ -133,203 +160,221 @@ def test_the_smallest_scenes_are_those_of_their_room_type():
     assert smallest_scenes(tensors([large] * 20 + [small], WIDE), structure, 2) == (4, 4, 4)
 
 
-def test_popularity_is_the_log_odds_of_a_class_in_a_complete_scene():
-    scenes = [scene([0, 1]), scene([0]), replace(scene([0, 2]), weight=0.5)]
-    found = popularity(tensors([*scenes, replace(scene([3]), complete=False)], WIDE))
-    assert found[:4] == pytest.approx(np.log([3.0 / 0.5, 1.5 / 2.0, 1.0 / 2.5, 0.5 / 3.0]))
+# ----------------------------------------------------------------------------------------- missing
+
+BARE = torch.zeros(WIDE, dtype=torch.bool)
+
+
+def lists_with_hidden(count=200, classes=7):
+    """Scenes of `classes` random classes."""
+    rng = np.random.default_rng(3)
+    rows = [sorted(rng.permutation(WIDE)[:classes].tolist()) for _ in range(count)]
+    return tensors([scene(row, name=f"scene {k}") for k, row in enumerate(rows)], WIDE)
+
+
+def hidden_of(scenes, v):
+    """The hidden classes of lists v, in scenes of which each has a list of each length."""
+    lengths = [n for n in LENGTHS if n < scenes.v[0].sum()]
+    assert v.sum(1).tolist() == [n for n in lengths for _ in range(len(scenes))]
+    return (scenes.v.repeat(len(lengths), 1) > v).numpy()
+
+
+def test_the_coverage_that_ranks_best_is_chosen(monkeypatch):
+    """The log-odds name the hidden classes the more often, the closer the coverage is to .45."""
+    scenes = lists_with_hidden()
+    rng = np.random.default_rng(0)
+
+    def log_odds(artifact, v, coverage):
+        hidden = hidden_of(scenes, v)
+        return hidden / (1 + 4 * abs(coverage - 0.45)) + rng.normal(0, 0.5, hidden.shape)
+
+    monkeypatch.setattr(of_objects, "unlisted_log_odds", log_odds)
+    assert fit_missing(None, scenes, BARE)["coverage"] == 0.45
+    chosen = Calibration.neutral(4).model_copy(update={"coverage": 0.8})
+    assert fit_missing(None, scenes, BARE, chosen)["coverage"] == 0.8
+
+
+def test_ranks_ignore_other_hidden_classes_and_listed_ones():
+    z = np.array([[9.0, 3.0, 2.0, 1.0, 0.0]])
+    candidates = np.array([[False, True, True, True, True]])
+    hidden = np.array([[False, True, False, True, False]])
+    assert of_objects._mean_rank(z, candidates, hidden) == pytest.approx((1 + 1 / 2) / 2)
+
+
+def test_missing_classes_are_fitted_to_the_number_of_listed_classes(monkeypatch):
+    """Log-odds z of which 2z - log n + 1 are the true ones. Standard errors: .1, and .1 of log n.
+
+    The fit takes all unlisted classes, so no selection changes the frequencies.
+    """
+    scenes = lists_with_hidden(600)
+    rng = np.random.default_rng(0)
+
+    def log_odds(artifact, v, coverage):
+        hidden, n = hidden_of(scenes, v), v.sum(1, keepdim=True).numpy()
+        # Given the truth y, z is N(m_y, s²); then the log-odds of y are linear in z.
+        share = (7 - n) / (WIDE - n)
+        prior, s = np.log(share / (1 - share)), 0.7
+        # Slope (m_1 - m_0) / s² = 2, intercept prior - (m_1² - m_0²) / 2s² = 1 - log n.
+        gap = 2 * s**2
+        middle = (prior - 1 + np.log(n)) / 2
+        return middle + gap * (hidden - 0.5) + rng.normal(0, s, hidden.shape)
+
+    monkeypatch.setattr(of_objects, "unlisted_log_odds", log_odds)
+    monkeypatch.setattr(of_objects, "_LISTED", WIDE)
+    entry = fit_missing(None, scenes, BARE)["missing"]
+    assert entry.slope == pytest.approx(2, abs=0.3)
+    assert entry.log_count == pytest.approx(-1, abs=0.3)
+    assert entry.intercept == pytest.approx(1, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("size", "error"),
+    [(exactly(1), 0.1), (exactly(3), 0.1), (exactly(6), 0.1), (up_to_longest, 0.05)],
+)
+def test_hidden_classes_are_as_likely_as_the_answer_states(judging, size, error):
+    """On 200 other rooms. The fit is a line in the log of the number of listed classes."""
+    answers = collect_missing(judging, rooms(200, 3), size)
+    assert answers.score.mean() == pytest.approx(answers.truth.mean(), abs=error)
+    assert answers.metric("ECE").value < error + 0.03
+    assert answers.metric("Brier skill").value > 0
 
 
 # --------------------------------------------------------------------------------------- intruders
 
 
-def judged(hits):
-    """Scores of intruders of which class 1 is popular: found in so many scenes of 10 at alpha 0.
-
-    Where one is missed, it is .3 above the other object, alone and with it; a prior of 1 on class 1
-    takes it below from alpha = .375 on.
-    """
-    own = np.where(np.arange(10) < hits, -1.0, 0.3)
-    return with_intruders(np.zeros(10), np.zeros(10), own, 3)
-
-
-PRIOR = np.array([0.0, 1.0])
-
-
-def test_alpha_is_the_smallest_good_weight():
-    kinds = {"uniform": judged(10), "popularity": judged(5), "signature": judged(5)}
-    assert choose_alpha(kinds, PRIOR) == 0.375
-    assert choose_alpha({"uniform": judged(10)}, PRIOR) == 0.0
-
-
-def test_alpha_keeps_the_uniform_intruders():
-    """Popular intruders would be found at .375; of uniform ones, which are rare classes, none."""
-    rare = replace(judged(10), log_odds=np.tile([0.0, 0.0, -0.2], 10), thing=np.tile([1, 1, 0], 10))
-    popular = judged(5)
-    assert choose_alpha({"popularity": popular, "uniform": rare}, PRIOR) == 0.0
-    assert choose_alpha({"popularity": popular}, PRIOR) == 0.375
-    assert 0.375 in ALPHAS
-
-
-@pytest.fixture(scope="module")
-def model():
-    """A machine of furnished rooms whose objects were trained, with stored samples."""
-    data = rooms(ROOM_COUNT, 2)
-    return draft_artifact(trained(data), VOCABULARY)
-
-
-def trained(data):
-    spec = MachineSpec(
-        "triway", V=len(VOCABULARY), A=4, H1=90, K=3, C=len(VOCABULARY.room_types), N=256,
-        form="local",
-    )  # fmt: skip
-    machine = build(spec).initialise(torch.Generator().manual_seed(0), 0.05)
-    with torch.no_grad():
-        share = data.v.mean(0).clamp(0.01, 0.99)
-        machine.b.copy_((share / (1 - share)).log())
-    fit_objects(machine, data, ObjectsConfig(epochs=30, chains=64, batch_size=32), seed=0)
-    store_samples(machine, data, 0.5, seed=0)
-    return machine.eval().requires_grad_(False)
-
-
-@pytest.fixture(scope="module")
-def fitted(model):
-    return calibrate_objects(model, rooms(300, 1), rooms(ROOM_COUNT, 2), STRUCTURE)
-
-
-def test_every_entry_of_objects_is_fitted(fitted):
-    neutral = Calibration.neutral(4)
-    for name in ("missing", "outlier", "outlier_thresholds", "popularity"):
-        assert getattr(fitted, name) != getattr(neutral, name), name
-    assert fitted.popularity_weight in ALPHAS
-    assert fitted.coverage in COVERAGES
-    assert fitted.coverage_weight in WEIGHTS
-    assert fitted.evidence.relations_on_objects in EVIDENCE_WEIGHTS
-    assert fitted.evidence.poses_on_objects in EVIDENCE_WEIGHTS
-    # The likelier a class, the likelier it is missing; the likelier, the less an intruder.
-    assert fitted.missing.slope > 0
-    assert fitted.outlier.slope < 0
-    assert fitted.relation == neutral.relation
-
-
-def test_thresholds_keep_their_share_of_untouched_scenes(model, fitted):
-    """On the scenes that they were fitted on."""
-    scenes = complete_scenes(rooms(300, 1))
-    scores = intruder_scores(scenes, STRUCTURE, MachineScore(machine_of(model.weights)))
-    own = scores.with_prior(fitted.popularity_weight * np.array(fitted.popularity))
-    p = 1 / (1 + np.exp(-calibrated(fitted.outlier, own.log_odds, own.size)))
-    for name, share in ALARMS.items():
-        found = own.false_alarms(p >= getattr(fitted.outlier_thresholds, name)).value
-        assert 0 < found <= share + 0.01
-
-
-def raised(calibration, scores):
-    """Whether the service reports each object at medium sensitivity."""
-    own = scores.with_prior(calibration.popularity_weight * np.array(calibration.popularity))
-    p = 1 / (1 + np.exp(-calibrated(calibration.outlier, own.log_odds, own.size)))
-    limits = [*calibration.short_list_thresholds, calibration.outlier_thresholds]
-    medium = np.array([limit.medium for limit in limits])
-    return p >= medium[np.minimum(scores.listed, len(limits)) - 1]
-
-
-def test_lists_of_few_classes_keep_the_share_too(model, fitted):
-    """On other parts of the rooms than were fitted on."""
-    scenes, rng = complete_scenes(rooms(300, 1)), np.random.default_rng(7)
-    artifact = replace(model, calibration=fitted)
-    assert fitted.short_list_thresholds
-    every = [*fitted.short_list_thresholds, fitted.outlier_thresholds]
-    for name in ALARMS:
-        limits = [getattr(one, name) for one in every]
-        assert limits == sorted(limits, reverse=True)
-    for listed in range(1, len(every)):
-        some, parts = listing(scenes, STRUCTURE, listed, rng)
-        plain = (parts > 0) & ~STRUCTURE
-        assert (plain.sum(1) == listed).all()
-        assert (parts <= some.v).all()
-        assert (parts * STRUCTURE == some.v * STRUCTURE).all()
-        assert ((some.v > 0) & ~STRUCTURE).sum(1).min() > listed
-        found = clean_scores(parts, STRUCTURE, MachineScore(machine_of(model.weights)))
-        assert (found.listed == listed).all()
-        alarms = found.false_alarms(raised(fitted, found)).value
-        # 300 rooms: a share of .1 lies above .17 with probability 1e-4.
-        assert alarms <= 0.17
-        k = int(found.scene[0])
-        short = of_classes(parts[k].nonzero().squeeze(1).tolist())
-        limit = outliers(artifact, short).threshold
-        medium = fitted.short_list_thresholds[listed - 1].medium
-        assert limit == pytest.approx(medium, rel=1e-5)
-        assert limit >= fitted.outlier_thresholds.medium - 1e-6
-
-
-def test_few_scenes_suffice_for_lists_of_few_classes(model):
-    """Fitted on 24 rooms, as for a user with 300 scenes; measured on 300 other rooms."""
-    few = calibrate_objects(model, rooms(24, 1), rooms(ROOM_COUNT, 2), STRUCTURE)
-    scenes, rng = complete_scenes(rooms(300, 3)), np.random.default_rng(7)
-    score = MachineScore(machine_of(model.weights))
-    for listed in (1, 2, 3, 4):
-        _, parts = listing(scenes, STRUCTURE, listed, rng)
-        found = clean_scores(parts, STRUCTURE, score)
-        alarms = found.false_alarms(raised(few, found)).value
-        # The share of .1 is estimated from 24 rooms. It lies above .3 with probability 2e-3.
-        assert alarms <= 0.3
-        one_limit = few.model_copy(update={"short_list_thresholds": ()})
-        whole = found.false_alarms(raised(one_limit, found)).value
-        assert whole > 0.3 or listed > 2
-
-
-def test_an_alarm_needs_a_probability_worth_an_alarm():
-    """The target share of clean scenes would need alarms from .001."""
-    scenes = complete_scenes(rooms(40, 1))
-    certain = clean_scores(scenes.v, STRUCTURE, lambda v: torch.full(v.shape, 7.0))
-    limits = thresholds(
-        partial(limit_of, [(certain, scenes)], CountSlope(slope=-1.0), np.random.default_rng(0))
+def scores_of(log_odds, intruder, popularity=None):
+    """Scores of lists, of which each row of log_odds, (lists, n), has the listed classes."""
+    lists, n = log_odds.shape
+    popularity = np.zeros(log_odds.shape) if popularity is None else popularity
+    return ListScores(
+        row=np.repeat(np.arange(lists), n),
+        log_odds=log_odds.ravel(),
+        popularity=np.broadcast_to(popularity, log_odds.shape).ravel(),
+        intruder=np.broadcast_to(intruder, log_odds.shape).ravel(),
+        size=np.full(lists, n),
     )
-    assert (limits.low, limits.medium, limits.high) == (0.5, 0.3, 0.2)
 
 
-def test_hidden_classes_are_as_likely_as_said(model, fitted):
-    """On 200 other rooms."""
-    artifact = replace(model, calibration=fitted)
-    found = collect_missing(artifact, rooms(200, 3), up_to_longest)
-    assert found.score.mean() == pytest.approx(found.truth.mean(), abs=0.05)
-    assert found.metric("ECE").value < 0.08
-    assert found.metric("Brier skill").value > 0
+CLEAN = {3: scores_of(np.tile([0.1, 0.2, 0.3], (50, 1)), False)}
+LAST = np.array([False, False, True])
 
 
-@pytest.mark.slow
-def test_a_seed_gives_the_same_calibration(model, fitted):
-    again = calibrate_objects(model, rooms(300, 1), rooms(ROOM_COUNT, 2), STRUCTURE)
-    assert again == fitted
+def intruders(log_odds, popularity):
+    """50 lists of three classes, of which the last is an intruder."""
+    return scores_of(np.tile([0.0, 0.0, log_odds], (50, 1)), LAST, [0.0, 0.0, popularity])
 
 
-def test_photographs_alone_are_calibrated_on_photographs():
-    """There no scene lists all of its objects."""
-    cut = tensors([replace(scene([0, 1]), complete=False) for _ in range(20)], WIDE)
-    assert len(complete_scenes(cut)) == 20
+def test_alpha_is_the_smallest_that_detects_most():
+    """A popular intruder has the lowest score from .3 / 1 < alpha on."""
+    assert choose_alpha(CLEAN, {"popularity": intruders(0.3, 1.0)}) == 0.375
+    assert choose_alpha(CLEAN, {"uniform": intruders(-1.0, 0.0)}) == 0.0
 
 
-def test_machines_without_samples_use_the_closed_form_alone():
-    artifact = artifact_of(larger_machine("triway-local"))
-    V = artifact.spec.V
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    found = fit_coverage(artifact, tensors(random_scenes(40, V - 1), V), structure)
-    assert found["coverage_weight"] == 0.0
-    assert found["coverage"] == artifact.calibration.coverage
+def test_alpha_weighs_all_kinds_of_intruders_alike():
+    """A large alpha hides rare intruders, and a small one popular intruders."""
+    rare, popular = intruders(-0.2, -1.0), intruders(0.1, 1.0)
+    assert choose_alpha(CLEAN, {"uniform": rare, "popularity": popular, "more": popular}) == 0.125
+    assert choose_alpha(CLEAN, {"uniform": rare, "more": rare, "popularity": popular}) in (0, 0.125)
 
 
-def test_the_least_pull_that_is_as_good_is_taken():
-    """More evidence that brings nothing may do harm elsewhere."""
-    assert smallest_good_weight({0.0: 0.400, 0.2: 0.402, 1.0: 0.4025}) == 0.0
-    assert smallest_good_weight({0.0: 0.400, 0.2: 0.410, 1.0: 0.411}) == 0.2
-    assert smallest_good_weight({0.0: 0.400, 0.2: 0.410, 1.0: 0.420}) == 1.0
+@pytest.mark.parametrize("share", ALARMS.values())
+def test_alarm_lines_keep_their_share_at_each_length(share):
+    """4,000 lists of each length. The share of one length has a standard error of .002 to .006.
+
+    The log-odds of each object are logistic. Given other objects they become more certain.
+    """
+    rng = np.random.default_rng(0)
+    entry = CountSlope(intercept=-1.0, slope=-1.2, log_count=-0.4)
+
+    def lists(n):
+        return scores_of(rng.logistic(2 + 0.8 * np.log(n), 1.0, (4000, n)), False)
+
+    line = fit_line({n: lists(n) for n in LENGTHS}, entry, 0.0, share)
+    shares = []
+    for n in LENGTHS:
+        scores = lists(n)
+        z = calibrated(entry, scores.log_odds, scores.size[scores.row])
+        alarm = 1 / (1 + np.exp(-z)) >= line.threshold(n)
+        shares.append(np.bincount(scores.row, alarm).astype(bool).mean())
+    assert np.mean(shares) == pytest.approx(share, abs=0.006)
+    assert shares == pytest.approx([share] * len(shares), abs=0.02 + share / 10)
 
 
-def test_evidence_of_no_scene_has_no_weight():
-    artifact = artifact_of(larger_machine("triway-local"))
-    V = artifact.spec.V
-    bare = tensors([scene([0, 1, 2]) for _ in range(5)], V)
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    found = fit_evidence(artifact, bare, structure)
-    assert (found.relations_on_objects, found.poses_on_objects) == (0, 0)
+def test_one_length_has_a_line_without_slope():
+    line = fit_line(CLEAN, CountSlope(slope=-1.0), 0.0, 0.1)
+    assert (line.intercept, line.log_count) == (pytest.approx(-0.1), 0.0)
+
+
+def test_untouched_lists_of_other_rooms_keep_the_share(judging):
+    """Of 300 rooms a share of .1 lies above .17 with probability 1e-4.
+
+    One class alone has one of few values, and the share jumps from value to value.
+    """
+    calibration, shares = judging.calibration, {}
+    for n in (1, 2, 3, 5, 8):
+        parts = draw_parts(rooms(300, 3), STRUCTURE, exactly(n))
+        scores = score_lists(judging, parts)
+        z = calibrated(
+            calibration.outlier,
+            scores.score(calibration.popularity_weight),
+            scores.size[scores.row],
+        )
+        limit = calibration.outlier_lines.medium.threshold(n)
+        shares[n] = float((1 / (1 + np.exp(-scores.extreme(z))) >= limit).mean())
+    assert np.mean(list(shares.values())) == pytest.approx(0.1, abs=0.04)
+    assert max(share for n, share in shares.items() if n > 1) <= 0.17
+
+
+def test_intruders_are_as_likely_as_the_answer_states(judging):
+    """Half of the parts of 200 other rooms have an intruder, of one of three kinds."""
+    data = rooms(200, 3)
+    choices = draw_intruder_choices(data, STRUCTURE, rooms(ROOM_COUNT, 2))
+    answers = collect(judging, data, partial(ask_outliers, intruders=choices))
+    assert answers.score.mean() == pytest.approx(answers.truth.mean(), abs=0.04)
+    assert answers.metric("ECE").value < 0.06
+    assert answers.metric("Brier skill").value > 0.1
+
+
+def test_structure_and_classes_that_belong_anywhere_are_never_judged(judging):
+    """Neither in untouched lists nor as intruders."""
+    entries = [replace(c, anywhere=c.label in {"lamp", "book"}) for c in VOCABULARY.objects]
+    vocabulary = Vocabulary(entries, VOCABULARY.room_types)
+    artifact = replace(judging, vocabulary=vocabulary)
+    judged = vocabulary.judged
+    assert judged.sum() == len(judged) - int(STRUCTURE.sum()) - 2
+    parts = draw_parts(rooms(100, 3), STRUCTURE, exactly(4))
+    scores = score_lists(artifact, parts)
+    row, classes = np.nonzero(parts.v.numpy() * judged)
+    assert scores.row.tolist() == row.tolist()
+    assert scores.popularity.tolist() == np.array(artifact.calibration.popularity)[classes].tolist()
+    assert scores.size.tolist() == [4] * len(parts.v)
+    altered = score_intruders(artifact, rooms(100, 3), STRUCTURE, torch.from_numpy(~judged + 1e-9))
+    popularity = altered.popularity[altered.intruder]
+    assert np.isin(popularity, np.array(artifact.calibration.popularity)[judged]).all()
+    assert np.bincount(altered.row, altered.intruder).tolist() == [1.0] * len(altered.size)
+
+
+@pytest.mark.parametrize("count", [19, 20])
+def test_few_scenes_give_no_judgement_of_objects(judging, count):
+    scenes = real_scenes(rooms(60, 1))
+    some = replace_scenes(scenes, count)
+    entries = fit_outliers(judging, some, rooms(ROOM_COUNT, 2), STRUCTURE)
+    if count < 20:
+        assert entries == {}
+    else:
+        assert set(entries) == {"popularity_weight", "outlier", "outlier_lines"}
+
+
+def replace_scenes(scenes, count):
+    """The first scenes of a set."""
+    return tensors(scenes.scenes[:count], len(VOCABULARY))
+
+
+def test_few_scenes_leave_the_model_without_judgements(model):
+    few = calibrate(model, data_of(replace_scenes(rooms(60, 1), 15)), CONFIG)
+    assert few.outlier is few.outlier_lines is None
+    assert few.misplaced is few.misplaced_thresholds is None
+    assert few.missing != CountSlope()
 
 
 # --------------------------------------------------------------------------------------- relations
@@ -337,7 +382,7 @@ def test_evidence_of_no_scene_has_no_weight():
 
 def test_relations_are_fitted_to_what_is_known():
     """Scenes of which nothing is known but what holds change no entry."""
-    artifact = artifact_of(larger_machine("triway-local"))
+    artifact = larger_artifact("triway")
     V = artifact.spec.V
     known = random_scenes(60, V - 1)
     vague = [
@@ -376,20 +421,10 @@ def test_a_ridge_bounds_the_slope_of_few_examples_and_leaves_many_alone():
     assert logistic(many, truth, C=RIDGE) == pytest.approx(logistic(many, truth), rel=0.01)
 
 
-def test_everything_is_calibrated_at_once(model):
-    found = calibrate(model, rooms(120, 1), rooms(ROOM_COUNT, 2))
-    neutral = Calibration.neutral(4)
-    assert len(found.relation) == len(found.relation_given) == len(found.placement) == 4
-    assert found.relation != neutral.relation
-    limits = found.misplaced_thresholds
-    assert 1 >= limits.low >= limits.medium >= limits.high >= LEAST["high"]
-    assert found.misplaced.slope < 0  # unlikely relations are false
-
-
 @pytest.mark.parametrize(("count", "sign"), [(120, 1), (15, 1), (60, -1)])
 def test_misplaced_needs_enough_scenes_and_likely_true_relations(count, sign):
     """The true relations of a scene are those that the machine finds most (or least) likely."""
-    artifact = artifact_of(larger_machine("triway-local"))
+    artifact = larger_artifact("triway")
     scenes = []
     for k, one in enumerate(random_scenes(count, artifact.spec.V - 1)):
         classes = one.evidence.classes
@@ -406,3 +441,24 @@ def test_misplaced_needs_enough_scenes_and_likely_true_relations(count, sign):
         (kept,) = (one for one in untouched_alarms(judging, scenes) if one.sensitivity == name)
         assert kept.scenes == count
         assert kept.alarms <= (share + 0.02) * count
+
+
+@pytest.mark.parametrize("share", ALARMS.values())
+def test_misplaced_relations_keep_the_share_in_each_large_source(share):
+    """The second source is far more varied: one quantile over both would raise more alarms."""
+    rng = np.random.default_rng(0)
+    values = np.concatenate([rng.normal(0, 1, 4000), rng.normal(0, 3, 4000)])
+    sources = np.repeat(["a", "b"], 4000)
+    limit = hardest_quantile(values, sources, 1 - share)
+    alarms = [(values[sources == name] >= limit).mean() for name in ("a", "b")]
+    assert alarms[1] == pytest.approx(share, abs=1e-3)
+    assert alarms[0] < share / 2
+
+
+def test_small_sources_count_as_one_and_equal_values_raise_no_alarm():
+    """199 and 150 scenes; each alone would have another quantile."""
+    values = np.concatenate([np.zeros(400), np.arange(199.0), np.full(150, 500.0)])
+    sources = np.repeat(["large", "a", "b"], [400, 199, 150])
+    limit = hardest_quantile(values, sources, 0.5)
+    assert limit == pytest.approx(np.median(values[400:]))
+    assert not (np.full(3, np.median(values[400:])) >= limit).any()
