@@ -1,14 +1,12 @@
 """Plots of the results of `benchmark`.
 
-learning-curves.png   validation metrics by epoch, for every machine and training seed
-reliability-*.png     predicted probability against observed frequency, one file per machine
-recall.png            recall among the first k predictions, for relations and for removed objects
+reliability-*.png   predicted probability against observed frequency, one file per machine
+recall.png          recall among the first k predictions, for relations and for removed objects
 """
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +20,6 @@ from training.evaluation.setting import Outcome
 from training.research.entries import Entry
 from training.research.measure import POOLED, Plan, slug
 
-_CURVES = {
-    "mrr_validation": "MRR of removed objects",
-    "r_precision_validation": "R-precision of relations",
-    "object_error_validation": "reconstruction error, objects",
-    "relation_error_validation": "reconstruction error, relations",
-}
 _RECALL = {
     "T1a relations": ("R@", "annotated relations among the first k of a scene"),
     "T2 missing": ("top-", "removed objects in the first k places"),
@@ -43,10 +35,7 @@ def write_plots(
         machines: trained and calibrated machines, one per training seed. The reliability plots use
             the seed of the first machine.
     """
-    runs: dict[str, list[Path]] = {}
-    for entry in machines:
-        runs.setdefault(entry.name, []).append(plan.folder_of(entry) / "run" / "curve.csv")
-    figures = {"learning-curves": learning_curves(runs), "recall": recall_curves(results, POOLED)}
+    figures = {"recall": recall_curves(results, POOLED)}
     for entry in machines:
         outcome = reports[entry.name, entry.seed][POOLED].outcomes.get("Calibration")
         if outcome is not None and entry.seed == machines[0].seed:
@@ -58,28 +47,6 @@ def write_plots(
         figure.savefig(path, dpi=110)
         paths.append(path)
     return paths
-
-
-def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
-    """Plot validation metrics by epoch, with one colour per machine and one line per seed."""
-    figure = Figure(figsize=(11, 6.5), layout="constrained")
-    axes = figure.subplots(2, 2).flat
-    for axis, (column, title) in zip(axes, _CURVES.items(), strict=True):
-        for colour, (name, paths) in enumerate(runs.items()):
-            for k, path in enumerate(paths):
-                epochs, values = read_curve(path, column)
-                label = name if k == 0 else None
-                axis.plot(epochs, values, color=f"C{colour}", alpha=0.8, label=label)
-        axis.set(xlabel="epoch", title=title)
-        axis.legend()
-    return figure
-
-
-def read_curve(path: Path, column: str) -> tuple[list[int], list[float]]:
-    """Return the epochs (counted from 1) and the values of one column of a curve file."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    return [int(row["epoch"]) + 1 for row in rows], [float(row[column]) for row in rows]
 
 
 def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
