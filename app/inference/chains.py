@@ -300,15 +300,14 @@ class ConditionedChains:
     def log_score(self, state: ChainState, shown: Mask, kept: Mask) -> float:
         """Return the log score of a sampled scene at temperature 1.
 
-        The score is a log-probability up to a constant of the model and the room type:
+        The score is a log-probability up to a constant of the model:
 
             b·v + v'Lv/2 + e_t + sum_m log sum_z exp(x_mz) + log p(kept | v, h1)
 
         The first terms are log p(v, t) + log Z, where t is the room type. An unknown room type has
-        e_t = 0. The last term is the log-probability of the relations
-        given the sampled h1. With a second layer, m is the mean field of h2. Then x contains J m,
-        and the score also contains c2·m and the entropy of m. This score is a lower bound on the
-        log of the sum over h2.
+        e_t = 0. The last term is the log-probability of the relations given the sampled h1. With a
+        second layer, m is the mean field of h2. Then x contains J m, and the score also contains
+        c2·m and the entropy of m. This score is a lower bound on the log of the sum over h2.
 
         Args:
             state: final state of a chain.

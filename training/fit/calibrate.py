@@ -86,7 +86,9 @@ def calibrate(
     """Fit every entry of the calibration. `calibrate_objects` copies some values of `chosen`."""
     popularity = served_popularity(ObjectScenes.of(data.train, data.structure, config), config)
     scenes = data.validation
-    objects = calibrate_objects(artifact, scenes, data.train, popularity, seed, chosen)
+    objects = calibrate_objects(
+        *(artifact, scenes, data.train, popularity, config.served_sources, seed, chosen)
+    )
     artifact = replace(artifact, calibration=objects)
     generator = torch.Generator().manual_seed(seed)
     pick = torch.randperm(len(scenes), generator=generator)
