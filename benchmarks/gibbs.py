@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Generic, TypeVar
-
 import torch
 
 from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, rbms, scikit_learn
 from training.machines import MachineSpec
-from training.machines.gibbs import gibbs_step, initial_state
-from training.machines.machine import State
+from training.machines.gibbs import start_chains, sweep
 
 OURS, SKLEARN, RBMS = "ours", "scikit-learn", "rbms"
 PRODUCTS = "two bare products"
-
-S = TypeVar("S")
-
-
-class Chains(Generic[S]):
-    """Gibbs chains. Each call advances the state of all chains by one sweep."""
-
-    def __init__(self, state: S, sweep: Callable[[S], S]) -> None:
-        self.state, self.sweep = state, sweep
-
-    def __call__(self) -> None:
-        self.state = self.sweep(self.state)
 
 
 @torch.no_grad()
@@ -45,25 +29,30 @@ def gibbs(
         objects: mean number of objects per scene.
         rounds: number of rounds; each round times every sampler.
     """
-    machine = object_machine(MachineSpec("rbm", V=V, A=4, H1=H), objects)
+    machine = object_machine(MachineSpec("rbm", V=V, A=4, units=H), objects)
     generator = torch.Generator().manual_seed(1)
     v = presence(random_scenes(chains, V, objects, generator), V)
     h = (torch.rand(chains, H, generator=generator) < 0.5).float()
     W = machine.W
-
-    def sweep(state: State) -> State:
-        # An RBM over objects has no relation units.
-        return gibbs_step(machine, state, generator, relations=False)
-
     sklearn_rbm, rbms_rbm = scikit_learn(machine), rbms(machine)
-    ours = Chains(initial_state(machine, v, generator), sweep)
-    sklearn = Chains(v.numpy(), sklearn_rbm.gibbs)
-    other = Chains(
-        rbms_rbm.init_chains(chains, start_v=v),
-        lambda state: rbms_rbm.sample_visibles(rbms_rbm.sample_hiddens(state)),
-    )
+    ours = start_chains(machine, v, generator)
+    sklearn, other = v.numpy(), rbms_rbm.init_chains(chains, start_v=v)
+
+    def sklearn_sweep() -> None:
+        nonlocal sklearn
+        sklearn = sklearn_rbm.gibbs(sklearn)
+
+    def rbms_sweep() -> None:
+        nonlocal other
+        other = rbms_rbm.sample_visibles(rbms_rbm.sample_hiddens(other))
+
     timings = interleave(
-        {OURS: ours, SKLEARN: sklearn, RBMS: other, PRODUCTS: lambda: (v @ W, h @ W.T)},
+        {
+            OURS: lambda: sweep(machine, ours, generator),
+            SKLEARN: sklearn_sweep,
+            RBMS: rbms_sweep,
+            PRODUCTS: lambda: (v @ W, h @ W.T),
+        },
         rounds=rounds,
     )
     return Result(
@@ -75,8 +64,8 @@ def gibbs(
         unit="chain-sweeps/s",
         targets={SKLEARN: 2, RBMS: 2, PRODUCTS: 0.45},
         facts={
-            "objects present a chain, ours": float(ours.state.v.sum(1).mean()),
-            "objects present a chain, scikit-learn": float(sklearn.state.sum(1).mean()),
-            "objects present a chain, rbms": float(other.state["visible"].sum(1).mean()),
+            "objects present a chain, ours": float(ours.v.sum(1).mean()),
+            "objects present a chain, scikit-learn": float(sklearn.sum(1).mean()),
+            "objects present a chain, rbms": float(other["visible"].sum(1).mean()),
         },
     )

@@ -20,6 +20,7 @@ from tempfile import TemporaryDirectory
 import torch
 
 from app import questions
+from app.inference.weights import pack_scenes
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.description import Calibration, Description, VocabularyEntry
 from app.scene.scene import Scene, SceneObject
@@ -28,13 +29,12 @@ from benchmarks.report import Fact, Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes
 from training.machines import BoltzmannMachine, MachineSpec, Triway
-from training.machines.chain_samples import pack_scenes
 
 CLASSES = (417, 2_000, 10_000)
 OBJECTS, SCENES = 12, 8
 
 # Standard deviations of the relation weights in the default model, by parameter name.
-# `object_machine` draws the other weights.
+# `object_machine` draws the other weights. Couplings stay 0: their time does not depend on values.
 _SPREAD = {"S": 0.065, "O": 0.065, "R": 0.32, "M": 0.23, "P": 0.06, "B": 0.14}
 _TRIPLES_A_CLASS = 17
 _MEGABYTE = 1e6
@@ -43,7 +43,8 @@ _MEGABYTE = 1e6
 def scaling(
     *,
     classes: Sequence[int] = CLASSES,
-    H1: int = 200,
+    units: int = 8,
+    states: int = 32,
     K: int = 32,
     N: int = 512,
     objects: int = OBJECTS,
@@ -53,7 +54,8 @@ def scaling(
 
     Args:
         classes: vocabulary sizes in increasing order. The first size is the reference.
-        H1: number of hidden units.
+        units: number of hidden units.
+        states: number of states of a hidden unit.
         K: rank of the relation weights.
         N: number of stored samples for the generation of scenes.
         objects: number of objects in the scene, equal for all sizes.
@@ -61,7 +63,10 @@ def scaling(
     """
     scene = _scene(classes[0], objects)
     with TemporaryDirectory() as folder:
-        paths = {V: _write(Path(folder) / str(V), V, H1, K, N, objects) for V in classes}
+        paths = {
+            V: _write(Path(folder) / str(V), _spec(V, units, states, K, N), objects)
+            for V in classes
+        }
         memory = {V: _memory(paths[classes[0]], paths[V], scene) for V in classes}
         files = {V: sum(file.stat().st_size for file in paths[V].iterdir()) for V in classes}
         artifacts = {V: load_artifact(path) for V, path in paths.items()}
@@ -117,13 +122,15 @@ def _label(number: int) -> str:
     return f"class {number}"
 
 
-def _write(path: Path, V: int, H1: int, K: int, N: int, objects: int) -> Path:
-    spec = MachineSpec(
-        "triway", V=V, A=4, H1=H1, C=33, K=K, T=_TRIPLES_A_CLASS * V, G=8, N=N, form="local"
-    )
+def _spec(V: int, units: int, states: int, K: int, N: int) -> MachineSpec:
+    sizes = {"V": V, "A": 4, "units": units, "states": states, "C": 33, "K": K, "G": 8, "N": N}
+    return MachineSpec("triway", **sizes, T=_TRIPLES_A_CLASS * V, coupled=True)
+
+
+def _write(path: Path, spec: MachineSpec, objects: int) -> Path:
     machine = _machine(spec, objects)
     vocabulary = Vocabulary(
-        [ObjectClass(_label(number)) for number in range(V)],
+        [ObjectClass(_label(number)) for number in range(spec.V)],
         [f"room {number}" for number in range(spec.C)],
     )
     description = Description(
@@ -162,8 +169,8 @@ def _machine(spec: MachineSpec, objects: int) -> BoltzmannMachine:
     square = spec.V**2
     machine.set_triples(torch.stack([keys // square, keys // spec.V % spec.V, keys % spec.V], 1))
     if spec.N:
-        dreamt = presence(random_scenes(spec.N, spec.V, objects, generator), spec.V)
-        machine.fantasies.copy_(pack_scenes(dreamt))
+        samples = presence(random_scenes(spec.N, spec.V, objects, generator), spec.V)
+        machine.fantasies.copy_(torch.from_numpy(pack_scenes(samples.numpy())))
         machine.fantasy_rooms.copy_(torch.arange(spec.N) % spec.C)
     return machine
 

@@ -1,143 +1,111 @@
-"""Benchmark of training: time of one contrastive-divergence step.
+"""Benchmark of training: time of one step of the object fit, which asks for unlisted classes.
 
-Our Triway machine has relation units only for pairs of present objects (active pairs), and shares
-weights between them. The dense machine has a unit and weights for every pair of classes.
+The fit computes the log-odds of all classes in closed form. The reference computes the same
+log-odds from free energies. It needs two copies of each scene for each class: with the class, and
+without.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
+from torch import Tensor
+from torch.nn.functional import softplus
 
 from benchmarks.report import Result
 from benchmarks.timing import interleave
-from benchmarks.yardsticks import frequencies, presence, random_scenes
-from training.datasets.batches import Batch
-from training.fit.configuration import ObjectiveConfig
-from training.fit.objectives.contrastive import ContrastiveDivergence
-from training.machines import MachineSpec, build
+from benchmarks.yardsticks import object_machine, presence, random_scenes
+from training.fit.configuration import ObjectsConfig
+from training.fit.objects import ObjectFit, ObjectScenes, random_parts
+from training.machines import BoltzmannMachine, MachineSpec
 
-OURS, LOCAL, DENSE = "ours, seed form", "ours, local form", "dense Triway"
-
-_RATE = 0.01
-_HOLDS = 0.1
+OURS, COPIES = "ours, closed form", "free energies of 2 V copies"
 
 
 def training_step(
     *,
     V: int = 417,
-    A: int = 4,
-    H1: int = 200,
-    H2: int = 100,
-    K: int = 32,
+    units: int = 8,
+    states: int = 32,
     scenes: int = 32,
     objects: int = 12,
     rounds: int = 5,
 ) -> Result:
-    """Time one CD-1 step of our Triway machine, and of a dense machine with all V + A·V² units.
+    """Time one step with closed-form log-odds, and one with a free energy for each class.
+
+    Both steps compute the loss of random parts of scenes, its gradient, and an update by Adam. The
+    machine has couplings between classes. Persistent chains and priors are left out.
 
     Args:
         V: number of object classes.
-        A: number of relations.
-        H1: number of units in the first hidden layer.
-        H2: number of units in the second hidden layer.
-        K: rank of the relation weights.
+        units: number of hidden units.
+        states: number of states of a hidden unit.
         scenes: number of scenes per step.
         objects: number of objects per scene.
-        rounds: number of rounds; each round times every machine.
+        rounds: number of rounds; each round times both steps.
     """
     generator = torch.Generator().manual_seed(0)
-    classes = random_scenes(scenes, V, objects, generator)
-    pairs = (scenes, A, objects, objects)
-    batch = Batch(
-        v=presence(classes, V),
-        classes=classes,
-        counts=torch.ones_like(classes),
-        holds=(torch.rand(pairs, generator=generator) < _HOLDS).float(),
-        observed=torch.ones(pairs, dtype=torch.bool),
-        room=torch.full((scenes,), -1),
-        source=torch.zeros(scenes, dtype=torch.int64),
+    v = presence(random_scenes(scenes, V, objects, generator), V)
+    unknown = torch.full((scenes,), -1)
+    data = ObjectScenes(
+        *(v, unknown, torch.zeros(scenes, dtype=torch.int64), torch.ones(scenes)),
+        shows=torch.ones(1, V, dtype=torch.bool),
+        sources=("random",),
     )
-    spec = MachineSpec("triway", V=V, A=A, H1=H1, H2=H2, K=K, form="seed")
-    dense_units = V + A * V * V
+    config = ObjectsConfig(
+        batch_size=scenes,
+        generative_weight=0,
+        weight_prior=0,
+        coupling_prior=0,
+        rate_prior=0,
+    )
+    spec = MachineSpec("triway", V=V, A=1, units=units, states=states, K=1, coupled=True)
+    ours, other = (object_machine(spec, objects).requires_grad_(True) for _ in range(2))
+    listed = random_parts(v, config.leave_one_out, generator).listed
+    absent = listed == 0
+    difference = (free_energy_log_odds(ours, listed) - ours.object_log_odds(listed))[absent]
     timings = interleave(
-        {
-            OURS: _triway_step(spec, batch, objects, generator),
-            LOCAL: _triway_step(replace(spec, form="local"), batch, objects, generator),
-            DENSE: _dense_step(batch, A, H1, generator),
-        },
+        {OURS: ObjectFit(ours, data, config, 0).step, COPIES: _copies_step(other, v, config)},
         rounds=rounds,
         slice_seconds=0.3,
     )
     return Result(
         name="training",
-        title=f"One CD-1 step, {scenes} scenes of {objects} objects, {V} classes, one thread",
+        title=f"One step of the object fit, {scenes} scenes of {objects} objects, {V} classes, "
+        "one thread",
         subject=OURS,
         timings=timings,
-        targets={DENSE: 200},
-        facts={
-            "weights, ours": build(spec).parameter_count,
-            "weights, dense": dense_units * H1 + dense_units + H1,
-        },
+        targets={COPIES: 50},
+        facts={"largest difference of log-odds": float(difference.detach().abs().max())},
     )
 
 
-def _triway_step(
-    spec: MachineSpec, batch: Batch, objects: int, generator: torch.Generator
-) -> Callable[[], None]:
-    """Return a function that runs one training step: loss, gradients by autograd, and update."""
-    machine = build(spec).initialise(generator, scale=0.05)
-    with torch.no_grad():
-        machine.b.copy_(frequencies(spec.V, objects).logit())
-        machine.get_parameter("d").fill_(math.log(_HOLDS))
-    config = ObjectiveConfig(name="contrastive_divergence", k=1)
-    objective = ContrastiveDivergence(config, machine)
-    trained = [parameter for parameter in machine.parameters() if parameter.requires_grad]
-    optimiser = torch.optim.SGD(trained, lr=_RATE, fused=True)
+def free_energy_log_odds(machine: BoltzmannMachine, listed: Tensor) -> Tensor:
+    """Return the log-odds of each class given the others, (scenes, classes), by free energies."""
+    V = machine.spec.V
+    present = listed.repeat_interleave(V, 0)
+    absent = present.clone()
+    rows = torch.arange(len(present))
+    present[rows, rows % V] = 1
+    absent[rows, rows % V] = 0
+    return (machine.free_energy(absent) - machine.free_energy(present)).view(-1, V)
+
+
+def _copies_step(machine: BoltzmannMachine, v: Tensor, config: ObjectsConfig) -> Callable[[], None]:
+    """Return a function that runs one step with the free energies of the copies."""
+    generator = torch.Generator().manual_seed(0)
+    weights = [machine.b, machine.c1, machine.W, machine.L, machine.kappa]
+    optimiser = torch.optim.Adam(weights, lr=config.learning_rate)
 
     def step() -> None:
-        optimiser.zero_grad(set_to_none=True)
-        objective.loss(machine, batch, generator).backward()
-        objective.adjust_gradients(machine)
+        parts = random_parts(v, config.leave_one_out, generator)
+        log_odds = free_energy_log_odds(machine, parts.listed) + machine.kappa[parts.share]
+        hidden = v - parts.listed
+        weight = (1 - parts.listed) * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
+        loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum() / len(v)
+        optimiser.zero_grad()
+        loss.backward()
         optimiser.step()
-
-    return step
-
-
-def _dense_step(batch: Batch, A: int, H: int, generator: torch.Generator) -> Callable[[], None]:
-    """Return a function that runs one training step of a dense machine with one hidden layer.
-
-    The visible layer x has a unit for each object class and for each of the A·V² relations. A
-    relation can be on only if both its objects are on, and it then forces these objects on. The
-    step adds gradients directly to the weights, without autograd.
-    """
-    scenes, V = batch.v.shape
-    x = torch.zeros(scenes, V + A * V * V)
-    x[:, :V] = batch.v
-    grid = x[:, V:].view(scenes, A, V, V)
-    for row, classes in enumerate(batch.classes):
-        grid[row, :, classes[:, None], classes[None, :]] = batch.holds[row]
-    weights = torch.randn(x.shape[1], H, generator=generator).mul_(0.001)
-    bias, c = torch.full((x.shape[1],), -4.0), torch.zeros(H)
-
-    @torch.no_grad()
-    def step() -> None:
-        data = torch.addmm(c, x, weights).sigmoid_()
-        h = torch.bernoulli(data, generator=generator)
-        p = torch.addmm(bias, h, weights.T).sigmoid_()
-        related = grid.amax(1)
-        held = torch.maximum(related.amax(1), related.amax(2))
-        v = torch.bernoulli(p[:, :V], generator=generator).maximum(held)
-        pairs = v[:, :, None] * v[:, None, :]
-        p[:, V:].view(grid.shape).mul_(pairs.unsqueeze(1))
-        y = torch.bernoulli(p, generator=generator)
-        y[:, :V] = v
-        model = torch.addmm(c, y, weights).sigmoid_()
-        weights.addmm_(x.T, data, alpha=_RATE / scenes).addmm_(y.T, model, alpha=-_RATE / scenes)
-        bias.add_((x - y).mean(0), alpha=_RATE)
-        c.add_((data - model).mean(0), alpha=_RATE)
 
     return step

@@ -26,8 +26,10 @@ def object_machine(spec: MachineSpec, objects: float) -> BoltzmannMachine:
     machine = build(spec).requires_grad_(False)
     machine.initialise(torch.Generator().manual_seed(0), scale=0.1)
     p = frequencies(spec.V, objects)
-    # Half of the hidden units are on. The object biases compensate the effect of these units.
-    machine.b.copy_(p.logit() - machine.W.sum(1) / 2 - machine.W.square().sum(1) / 8)
+    # All states of a hidden unit are equally likely. The object biases compensate their effect.
+    mean = 1 / spec.states
+    variance = machine.W.square().sum(1) * mean * (1 - mean)
+    machine.b.copy_(p.logit() - machine.W.sum(1) * mean - variance / 2)
     machine.c1.copy_(-(p @ machine.W))
     return machine
 
@@ -44,7 +46,7 @@ def presence(classes: Tensor, V: int) -> Tensor:
 
 
 def scikit_learn(machine: BoltzmannMachine) -> BernoulliRBM:
-    """Return a fitted scikit-learn RBM with the object and hidden weights of a machine."""
+    """Return a scikit-learn RBM with the object and hidden weights of a machine of binary units."""
     rbm = BernoulliRBM(machine.spec.H1)
     rbm.components_ = machine.W.T.contiguous().numpy()
     rbm.intercept_hidden_ = machine.c1.numpy().copy()

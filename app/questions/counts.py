@@ -25,6 +25,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from app.compiling import compiled
 from app.questions.answer import Fields, significant
 from app.questions.posterior import present
 from app.registry.artifact import Artifact
@@ -131,25 +132,70 @@ def distribution(
         Indices into `classes` of the k classes with statistics that cover the listed number, (k,).
         Then the probability of 1, 2, ... M instances, (k, M).
     """
-    M = counts.log_share.shape[1]
     entry = np.searchsorted(counts.classes, classes)
     entry[entry == len(counts.classes)] = 0
     rows = np.flatnonzero((counts.classes[entry] == classes) & (listed <= counts.most[entry]))
-    entry, number, k = entry[rows], np.arange(1, M + 1), listed[rows, None]
-    weights, is_several = counts.weights[entry, :, :ROOM].astype(np.float64), listed > 1
-    exponents = weights[..., INTERCEPT] + weights[..., SINGLE] * (k == 1)
-    exponents += weights[..., SEVERAL] * (is_several.sum() > is_several[rows, None])
-    if room is not None:
-        exponents += counts.weights[entry, :, ROOM + room]
-    if (others := len(classes) - 1) > 0:
-        # The effect of a class on itself is 0, so the sum over all listed classes is correct.
-        effects = counts.weights[entry[:, None], :, counts.weights.shape[-1] - V + classes]
-        exponents += effects.sum(axis=1, dtype=np.float64) / math.sqrt(others)
-    logits = counts.log_share[entry] + exponents @ functions(M)
-    logits += (number - k) * math.log(max(unlisted, sys.float_info.min))
-    logits[number < k] = -np.inf
-    p = np.exp(logits - logits.max(axis=1, keepdims=True, initial=-np.inf))
-    return rows, p / p.sum(axis=1, keepdims=True)
+    is_several = listed > 1
+    has_others = is_several.sum() > is_several[rows]
+    first = counts.weights.shape[-1] - V
+    log_unlisted = math.log(max(unlisted, sys.float_info.min))
+    entry, k, room_index = entry[rows], listed[rows], -1 if room is None else room
+    tables = counts.log_share, counts.weights
+    scene = entry, k, has_others, classes, first, room_index, log_unlisted
+    return rows, _distributions(*tables, *scene)
+
+
+@compiled
+def _distributions(
+    log_share: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    entry: Ints,
+    listed: Ints,
+    has_others: NDArray[np.bool_],
+    classes: Ints,
+    first: int,
+    room: int,
+    log_unlisted: float,
+) -> Floats:
+    """Return the distributions of `distribution`, (k, M).
+
+    Args:
+        entry, listed: (k,) rows of the statistics, and numbers of listed objects.
+        has_others: (k,) True if another class is listed several times.
+        classes: (n,) listed classes. `first` is the column of class 0 in the weights.
+        room: index of the room type, or -1.
+    """
+    M = log_share.shape[1]
+    p, exponents = np.empty((len(entry), M), np.float64), np.empty(2, np.float64)
+    for row in range(len(entry)):
+        e, k, largest = entry[row], listed[row], -np.inf
+        for x in range(2):
+            # The effect of a class on itself is 0, so the sum over all listed classes is correct.
+            effects = 0.0
+            for j in range(len(classes)):
+                effects += weights[e, x, first + classes[j]]
+            total = weights[e, x, INTERCEPT] + effects / math.sqrt(max(len(classes) - 1, 1))
+            if k == 1:
+                total += weights[e, x, SINGLE]
+            if has_others[row]:
+                total += weights[e, x, SEVERAL]
+            if room >= 0:
+                total += weights[e, x, ROOM + room]
+            exponents[x] = total
+        for n in range(1, M + 1):
+            log, value = math.log(n), -np.inf
+            if n >= k:
+                value = log_share[e, n - 1] + exponents[0] * log + (n - k) * log_unlisted
+                value += exponents[1] * log * (math.log(M) - log)
+            p[row, n - 1] = value
+            largest = max(largest, value)
+        sum_p = 0.0
+        for n in range(M):
+            p[row, n] = math.exp(p[row, n] - largest)
+            sum_p += p[row, n]
+        for n in range(M):
+            p[row, n] /= sum_p
+    return p
 
 
 @lru_cache(maxsize=8)

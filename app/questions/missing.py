@@ -274,7 +274,7 @@ _EXAMPLES: Final = {
         {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
     ),
     "coverage": Example(
-        "a complete list: unlisted classes count as absent", {**LABELS, "coverage": 1.0}
+        "a complete list: at most one class is missing", {**LABELS, "coverage": 1.0}
     ),
     "candidates": Example(
         "only these candidates", {**LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3}

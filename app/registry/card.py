@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from math import prod
 
+from app.inference import MachineSpec
 from app.registry.counts import PREFIX as COUNTS
 from app.registry.description import DataSource, Description
 from app.registry.manifest import TensorEntry, of_machine
@@ -35,16 +36,16 @@ from a second training run with the same configuration on nine tenths of all sce
 of the second run used the other tenth."""
 
 _PROBABILITIES = """\
-The probabilities are calibrated on validation scenes. Perfect probabilities have an expected
-calibration error (ECE) of 0 and a Brier skill of 1. A Brier skill of 0 means that the base rate is
-equally good. The probabilities mean:
+The probabilities are calibrated on validation scenes, and those of objects on random parts of the
+scenes. Perfect probabilities have an expected calibration error (ECE) of 0 and a Brier skill of 1.
+A Brier skill of 0 means that the base rate is equally good. The probabilities mean:
 
 - relations: the relation holds between the two objects
 - placements: the relation holds between the missing object and an object of the scene
 - missing: the class is in the scene although it was not listed; in answers about a place: the class
   is in the scene and at this place
-- outliers: the object is an intruder, if half of the scenes contain an intruder; at the default
-  threshold, about 10 % of the unchanged scenes of the hardest large source raise an alarm
+- outliers: the object is an intruder, if half of the lists contain an intruder; at the default
+  threshold, about 10 % of the unchanged parts of real validation scenes raise an alarm
 - misplaced: the relation is false, if half of the scenes contain an altered relation"""
 
 _OFFSETS = """\
@@ -63,9 +64,8 @@ _LIMITS = """\
 - Offsets predict where an object usually is. They ignore free space, and the size and heading of
   the other object.
 - The model does not know labels outside its vocabulary. It accepts structural and vague labels
-  (floor, sky, object), but never proposes them.
-- The figures do not apply if a scene differs from the scenes of the sources above, or if the robot
-  saw only a small part of the scene.
+  (floor, sky, object), but never proposes them. They change no answer about objects.
+- The figures do not apply if a scene differs from the scenes of the sources above.
 - A probability is a statistical statement about such scenes, not a safety check. Do not let a
   robot move an object, or leave it in place, because of this answer alone."""
 
@@ -90,7 +90,8 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
             ("", ""),
             [
                 ("Kind", f"{description.variant}, a Boltzmann machine over objects and relations"),
-                ("Shape", ", ".join(f"{name} {value}" for name, value in spec.items())),
+                *_machine(MachineSpec.from_dict(dict(spec))),
+                ("Profiles", ", ".join(words.profiles) or "none"),
                 ("Weights", f"{weights:,} (stored as {stored})"),
                 ("Object classes", f"{len(words.objects)}, of which {proposed} may be proposed"),
                 ("Relations", ", ".join(words.relations)),
@@ -118,6 +119,28 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
         or "not recorded",
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def _machine(spec: MachineSpec) -> list[tuple[str, str]]:
+    """Return the rows of the table about units and weights."""
+    rows = [("Hidden units", _units(spec.units, spec.states))]
+    if spec.H2:
+        rows.append(("Second layer", _units(spec.H2, 2)))
+    relations = f"own weights of {spec.T:,} triples"
+    if spec.kind.factorised:
+        relations = f"factors of rank {spec.K}, and {relations}"
+    if spec.G:
+        relations += f"; implications of rank {spec.G}"
+    return [
+        *rows,
+        ("Couplings", "between all pairs of classes" if spec.coupled else "none"),
+        ("Relation weights", relations),
+        ("Stored scenes", f"{spec.N:,}, where chains start" if spec.N else "none"),
+    ]
+
+
+def _units(units: int, states: int) -> str:
+    return f"{units} binary units" if states == 2 else f"{units} units of {states} states"
 
 
 def _size(tensors: Mapping[str, TensorEntry], name: str) -> int:

@@ -289,7 +289,7 @@ class Description(Frozen):
     Attributes:
         name, version: name and version of the model in the store.
         created: time of creation in UTC.
-        spec: sizes and form of the machine, as returned by `MachineSpec.to_dict`.
+        spec: sizes of the machine, as returned by `MachineSpec.to_dict`.
         vocabulary: V object classes, A relations and C room types, in the order of their indices.
         calibration: conversion of log-odds into probabilities.
         training: configuration and seed of the training, as JSON without a fixed schema.

@@ -68,6 +68,7 @@ SCENE: Final[dict[str, Any]] = {
     ],
     "relations_complete": False,
     "room_type": "bedroom",
+    "profile": "homes",
     "frame_id": "base_link",
     "stamp": {"sec": 1, "nanosec": 2},
     "viewpoint": {"x": 0.0, "y": 0.0, "yaw": 0.0},

@@ -123,9 +123,9 @@ def test_a_scene_may_come_from_a_file_or_a_pipe_and_options_go_before_it(
     ("line", "words"),
     [
         ("models", ("home@1.0.0", "default", "triway", "ready")),
-        ("vocabulary", ("garbage bin", "trash can, waste basket", "structure")),
-        ("contexts", ("layer", "unit")),
-        ("outliers bed toilet", ("toilet", "because")),
+        ("vocabulary", ("garbage bin", "trash can, waste basket", "structure", "homes, shops")),
+        ("contexts", ("layer", "unit", "state")),
+        ("outliers bed toilet sink", ("toilet", "because")),
     ],
 )
 def test_everything_has_a_table(scene: Any, line: str, words: tuple[str, ...]) -> None:

@@ -87,7 +87,7 @@ def description(
             "spec": SPECS[variant],
             "vocabulary": VocabularyEntry.of(VOCABULARY, profiles=PROFILES[variant]),
             "calibration": Calibration.neutral(4).model_copy(update=JUDGING),
-            "training": {"objective": "pcd", "seed": 7, "rate": 0.1},
+            "training": {"objects": {"steps": 800}, "seed": 7, "rate": 0.1},
             "data": [DATA],
             "metrics": [{"task": "missing", "source": "generated", "metric": "MRR", **FIGURE}],
             "terms": "Apache-2.0",

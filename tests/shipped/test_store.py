@@ -65,13 +65,23 @@ def test_an_artifact_loads_in_under_a_second(artifact):
     assert time.process_time() - began < 1.0
 
 
-def test_the_structure_is_the_seed_paper_s_but_for_the_second_layer_of_the_triway(artifact):
-    """Why it has gone: docs/decisions/objective.md."""
-    spec = artifact.spec
-    assert spec.H1 == 200
-    deep = spec.variant == "gbm" or artifact.manifest.name.endswith("deep")
+def test_the_hidden_layers_are_the_seed_paper_s_but_for_the_default(artifact):
+    """The default and `open-triway` have couplings, and few units of many states."""
+    spec, name = artifact.spec, artifact.manifest.name
+    coupled = name in ("indoor-triway", "open-triway")
+    assert (spec.units, spec.states, spec.coupled) == ((8, 32, True) if coupled else (200, 2, False))
+    deep = spec.variant == "gbm" or name.endswith("deep")
     assert (100 if deep else 0) == spec.H2
     assert len(CANONICAL) == spec.A
+
+
+def test_structure_has_no_object_weights(artifact):
+    """So listing it changes no answer about other classes."""
+    structure = artifact.vocabulary.structure
+    assert structure.any()
+    assert not artifact.weights["W"][structure].any()
+    if artifact.spec.coupled:
+        assert not artifact.weights["L"][structure].any()
 
 
 def test_the_card_names_the_data_and_its_terms(artifact):

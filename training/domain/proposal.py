@@ -1,8 +1,7 @@
 """Propose a vocabulary and a training configuration for scenes, with a reason for each entry.
 
-The rules interpolate between configurations that a search found for data sets of different sizes
-(docs/decisions/objective.md, docs/decisions/own-scenes.md). The command `training tune` searches
-for a better configuration.
+Few scenes get a small machine, and many scenes a larger one (docs/decisions/own-scenes.md). The
+command `training tune` searches for a better configuration.
 """
 
 from __future__ import annotations
@@ -300,7 +299,7 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
     n = parts["train"]
     is_large = n >= _MANY_SCENES
     machine: dict[str, Any] = {"variant": "triway" if facts.related else "rbm"}
-    machine |= {"units": 8, "states": 32 if is_large else 8, "coupled": is_large}
+    machine |= {"units": 8, "states": 32 if is_large else 8}
     machine |= {"K": 32 if is_large else 16, "G": 8} if facts.related else {"K": 0}
     machine |= {"N": 512 if is_large else 128, "min_triple_count": 2}
     objects = {
@@ -314,7 +313,6 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         if facts.related
         else "the scenes contain no relations or positions: the model learns objects only",
         "machine.states": f"states of a hidden unit: more do not help with {n} training scenes",
-        "machine.coupled": f"couplings between classes help from {_MANY_SCENES} scenes on",
         "objects.steps": "more steps do not help, because priors limit the weights",
     }
     if facts.related:

@@ -304,7 +304,8 @@ def calibration_task(model: Model, setting: Setting) -> Outcome | None:
             raw_answers = ask_all(uncalibrated(model.artifact))
             for figure in ("ECE", "Brier skill"):
                 metrics[f"{figure}, {name}"] = answers.metric(figure)
-                metrics[f"{figure}, {name}, uncalibrated"] = raw_answers.metric(figure)
+                if len(raw_answers.scene):
+                    metrics[f"{figure}, {name}, uncalibrated"] = raw_answers.metric(figure)
     # Brier skill is undefined if all answers are true or all answers are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None

@@ -165,13 +165,16 @@ def models(answer: schemas.ModelList) -> RenderableType:
 
 
 def contexts(answer: schemas.ContextsAnswer) -> RenderableType:
-    """Return a table of hidden units with the classes of their largest weights."""
+    """Return a table of the states of hidden units with the classes of their largest weights."""
     rows = [
-        (layer, str(unit.unit), _weighted(unit.objects), _weighted(unit.room_types))
+        (
+            *(layer, str(unit.unit), str(unit.state)),
+            *(_weighted(unit.objects), _weighted(unit.room_types)),
+        )
         for layer, units in answer.layers.items()
         for unit in units
     ]
-    return _table("layer", "unit", "objects", "room types", rows=rows)
+    return _table("layer", "unit", "state", "objects", "room types", rows=rows)
 
 
 def vocabulary(answer: schemas.VocabularyAnswer) -> RenderableType:
@@ -181,6 +184,8 @@ def vocabulary(answer: schemas.VocabularyAnswer) -> RenderableType:
         for entry in answer.objects
     ]
     title = f"room types: {', '.join(answer.room_types) or 'none'}"
+    if answer.profiles:
+        title += f"\nprofiles: {', '.join(answer.profiles)}"
     return _table("object", "also", "", rows=rows, title=title)
 
 

@@ -200,12 +200,12 @@ def test_a_slip_becomes_an_alias_and_a_rare_label_no_class() -> None:
     assert proposal.covered[8][0] == 3
 
 
-@pytest.mark.parametrize(("scenes", "states", "coupled"), [(80, 8, False), (1500, 32, True)])
-def test_many_scenes_get_a_larger_machine(scenes, states, coupled) -> None:
+@pytest.mark.parametrize(("scenes", "states"), [(80, 8), (1500, 32)])
+def test_many_scenes_get_a_larger_machine(scenes, states) -> None:
     rooms = generate_rooms(scenes, 0, DOMAINS["workplaces"])
     proposal = propose("lab", rooms, ["scenes.jsonl"])
     config, n = proposal.config, proposal.parts["train"]
-    assert (config.machine.states, config.machine.coupled) == (states, coupled)
+    assert (config.machine.states, config.machine.coupled) == (states, False)
     updates = config.relations.epochs * math.ceil(n / config.relations.batch_size)
     assert 200 <= updates <= 900
     assert 8 <= math.ceil(n / config.relations.batch_size) <= 25

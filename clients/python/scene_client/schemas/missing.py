@@ -39,9 +39,9 @@ class MissingRequest(SceneRequest):
     coverage: Annotated[
         Probability | None,
         Field(
-            description="probability that the request lists an object of the real scene. With 1, "
-            "unlisted classes count as absent. With 0, unlisted classes do not count as evidence. "
-            "Default: the value of the model",
+            description="share of the real scene's classes that the request lists. With 1, at most "
+            "one class is missing. Values below 0.15 mean 0.15. Default: the value of the model, "
+            "which gave validation scenes the best answers",
         ),
     ] = None
     top_k: Annotated[int, Field(ge=1)] = 10
