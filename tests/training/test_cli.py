@@ -28,7 +28,7 @@ from training.runs.publish import refit
 ROOT = Path(__file__).parents[2]
 
 CONFIG = with_settings(
-    small_config(rooms=160),
+    small_config(rooms=260),
     {
         "machine.units": 4,
         "machine.states": 4,
@@ -111,8 +111,10 @@ def test_from_rooms_to_answers(tmp_path):
     same_weights_with_refitted_statistics(artifact, tmp_path / "store")
     calibration = artifact.calibration
     assert calibration.outlier.slope < 0  # the likelier an object, the less an intruder
-    limits = calibration.outlier_thresholds
-    assert 1 > limits.low >= limits.medium >= limits.high > 0
+    lines = calibration.outlier_lines
+    limits = [line.threshold(3) for line in (lines.low, lines.medium, lines.high)]
+    assert limits == sorted(limits, reverse=True)
+    assert 1 > limits[0] >= limits[2] > 0
     things = ("bed", "nightstand", "lamp")
     scene = Scene(
         tuple(SceneObject(name, name, artifact.vocabulary.index(name)) for name in things)

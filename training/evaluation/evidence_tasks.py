@@ -1,20 +1,19 @@
-"""Measure how additional evidence changes the answers: relations, poses or the room type.
+"""Measure how additional evidence changes the answers: the room type, relations or poses.
 
 Each question is asked twice about the same scene: with the object labels only, and with labels and
 one kind of evidence. The result is the paired change of a metric, with an interval over scenes.
 
-    T2   (missing objects) One class is removed with all its instances. The evidence is the
-         relations or poses of the remaining instances, or the room type. Metric: change of the
-         mean reciprocal rank (MRR) of the removed class among absent classes
-    T3   (outliers) A uniformly drawn absent class is added as an intruder. The relations of the
-         intruder are unknown. Metric: change of the share of scenes whose intruder ranks first
+    T2   (missing objects) One class is removed with all its instances. The evidence is the room
+         type. Metric: change of the mean reciprocal rank (MRR) of the removed class among absent
+         classes
+    T3   (outliers) A uniformly drawn absent class is added as an intruder. The evidence is the room
+         type. Metric: change of the share of scenes whose intruder ranks first
     T1   (relations) The evidence is the relations or poses between the instances of half of the
          classes. Metric: change of R-precision on all other ordered pairs. The number of
          predictions is the number of listed relations. An unlisted relation counts as wrong
 
-Poses also show which relations do not hold. Only data sources with positions have poses. Scenes
-without a relation between the remaining instances are left out. The evidence never contains the
-answer.
+Relations and poses are no evidence for objects in these machines. Poses also show which relations
+do not hold. Only data sources with positions have poses. The evidence never contains the answer.
 """
 
 from __future__ import annotations
@@ -44,7 +43,9 @@ from training.evaluation.model import Model
 from training.evaluation.relation_tasks import expected_hits
 from training.evaluation.setting import Outcome, Setting
 
-KINDS = ("relations", "poses", "room type")
+OF_RELATIONS = ("relations", "poses")
+OF_OBJECTS = ("room type",)
+"""Kinds of evidence for relations and for objects."""
 
 # Number of questions per scene in T2, each with another removed class. With one question per scene,
 # the random choice of the class changes the result of a small data source by about 0.01.
@@ -72,29 +73,29 @@ class Case:
     items: int = 1
 
 
-def with_evidence(
-    encoded: EncodedScene, kept: list[int], kind: str, between: Flags | None = None
-) -> tuple[Scene, Scene] | None:
+def with_relations(encoded: EncodedScene, kind: str, between: Flags) -> tuple[Scene, Scene] | None:
     """Return a scene with labels only, and with evidence; None if the scene lacks this evidence.
 
-    `between` (instances, instances) are the pairs of instances with evidence; None means all pairs.
+    `between` (instances, instances) are the pairs of instances with evidence.
     """
-    bare = replace(scene_of(encoded, kept, ()), room_type=None)
-    if kind == "room type":
-        with_room = scene_of(encoded, kept, ())
-        return None if with_room.room_type is None else (bare, with_room)
-    mask = np.ones((len(kept),) * 2, dtype=np.bool_) if between is None else between
-    holds = encoded.instance_holds[:, kept][:, :, kept] & mask
+    bare = replace(scene_of(encoded, range(len(between)), ()), room_type=None)
+    holds = encoded.instance_holds & between
     triples = tuple((int(a), int(i), int(j)) for a, i, j in np.argwhere(holds))
     if not triples or (kind == "poses" and encoded.instance_positions is None):
         return None
     poses = None
     if kind == "poses":
-        poses = PoseRelations(holds, encoded.instance_observed[:, kept][:, :, kept] & mask)
+        poses = PoseRelations(holds, encoded.instance_observed & between)
     return bare, replace(bare, relations=triples, poses=poses)
 
 
-def removals(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
+def with_room(encoded: EncodedScene, kept: list[int]) -> tuple[Scene, Scene] | None:
+    """Return a scene with labels only, and with its room type; None if this is unknown."""
+    scene = scene_of(encoded, kept, ())
+    return None if scene.room_type is None else (replace(scene, room_type=None), scene)
+
+
+def removals(scenes: SceneTensors, structure: Flags, seed: int = 0) -> Iterator[Case]:
     """Generate the T2 questions: up to two questions per scene, each with one removed class."""
     for index, encoded in enumerate(scenes.scenes):
         classes = encoded.evidence.classes
@@ -103,30 +104,20 @@ def removals(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -
             continue
         for target in scene_rng(encoded, seed).permutation(removable)[:_REMOVALS]:
             kept = thing_instances(encoded, structure, {int(target)})
-            if (pair := with_evidence(encoded, kept, kind)) is not None:
+            if (pair := with_room(encoded, kept)) is not None:
                 yield Case(index, pair, int(target))
 
 
 def intrusions(
-    artifact: Artifact, scenes: SceneTensors, structure: Flags, intruders: Ints, kind: str
+    artifact: Artifact, scenes: SceneTensors, structure: Flags, intruders: Ints
 ) -> Iterator[Case]:
     """Generate the T3 questions: each scene with its intruder, (scenes,); -1 skips the scene."""
     for index, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
-        pair = with_evidence(encoded, thing_instances(encoded, structure), kind)
+        pair = with_room(encoded, thing_instances(encoded, structure))
         if intruder < 0 or pair is None:
             continue
-        bare, informed = (_add_intruder(artifact, scene, int(intruder)) for scene in pair)
+        bare, informed = (with_intruder(artifact, scene, int(intruder)) for scene in pair)
         yield Case(index, (bare, informed), len(bare.objects) - 1)
-
-
-def _add_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
-    """Return the scene with an intruder. All relations of the intruder are unobserved."""
-    larger = with_intruder(artifact, replace(scene, poses=None), intruder)
-    if scene.poses is None:
-        return larger
-    pad = ((0, 0), (0, 1), (0, 1))  # one row and one column of False for the intruder
-    poses = PoseRelations(np.pad(scene.poses.holds, pad), np.pad(scene.poses.observed, pad))
-    return replace(larger, poses=poses)
 
 
 def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> Iterator[Case]:
@@ -139,7 +130,7 @@ def halves(scenes: SceneTensors, structure: Flags, kind: str, seed: int = 0) -> 
         half = scene_rng(encoded, seed).permutation(things)[: max(2, len(things) // 2)]
         in_half, is_thing = np.isin(instances, half), ~structure[instances]
         between = in_half[:, None] & in_half
-        scene_pair = with_evidence(encoded, list(range(len(instances))), kind, between)
+        scene_pair = with_relations(encoded, kind, between)
         pair = is_thing[:, None] & is_thing & ~between & ~np.eye(len(instances), dtype=np.bool_)
         queried = np.broadcast_to(pair, encoded.instance_holds.shape)
         truth = encoded.instance_holds & queried
@@ -161,8 +152,9 @@ def missing_evidence_task(model: Model, setting: Setting) -> Outcome | None:
         "MRR",
         model,
         setting,
-        lambda _, scenes, kind: removals(scenes, structure, kind, setting.seed),
+        lambda _, scenes, __: removals(scenes, structure, setting.seed),
         lambda artifact, scene, case: reciprocal_rank(artifact, scene, case.target),
+        OF_OBJECTS,
     )
 
 
@@ -170,16 +162,16 @@ def outliers_evidence_task(model: Model, setting: Setting) -> Outcome | None:
     """Measure T3 (outliers) with labels only and with additional evidence."""
     structure = setting.structure.numpy()
 
-    def cases(artifact: Artifact, scenes: SceneTensors, kind: str) -> Iterator[Case]:
+    def cases(artifact: Artifact, scenes: SceneTensors, _: str) -> Iterator[Case]:
         intruders = draw_intruders(scenes, setting.structure, seed=setting.seed).numpy()
-        return intrusions(artifact, scenes, structure, intruders, kind)
+        return intrusions(artifact, scenes, structure, intruders)
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
         p = judge(artifact, scene)[:, 0]
         is_highest = p == p.max()
         return float(is_highest[case.target] / is_highest.sum())
 
-    return _changes("hit@1", model, setting, cases, value)
+    return _changes("hit@1", model, setting, cases, value, OF_OBJECTS)
 
 
 def relations_evidence_task(model: Model, setting: Setting) -> Outcome | None:
@@ -195,7 +187,7 @@ def relations_evidence_task(model: Model, setting: Setting) -> Outcome | None:
         setting,
         lambda _, scenes, kind: halves(scenes, setting.structure.numpy(), kind, setting.seed),
         value,
-        KINDS[:2],
+        OF_RELATIONS,
     )
 
 
@@ -205,7 +197,7 @@ def _changes(
     setting: Setting,
     cases_of: Callable[[Artifact, SceneTensors, str], Iterator[Case]],
     value: Callable[[Artifact, Scene, Case], float],
-    kinds: tuple[str, ...] = KINDS,
+    kinds: tuple[str, ...],
 ) -> Outcome | None:
     """Return the metric without and with each kind of evidence, and the change of the metric.
 
@@ -217,7 +209,7 @@ def _changes(
     artifact = model.artifact
     if artifact is None:
         return None
-    scenes = setting.some(related=True)
+    scenes = setting.some(related=kinds == OF_RELATIONS)
     metrics: dict[str, Metric] = {}
     skipped: list[int] = []
     for kind in kinds:

@@ -38,44 +38,6 @@ def _by_score(
     return scores, count
 
 
-def auroc(score: Floats, truth: Flags) -> Prepared:
-    """Return the probability that a true item scores above a false item; ties count half."""
-    _, count = _by_score(score, truth)
-
-    def at(weight: Floats) -> float:
-        totals, true = count(weight)
-        false = totals - true
-        below = np.cumsum(false) - false
-        pairs = true.sum() * false.sum()
-        return float((true * (below + false / 2)).sum() / pairs) if pairs else float("nan")
-
-    return at
-
-
-def average_precision(score: Floats, truth: Flags) -> Prepared:
-    """Return the mean precision at the ranks of the true items.
-
-    Suppose that n items have the same score and that p of them are true. Suppose also that N items
-    have a higher score and that P of them are true. If a true item has rank N + k, the expected
-    number of true items among the first N + k items is P + 1 + (k - 1)(p - 1)/(n - 1).
-    """
-    _, count = _by_score(score, truth)
-
-    def at(weight: Floats) -> float:
-        totals, true = (part[::-1] for part in count(weight))
-        is_nonempty = totals > 0
-        n, p = totals[is_nonempty], true[is_nonempty]
-        if not p.sum():
-            return float("nan")
-        N, P = np.cumsum(n) - n, np.cumsum(p) - p
-        harmonic = np.concatenate([[0.0], np.cumsum(1.0 / np.arange(1, int(n.sum()) + 1))])
-        inverse = harmonic[(N + n).astype(np.int64)] - harmonic[N.astype(np.int64)]
-        tied_hits = (p - 1) / np.maximum(n - 1, 1) * (n - (N + 1) * inverse)
-        return float((p / n * ((P + 1) * inverse + tied_hits)).sum() / p.sum())
-
-    return at
-
-
 def calibration_error(score: Floats, truth: Flags) -> Prepared:
     """Return the expected calibration error (ECE) of probabilities.
 
@@ -139,8 +101,6 @@ def _bins(scores: Floats, totals: Floats, true: Floats) -> tuple[Floats, Floats]
 
 
 STATISTICS: dict[str, Callable[[Floats, Flags], Prepared]] = {
-    "AUROC": auroc,
-    "average precision": average_precision,
     "ECE": calibration_error,
     "Brier skill": brier_skill,
 }

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Self
 
@@ -233,82 +233,15 @@ class Ratio(Metric):
         )
 
 
-class _OfItems(Metric):
-    """A metric of N items that belong to scenes; subclasses are dataclasses of columns.
-
-    Attributes:
-        scene: (N,) scene of each item.
-
-    Raises:
-        ValueError: there are no items.
-    """
-
-    scene: Ints
-    count: int
-
-    def __post_init__(self) -> None:
-        if not len(self.scene):
-            raise ValueError("no scene could be scored")
-
-    @property
-    def scenes(self) -> int:  # type: ignore[override]
-        return self.count
-
-    @classmethod
-    def join(cls, parts: Sequence[Self]) -> Self:
-        values: dict[str, Any] = {}
-        for field in fields(cls):  # type: ignore[arg-type]
-            items = [getattr(part, field.name) for part in parts]
-            is_column = isinstance(items[0], np.ndarray)
-            values[field.name] = np.concatenate(items) if is_column else items[0]
-        # The scene indices of a part are shifted by the number of scenes in earlier parts.
-        starts = np.cumsum([0, *(part.count for part in parts)]).tolist()
-        shifted = [part.scene + start for part, start in zip(parts, starts[:-1], strict=True)]
-        scene = np.concatenate(shifted).astype(np.int64)
-        return cls(**values | {"scene": scene, "count": starts[-1]})
-
-
 @dataclass(frozen=True, eq=False)
-class Macro(_OfItems):
-    """Macro-average: the mean over groups, such as classes, of the mean over the group's items.
-
-    A resample may lack rare groups. This raises its mean if rare groups score lower. So the
-    resamples are centred on the value.
-
-    Attributes:
-        group: (N,) group of each item.
-        value_of: (N,) value of each item.
-    """
-
-    scene: Ints
-    group: Ints
-    value_of: Floats
-    count: int
-
-    @property
-    def n(self) -> int:  # type: ignore[override]
-        return len(np.unique(self.group))
-
-    def at(self, weight: Floats) -> float:
-        item_weight = weight[self.scene]
-        weights = np.bincount(self.group, weights=item_weight)
-        sums = np.bincount(self.group, weights=item_weight * self.value_of)
-        has_items = weights > 0
-        if not has_items.any():
-            return float("nan")
-        return float((sums[has_items] / weights[has_items]).mean())
-
-    @cached_property
-    def draws(self) -> Floats:
-        return _centred(resample(self.at, self.scenes), self.value)
-
-
-@dataclass(frozen=True, eq=False)
-class Scored(_OfItems):
-    """A statistic of the scores of all items: AUROC, average precision or calibration.
+class Scored(Metric):
+    """A statistic of the scores of N items that belong to scenes, such as the calibration error.
 
     Attributes:
         statistic: name in `STATISTICS`.
+        scene: (N,) scene of each item.
+        score, truth: (N,) score and truth value of each item.
+        count: number of scenes.
 
     Raises:
         ValueError: there are no items, or the statistic is unknown.
@@ -325,7 +258,25 @@ class Scored(_OfItems):
             raise ValueError(
                 f"unknown statistic {self.statistic!r}: must be one of {sorted(STATISTICS)}"
             )
-        super().__post_init__()
+        if not len(self.scene):
+            raise ValueError("no scene could be scored")
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        # The scene indices of a part are shifted by the number of scenes in earlier parts.
+        starts = np.cumsum([0, *(part.count for part in parts)]).tolist()
+        shifted = [part.scene + start for part, start in zip(parts, starts[:-1], strict=True)]
+        return cls(
+            parts[0].statistic,
+            np.concatenate(shifted).astype(np.int64),
+            np.concatenate([part.score for part in parts]),
+            np.concatenate([part.truth for part in parts]),
+            starts[-1],
+        )
+
+    @property
+    def scenes(self) -> int:  # type: ignore[override]
+        return self.count
 
     @property
     def n(self) -> int:  # type: ignore[override]

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from app.inference.weights import SHARES
 from training.datasets.array_types import Floats, Ints, Rng
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import scene_rng, some_scenes
@@ -24,8 +25,8 @@ from training.evaluation.metrics import Metric, Ratio
 REAL_SOURCES: Final = ("sunrgbd", "3dssg", "sunrgbd_bedrooms_3d", "matterport_rooms")
 """Data sources of real rooms with nearly complete object lists."""
 
-SHARE_BINS: Final = (0.3, 0.6)
-"""Upper limits of the first two bins of the listed share of a scene, see `share_bin`."""
+ALL_BUT_ONE: Final = len(SHARES)
+"""Bin of the listed share, and row of kappa, for lists of all classes but one."""
 
 LONGEST: Final = 12
 """Maximum number of listed classes of a random part in `validation_score`."""
@@ -108,10 +109,10 @@ def draw_parts(
 def share_bin(listed: Tensor, classes: Tensor) -> Tensor:
     """Return the bin of the listed share of scenes of so many classes, (B,) int64.
 
-    The bins are up to 30 %, up to 60 %, below 100 %, and all classes but one.
+    `app.inference.weights.SHARES` has the limits of the bins. `ALL_BUT_ONE` is the last bin.
     """
-    bins = torch.bucketize(listed / classes, torch.tensor(SHARE_BINS))
-    return torch.where(listed >= classes - 1, len(SHARE_BINS) + 1, bins)
+    bins = torch.bucketize(listed / classes, torch.tensor(SHARES[:-1]))
+    return torch.where(listed >= classes - 1, ALL_BUT_ONE, bins)
 
 
 @dataclass(frozen=True, eq=False)

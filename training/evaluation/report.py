@@ -25,7 +25,7 @@ from app.registry import Metric as CardMetric
 from training.datasets.batches import SceneTensors, subset
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.everyday_task import SOURCE, facts_digest
-from training.evaluation.metrics import Macro, Metric, Ratio, Resampled, Scored
+from training.evaluation.metrics import Metric, Ratio, Resampled, Scored
 from training.evaluation.model import Model
 from training.evaluation.setting import Outcome, Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
@@ -274,10 +274,8 @@ def pool(parts: Sequence[Metric]) -> Metric | None:
     return type(parts[0]).join(parts)
 
 
-_KINDS: dict[str, type[Any]] = {
-    cls.__name__.lower(): cls for cls in (Ratio, Macro, Scored, Resampled)
-}
-_TYPES: dict[str, type] = {"scene": np.int64, "group": np.int64, "truth": np.bool_}
+_KINDS: dict[str, type[Any]] = {cls.__name__.lower(): cls for cls in (Ratio, Scored, Resampled)}
+_TYPES: dict[str, type] = {"scene": np.int64, "truth": np.bool_}
 
 
 def metric_to_dict(metric: Metric) -> dict[str, Any]:

@@ -15,7 +15,8 @@ from training.evaluation.calibration_task import NAMES, calibration_task
 from training.evaluation.density_task import density_task
 from training.evaluation.everyday_task import LINES, everyday_task
 from training.evaluation.evidence_tasks import (
-    KINDS,
+    OF_OBJECTS,
+    OF_RELATIONS,
     missing_evidence_task,
     outliers_evidence_task,
     relations_evidence_task,
@@ -89,7 +90,7 @@ TASKS: dict[str, Task] = {
     "T1 with evidence": _carded(
         "relations, with more evidence",
         relations_evidence_task,
-        _each(("change of R-precision",), KINDS[:2]),
+        _each(("change of R-precision",), OF_RELATIONS),
         of_objects=False,
     ),
     "T1b completion": _carded(
@@ -103,9 +104,9 @@ TASKS: dict[str, Task] = {
     ),
     "Structure": _carded("floor, wall and ceiling listed", structure_task, ("change of p",)),
     "T2 with evidence": _carded(
-        "missing object, with more evidence",
+        "missing object, with the room type",
         missing_evidence_task,
-        _each(("change of MRR",), KINDS),
+        _each(("change of MRR",), OF_OBJECTS),
     ),
     "T2-at missing at a place": _objects(
         "missing object at a place", placed_task, ("MRR", "MRR, on-top"), ("MRR",)
@@ -119,7 +120,9 @@ TASKS: dict[str, Task] = {
         tuple(f"alarms, {name}, {n} classes" for n in LENGTHS for name in SENSITIVITIES),
     ),
     "T3 with evidence": _carded(
-        "intruder, with more evidence", outliers_evidence_task, _each(("change of hit@1",), KINDS)
+        "intruder, with the room type",
+        outliers_evidence_task,
+        _each(("change of hit@1",), OF_OBJECTS),
     ),
     "T3b placement": _carded("false relation", placement_task, ("hit@1",), of_objects=False),
     "T4 generate": _objects(

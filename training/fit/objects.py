@@ -37,9 +37,9 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy, softplus
 from torch.nn.utils.parametrize import cached
 
-from app.inference.weights import SHARES
 from training.datasets.batches import SceneTensors
 from training.datasets.sources import SOURCES
+from training.evaluation.parts import share_bin
 from training.fit.configuration import ObjectsConfig
 from training.machines import BoltzmannMachine
 from training.machines.gibbs import Chains, start_chains, sweep
@@ -49,8 +49,6 @@ _SHOWN = 3  # scenes of a source in which a class must occur
 _LEAST_SHARE = 0.05
 _AVERAGED = 0.3  # last share of the steps whose weights are averaged
 _RARE = -9.0  # least initial bias of a class
-ALL_BUT_ONE = len(SHARES)
-"""Bin of kappa for lists of all classes but one."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ class Parts(NamedTuple):
 
     Attributes:
         listed: listed classes, (scenes, classes) 0 or 1.
-        share: bin of the listed share, (scenes,) int64; see `app.inference.weights.SHARES`.
+        share: bin of the listed share, (scenes,) int64; see `share_bin`.
         weight: weight of a hidden class that is present, (scenes,).
     """
 
@@ -166,13 +164,7 @@ def random_parts(v: Tensor, leave_one_out: float, generator: torch.Generator) ->
     keys = torch.rand(v.shape, generator=generator) + 2 * (1 - v)
     rank = keys.argsort(1).argsort(1)
     listed = v * (rank < count.unsqueeze(1))
-    bins = torch.where(count == n - 1, ALL_BUT_ONE, share_bin(count / n))
-    return Parts(listed, bins, torch.where(hides_one, n, 1.0))
-
-
-def share_bin(share: Tensor) -> Tensor:
-    """Return the bin of each listed share between 0 and 1, int64."""
-    return torch.bucketize(share - 1e-6, torch.tensor(SHARES[:-1]))
+    return Parts(listed, share_bin(count, n), torch.where(hides_one, n, 1.0))
 
 
 class ObjectFit:

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import json
-from itertools import permutations
 
 import numpy as np
 import pytest
-from sklearn.metrics import average_precision_score, roc_auc_score
 
 from training.evaluation.item_statistics import (
     BINS,
     STATISTICS,
-    auroc,
-    average_precision,
     brier_skill,
     calibration_error,
     reliability,
 )
 from training.evaluation.metrics import (
     Figure,
-    Macro,
     MeanOverSeeds,
     Ratio,
     Resampled,
@@ -43,23 +38,20 @@ def mean_of(values):
 
 
 RATIO = Ratio(floats(1, 0, 3), floats(2, 0, 4))
-MACRO = Macro(ints(0, 0, 1, 1), ints(7, 7, 7, 2), floats(1, 0, 0.5, 1), 3)
-SCORED = Scored("AUROC", ints(0, 0, 1), floats(3, 1, 2), np.array([True, False, False]), 2)
+SCORED = Scored(
+    "Brier skill", ints(0, 0, 1), floats(0.9, 0.1, 0.4), np.array([True, False, False]), 2
+)
 RESAMPLED = Resampled.of(lambda weight: float(weight @ [1, 2]) / 2, 2, 9, 50)
-POOLABLE = {"ratio": RATIO, "macro": MACRO, "scored": SCORED}
+POOLABLE = {"ratio": RATIO, "scored": SCORED}
 
 
 def test_metrics_by_hand():
     assert RATIO.value == pytest.approx(4 / 6)
     assert (RATIO.n, RATIO.scenes) == (6, 3)
     assert RATIO.mean_over_scenes().value == pytest.approx((1 / 2 + 3 / 4) / 2)
-    # Every group counts alike; without scene 0 class 7 keeps one item.
-    assert MACRO.value == pytest.approx((1.5 / 3 + 1) / 2)
-    assert (MACRO.n, MACRO.scenes) == (2, 3)
-    assert MACRO.at(floats(0, 1, 1)) == pytest.approx((0.5 + 1) / 2)
     # Items count as often as their scene.
-    scene, score = ints(0, 0, 0, 0, 1), floats(3, 1, 3, 1, 2)
-    twice = Scored("AUROC", scene, score, np.array([1, 0, 1, 0, 0], bool), 2)
+    scene, score = ints(0, 0, 0, 0, 1), floats(0.9, 0.1, 0.9, 0.1, 0.4)
+    twice = Scored("Brier skill", scene, score, np.array([1, 0, 1, 0, 0], bool), 2)
     assert SCORED.at(floats(2, 1)) == pytest.approx(twice.value)
 
 
@@ -75,7 +67,7 @@ def test_pooling_is_measuring_the_union(metric):
 def test_metrics_of_whole_sets_do_not_pool():
     assert pool([RESAMPLED, RESAMPLED]) is None
     with pytest.raises(ValueError, match="2 types"):
-        pool([RATIO, MACRO])
+        pool([RATIO, SCORED])
 
 
 @pytest.mark.parametrize("metric", [*POOLABLE.values(), RESAMPLED], ids=[*POOLABLE, "resampled"])
@@ -102,12 +94,6 @@ TRUTH = RNG.random(60) < 0.3
 ONE = np.ones(60)
 
 
-def test_rankings_are_scikit_learn_s_where_nothing_ties():
-    assert auroc(SCORE, TRUTH)(ONE) == pytest.approx(roc_auc_score(TRUTH, SCORE))
-    expected = average_precision_score(TRUTH, SCORE)
-    assert average_precision(SCORE, TRUTH)(ONE) == pytest.approx(expected)
-
-
 @pytest.mark.parametrize("statistic", STATISTICS.values(), ids=STATISTICS)
 def test_weights_are_copies(statistic):
     weight = RNG.integers(0, 3, size=60)
@@ -115,22 +101,8 @@ def test_weights_are_copies(statistic):
     assert statistic(P, TRUTH)(weight.astype(float)) == pytest.approx(copied)
 
 
-def test_ties_score_their_expectation_under_random_order():
-    score = np.array([2.0, 1, 1, 1, 0])
-    truth = np.array([False, True, False, True, True])
-    expected = []
-    for order in permutations((1, 2, 3)):
-        broken = score.copy()
-        broken[list(order)] += np.array([0.2, 0.1, 0.0])
-        expected.append(average_precision_score(truth, broken))
-    assert average_precision(score, truth)(np.ones(5)) == pytest.approx(np.mean(expected))
-    assert auroc(np.zeros(5), truth)(np.ones(5)) == pytest.approx(0.5)
-
-
-def test_one_sided_truth_has_no_ranking():
-    assert np.isnan(auroc(SCORE, np.ones(60, bool))(ONE))
-    assert np.isnan(average_precision(SCORE, np.zeros(60, bool))(ONE))
-    assert np.isnan(brier_skill(SCORE, np.zeros(60, bool))(ONE))
+def test_one_sided_truth_has_no_skill():
+    assert np.isnan(brier_skill(P, np.zeros(60, bool))(ONE))
 
 
 def test_calibration_error_by_hand():
@@ -172,16 +144,12 @@ def test_the_interval_covers_the_truth():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_interval_holds_a_value_that_moves_under_resampling(seed):
-    """Most groups are in one scene and do badly: resamples without them would be too good."""
+    """Resampling inflates calibration errors."""
     rng = np.random.default_rng(seed)
-    group = np.concatenate([np.zeros(100, np.int64), np.arange(1, 60)])
-    value = np.where(group == 0, 0.9, rng.random(len(group)) * 0.1)
-    macro = Macro(rng.integers(100, size=len(group)), group, value, 100)
     probability = rng.random(300)
     truth = rng.random(300) < probability
-    for metric in (macro, Scored("ECE", np.arange(300) % 50, probability, truth, 50)):
-        figure = metric.figure()
-        assert figure.low < figure.value < figure.high
+    figure = Scored("ECE", np.arange(300) % 50, probability, truth, 50).figure()
+    assert figure.low < figure.value < figure.high
 
 
 def test_a_paired_difference_sees_what_two_intervals_hide():

@@ -97,11 +97,10 @@ def test_scores_that_know_everything_or_nothing():
             hits = rank([dataclasses.replace(asked, scene=0)], 1).hits[0]
             assert hits == pytest.approx(held**2 / len(asked.score))
     scores = placement_scores(DATA, WIDE_STRUCTURE, knowing(DATA))
-    assert scores.hit_at_1().value == scores.metric("AUROC").value == 1.0
+    assert scores.hit_at_1().value == 1.0
     scores = placement_scores(DATA, WIDE_STRUCTURE, flat)
     triples = np.bincount(scores.scene)
     assert scores.hit_at_1().value == pytest.approx((1 / triples[triples > 0]).mean())
-    assert scores.metric("AUROC").value == pytest.approx(0.5)
 
 
 def test_expected_hits_shares_ties():

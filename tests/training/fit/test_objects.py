@@ -14,9 +14,10 @@ from torch.nn.functional import softplus
 from app.inference.weights import unpack_scenes
 from tests.enumeration.small_machines import binary, random_weights, unit_states
 from tests.training.evaluation.scenes import scene, tensors
+from training.evaluation.parts import ALL_BUT_ONE
 from training.fit import objects
 from training.fit.configuration import ObjectsConfig
-from training.fit.objects import ALL_BUT_ONE, ObjectFit, ObjectScenes, fit_objects, random_parts
+from training.fit.objects import ObjectFit, ObjectScenes, fit_objects, random_parts
 from training.fit.samples import store_samples
 from training.machines import MachineSpec, build
 from training.machines.gibbs import Chains
@@ -128,8 +129,10 @@ def test_parts_list_and_hide_at_least_one_class(seed, leave_one_out, classes, de
     assert bool((parts.listed <= v).all())
     assert bool(((listed >= 1) & (listed <= n - 1)).all())
     one = parts.share == ALL_BUT_ONE
-    assert torch.equal(listed[one], n[one] - 1)
-    assert torch.equal(parts.weight, torch.where(one, n, 1.0))
+    assert torch.equal(one, listed == n - 1)
+    drawn = parts.weight > 1
+    assert bool(one[drawn].all())
+    assert torch.equal(parts.weight, torch.where(drawn, n, 1.0))
     share = listed / n
     bins = (share > 0.3 + 1e-5).int() + (share > 0.6 + 1e-5).int()
     assert torch.equal(bins[~one], parts.share[~one].int())
@@ -141,7 +144,7 @@ def test_shares_of_random_parts():
     v = torch.zeros(count, 50)
     v[:, 5:45] = 1
     parts = random_parts(v, 0.3, torch.Generator().manual_seed(0))
-    one = parts.share == ALL_BUT_ONE
+    one = parts.weight > 1
     assert float(one.float().mean()) == pytest.approx(0.3, abs=5 * (0.21 / count) ** 0.5)
     listed = parts.listed[~one].sum(1)
     # A share of U(.05, 1), rounded, at most 39 of 40: every number has the same chance but the
