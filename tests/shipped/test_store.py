@@ -69,7 +69,9 @@ def test_the_hidden_layers_are_the_seed_paper_s_but_for_the_default(artifact):
     """The default and `open-triway` have couplings, and few units of many states."""
     spec, name = artifact.spec, artifact.manifest.name
     coupled = name in ("indoor-triway", "open-triway")
-    assert (spec.units, spec.states, spec.coupled) == ((8, 32, True) if coupled else (200, 2, False))
+    assert (spec.units, spec.states, spec.coupled) == (
+        (8, 32, True) if coupled else (200, 2, False)
+    )
     deep = spec.variant == "gbm" or name.endswith("deep")
     assert (100 if deep else 0) == spec.H2
     assert len(CANONICAL) == spec.A
