@@ -119,25 +119,19 @@ def canonical_triple(scene: Scene, entry: Mapping[str, Any]) -> tuple[int, int, 
 
 
 def missing_probabilities(
-    artifact: Artifact,
-    scene: Scene,
-    coverage: float | None = None,
-    at: tuple[str, int] | None = None,
+    artifact: Artifact, scene: Scene, at: tuple[str, int] | None = None
 ) -> Floats:
     """Return the probability that each class is missing, (V,).
 
     The value is -inf for classes that `/missing` cannot propose.
 
     Args:
-        coverage: share of the objects that the scene lists. None means the default of the model.
         at: place of the missing object: a relation, and the index of the object to which the
             missing object has this relation. None means the whole scene.
     """
     vocabulary = artifact.vocabulary
     probabilities = np.full(len(vocabulary), -np.inf)
-    answer = questions.missing(
-        artifact, scene, top_k=len(vocabulary), coverage=coverage, at=at, details=False
-    )
+    answer = questions.missing(artifact, scene, top_k=len(vocabulary), at=at, details=False)
     for entry in answer["missing"]:
         probabilities[vocabulary.index(entry["label"])] = entry["probability"]
     return probabilities

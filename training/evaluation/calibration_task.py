@@ -198,14 +198,12 @@ def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered 
     return [(entry["probability"], entry["label"] in placed) for entry in annotated]
 
 
-def _draw_hidden(
-    artifact: Artifact, encoded: EncodedScene, rng: Rng, size: Size = up_to_longest
-) -> Ints | None:
+def _draw_hidden(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Ints | None:
     """Draw the classes that a random part of a scene hides; None if the scene has no part."""
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
     order: Ints = rng.permutation(classes[~structure[classes]])
-    listed = size(len(order), rng) if encoded.complete else 0
+    listed = up_to_longest(len(order), rng) if encoded.complete else 0
     return order[listed:] if listed else None
 
 

@@ -164,7 +164,7 @@ def leave_one_out_at(
 
 
 def placed_task(model: Model, setting: Setting) -> Outcome | None:
-    """Measure T2-at. Also measure the same removed classes in requests without the place."""
+    """Measure T2-at."""
     if model.at_place is None:
         return None
     scenes, structure = setting.some(related=True, share=3), setting.structure
@@ -175,9 +175,4 @@ def placed_task(model: Model, setting: Setting) -> Outcome | None:
     for a, name in enumerate(CANONICAL):
         if (relation == a).any():
             metrics[f"MRR, {name}"] = ranking.mrr(relation == a)
-    if (objects := model.missing) is not None:
-        without_place, _ = leave_one_out_at(
-            scenes, structure, lambda places: objects(places.v), seed=setting.seed
-        )
-        metrics["MRR, place unknown"] = without_place.mrr()
     return Outcome(metrics, len(scenes), ranking.skipped)

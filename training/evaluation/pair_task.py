@@ -139,13 +139,9 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
     p = np.concatenate(ask_every(score, questions))
     listed = np.concatenate([q.listed for q in questions])
     scene = np.repeat([q.place for q in questions], [len(q.ends) for q in questions])
-    vertical = [a + back for back in (0, p.shape[1] // 2) for a in VERTICAL]
     hits, loss = accuracy(p, listed), log_loss(p, listed)
     metrics: dict[str, Metric] = {
         "accuracy": Ratio.of_items(scene, hits, len(scenes)),
-        "accuracy, vertical": Ratio.of_items(
-            scene, accuracy(p[:, vertical], listed[:, vertical]), len(scenes)
-        ),
         "log-loss": Ratio.of_items(scene, loss, len(scenes)),
     }
     classes = np.concatenate([q.scene.evidence.classes[q.ends] for q in questions])

@@ -279,7 +279,7 @@ def relations_task(model: Model, setting: Setting) -> Outcome | None:
 
 
 def completion_task(model: Model, setting: Setting) -> Outcome | None:
-    """Measure T1b. Also score the same candidates without given triples."""
+    """Measure T1b."""
     if model.completion is None:
         return None
     scenes, structure, seed = setting.scenes, setting.structure, setting.seed
@@ -292,9 +292,6 @@ def completion_task(model: Model, setting: Setting) -> Outcome | None:
         "R-precision, mean over scenes": ranking.per_scene(),
     }
     metrics |= _details(candidates, setting, _RECALLS)
-    if model.relations is not None:
-        unaided = complete_scenes(scenes, structure, model.relations, seed=seed)
-        metrics["R-precision, nothing given"] = rank(unaided, len(scenes)).pooled()
     return Outcome(metrics, len(scenes), ranking.skipped)
 
 
