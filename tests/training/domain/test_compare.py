@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from rich.console import Console
 
 from app.scene import Vocabulary
@@ -16,17 +15,17 @@ from training.evaluation.baselines import EASE, FREQUENCY_TABLE, POPULARITY
 from training.evaluation.model import Model
 from training.evaluation.tasks import in_words
 from training.fit.configuration import Config, ConfigError
+from training.fit.draft import as_stored, draft_artifact
+from training.fit.objects import ObjectScenes
 from training.fit.trainer import new_machine
 from training.runs.config_files import with_settings
 from training.runs.pipeline import prepare, read_sources
-from training.runs.publish import as_stored, draft_artifact
 
 CONFIG = Config.model_validate(
     {
         "name": "small",
         "data": {"sources": ["rooms"], "rooms": 120, "vocabulary": "rooms", "split": "stable"},
-        "machine": {"variant": "rbm", "form": "local", "H1": 4, "H2": 0, "K": 0},
-        "objective": {"name": "composite"},
+        "machine": {"variant": "rbm", "units": 2, "states": 3, "N": 0},
     }
 )
 
@@ -56,7 +55,9 @@ def test_a_comparison_fits_into_80_columns_and_notes_lacking_classes_alone(lacki
     classes = list(reversed(scenes.vocabulary.objects))
     if lacking:
         classes[0] = replace(classes[0], label="unheard of", aliases=())
-    machine = new_machine(CONFIG, scenes.training_data(), torch.Generator().manual_seed(0))
+    data = scenes.training_data()
+    objects = ObjectScenes.of(data.train, data.structure, CONFIG.objects)
+    machine = new_machine(CONFIG, data, objects)
     other = Vocabulary(classes, scenes.vocabulary.room_types)
     a, b = (
         Candidate(title, CONFIG, scenes.digests, draft_artifact(as_stored(machine), vocabulary))

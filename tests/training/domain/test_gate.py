@@ -17,9 +17,9 @@ from training.domain.gate import Usefulness, losses, measure_usefulness, served_
 from training.evaluation.metrics import Figure
 from training.evaluation.results import Difference, Results
 from training.fit.configuration import Config
+from training.fit.draft import as_stored, draft_artifact
 from training.fit.trainer import Trainer
 from training.runs.pipeline import SplitScenes, prepare
-from training.runs.publish import as_stored, draft_artifact
 
 
 def difference(task: str, metric: str, low: float, high: float) -> Difference:
@@ -94,14 +94,14 @@ def test_a_model_without_relation_metrics_replaces_no_model_with_them(
 # ---------------------------------------------------------------------- against the baselines
 
 
-def small(**training: float) -> Config:
+def small(**objects: float) -> Config:
     return Config.model_validate(
         {
             "name": "small",
             "data": {"sources": ["rooms"], "rooms": 240, "vocabulary": "rooms", "split": "stable"},
-            "machine": {"variant": "rbm", "form": "local", "H1": 16, "H2": 0, "K": 0},
-            "objective": {"name": "composite"},
-            "training": {"epochs": 12, "batch_size": 16, "learning_rate": 0.05} | training,
+            "machine": {"variant": "rbm", "units": 4, "states": 4, "N": 0},
+            "objects": {"steps": 150, "batch_size": 32} | objects,
+            "relations": {"epochs": 0},
         }
     )
 
@@ -128,7 +128,7 @@ def test_a_trained_model_is_better_than_popularity() -> None:
 @pytest.mark.parametrize("how", ["hardly trained", "labels shuffled between scenes"])
 def test_a_useless_model_is_refused_with_its_figures(how: str) -> None:
     if how == "hardly trained":
-        found = usefulness(rooms(), small(epochs=1, learning_rate=1e-6))
+        found = usefulness(rooms(), small(steps=1, learning_rate=1e-6))
     else:
         found = usefulness(rooms().shuffled(0), small())
     popularity, ease = found.objections()
@@ -157,7 +157,7 @@ def test_a_useful_model_leads_popularity_for_sure_and_by_enough(popularity, reas
 def test_photographs_with_incomplete_lists_are_used_where_there_are_no_others() -> None:
     data = rooms().training_data()
     flags = [replace(scene, complete=False) for scene in data.test.scenes]
-    machine = as_stored(Trainer(small(epochs=1), data).run().machine)
+    machine = as_stored(Trainer(small(steps=1), data).run().machine)
     artifact = draft_artifact(machine, rooms().vocabulary)
     incomplete = replace(data, test=replace(data.test, scenes=flags))
     found = measure_usefulness(artifact, incomplete, limit=300, say=lambda _: None)
@@ -175,7 +175,7 @@ def test_too_few_test_scenes_decide_nothing_and_are_refused(which) -> None:
         v[:4] = data.test.v[:4]
         few = replace(data, test=replace(data.test, v=v))
     artifact = draft_artifact(
-        as_stored(Trainer(small(epochs=1), data).run().machine), rooms().vocabulary
+        as_stored(Trainer(small(steps=1), data).run().machine), rooms().vocabulary
     )
     found = measure_usefulness(artifact, few, limit=300, say=lambda _: None)
     assert list(found.lines()) == []

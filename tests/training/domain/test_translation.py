@@ -10,8 +10,8 @@ from training.datasets.batches import Batch
 from training.domain.translation import BEYOND, Translation, same_classes
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.model import Places
+from training.fit.draft import draft_artifact
 from training.machines import MachineSpec, build
-from training.runs.publish import draft_artifact
 
 
 def vocabulary(*labels: str, aliases: dict[str, tuple[str, ...]] | None = None) -> Vocabulary:
@@ -24,7 +24,7 @@ V, A = len(MODEL), 4
 
 @pytest.fixture(scope="module")
 def model():
-    machine = build(MachineSpec("triway", V=V, A=A, H1=5, K=3, form="local"))
+    machine = build(MachineSpec("triway", V=V, A=A, units=2, states=3, K=3))
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in machine.parameters():
