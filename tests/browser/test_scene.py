@@ -134,7 +134,7 @@ def test_an_object_of_unknown_size_is_round(open_board: OpenBoard, api: httpx.Cl
     words = api.get("/models/default/vocabulary").json()["objects"]
     (tv,) = [entry for entry in words if entry["label"] == "tv"]
     place = {"x": 2, "y": 0, "z": 0.5}
-    names = (str(tv["aliases"][0]), "table")
+    names = (str(tv["aliases"][0]), next(e["label"] for e in words if not e["size"]))
     board = open_board({"objects": [{"label": name, "position": place} for name in names]})
     assert board.scene["objects"][0]["size"] == tv["size"]
     boxes = [board.thing(name).locator("rect") for name in names]

@@ -40,10 +40,10 @@ from training.fit.calibrate_objects import (
     fit_line,
     fit_missing,
     fit_outliers,
-    real_scenes,
     recalibrated,
     score_intruders,
     score_lists,
+    served_scenes,
     smallest_scenes,
 )
 from training.fit.configuration import ObjectsConfig
@@ -143,10 +143,13 @@ def test_real_rooms_come_before_generated_ones():
     """At most 400 scenes of each source; sources of the user count if no room is real."""
     made = [scene([0, 1], source="procthor") for _ in range(500)]
     real = [scene([0, 1], source=name) for name in ["3dssg"] * 30 + ["sunrgbd"] * 450]
-    kept = real_scenes(tensors([*made, *real], WIDE))
+    few = [scene([0, 1], source="nr3d") for _ in range(19)]
+    served = {"3dssg": 1.0, "sunrgbd": 1.0, "nr3d": 1.0, "procthor": 0.1}
+    kept = served_scenes(tensors([*made, *real, *few], WIDE), served)
     sources = [one.source for one in kept.scenes]
     assert {name: sources.count(name) for name in set(sources)} == {"3dssg": 30, "sunrgbd": 400}
-    assert len(real_scenes(tensors(made, WIDE))) == 400
+    assert len(served_scenes(tensors(made, WIDE), served)) == 400
+    assert len(served_scenes(tensors(made, WIDE), {})) == 400
 
 
 def test_the_smallest_scenes_are_those_of_their_room_type():
@@ -252,6 +255,7 @@ def scores_of(log_odds, intruder, popularity=None):
         popularity=np.broadcast_to(popularity, log_odds.shape).ravel(),
         intruder=np.broadcast_to(intruder, log_odds.shape).ravel(),
         size=np.full(lists, n),
+        weight=np.ones(lists),
     )
 
 
@@ -313,7 +317,7 @@ def test_untouched_lists_of_other_rooms_keep_the_share(judging):
     calibration, shares = judging.calibration, {}
     for n in (1, 2, 3, 5, 8):
         parts = draw_parts(rooms(300, 3), STRUCTURE, exactly(n))
-        scores = score_lists(judging, parts)
+        scores = score_lists(judging, rooms(300, 3), parts)
         z = calibrated(
             calibration.outlier,
             scores.score(calibration.popularity_weight),
@@ -343,7 +347,7 @@ def test_structure_and_classes_that_belong_anywhere_are_never_judged(judging):
     judged = vocabulary.judged
     assert judged.sum() == len(judged) - int(STRUCTURE.sum()) - 2
     parts = draw_parts(rooms(100, 3), STRUCTURE, exactly(4))
-    scores = score_lists(artifact, parts)
+    scores = score_lists(artifact, rooms(100, 3), parts)
     row, classes = np.nonzero(parts.v.numpy() * judged)
     assert scores.row.tolist() == row.tolist()
     assert scores.popularity.tolist() == np.array(artifact.calibration.popularity)[classes].tolist()
@@ -356,7 +360,7 @@ def test_structure_and_classes_that_belong_anywhere_are_never_judged(judging):
 
 @pytest.mark.parametrize("count", [19, 20])
 def test_few_scenes_give_no_judgement_of_objects(judging, count):
-    scenes = real_scenes(rooms(60, 1))
+    scenes = served_scenes(rooms(60, 1), {})
     some = replace_scenes(scenes, count)
     entries = fit_outliers(judging, some, rooms(ROOM_COUNT, 2), STRUCTURE)
     if count < 20:
