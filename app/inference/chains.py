@@ -66,7 +66,7 @@ class Arrays(NamedTuple):
         WT: (H1, V), transpose of W.
         JT: (H2, H1), transpose of J.
         L: (V, V) couplings, or (0, V) for a machine without couplings.
-        b: (V,) biases of the classes, with those of the profile.
+        b: (V,) biases of the classes.
     """
 
     W: Floats
@@ -89,7 +89,7 @@ class Conditions:
         held: (held units, 2) units of h1 and the state that each of them keeps.
         held2: distinct indices of the units of h2 that stay on.
         room: index of the room type, or None if unknown.
-        profile: index of the data source whose base rates apply, or None for the served mix.
+        profile: index of the data source whose base rates apply, or None.
     """
 
     classes: Indices
@@ -200,9 +200,10 @@ class ConditionedChains:
 
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
         self._chains, self._machine, self._w = chains, chains.machine, chains.arrays
-        spec, profile = chains.machine.spec, conditions.profile
-        if profile is not None:
-            self._w = self._w._replace(b=self._w.b + chains.machine["a"][profile])
+        spec = chains.machine.spec
+        certain = np.ones(len(conditions.classes), np.float32)
+        bias = chains.machine.class_bias(conditions.classes, certain, conditions.profile)
+        self._w = self._w._replace(b=bias)
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
         self._required_classes = _indicator(spec.V, conditions.classes)

@@ -1,4 +1,4 @@
-"""Elementary functions: sigmoid and softplus for arrays; exp, log and logistic for kernels.
+"""Elementary functions: sigmoid, softplus and softmax for arrays; exp, log and logistic for kernels.
 
 The functions for compiled kernels take float32 numbers. Functions of the C library take one number
 at a time. The exp and log of this module consist of arithmetic operations, so the compiler can
@@ -46,6 +46,12 @@ def softplus(x: Floats) -> Floats:
     """Compute log(1 + e^x)."""
     y: Floats = np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
     return y
+
+
+def softmax(x: Floats) -> Floats:
+    """Compute e^x / sum e^x over the last axis, which may be empty."""
+    y: Floats = np.exp(x - x.max(-1, keepdims=True, initial=-np.inf))
+    return y / y.sum(-1, keepdims=True)
 
 
 @intrinsic

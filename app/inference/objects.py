@@ -7,9 +7,10 @@ The gain of a row w of weights is the contribution of the hidden units m to the 
 
 The first state of a unit has the weight 0. The log-odds of class i given the other classes are
 
-    b_i + a_qi + sum_j presence_j L_ij + gain_i
+    b_i + sum_q p_q a_qi + sum_j presence_j L_ij + gain_i,   p = softmax(f + a v)
 
-at the logits x without class i. Both factors of a product p_m(z) exp(w) are positive, so their sum
+at the logits x without class i, with the presence v of the other classes. p_q is the probability of
+the data source q. If a request names its profile q, p_q is 1. Both factors of a product p_m(z) exp(w) are positive, so their sum
 loses no digits. A kernel multiplies the sums of several units and takes one log of the product. The
 group is small enough to keep the product within float32.
 """
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.inference.elementary import exponent, log, mantissa
+from app.inference.elementary import exponent, log, mantissa, softmax
 from app.inference.weights import SHARES, Weights
 
 Floats = NDArray[np.float32]
@@ -156,11 +157,6 @@ class ObjectScorer:
         self.gains = Gains(weights["W"], self._states)
         self.room_gains = Gains(weights["Q"], self._states)
 
-    def bias(self, profile: int | None) -> Floats:
-        """Return b + a[profile], (V,). None means the served mix of the data sources, b."""
-        bias: Floats = self._weights["b"]
-        return bias if profile is None else bias + self._weights["a"][profile]
-
     def absent(
         self, x: Floats, classes: Indices, presence: Floats, profile: int | None, coverage: float
     ) -> Floats:
@@ -175,7 +171,8 @@ class ObjectScorer:
             profile: index of a data source, whose base rates apply, or None.
             coverage: listed share of the scene. 1 means that all classes but one are listed.
         """
-        log_odds = self.bias(profile) + self.gains(x[None])[0] + self.kappa(coverage)
+        bias = self._weights.class_bias(classes, presence, profile)
+        log_odds: Floats = bias + self.gains(x[None])[0] + self.kappa(coverage)
         if self._weights.spec.coupled:
             log_odds += presence @ self._weights["L"][classes]
         return log_odds
@@ -199,14 +196,27 @@ class ObjectScorer:
             shares: (n, H1) contribution of each class to x.
             classes, presence, profile: see `absent`.
         """
-        log_odds = self.bias(profile)[classes] + self._weights["kappa"][-1, classes]
-        log_odds += self._gains_of_rows(x - shares, self._weights["W"][classes])
+        weights = self._weights
+        log_odds = weights["b"][classes] + weights["kappa"][-1, classes]
+        log_odds += self._gains_of_rows(x - shares, weights["W"][classes])
+        a = weights["a"][:, classes].T
+        if profile is None:
+            logits = weights.source_logits(classes, presence) - a * presence[:, None]
+            log_odds += (softmax(logits) * a).sum(1)
+        else:
+            log_odds += a[:, profile]
         if self._weights.spec.coupled:
             log_odds += self._weights["L"][np.ix_(classes, classes)] @ presence
         return log_odds
 
     def reasons(
-        self, x: Floats, shares: Floats, classes: Indices, presence: Floats, rows: Indices
+        self,
+        x: Floats,
+        shares: Floats,
+        classes: Indices,
+        presence: Floats,
+        profile: int | None,
+        rows: Indices,
     ) -> Floats:
         """Return how much each class j changes the log-odds of each listed class i, (N, n).
 
@@ -217,18 +227,48 @@ class ObjectScorer:
         change = self._changes(x - shares[rows], shares, self._weights["W"][classes[rows]])
         if self._weights.spec.coupled:
             change += self._weights["L"][np.ix_(classes[rows], classes)] * presence
+        if profile is None:
+            change += self._changes_by_source(classes, presence, rows, classes[rows])
         change[np.arange(len(rows)), rows] = 0
         return change
 
     def reasons_for_absent(
-        self, x: Floats, shares: Floats, classes: Indices, presence: Floats, candidates: Indices
+        self,
+        x: Floats,
+        shares: Floats,
+        classes: Indices,
+        presence: Floats,
+        profile: int | None,
+        candidates: Indices,
     ) -> Floats:
         """Return how much each listed class changes the log-odds of N unlisted classes, (N, n)."""
         logits = np.broadcast_to(x, (len(candidates), len(x)))
         change = self._changes(logits, shares, self._weights["W"][candidates])
         if self._weights.spec.coupled:
             change += self._weights["L"][np.ix_(candidates, classes)] * presence
+        if profile is None:
+            change += self._changes_by_source(classes, presence, None, candidates)
         return change
+
+    def _changes_by_source(
+        self, classes: Indices, presence: Floats, rows: Indices | None, targets: Indices
+    ) -> Floats:
+        """Return how much each listed class changes sum_q p_q a_qi of N classes i, (N, n).
+
+        Args:
+            rows: (N,) position of each class i among the listed classes, which is not evidence for
+                itself; None if the classes i are not listed.
+            targets: (N,) the classes i.
+        """
+        a = self._weights["a"]
+        logits = self._weights.source_logits(classes, presence)[None]
+        shares = a[:, classes].T * presence[:, None]
+        if rows is not None:
+            logits = logits - shares[rows]
+        # p with class j minus p without class j, (N or 1, n, sources).
+        change = softmax(logits)[:, None] - softmax(logits[:, None] - shares)
+        effect: Floats = (change * a[:, targets].T[:, None]).sum(2)
+        return effect
 
     def room_logits(self, x: Floats) -> Floats:
         """Return log p(t | listed classes) of each room type t, plus a constant, (C,)."""

@@ -65,7 +65,7 @@ class ScenePosterior:
     log-odds of a relation is `NO_UNIT`.
 
     Args:
-        profile: index of the data source whose base rates apply, or None for the served mix.
+        profile: index of the data source whose base rates apply, or None.
     """
 
     def __init__(
@@ -100,7 +100,8 @@ class ScenePosterior:
 
         `ObjectScorer.reasons` describes argument and result.
         """
-        return self._objects.reasons(self.context.x, self.context.shares, *self._scene, rows)
+        x, shares = self.context.x, self.context.shares
+        return self._objects.reasons(x, shares, *self._scene, self._profile, rows)
 
     def reasons_for_absent(self, candidates: Indices) -> Floats:
         """Return how much each class of the scene changes the log-odds of absent classes, (N, n).
@@ -110,7 +111,8 @@ class ScenePosterior:
         candidate's log-odds without this class.
         """
         x, shares = self.context.x, self.context.shares
-        return self._objects.reasons_for_absent(x, shares, *self._scene, candidates)
+        profile = self._profile
+        return self._objects.reasons_for_absent(x, shares, *self._scene, profile, candidates)
 
     def relation_log_odds(self) -> Floats:
         """Return the log-odds of every relation between the classes of the scene, (A, n, n).

@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.elementary import sigmoid
+from app.inference.elementary import sigmoid, softmax
 from app.inference.variants import MachineSpec
 
 SWEEPS: Final = 10
@@ -45,9 +45,10 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     `MachineSpec` defines the sizes.
 
         b (V,), c1 (H1,), c2 (H2,), e (C,): biases of objects, hidden units and room types
+        f (profiles,): biases of the data sources; see `Weights.class_bias`
         W (V, H1), J (H1, H2), Q (C, H1): weights between h1 and objects, h2 and room types
         L (V, V): couplings between classes, symmetric with a diagonal of 0, if `coupled`
-        a (profiles, V): change of b in scenes of a data source
+        a (profiles, V): change of b in scenes of a data source, 0 for classes that it cannot show
         kappa (4, V): change of the log-odds of unlisted classes by the listed share; see `SHARES`
         triples (T, 3): sorted triples (relation a, subject class i, object class j) with an own
             weight
@@ -58,7 +59,8 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     V, H1, H2 = spec.V, spec.H1, spec.H2
     floats: dict[str, tuple[int, ...]] = {
         "b": (V,), "c1": (H1,), "c2": (H2,), "e": (spec.C,), "W": (V, H1), "J": (H1, H2),
-        "Q": (spec.C, H1), "a": (spec.profiles, V), "kappa": (len(SHARES) + 1, V),
+        "Q": (spec.C, H1), "f": (spec.profiles,), "a": (spec.profiles, V),
+        "kappa": (len(SHARES) + 1, V),
     }  # fmt: skip
     if spec.coupled:
         floats["L"] = (V, V)
@@ -129,6 +131,32 @@ class Weights:
         """
         bias: NDArray[Any] = self["c1"]
         return bias if room is None or not self.spec.C else bias + self["Q"][room]
+
+    def source_logits(self, classes: NDArray[Any], presence: NDArray[Any]) -> NDArray[Any]:
+        """Return the logits of the data sources given the listed classes, (profiles,): f + a v."""
+        logits: NDArray[Any] = self["f"] + self["a"][:, classes] @ presence
+        return logits
+
+    def class_bias(
+        self, classes: NDArray[Any], presence: NDArray[Any], profile: int | None
+    ) -> NDArray[Any]:
+        """Return the bias of each class given the listed classes, (V,).
+
+        For a profile q, the bias is b + a[q]. Otherwise it is b + sum_q p(q) a[q] with the
+        probabilities p = softmax(f + a v) of the data sources. b alone is the bias without listed
+        classes.
+
+        Args:
+            classes, presence: (n,) indices of the listed classes, and the probabilities that they
+                are present.
+            profile: index of the data source whose base rates apply, or None.
+        """
+        if profile is None:
+            change = softmax(self.source_logits(classes, presence)) @ self["a"]
+        else:
+            change = self["a"][profile]
+        bias: NDArray[Any] = self["b"] + change
+        return bias
 
     def state_means(self, x: NDArray[Any]) -> NDArray[Any]:
         """Return the probabilities of the states of h1 with the logits x, both (..., H1)."""

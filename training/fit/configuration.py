@@ -102,6 +102,9 @@ class ObjectsConfig(_Section):
     )
     coupling_prior: float = Field(default=2.5, ge=0, description="precision of L")
     rate_prior: float = Field(default=7.5, ge=0, description="precision of a and kappa")
+    source_loss: float = Field(
+        default=3.0, ge=0, description="weight of the log-likelihood of the data source"
+    )
     generative_weight: float = Field(default=0.2, ge=0, description="weight of PCD")
     chains: int = Field(default=256, ge=1, description="number of persistent chains (PCD)")
     classes_per_sweep: int = Field(

@@ -3,7 +3,8 @@
 A robot lists a few objects of a room and asks for the rest. Each step shows a random part of each
 scene. The loss is the negative log-likelihood of every class that is not listed:
 
-    loss = mean over scenes of sum_i [ζ(λ_i) - v_i λ_i] - log p(t | listed) + g [F(v) - F(chains)]
+    loss = mean over scenes of sum_i [ζ(λ_i) - v_i λ_i] - log p(t | listed) - s log p(q | listed)
+           + g [F(v) - F(chains)]
 
 λ_i is the closed-form log-odds of class i given the listed classes (`BoltzmannMachine`), and ζ the
 softplus.
@@ -14,7 +15,8 @@ softplus.
   cross-entropy.
 - A class that a source shows in fewer than 3 scenes says nothing there: it has no term in the loss
   (partial labels). Structure is neither listed nor asked for.
-- Each source q has its own base rates a_q, and each listed share its own bias kappa.
+- Each source q has its own base rates a_q, and each listed share its own bias kappa. The machine
+  also learns p(q | listed), with the weight s, because a robot's list names no source.
 - With the weight g, persistent Gibbs chains (PCD) keep samples of the machine like scenes. The
   chains of a source have its base rates.
 
@@ -49,6 +51,7 @@ _SHOWN = 3  # scenes of a source in which a class must occur
 _LEAST_SHARE = 0.05
 _AVERAGED = 0.3  # last share of the steps whose weights are averaged
 _RARE = -9.0  # least initial bias of a class
+_UNSERVED = 1e-9  # weight of a source outside of the served mix
 
 
 @dataclass(frozen=True)
@@ -83,8 +86,9 @@ class ObjectScenes:
         counts.index_add_(0, train.source, (train.v > 0).float())
         used = (weights > 0) & (counts.sum(1) > 0)
         open_sources = [shows_everything(q, config) for q in train.source_names]
-        shows = (counts >= _SHOWN) | torch.tensor(open_sources).unsqueeze(1)
-        shows &= ~structure & ~left_out(train)
+        shows = (counts >= _SHOWN) & train.annotated_classes
+        shows |= torch.tensor(open_sources).unsqueeze(1) & ~left_out(train)
+        shows &= ~structure
         v = (train.v > 0) & shows[train.source]
         kept = (used[train.source] & (v.sum(1) >= 2)).nonzero().squeeze(1)
         if not len(kept):
@@ -108,12 +112,16 @@ class ObjectScenes:
         """Return indices of scenes, (count,), drawn in proportion to their weights."""
         return torch.multinomial(self.weight, count, replacement=True, generator=generator)
 
+    @property
+    def source_sizes(self) -> Tensor:
+        """Sum of the weights of the scenes of each source, (sources,)."""
+        return torch.zeros(len(self.sources)).index_add_(0, self.source, self.weight)
+
     def log_odds(self) -> Tensor:
         """Return the smoothed log-odds of each class in the scenes that can show it, (classes,)."""
         weight = self.weight.unsqueeze(1)
         count = (self.v * weight).sum(0)
-        per_source = torch.zeros(len(self.sources)).index_add_(0, self.source, self.weight)
-        total = (self.shows * per_source.unsqueeze(1)).sum(0)
+        total = (self.shows * self.source_sizes.unsqueeze(1)).sum(0)
         total = torch.where(total > 0, total, self.size)
         return ((count + 0.5) / (total - count + 0.5)).log()
 
@@ -162,8 +170,9 @@ def random_parts(v: Tensor, leave_one_out: float, generator: torch.Generator) ->
     count = torch.where(hides_one, n - 1, (share * n).round().clamp(min=1).minimum(n - 1))
     # Listed are the `count` present classes with the smallest random keys.
     keys = torch.rand(v.shape, generator=generator) + 2 * (1 - v)
-    rank = keys.argsort(1).argsort(1)
-    listed = v * (rank < count.unsqueeze(1))
+    smallest = keys.topk(int(count.max()), largest=False).values
+    limit = smallest.gather(1, count.long().unsqueeze(1) - 1)
+    listed = v * (keys <= limit)
     return Parts(listed, share_bin(count, n), torch.where(hides_one, n, 1.0))
 
 
@@ -246,6 +255,9 @@ class ObjectFit:
         weight = self.scenes.shows[source] * (1 - parts.listed)
         weight = weight * torch.where(hidden > 0, parts.weight.unsqueeze(1), 1.0)
         loss = ((softplus(log_odds) - hidden * log_odds) * weight).sum()
+        rates = base_rates(machine.a, self.scenes, self.config)
+        logits = machine.f + parts.listed @ rates.T
+        loss = loss + self.config.source_loss * cross_entropy(logits, source, reduction="sum")
         asked = (listed_room < 0) & (room >= 0)
         if bool(asked.any()):
             logits = machine.room_logits(parts.listed[asked])
@@ -308,15 +320,18 @@ class ObjectFit:
     def finish(self) -> None:
         """Set the weights to their average, with the base rates of the served mix in b.
 
-        Afterwards, a[q] is the difference of source q from the served mix.
+        Afterwards, a[q] is the difference of source q from the served mix, and f are the log
+        weights of the mix, corrected for the lists of each source.
         """
         for name, weight in self._weights.items():
             weight.copy_(self._average[name])
         machine = self.machine
-        if machine.spec.profiles:
-            mix = served_base_rates(machine.a, self.scenes, self.config)
-            machine.b.add_(mix)
-            machine.a.sub_(mix)
+        mix = served_base_rates(machine.a, self.scenes, self.config)
+        machine.a.copy_(base_rates(machine.a, self.scenes, self.config) - mix)
+        machine.b.add_(mix)
+        served = served_weights(self.scenes, self.config).clamp(min=_UNSERVED)
+        mixed = served / served.sum()
+        machine.f.add_((mixed * self.scenes.size / self.scenes.source_sizes).log())
         couplings = machine.couplings
         if couplings is not None:
             machine.L.copy_(couplings)
@@ -344,31 +359,35 @@ class ObjectFit:
 
 def served_base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
     """Return the weighted mean of a[q] over the sources q that show each class, (classes,)."""
-    weights = _served_weights(scenes, config)
+    weights = served_weights(scenes, config).unsqueeze(1) * scenes.shows
     return (weights * a).sum(0) / weights.sum(0).clamp(min=1e-9)
+
+
+def base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
+    """Return a[q], with the served base rate of the classes that q does not show; same shape."""
+    return torch.where(scenes.shows, a, served_base_rates(a, scenes, config))
 
 
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
     """Return the log-odds that a scene of the served mix has each class, (classes,)."""
-    total = torch.zeros(len(scenes.sources)).index_add_(0, scenes.source, scenes.weight)
     count = torch.zeros(scenes.shows.shape)
     count.index_add_(0, scenes.source, scenes.v * scenes.weight.unsqueeze(1))
-    share = (count + 0.5) / (total.unsqueeze(1) + 1)
-    weights = _served_weights(scenes, config)
+    share = (count + 0.5) / (scenes.source_sizes.unsqueeze(1) + 1)
+    weights = served_weights(scenes, config).unsqueeze(1) * scenes.shows
     mean = (weights * share).sum(0) / weights.sum(0).clamp(min=1e-9)
     return torch.where(weights.sum(0) > 0, mean, share.amin()).logit()
 
 
-def _served_weights(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return the weight of each source that shows a class in the served mix, (sources, classes)."""
+def served_weights(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
+    """Return the weight of each source in the served mix, (sources,)."""
     served = config.served_sources or dict.fromkeys(scenes.sources, 1.0)
-    weights = torch.tensor([served.get(q, 0.0) for q in scenes.sources])
-    return weights.unsqueeze(1) * scenes.shows
+    return torch.tensor([served.get(q, 0.0) for q in scenes.sources])
 
 
 def start_objects(machine: BoltzmannMachine, scenes: ObjectScenes) -> None:
-    """Set the biases of classes to their log-odds in the scenes, and those of room types to 0."""
+    """Set the biases of classes to their log-odds in the scenes, and f to the sizes of sources."""
     with torch.no_grad():
+        machine.f.copy_((scenes.source_sizes / scenes.size).log())
         machine.b.copy_(scenes.log_odds().clamp(min=_RARE))
 
 

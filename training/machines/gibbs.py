@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.machines.machine import BoltzmannMachine
+from training.machines.machine import BoltzmannMachine, sums
 
 
 @dataclass
@@ -73,7 +73,7 @@ def sweep(
         beta: factor of all weights; see `training.machines.partition`.
         base: log-odds of the classes at beta = 0, (classes,). The default is 0.
     """
-    x = machine.context_bias(chains.room) + chains.v @ machine.W + chains.h2 @ machine.J.T
+    x = machine.context_bias(chains.room) + sums(chains.v, machine.W) + chains.h2 @ machine.J.T
     h1 = draw_states(beta * x, machine.spec.states, generator)
     if machine.spec.H2:
         logits = beta * machine.second_layer_logits(h1)

@@ -17,6 +17,9 @@ Given the objects, the log-odds of an unlisted class i have a closed form (one h
 
     log-odds_i = b_i + a_qi + (vL)_i + sum_m log sum_z p_m(z | v, t) exp(W_i[m, z])
 
+If the source is unknown, a_qi is replaced by its mean over the sources given the listed classes,
+with the probabilities p(q | v) = softmax(f + a v).
+
 p_m are the probabilities of the states of unit m, with the logits x = c1 + Q_t + v'W + J m2. With a
 second layer, m2 are its mean-field means given v. They stay the same for v_i = 0 and v_i = 1.
 
@@ -36,7 +39,7 @@ from app.inference.variants import MachineSpec
 from app.inference.weights import SHARES, SWEEPS
 from training.machines.edges import Edges, triple_keys
 
-OBJECT_WEIGHTS = ("b", "c1", "c2", "e", "W", "J", "Q", "L", "a", "kappa")
+OBJECT_WEIGHTS = ("b", "c1", "c2", "e", "W", "J", "Q", "L", "f", "a", "kappa")
 """Names of the weights without relations."""
 
 
@@ -59,6 +62,7 @@ class BoltzmannMachine(nn.Module, ABC):
         self.W = nn.Parameter(torch.zeros(spec.V, spec.H1))
         self.J = nn.Parameter(torch.zeros(spec.H1, spec.H2))
         self.Q = nn.Parameter(torch.zeros(spec.C, spec.H1))
+        self.f = nn.Parameter(torch.zeros(spec.profiles))
         self.a = nn.Parameter(torch.zeros(spec.profiles, spec.V))
         self.kappa = nn.Parameter(torch.zeros(len(SHARES) + 1, spec.V))
         if spec.coupled:
@@ -163,7 +167,7 @@ class BoltzmannMachine(nn.Module, ABC):
         With two layers, the means of h2 are a mean-field fixed point, differentiable in the
         weights.
         """
-        base = self.context_bias(room) + v @ self.W
+        base = self.context_bias(room) + sums(v, self.W)
         m2 = base.new_zeros(len(base), self.spec.H2)
         if not self.spec.H2:
             return base, m2
@@ -185,10 +189,24 @@ class BoltzmannMachine(nn.Module, ABC):
         return (states[..., :1] + states[..., 1:] @ factors).log().sum(0)
 
     def class_bias(self, source: Tensor | None) -> Tensor:
-        """Return b + a[q], (scenes or 1, classes). A source q of -1 or None has a[q] = 0."""
+        """Return b + a[q], (scenes or 1, classes). A source q of -1 or None has a[q] = 0.
+
+        b alone are the base rates of the served mix of sources.
+        """
         if source is None or not self.spec.profiles:
             return self.b.unsqueeze(0)
         return self.b + self.a[source.clamp(min=0)] * (source >= 0).unsqueeze(-1)
+
+    def source_weights(self, v: Tensor, source: Tensor | None) -> Tensor:
+        """Return p(q | v, source) of each data source q, (scenes, sources).
+
+        A known source has the probability 1. An unknown source is -1 or None.
+        """
+        inferred = (self.f + v @ self.a.T).softmax(-1)
+        if source is None or not self.spec.profiles:
+            return inferred
+        known = torch.nn.functional.one_hot(source.clamp(min=0), self.spec.profiles)
+        return torch.where((source >= 0).unsqueeze(-1), known.to(v.dtype), inferred)
 
     def object_log_odds(
         self,
@@ -202,15 +220,15 @@ class BoltzmannMachine(nn.Module, ABC):
 
         Args:
             v: listed classes, (scenes, classes) 0 or 1. The entry of a listed class has no meaning.
-            room, source: room types and data sources, (scenes,) int64. -1 means unknown.
+            room, source: room types and data sources, (scenes,) int64. -1 or None means unknown.
             share: bin of the listed share, (scenes,) int64; see `app.inference.weights.SHARES`. It
                 adds kappa to the log-odds.
         """
         x, _ = self.context(v, room)
-        log_odds = self.class_bias(source) + self.gain(x, self.W)
+        log_odds = self.b + self.source_weights(v, source) @ self.a + self.gain(x, self.W)
         couplings = self.couplings
         if couplings is not None:
-            log_odds = log_odds + v @ couplings
+            log_odds = log_odds + sums(v, couplings)
         return log_odds if share is None else log_odds + self.kappa[share]
 
     def room_logits(self, v: Tensor) -> Tensor:
@@ -235,12 +253,12 @@ class BoltzmannMachine(nn.Module, ABC):
                 "h2: pass h2"
             )
         free = -(v * self.class_bias(source)).sum(-1)
-        x = self.context_bias(room) + v @ self.W
+        x = self.context_bias(room) + sums(v, self.W)
         if h2 is not None:
             x, free = x + h2 @ self.J.T, free - h2 @ self.c2
         couplings = self.couplings
         if couplings is not None:
-            free = free - 0.5 * ((v @ couplings) * v).sum(-1)
+            free = free - 0.5 * (sums(v, couplings) * v).sum(-1)
         if room is not None and self.spec.C:
             free = free - self.e[room.clamp(min=0)] * (room >= 0)
         return free - self.log_states(x)
@@ -337,3 +355,8 @@ class BoltzmannMachine(nn.Module, ABC):
             log_weight = log_weight + self.e[room.clamp(min=0)] * (room >= 0)
         energy = -log_weight - self.relation_term(edges, v, r, h1)
         return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, energy)
+
+
+def sums(v: Tensor, weights: Tensor) -> Tensor:
+    """Return v @ weights for presence v, (scenes, classes). Most classes of a scene are absent."""
+    return torch.sparse.mm(v.to_sparse(), weights)
