@@ -1,4 +1,4 @@
-"""Elementary functions: sigmoid, softplus and softmax for arrays; exp, log and logistic for kernels.
+"""Elementary functions: sigmoid, softplus, softmax for arrays; exp, log, logistic for kernels.
 
 The functions for compiled kernels take float32 numbers. Functions of the C library take one number
 at a time. The exp and log of this module consist of arithmetic operations, so the compiler can

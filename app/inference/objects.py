@@ -10,9 +10,11 @@ The first state of a unit has the weight 0. The log-odds of class i given the ot
     b_i + sum_q p_q a_qi + sum_j presence_j L_ij + gain_i,   p = softmax(f + a v)
 
 at the logits x without class i, with the presence v of the other classes. p_q is the probability of
-the data source q. If a request names its profile q, p_q is 1. Both factors of a product p_m(z) exp(w) are positive, so their sum
-loses no digits. A kernel multiplies the sums of several units and takes one log of the product. The
-group is small enough to keep the product within float32.
+the data source q. If a request names its profile q, p_q is 1.
+
+Both factors of a product p_m(z) exp(w) are positive, so their sum loses no digits. A kernel
+multiplies the sums of several units and takes one log of the product. The group is small enough to
+keep the product within float32.
 """
 
 from __future__ import annotations
