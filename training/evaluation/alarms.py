@@ -34,8 +34,7 @@ ALARMS: dict[Sensitivity, float] = {"low": 0.02, "medium": 0.1, "high": 0.2}
 
 EXCESS = 1.5
 
-SOURCE_SCENES = 200
-"""Minimum number of scenes of a source with its own threshold, or its own count of alarms."""
+_GROUPS = 30  # minimum number of groups of a source with its own count of alarms
 
 
 @dataclass(frozen=True)
@@ -70,17 +69,17 @@ def untouched_alarms(artifact: Artifact, scenes: Sequence[EncodedScene]) -> Iter
     """Ask about an untouched part of each scene, and count the scenes with an alarm.
 
     One random scene of each group takes part, because its scenes are not independent. Objects
-    count only if the object list is complete. Sources of few scenes count together.
+    count only if the object list is complete. Sources of few groups count together.
     """
     rng = np.random.default_rng(0)
-    sizes = Counter(scene.source for scene in scenes)
     scene_of_group: dict[tuple[str, str], EncodedScene] = {}
     for k in rng.permutation(len(scenes)).tolist():
         scene_of_group.setdefault((scenes[k].source, scenes[k].group), scenes[k])
+    groups = Counter(source for source, _ in scene_of_group)
     cases: dict[str, list[tuple[Scene, bool]]] = {}
     for scene in scene_of_group.values():
         listed = _random_part(scene, artifact.vocabulary.structure, rng)
-        is_small = len(sizes) > 1 and sizes[scene.source] < SOURCE_SCENES
+        is_small = len(groups) > 1 and groups[scene.source] < _GROUPS
         source = "the smaller sources" if is_small else scene.source
         cases.setdefault(source, []).append((listed, scene.complete))
     for source, sensitivity in product(sorted(cases), ALARMS):

@@ -46,7 +46,7 @@ from training.datasets.cases import (
     scene_of,
 )
 from training.datasets.sources import meaning_of
-from training.evaluation.alarms import ALARMS, SOURCE_SCENES
+from training.evaluation.alarms import ALARMS
 from training.fit.calibrate_objects import calibrate_objects, recalibrated
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_popularity
@@ -73,6 +73,7 @@ _PLACEMENT_CASES = 4
 # Minimum thresholds. If true and false relations hardly overlap, the target shares would need
 # alarms for relations that probably hold.
 _LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
+_SOURCE_SCENES = 200  # minimum number of scenes of a source with its own quantile
 _JUDGED_SCENES = 20  # minimum number of scenes with relations for a judgement of relations
 
 
@@ -409,8 +410,8 @@ def hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) ->
     below it.
     """
     names, sizes = np.unique(sources, return_counts=True)
-    small = np.isin(sources, names[sizes < SOURCE_SCENES])
-    parts = [sources == name for name in names[sizes >= SOURCE_SCENES]]
+    small = np.isin(sources, names[sizes < _SOURCE_SCENES])
+    parts = [sources == name for name in names[sizes >= _SOURCE_SCENES]]
     parts += [small] if small.any() else []
     highest = max(float(np.quantile(values[part], share)) for part in parts)
     return float(np.nextafter(highest, np.inf))
