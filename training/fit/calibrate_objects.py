@@ -9,7 +9,7 @@ sources for which the answers stand (`served_scenes`). Structure is not listed.
     outlier    Probability that a class is an intruder. Half of the parts contain an intruder.
     lines      An object is an outlier if its log-odds of being an intruder are above a line in the
                log of the number of listed classes. Each line raises alarms in a given share of the
-               untouched parts (`training.evaluation.alarms.ALARMS`), in the mean over the sources.
+               untouched parts (`training.evaluation.alarms.ALARMS`).
 
 The prior of an intruder class is proportional to (frequency of the class)^alpha. Alpha and the
 logistic regression are fitted to three kinds of intruders with equal weights. Intruders are drawn
@@ -114,16 +114,16 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
 def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTensors:
     """Return the scenes of the sources for which the answers stand; see `ObjectsConfig`.
 
-    These are the sources with the largest weight in `served` and at least 20 scenes. Without such a
-    source, they are all scenes with complete object lists. At most 400 scenes of a source take
-    part.
+    These are the sources with at least half of the largest weight in `served` and at least 20
+    scenes. Without such a source, they are all scenes with complete object lists. At most 400
+    scenes of a source take part.
     """
     names = np.array([scenes.source_names[q] for q in scenes.source.tolist()], dtype=np.str_)
     largest = max(served.values(), default=0.0)
     chosen = [
         name
         for name, weight in served.items()
-        if weight == largest and (names == name).sum() >= _LEAST_SCENES
+        if weight >= largest / 2 and (names == name).sum() >= _LEAST_SCENES
     ]
     if not chosen:
         scenes = complete_scenes(scenes)
@@ -134,17 +134,6 @@ def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTen
         index = np.flatnonzero(names == name)
         kept += np.random.default_rng(0).permutation(index)[:_SOURCE_SCENES].tolist()
     return subset(scenes, torch.tensor(sorted(kept), dtype=torch.int64))
-
-
-def source_weights(scenes: SceneTensors, index: Tensor) -> Floats:
-    """Return weights of parts, (parts,), so that all sources count alike.
-
-    Args:
-        index: index of the scene of each part, (parts,).
-    """
-    source = scenes.source[index].numpy()
-    counts = np.bincount(source, minlength=len(scenes.source_names))
-    return len(source) / (np.count_nonzero(counts) * counts[source])
 
 
 # ------------------------------------------------------------------------------------ missing
@@ -217,7 +206,6 @@ class ListScores:
         popularity: log-odds of each class in the served mix, (n,).
         intruder: True for intruders, (n,) bool.
         size: number of listed classes of each list, (N,).
-        weight: weight of each list, (N,).
     """
 
     row: Ints
@@ -225,7 +213,6 @@ class ListScores:
     popularity: Floats
     intruder: Flags
     size: Ints
-    weight: Floats
 
     def score(self, alpha: float) -> Floats:
         """Return log-odds with the prior of intruders, (n,); low values mean intruders."""
@@ -249,8 +236,7 @@ def fit_outliers(
     if len(scenes) < _LEAST_SCENES:
         return {}
     untouched = {
-        n: score_lists(artifact, scenes, draw_parts(scenes, structure, exactly(n), _SEEDS))
-        for n in LENGTHS
+        n: score_lists(artifact, draw_parts(scenes, structure, exactly(n), _SEEDS)) for n in LENGTHS
     }
     untouched = {n: scores for n, scores in untouched.items() if len(scores.size) >= _LEAST_SCENES}
     laws = {"uniform": None, "popularity": by_popularity, "signature": by_signature}
@@ -273,9 +259,7 @@ def fit_outliers(
     }
 
 
-def score_lists(
-    artifact: Artifact, scenes: SceneTensors, parts: Parts, intruders: Tensor | None = None
-) -> ListScores:
+def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = None) -> ListScores:
     """Return the scores of parts of scenes, each with an intruder (parts,) if these are given."""
     popularity = np.array(artifact.calibration.popularity)
     rows, log_odds, classes_of, is_intruder = [], [], [], []
@@ -300,7 +284,6 @@ def score_lists(
         popularity=popularity[all_classes],
         intruder=np.concatenate(is_intruder or empty).astype(np.bool_),
         size=parts.v.sum(1).numpy().astype(np.int64) + (intruders is not None),
-        weight=source_weights(scenes, parts.scene),
     )
 
 
@@ -313,7 +296,7 @@ def score_intruders(
     kept = (intruders >= 0).nonzero().squeeze(1)
     usable = subset(scenes, kept)
     parts = draw_parts(usable, structure, up_to_longest, _SEEDS)
-    return score_lists(artifact, usable, parts, intruders[kept][parts.scene])
+    return score_lists(artifact, parts, intruders[kept][parts.scene])
 
 
 def choose_alpha(untouched: Mapping[int, ListScores], altered: Mapping[str, ListScores]) -> float:
@@ -322,9 +305,7 @@ def choose_alpha(untouched: Mapping[int, ListScores], altered: Mapping[str, List
     for alpha in ALPHAS:
         limit = np.mean(
             [
-                weighted_quantile(
-                    scores.extreme(-scores.score(alpha)), scores.weight, 1 - ALARMS["medium"]
-                )
+                np.quantile(scores.extreme(-scores.score(alpha)), 1 - ALARMS["medium"])
                 for scores in untouched.values()
             ]
         )
@@ -338,10 +319,8 @@ def _detection(scores: ListScores, alpha: float, limit: float) -> float:
     """Return the mean of hit@1 and of the share of intruders above a limit."""
     values = -scores.score(alpha)
     first = values >= scores.extreme(values)[scores.row]
-    is_intruder, weight = scores.intruder, scores.weight[scores.row]
-    hits = np.average(first[is_intruder], weights=weight[is_intruder])
-    caught = np.average(values[is_intruder] > limit, weights=weight[is_intruder])
-    return float(hits + caught) / 2
+    caught = values > limit
+    return float(first[scores.intruder].mean() + caught[scores.intruder].mean()) / 2
 
 
 def _fit_intruders(
@@ -354,8 +333,7 @@ def _fit_intruders(
             size = np.log(scores.size[scores.row])
             columns.append(np.stack([scores.score(alpha), size], 1))
             truth.append(scores.intruder)
-            weight = scores.weight[scores.row]
-            weights.append(weight / (len(group) * scores.weight.sum()))
+            weights.append(np.full(len(scores.row), 1 / (len(group) * len(scores.size))))
     total = np.concatenate(weights)
     total *= len(total) / total.sum()
     slope, count, intercept = logistic(np.concatenate(columns), np.concatenate(truth), total, RIDGE)
@@ -376,21 +354,14 @@ def fit_line(
         )
         for n, scores in untouched.items()
     }
-    quantiles = [weighted_quantile(worst[n], untouched[n].weight, 1 - share) for n in worst]
+    quantiles = [np.quantile(values, 1 - share) for values in worst.values()]
     slope = 0.0
     if len(worst) > 1:
         slope = float(np.polyfit(np.log(list(worst)), quantiles, 1)[0])
     above = np.concatenate([values - slope * np.log(n) for n, values in worst.items()])
-    weight = np.concatenate([untouched[n].weight / untouched[n].weight.sum() for n in worst])
-    return AlarmLine(intercept=weighted_quantile(above, weight, 1 - share), log_count=slope)
-
-
-def weighted_quantile(values: Floats, weight: Floats, share: float) -> float:
-    """Return the smallest value below or at which lies at least a share of the weight."""
-    order = np.argsort(values)
-    cumulative = np.cumsum(weight[order])
-    position = int(np.searchsorted(cumulative, share * cumulative[-1]))
-    return float(values[order[min(position, len(order) - 1)]])
+    weight = np.concatenate([np.full(len(values), 1 / len(values)) for values in worst.values()])
+    limit = np.quantile(above, 1 - share, weights=weight, method="inverted_cdf")
+    return AlarmLine(intercept=float(limit), log_count=slope)
 
 
 # ------------------------------------------------------------------------------------ generate

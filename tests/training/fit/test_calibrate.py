@@ -255,7 +255,6 @@ def scores_of(log_odds, intruder, popularity=None):
         popularity=np.broadcast_to(popularity, log_odds.shape).ravel(),
         intruder=np.broadcast_to(intruder, log_odds.shape).ravel(),
         size=np.full(lists, n),
-        weight=np.ones(lists),
     )
 
 
@@ -317,7 +316,7 @@ def test_untouched_lists_of_other_rooms_keep_the_share(judging):
     calibration, shares = judging.calibration, {}
     for n in (1, 2, 3, 5, 8):
         parts = draw_parts(rooms(300, 3), STRUCTURE, exactly(n))
-        scores = score_lists(judging, rooms(300, 3), parts)
+        scores = score_lists(judging, parts)
         z = calibrated(
             calibration.outlier,
             scores.score(calibration.popularity_weight),
@@ -347,7 +346,7 @@ def test_structure_and_classes_that_belong_anywhere_are_never_judged(judging):
     judged = vocabulary.judged
     assert judged.sum() == len(judged) - int(STRUCTURE.sum()) - 2
     parts = draw_parts(rooms(100, 3), STRUCTURE, exactly(4))
-    scores = score_lists(artifact, rooms(100, 3), parts)
+    scores = score_lists(artifact, parts)
     row, classes = np.nonzero(parts.v.numpy() * judged)
     assert scores.row.tolist() == row.tolist()
     assert scores.popularity.tolist() == np.array(artifact.calibration.popularity)[classes].tolist()
