@@ -143,8 +143,8 @@ class Weights:
         """Return the bias of each class given the listed classes, (V,).
 
         For a profile q, the bias is b + a[q]. Otherwise it is b + sum_q p(q) a[q] with the
-        probabilities p = softmax(f + a v) of the data sources. b alone is the bias without listed
-        classes.
+        probabilities p = softmax(f + a v) of the data sources. b alone is the bias for the mix of
+        data sources that the model serves.
 
         Args:
             classes, presence: (n,) indices of the listed classes, and the probabilities that they

@@ -56,6 +56,15 @@ def random_weights(
     return machine.requires_grad_(False)
 
 
+def mean_rates(machine: BoltzmannMachine, v: Tensor) -> Tensor:
+    """sum_q p(q | v) a_q, (V,), by a loop over the sources; 0 for a machine without sources."""
+    total, weights = torch.zeros(machine.spec.V, dtype=torch.float64), 0.0
+    for f, a in zip(machine.f.double(), machine.a.double(), strict=True):
+        weight = math.exp(f + sum(float(rate) for rate, on in zip(a, v, strict=True) if on))
+        total, weights = total + weight * a, weights + weight
+    return total / weights if weights else total
+
+
 def binary(units: int) -> Tensor:
     """All 2^units binary vectors, (2^units, units) float64."""
     codes = torch.arange(2**units).unsqueeze(1)

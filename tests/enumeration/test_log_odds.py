@@ -2,6 +2,7 @@
 
 In the joint, the room type t is a unit with C + 1 states, of which one is "not listed". A list of
 classes means v_j = 0 for every other class j: a log-odds is that of v_i given all other classes.
+The joint of an unknown source has the mean base rates given the listed classes.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from tests.enumeration.small_machines import (
     binary,
     enumerate_joint,
     left_out,
+    mean_rates,
     same,
     small_machine,
 )
@@ -37,6 +39,8 @@ def differences(name, room, source, scale=0.8):
     joint = enumerate_joint(machine, *range(-1, machine.spec.C), source=source)
     for i, v, given in left_out(joint):
         exact = joint.log_odds(joint.v[:, i] > 0, given & (joint.room == room))
+        if source < 0:
+            exact += float(mean_rates(machine, v)[i])
         ours = machine.object_log_odds(
             v[None], room=torch.tensor([room]), source=torch.tensor([source])
         )

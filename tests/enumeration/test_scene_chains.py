@@ -23,6 +23,7 @@ from tests.enumeration.small_machines import (
     binary,
     check_frequencies,
     enumerate_joint,
+    mean_rates,
     random_weights,
     same,
     small_machine,
@@ -66,6 +67,13 @@ def code(*blocks):
     return (bits << np.arange(bits.shape[-1])).sum(-1)
 
 
+def with_mean_rates(machine, classes=()):
+    """A float64 copy whose biases contain the mean base rates given the listed classes."""
+    copied = copy.deepcopy(machine).double()
+    copied.b += mean_rates(machine, [i in classes for i in range(machine.spec.V)])
+    return copied
+
+
 def at_temperature(machine, beta):
     """The machine whose weights between objects and hidden units are multiplied by beta."""
     scaled = copy.deepcopy(machine)
@@ -76,9 +84,10 @@ def at_temperature(machine, beta):
 
 def check_stationary(name, condition, given, beta=1.0):
     single = served_machine(name).float()
-    spec, double = single.spec, at_temperature(copy.deepcopy(single).double(), beta)
-    source = -1 if condition.profile is None else condition.profile
-    joint = enumerate_joint(double, condition.room, source=source)
+    spec, double, source = single.spec, copy.deepcopy(single).double(), condition.profile
+    if source is None:
+        double, source = with_mean_rates(single, condition.classes), -1
+    joint = enumerate_joint(at_temperature(double, beta), condition.room, source=source)
     where = given(joint)
     keys, which = np.unique(code(joint.v, joint.h1, joint.h2), return_inverse=True)
     p = torch.where(where, joint.p, 0.0).numpy()
@@ -99,14 +108,17 @@ def test_chains_are_stationary(name, beta):
     check_stationary(name, conditions(), lambda joint: joint.p >= 0, beta)
 
 
-@pytest.mark.parametrize("state", [0, 1, 2])
+@pytest.mark.parametrize(("state", "profile"), [(0, None), (1, 1), (2, None)])
 @pytest.mark.parametrize("name", SMALL)
-def test_chains_are_stationary_under_conditions(name, state):
-    """A class present, a unit of h1 in a state, a unit of h2 on, a room type and a profile."""
+def test_chains_are_stationary_under_conditions(name, state, profile):
+    """A class present, a unit of h1 in a state, a unit of h2 on, a room type and a profile.
+
+    Without a profile, the base rates are their mean given the class.
+    """
     spec = SMALL[name]
     state = min(state, spec.states - 1)
     held2 = [1] if spec.H2 else []
-    room, profile = 1 if spec.C else None, 1 if spec.profiles else None
+    room, profile = 1 if spec.C else None, profile if spec.profiles else None
 
     def given(joint):
         unit = joint.h1[:, spec.states - 1 : 2 * (spec.states - 1)]
@@ -252,7 +264,7 @@ def test_log_score_is_the_log_probability(name, room):
     machine = served_machine(name)
     spec = machine.spec
     room = room if spec.C else None
-    joint = enumerate_joint(machine, room)
+    joint = enumerate_joint(with_mean_rates(machine), room)
     chains = SceneChains(weights_of(machine)).under(conditions(room=room))
     every = np.arange(spec.V)
     errors = []

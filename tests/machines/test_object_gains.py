@@ -86,11 +86,11 @@ def test_weights_that_float32_products_do_not_cover_are_refused(value):
 
 V, C = 14, 3
 SPECS = {
-    "binary": MachineSpec("rbm", V=V, A=1, units=30, C=C, profiles=2),
+    "binary": MachineSpec("rbm", V=V, A=1, units=30, C=C, profiles=3),
     "states": MachineSpec(
-        "triway", V=V, A=1, units=5, states=8, C=C, K=1, profiles=2, coupled=True
+        "triway", V=V, A=1, units=5, states=8, C=C, K=1, profiles=3, coupled=True
     ),
-    "two-layers": MachineSpec("gbm", V=V, A=1, units=6, states=4, H2=5, C=C, profiles=2),
+    "two-layers": MachineSpec("gbm", V=V, A=1, units=6, states=4, H2=5, C=C, profiles=3),
 }
 ONE_LAYER = ("binary", "states")
 
@@ -109,7 +109,7 @@ class Case:
         self.classes = torch.randperm(V, generator=generator)[:n].numpy()
         self.presence = torch.rand(n, generator=generator).numpy()
         self.room = int(torch.randint(-1, C, (), generator=generator))
-        self.source = int(torch.randint(-1, 2, (), generator=generator))
+        self.source = int(torch.randint(-1, 3, (), generator=generator))
         self.profile = None if self.source < 0 else self.source
         self.scorer = ObjectScorer(weights)
         room = None if self.room < 0 else self.room
@@ -150,7 +150,7 @@ def test_log_odds_equal_the_tensors(name, seed):
 def test_reasons_are_differences_of_log_odds(name, seed):
     """With class j minus without class j, recomputed; of class i itself, 0."""
     case = Case(name, seed)
-    scene = case.x, case.shares, case.classes, case.presence
+    scene = case.x, case.shares, case.classes, case.presence, case.profile
     rows = np.arange(len(case.classes))[::-2]
     found, expected = case.scorer.reasons(*scene, rows), np.zeros((len(rows), len(case.classes)))
     for row, k in enumerate(rows):
@@ -177,7 +177,7 @@ def test_reasons_of_two_layers_add_the_effects_through_the_second(scale):
         case.machine.double()
         case.room = -1
         rows = np.arange(len(case.classes))
-        scene = context.x, context.shares, case.classes, case.presence
+        scene = context.x, context.shares, case.classes, case.presence, case.profile
         found = ObjectScorer(weights).reasons(*scene, rows)
         for k in rows:
             for j in set(rows) - {k}:

@@ -56,7 +56,7 @@ _UNSERVED = 1e-9  # weight of a source outside of the served mix
 
 @dataclass(frozen=True)
 class ObjectScenes:
-    """The scenes that teach objects: at least two classes, and a source with a weight above 0.
+    """The scenes that teach objects: they have at least two classes, and a weight above 0.
 
     Attributes:
         v: presence of the classes that the source shows, without structure, (scenes, classes).
@@ -64,7 +64,7 @@ class ObjectScenes:
         source: index of the source in `sources`, (scenes,) int64.
         weight: weight of each scene, (scenes,).
         shows: True for classes that a source shows, (sources, classes) bool.
-        sources: names of the sources.
+        sources: names of the sources of these scenes.
     """
 
     v: Tensor
@@ -84,21 +84,22 @@ class ObjectScenes:
         weights = torch.tensor([config.source_weights.get(q, 1.0) for q in train.source_names])
         counts = torch.zeros(train.annotated_classes.shape)
         counts.index_add_(0, train.source, (train.v > 0).float())
-        used = (weights > 0) & (counts.sum(1) > 0)
         open_sources = [shows_everything(q, config) for q in train.source_names]
         shows = (counts >= _SHOWN) & train.annotated_classes
         shows |= torch.tensor(open_sources).unsqueeze(1) & ~left_out(train)
         shows &= ~structure
         v = (train.v > 0) & shows[train.source]
-        kept = (used[train.source] & (v.sum(1) >= 2)).nonzero().squeeze(1)
+        weight = train.weight * weights[train.source]
+        kept = ((weight > 0) & (v.sum(1) >= 2)).nonzero().squeeze(1)
         if not len(kept):
             raise ValueError("no training scene has two classes; add scenes with more objects")
+        used = train.source[kept].bincount(minlength=len(weights)) > 0
         index = used.long().cumsum(0) - 1
         return cls(
             v=v[kept].float(),
             room=train.room[kept],
             source=index[train.source[kept]],
-            weight=(train.weight * weights[train.source])[kept],
+            weight=weight[kept],
             shows=shows[used],
             sources=tuple(q for q, u in zip(train.source_names, used.tolist(), strict=True) if u),
         )
@@ -320,8 +321,8 @@ class ObjectFit:
     def finish(self) -> None:
         """Set the weights to their average, with the base rates of the served mix in b.
 
-        Afterwards, a[q] is the difference of source q from the served mix, and f are the log
-        weights of the mix, corrected for the lists of each source.
+        Afterwards, a[q] is the difference of source q from the served mix. f are the log weights of
+        the mix, plus what training added to the log sizes of the sources.
         """
         for name, weight in self._weights.items():
             weight.copy_(self._average[name])

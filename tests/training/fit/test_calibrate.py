@@ -64,11 +64,11 @@ CONFIG = ObjectsConfig(steps=150, batch_size=64, learning_rate=0.03, generative_
 @pytest.fixture(scope="module")
 def model():
     """A machine whose object weights are fitted to furnished rooms."""
-    spec = MachineSpec(
-        "triway", V=len(VOCABULARY), A=4, units=6, states=8, K=3, C=len(VOCABULARY.room_types)
-    )
-    machine = build(spec).initialise(torch.Generator().manual_seed(0), 0.05)
     scenes = ObjectScenes.of(rooms(ROOM_COUNT, 2), STRUCTURE, CONFIG)
+    V, C = len(VOCABULARY), len(VOCABULARY.room_types)
+    sources = len(scenes.sources)
+    spec = MachineSpec("triway", V=V, A=4, units=6, states=8, K=3, C=C, profiles=sources)
+    machine = build(spec).initialise(torch.Generator().manual_seed(0), 0.05)
     start_objects(machine, scenes)
     fit_objects(ObjectFit(machine, scenes, CONFIG, seed=0))
     return draft_artifact(machine.eval().requires_grad_(False), VOCABULARY)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -12,14 +13,15 @@ from hypothesis import strategies as st
 from torch.nn.functional import softplus
 
 from app.inference.weights import unpack_scenes
-from tests.enumeration.small_machines import binary, random_weights, unit_states
+from tests.enumeration.small_machines import binary, mean_rates, random_weights, unit_states
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.parts import ALL_BUT_ONE
 from training.fit import objects
 from training.fit.configuration import ObjectsConfig
-from training.fit.objects import ObjectFit, ObjectScenes, fit_objects, random_parts
+from training.fit.objects import ObjectFit, ObjectScenes, fit_objects, random_parts, start_objects
 from training.fit.samples import store_samples
 from training.machines import MachineSpec, build
+from training.machines.arrays import weights_of
 from training.machines.gibbs import Chains
 
 V = 4
@@ -93,9 +95,10 @@ PARTIAL = torch.tensor([[True, True, True, False], [True, True, True, True]])
 
 def test_scenes_keep_classes_that_their_source_shows():
     """procthor shows class 0 twice only; sunrgbd has an open vocabulary and shows all; of the
-    structure (class 4) nothing is learned; a scene of one class and a source of weight 0 go."""
+    structure (class 4) nothing is learned; a scene of one class, a source of such scenes and a
+    source of weight 0 go."""
     rows = [*[([0, 1, 4], "procthor")] * 2, *[([1, 2, 3], "procthor")] * 3, ([1, 4], "procthor")]
-    rows += [([0, 3], "sunrgbd"), ([0, 2], "bddl")]
+    rows += [([0, 3], "sunrgbd"), ([0, 2], "bddl"), ([1, 4], "house"), ([2], "house")]
     data = tensors([scene(classes, source=source) for classes, source in rows])
     config = CONFIG.model_copy(update={"source_weights": {"bddl": 0.0, "procthor": 0.5}})
     found = ObjectScenes.of(data, torch.arange(5) == 4, config)
@@ -161,6 +164,18 @@ def test_shares_of_random_parts():
 # -- the losses and their gradients ------------------------------------------------------------
 
 
+def source_logit(machine, shows, x, q):
+    """f_q plus the base rates of the list x in source q.
+
+    The rate of a class that q does not show is the mean of the sources that show it.
+    """
+    total = machine.f[q]
+    for i in x.nonzero().flatten().tolist():
+        sources = [q] if shows[q, i] else [p for p in range(len(shows)) if shows[p, i]]
+        total = total + sum(machine.a[p, i] for p in sources) / len(sources)
+    return total
+
+
 def masked_loss(machine, scenes, parts, index, listed_room):
     """The loss of a batch, with each probability as a sum over all states of the hidden units."""
     total = torch.zeros((), dtype=torch.float64)
@@ -175,6 +190,8 @@ def masked_loss(machine, scenes, parts, index, listed_room):
             log_odds = on - off + machine.kappa[parts.share[row], i]
             weight = float(parts.weight[row]) if v[i] else 1.0
             total = total + weight * softplus(-log_odds if v[i] else log_odds)
+        logits = [source_logit(machine, scenes.shows, x, q) for q in range(len(scenes.shows))]
+        total = total - CONFIG.source_loss * torch.stack(logits).log_softmax(0)[source]
         true = int(scenes.room[k])
         if room < 0 <= true:
             every = torch.cat([log_sum(machine, x[None], t, source) for t in range(2)])
@@ -184,7 +201,10 @@ def masked_loss(machine, scenes, parts, index, listed_room):
 
 @pytest.mark.parametrize("name", ONE_LAYER)
 def test_the_masked_loss_and_its_gradient(name, monkeypatch):
-    """Equal to a formula of its own, with the weights of hidden classes and partial labels."""
+    """Equal to a formula of its own, with the weights of hidden classes and partial labels.
+
+    A class that a source does not show is no evidence for or against this source.
+    """
     machine = machine_of(name, scale=0.7).double()
     scenes = scenes_of(PARTIAL)
     scenes = replace(scenes, v=scenes.v.double())
@@ -204,7 +224,7 @@ def test_the_masked_loss_and_its_gradient(name, monkeypatch):
     index = scenes.draw(60, torch.Generator().manual_seed(1))
     batch = scenes.v[index], scenes.room[index], scenes.source[index]
     loss = fit._conditional_loss(*batch)
-    names = [n for n in ("b", "c1", "e", "W", "Q", "L", "a", "kappa") if hasattr(machine, n)]
+    names = [n for n in ("b", "c1", "e", "W", "Q", "L", "f", "a", "kappa") if hasattr(machine, n)]
     weights = [machine.get_parameter(n) for n in names]
     found = torch.autograd.grad(loss, weights)
     assert 10 < int((kept["room"] >= 0).sum()) < 35
@@ -342,7 +362,7 @@ def test_the_generative_share_brings_samples_near_the_scenes(name):
 
     def divergence(weight):
         config = CONFIG.model_copy(update={"generative_weight": weight, "rate_prior": 1e4})
-        machine = machine_of(name, scale=0.1, profiles=1)
+        machine = machine_of(name, scale=0.1, seed=1, profiles=1)
         fit_objects(ObjectFit(machine, target_scenes(), config, seed=0))
         q = log_p(machine.double()).detach()
         seen = TARGET > 0
@@ -376,15 +396,56 @@ def test_the_served_mix_moves_into_b_and_keeps_the_rates_of_each_source(served):
     fit = ObjectFit(machine, scenes, config, seed=0)
     while not fit.finished:
         fit.step()
-    rates, average = fit._average["b"] + fit._average["a"], fit._average["a"].clone()
+    b, a, f = (fit._average[name].clone() for name in "baf")
     fit.finish()
-    torch.testing.assert_close(machine.b + machine.a, rates)
     weight = torch.tensor([1.0, served.get("procthor", 1.0)])
-    mix = (weight @ average) / weight.sum()
-    mix[3] = average[1, 3]  # of the one source that shows class 3
-    torch.testing.assert_close(machine.b, fit._average["b"] + mix)
+    mix = (weight @ a) / weight.sum()
+    mix[3] = a[0, 3] = a[1, 3]  # of the one source that shows class 3
+    torch.testing.assert_close(machine.b, b + mix)
+    torch.testing.assert_close(machine.b + machine.a, b + a)
+    torch.testing.assert_close(weight @ machine.a, torch.zeros(V), rtol=0, atol=1e-6)
+    assert not machine.a[:, 3].any()
+    share = torch.bincount(scenes.source) / len(scenes.source)
+    torch.testing.assert_close(machine.f, f + (weight / weight.sum() / share).log())
     torch.testing.assert_close(machine.L, machine.L.T)
     assert not machine.L.diagonal().any()
+
+
+@torch.no_grad()
+def test_b_is_the_bias_without_a_list_before_training():
+    """f starts with the sizes of the sources, and ends with their weights in the served mix."""
+    config = CONFIG.model_copy(update={"served_sources": {"sunrgbd": 1.0, "procthor": 0.25}})
+    machine, scenes = machine_of("coupled", scale=1.0), scenes_of(PARTIAL)
+    start_objects(machine, scenes)
+    torch.testing.assert_close(machine.f.exp(), torch.bincount(scenes.source) / len(scenes.v))
+    ObjectFit(machine, scenes, config, seed=0).finish()
+    nothing = torch.zeros(1, V)
+    torch.testing.assert_close(machine.source_weights(nothing, None)[0], torch.tensor([0.8, 0.2]))
+    none = np.zeros(0, np.int64), np.zeros(0, np.float32)
+    found = weights_of(machine).class_bias(*none, None)
+    np.testing.assert_allclose(found, machine.b.numpy(), rtol=0, atol=1e-6)
+
+
+def test_training_finds_the_sources_of_lists():
+    """Scenes of two classes, of which one is listed, so that p(q | listed) has a closed form.
+
+    The sources have opposite base rates. In the served mix, they are equally likely.
+    """
+    v = EVERY[EVERY.sum(1) == 2].float().repeat(2, 1)
+    source, sizes = torch.arange(2).repeat_interleave(6), torch.tensor([900.0, 100.0])
+    liking = torch.tensor([[1.5, 0.5, -0.5, -1.5], [-1.5, -0.5, 0.5, 1.5]])
+    share = torch.stack([(v[source == q] @ liking[q]).softmax(0) for q in range(2)])
+    weight = (share * sizes.unsqueeze(1)).flatten()
+    names = ("sunrgbd", "procthor")
+    scenes = ObjectScenes(v, torch.full((12,), -1), source, weight, ALL, names)
+    changes = {"leave_one_out": 1.0, "rate_prior": 0.0, "source_loss": 30.0}
+    changes |= {"generative_weight": 0.0, "learning_rate": 0.02}
+    machine = machine_of("coupled")
+    start_objects(machine, scenes)
+    fit_objects(ObjectFit(machine, scenes, CONFIG.model_copy(update=changes), seed=0))
+    listed = share @ v[:6] / 2
+    found = machine.source_weights(torch.eye(V), None)
+    torch.testing.assert_close(found, (listed / listed.sum(0)).T, rtol=0, atol=0.04)
 
 
 def test_weights_are_averaged_over_the_last_steps():
@@ -428,8 +489,9 @@ def test_stored_samples_follow_the_machine_under_their_room_types(name):
     )
     sets = (found @ torch.tensor([1.0, 2, 4, 8])).long()
     assert set(rooms.tolist()) == {-1, 0, 1}
+    machine.double().b += mean_rates(machine, torch.zeros(V))
     for room in (-1, 0, 1):
         own = sets[rooms == room]
         share = torch.bincount(own, minlength=16).double() / len(own)
-        p = log_p(machine.double(), room).exp()
+        p = log_p(machine, room).exp()
         assert bool(((share - p).abs() <= 5 * (p * (1 - p) / len(own)).sqrt()).all())
