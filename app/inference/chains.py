@@ -305,10 +305,11 @@ class ConditionedChains:
 
             b·v + v'Lv/2 + e_t + sum_m log sum_z exp(x_mz) + log p(kept | v, h1)
 
-        The first terms are log p(v, t) + log Z, where t is the room type. An unknown room type has
-        e_t = 0. The last term is the log-probability of the relations given the sampled h1. With a
-        second layer, m is the mean field of h2. Then x contains J m, and the score also contains
-        c2·m and the entropy of m. This score is a lower bound on the log of the sum over h2.
+        b contains the base rates, which depend on the profile or on the listed classes. The first
+        terms are log p(v, t) + log Z, where t is the room type. An unknown room type has e_t = 0.
+        The last term is the log-probability of the relations given the sampled h1. With a second
+        layer, m is the mean field of h2. Then x contains J m, and the score also contains c2·m and
+        the entropy of m. This score is a lower bound on the log of the sum over h2.
 
         Args:
             state: final state of a chain.

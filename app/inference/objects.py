@@ -84,6 +84,12 @@ class Gains:
         return gain
 
 
+def _row_sum(rows: Floats, presence: Floats) -> Floats:
+    """Return presence @ rows. Rows of zeros, such as those of structure, do not change a digit."""
+    total: Floats = (presence[:, None] * rows).sum(0)
+    return total
+
+
 def all_states(x: NDArray[Any], states: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the probabilities of all states of the hidden units with the logits x, (..., H1).
 
@@ -176,7 +182,7 @@ class ObjectScorer:
         bias = self._weights.class_bias(classes, presence, profile)
         log_odds: Floats = bias + self.gains(x[None])[0] + self.kappa(coverage)
         if self._weights.spec.coupled:
-            log_odds += presence @ self._weights["L"][classes]
+            log_odds += _row_sum(self._weights["L"][classes], presence)
         return log_odds
 
     def kappa(self, coverage: float) -> Floats:
@@ -208,7 +214,7 @@ class ObjectScorer:
         else:
             log_odds += a[:, profile]
         if self._weights.spec.coupled:
-            log_odds += self._weights["L"][np.ix_(classes, classes)] @ presence
+            log_odds += _row_sum(self._weights["L"][np.ix_(classes, classes)], presence)
         return log_odds
 
     def reasons(

@@ -133,8 +133,12 @@ class Weights:
         return bias if room is None or not self.spec.C else bias + self["Q"][room]
 
     def source_logits(self, classes: NDArray[Any], presence: NDArray[Any]) -> NDArray[Any]:
-        """Return the logits of the data sources given the listed classes, (profiles,): f + a v."""
-        logits: NDArray[Any] = self["f"] + self["a"][:, classes] @ presence
+        """Return the logits of the data sources given the listed classes, (profiles,): f + a v.
+
+        The sum has float64 digits, so that listed structure, whose terms are 0, does not change it.
+        """
+        evidence = self["a"][:, classes].astype(np.float64) @ presence
+        logits: NDArray[Any] = (self["f"] + evidence).astype(self["f"].dtype)
         return logits
 
     def class_bias(

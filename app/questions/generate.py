@@ -95,7 +95,8 @@ def generate(
 
     Returns:
         The fields `seed` and `scenes` of `scene_client.schemas.GenerateAnswer`. For `log_score`,
-        see `ConditionedChains.log_score`. Only scores of the same model can be compared.
+        see `ConditionedChains.log_score`. Only scores of the same model, for the same listed
+        classes, room type and profile, can be compared.
 
     Raises:
         ValueError: a number is out of range, or `context` has an invalid layer, unit or state.

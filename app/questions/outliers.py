@@ -10,7 +10,8 @@ j raises the log-odds of class i by
 Here c1 are the biases of the hidden units, W_i are the weights of class i, and `gain` is the
 contribution of the hidden units (`app.inference.objects`). The increase is symmetric in i and j. So
 the gains of all classes at c1 + W_i give the increase by every class j. The formula is exact for a
-machine with one hidden layer. It leaves out a second layer and the room type.
+machine with one hidden layer. It leaves out a second layer, the room type, and what the classes
+tell about the data source.
 
 Rare classes have the largest increases, such as a toilet paper holder for a toilet. Common classes
 such as chair are likely in any scene. So companions are ranked by a product: the increase,

@@ -86,6 +86,7 @@ def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> Artifac
     for weights, parameter in machine.named_parameters():
         if weights in ("W", "L"):
             parameter[structure] = 0
+    machine.a[:, structure] = 0
     if machine.spec.coupled:
         machine.L[:, structure] = 0
     return artifact_of(machine, **changes)

@@ -14,7 +14,7 @@ import torch
 
 from app.scene import CANONICAL, OPPOSITES
 from tests.enumeration.implied import relation_by_definition
-from tests.enumeration.small_machines import Joint, enumerate_joint
+from tests.enumeration.small_machines import Joint, enumerate_joint, mean_rates
 from tests.questions.answers import disagreements, missing, outliers, relations
 from tests.questions.artifacts import EXACT, LABELS, artifact_of, random_machine, scene_of
 
@@ -42,9 +42,13 @@ CASES = [
 
 @dataclass(frozen=True)
 class Exact:
-    """Conditional probabilities of a machine, as sums over its joint."""
+    """Conditional probabilities of a machine, as sums over its joint.
+
+    infers_source: False for the joint of one data source.
+    """
 
     joint: Joint
+    infers_source: bool
 
     def unit(self, triple):
         """The index of a relation unit, or None if the machine does not have it."""
@@ -63,7 +67,13 @@ class Exact:
 
     def object(self, i, present):
         """Log-odds of class i, given the other classes. Relations are unobserved."""
-        return self.joint.log_odds(self.joint.v[:, i] > 0, self.states(present, free=i))
+        log_odds = self.joint.log_odds(self.joint.v[:, i] > 0, self.states(present, free=i))
+        if not self.infers_source:
+            return log_odds
+        machine, others = self.joint.machine, set(present) - {i}
+        return log_odds + float(
+            mean_rates(machine, [j in others for j in range(machine.spec.V)])[i]
+        )
 
     def kappa(self, i, coverage):
         """The bias of class i for the listed share of a scene."""
@@ -112,7 +122,7 @@ def exact_case(name, scale=1.3, room=None, profile=None):
     machine = random_machine(EXACT[name], scale)
     source = -1 if profile is None else profile
     joint = enumerate_joint(copy.deepcopy(machine).double(), room, source=source)
-    return artifact_of(machine), Exact(joint)
+    return artifact_of(machine), Exact(joint, profile is None)
 
 
 @pytest.fixture(params=EXACT)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from app.scene import CANONICAL, contradiction, derive_relations
 from app.scene.scene import Scene
-from tests.enumeration.small_machines import enumerate_joint
+from tests.enumeration.small_machines import enumerate_joint, mean_rates
 from tests.questions.answers import generate, outliers
 from tests.questions.artifacts import (
     EXACT,
@@ -179,12 +179,17 @@ DRAWN: dict[str, MachineSpec] = {
 }
 
 
-def with_joint(name, room=None, profile=None):
-    """An artifact, and the joint of its machine under a room type and a profile."""
+def with_joint(name, room=None, profile=None, evidence=()):
+    """An artifact, and the joint of its machine under a room type and a profile.
+
+    Without a profile, the joint has the mean base rates given the listed classes.
+    """
     machine = random_machine(DRAWN[name], 1.3)
-    source = -1 if profile is None else profile
-    joint = enumerate_joint(copy.deepcopy(machine).double(), room, source=source)
-    return artifact_of(machine), joint
+    double, source = copy.deepcopy(machine).double(), profile
+    if profile is None:
+        double.b += mean_rates(machine, [i in evidence for i in range(machine.spec.V)])
+        source = -1
+    return artifact_of(machine), enumerate_joint(double, room, source=source)
 
 
 def share(joint, event, condition):
@@ -212,7 +217,7 @@ def test_objects_have_the_distribution_of_the_model(name, evidence, clamped):
     profile = 1 if clamped and spec.profiles else None
     state = spec.states - 1
     context = {"h1": [(1, state)]} if clamped else None
-    artifact, joint = with_joint(name, room, profile)
+    artifact, joint = with_joint(name, room, profile, evidence)
     scene = scene_of(evidence, room=room, profile=profile)
     drawn = label_sets(generate(artifact, scene, count=512, seed=0, steps=40, context=context))
     condition = (joint.v[:, evidence] > 0).all(1)

@@ -85,14 +85,14 @@ def test_the_sensitivity_selects_the_threshold_of_misplaced_relations(name):
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_companions_raise_the_log_odds_of_an_outlier_most(name):
-    """In a scene with only the companion and the outlier."""
+    """In a scene with only the companion and the outlier, of one data source."""
     artifact = larger_artifact(name)
     machine, none = machine_of(artifact.weights), torch.zeros(1, len(LABELS))
 
     def log_odds(j, *listed):
         v = none.index_fill(1, torch.tensor(listed, dtype=torch.int64), 1.0)
         if not machine.spec.H2:
-            return float(machine.object_log_odds(v)[0, j])
+            return float(machine.object_log_odds(v, source=torch.tensor([0]))[0, j])
         # The formula leaves out the second layer.
         return float(machine.gain(machine.c1 + v @ machine.W, machine.W)[0, j])
 

@@ -29,7 +29,8 @@ def test_only_likely_places_and_strong_reasons_are_listed():
     """Places with 3/4 of the first place's probability, and reasons that change odds threefold."""
     scene = scene_of([0, 1, 2, 3], [(2, 1, 0)])
     further_places, reasons = [], []
-    for artifact in map(larger_artifact, ("rbm", "triway", "triway-states")):
+    for name in ("rbm", "triway", "triway-states"):
+        artifact = larger_artifact(name, scale=1.0)
         with without_minimums():
             every = missing(artifact, scene)
         for entry, complete in zip(missing(artifact, scene), every, strict=True):

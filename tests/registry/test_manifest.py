@@ -103,10 +103,10 @@ def test_reads_back_as_written(change: dict[str, Any]) -> None:
     read = Manifest.from_bytes(data)
     assert read == written
     assert read.to_bytes() == data
-    assert json.loads(data)["format"] == 4
+    assert json.loads(data)["format"] == 5
 
 
-@pytest.mark.parametrize("value", [3, 5, 4.0, "4", None, True])
+@pytest.mark.parametrize("value", [4, 6, 5.0, "5", None, True])
 def test_refuses_another_format(value: object) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"]
@@ -128,9 +128,9 @@ def test_refuses_another_format(value: object) -> None:
         (b"\xff\xfe", "truncated"),
         (b"[" * 200_000, "truncated"),
         (resign(b"{" + b'"a":[' * 100_000 + b"]" * 100_000 + b"}"), "invalid_manifest"),
-        (resign(b'{"format": 4, nonsense}'), "invalid_manifest"),
-        (b'{"format": 4}', "invalid_manifest"),
-        (resign(b'{"format": 4}'), "invalid_manifest"),
+        (resign(b'{"format": 5, nonsense}'), "invalid_manifest"),
+        (b'{"format": 5}', "invalid_manifest"),
+        (resign(b'{"format": 5}'), "invalid_manifest"),
     ],
 )
 def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
