@@ -64,6 +64,8 @@ def missing(
     The model assumes that the scene lists the share `coverage` of its classes. If the coverage is
     low, an unlisted class may well be present. Each class is judged separately, so the
     probabilities do not sum to 1. The list `missing` never contains listed or structural classes.
+    A kind of a listed class, such as an office chair beside a listed chair, may be the listed
+    object. So the list contains it only if `candidates` names it.
 
     Args:
         scene: the listed objects, their relations and the room type.
@@ -134,8 +136,11 @@ def _ranked(
     Returns:
         The class indices, their probabilities, and their log-odds before calibration, each (k,).
     """
+    listed_classes = posterior.present.classes
     usable = ~artifact.vocabulary.structure
-    usable[posterior.present.classes] = False
+    usable[listed_classes] = False
+    if candidates is None:
+        usable &= ~np.isin(artifact.vocabulary.parents, listed_classes)
     absent = np.flatnonzero(usable)
     chosen = np.ones(len(absent), np.bool_)
     if candidates is not None:

@@ -77,9 +77,9 @@ def outliers(
     same score. Intruders are often common objects in the wrong room. The prior of an intruder is
     therefore proportional to popularity^alpha. The popularity of a class is the odds that a
     training scene has the class. So the function subtracts alpha times the log of the popularity.
-    Structural classes, such as wall, and classes that belong anywhere, such as cat or bag, always
-    have the probability 0. A scene with few objects gives little evidence, so its threshold is
-    higher.
+    Structural classes, such as wall, classes that belong anywhere, such as cat or bag, and classes
+    that no training scene has always have the probability 0. A scene with few objects gives little
+    evidence, so its threshold is higher.
 
     Args:
         scene: the objects and stated relations to judge.
@@ -200,7 +200,7 @@ def _intruder_logits(
     classes = posterior.present.classes
     adjusted = _adjusted(artifact, classes, log_odds).astype(np.float64)
     logits = calibrated(entry, adjusted, max(1, posterior.listed)).astype(np.float64)
-    logits[~artifact.vocabulary.judged[classes]] = -np.inf
+    logits[~artifact.judged[classes]] = -np.inf
     return logits
 
 

@@ -100,9 +100,18 @@ class Artifact:
 
     @cached_property
     def popularity(self) -> NDArray[np.float64] | None:
-        """(V,) log-odds that a training scene has each class. None means that they are unknown."""
+        """(V,) log-odds that a training scene has each class. None means that they are unknown.
+
+        The entry of a class that no training scene has is NaN.
+        """
         popularity = self.calibration.popularity
-        return np.array(popularity) if popularity else None
+        return np.array(popularity, dtype=np.float64) if popularity else None
+
+    @cached_property
+    def judged(self) -> NDArray[np.bool_]:
+        """(V,) True for classes that can be intruders and occur in a training scene."""
+        judged = self.vocabulary.judged
+        return judged if self.popularity is None else judged & ~np.isnan(self.popularity)
 
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:

@@ -36,6 +36,22 @@ def test_the_popularity_of_a_class_counts_by_its_weight(alpha):
     assert probabilities == sorted(probabilities, reverse=True)
 
 
+def test_a_class_without_training_scene_is_never_an_outlier():
+    unseen = LABELS.index("lamp")
+    popularity = tuple(None if k == unseen else 0.0 for k in range(len(LABELS)))
+    entries = []
+    for known in ((0.0,) * len(LABELS), popularity):
+        artifact = larger_artifact(
+            "triway", outlier=LINE, outlier_lines=lines(-9, -9, -9), popularity=known
+        )
+        entries.append({e.label: e for e in outliers(artifact, scene_of([0, unseen, 2])).outliers})
+    before, after = entries
+    assert before["lamp"].is_outlier
+    assert not after["lamp"].is_outlier
+    assert after["lamp"].probability == 0
+    assert after["bed"].probability == before["bed"].probability
+
+
 def line(level: str, classes: int) -> float:
     """The probability of the alarm line of a sensitivity at a number of listed classes."""
     logit = {"low": 2.0, "medium": 0.9, "high": -0.4}[level] + SLOPE * math.log(max(1, classes))

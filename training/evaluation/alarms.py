@@ -2,7 +2,8 @@
 
 A part lists one to twelve random classes without structure, and their relations. Every object and
 relation of an untouched scene is right, so each alarm is false. A sensitivity promises a maximum
-share of parts with an alarm (`ALARMS`). A model is refused only if its share is certainly too
+share of parts with an alarm about an object, and the same share of parts with an alarm about a
+relation (`ALARMS`). A model is refused only if its share is certainly too
 large: the exact 95 % lower bound must exceed `EXCESS` times the promise.
 
 Source: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of
@@ -39,9 +40,14 @@ _GROUPS = 30  # minimum number of groups of a source with its own count of alarm
 
 @dataclass(frozen=True)
 class Alarms:
-    """The number of scenes of a source (at most one of each group), and of those with an alarm."""
+    """The number of scenes of a source (at most one of each group), and of those with an alarm.
+
+    Attributes:
+        about: "objects" or "relations".
+    """
 
     source: str
+    about: str
     sensitivity: Sensitivity
     scenes: int
     alarms: int
@@ -59,9 +65,9 @@ class Alarms:
         if self.at_least <= EXCESS * promise:
             return None
         return (
-            f"/outliers raises alarms in {self.alarms} of {self.scenes} untouched scenes of "
-            f"{self.source} at {self.sensitivity} sensitivity, which promises at most "
-            f"{promise:.0%}. Check the labels and relations, or provide more scenes"
+            f"/outliers raises alarms about {self.about} in {self.alarms} of {self.scenes} "
+            f"untouched scenes of {self.source} at {self.sensitivity} sensitivity, which promises "
+            f"at most {promise:.0%}. Check the labels and relations, or provide more scenes"
         )
 
 
@@ -83,8 +89,9 @@ def untouched_alarms(artifact: Artifact, scenes: Sequence[EncodedScene]) -> Iter
         source = "the smaller sources" if is_small else scene.source
         cases.setdefault(source, []).append((listed, scene.complete))
     for source, sensitivity in product(sorted(cases), ALARMS):
-        alarms = [_has_alarm(artifact, *case, sensitivity) for case in cases[source]]
-        yield Alarms(source, sensitivity, len(alarms), sum(alarms))
+        alarms = [_alarms(artifact, *case, sensitivity) for case in cases[source]]
+        for about, flags in zip(("objects", "relations"), zip(*alarms, strict=True), strict=True):
+            yield Alarms(source, about, sensitivity, len(flags), sum(flags))
 
 
 def _random_part(encoded: EncodedScene, structure: Flags, rng: Rng) -> Scene:
@@ -102,8 +109,10 @@ def _random_part(encoded: EncodedScene, structure: Flags, rng: Rng) -> Scene:
     return replace(scene_of(encoded, kept, triples), room_type=None)
 
 
-def _has_alarm(artifact: Artifact, scene: Scene, complete: bool, sensitivity: Sensitivity) -> bool:
+def _alarms(
+    artifact: Artifact, scene: Scene, complete: bool, sensitivity: Sensitivity
+) -> tuple[bool, bool]:
+    """Return whether the model raises an alarm about an object, and about a relation."""
     answer = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False)
-    return any(entry["is_misplaced"] for entry in answer["misplaced"]) or (
-        complete and any(entry["is_outlier"] for entry in answer["outliers"])
-    )
+    of_objects = complete and any(entry["is_outlier"] for entry in answer["outliers"])
+    return of_objects, any(entry["is_misplaced"] for entry in answer["misplaced"])

@@ -20,6 +20,7 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -77,13 +78,14 @@ def calibrate_objects(
     `chosen` calibration are copied.
 
     Args:
-        popularity: log-odds of each class in the served mix of sources, (classes,).
+        popularity: log-odds of each class in the served mix of sources, (classes,); NaN for a
+            class without a training scene.
         served: weights of the sources in the served mix; empty means that all are equal.
     """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     scenes = served_scenes(validation, served)
     learnt = complete_scenes(train, seed)
-    rounded = tuple(np.round(popularity.double().numpy(), 4).tolist())
+    rounded = tuple(None if math.isnan(x) else round(x, 4) for x in popularity.double().tolist())
     artifact = recalibrated(artifact, popularity=rounded)
     artifact = recalibrated(artifact, **fit_missing(artifact, scenes, structure, chosen))
     return recalibrated(
@@ -261,14 +263,14 @@ def fit_outliers(
 
 def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = None) -> ListScores:
     """Return the scores of parts of scenes, each with an intruder (parts,) if these are given."""
-    popularity = np.array(artifact.calibration.popularity)
+    popularity = np.array(artifact.calibration.popularity, dtype=np.float64)
     rows, log_odds, classes_of, is_intruder = [], [], [], []
     for k, v in enumerate(parts.v):
         classes = v.nonzero().squeeze(1).numpy()
         if intruders is not None:
             classes = np.sort(np.append(classes, int(intruders[k])))
         values = Posterior(artifact, of_classes(classes.tolist())).log_odds_given_rest()
-        kept = artifact.vocabulary.judged[classes]
+        kept = artifact.judged[classes]
         classes, values = classes[kept], values[kept]
         rows.append(np.full(len(classes), k))
         log_odds.append(values)
@@ -291,7 +293,7 @@ def score_intruders(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, weights: Tensor | None
 ) -> ListScores:
     """Return the scores of random parts of scenes, each with an intruder drawn by the weights."""
-    unjudged = torch.from_numpy(~artifact.vocabulary.judged)
+    unjudged = torch.from_numpy(~artifact.judged)
     intruders = draw_intruders(scenes, unjudged, weights)
     kept = (intruders >= 0).nonzero().squeeze(1)
     usable = subset(scenes, kept)

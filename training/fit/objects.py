@@ -370,13 +370,17 @@ def base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor
 
 
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return the log-odds that a scene of the served mix has each class, (classes,)."""
+    """Return the log-odds that a scene of the served mix has each class, (classes,).
+
+    The value is NaN for a class that no training scene has.
+    """
     count = torch.zeros(scenes.shows.shape)
     count.index_add_(0, scenes.source, scenes.v * scenes.weight.unsqueeze(1))
     share = (count + 0.5) / (scenes.source_sizes.unsqueeze(1) + 1)
     weights = served_weights(scenes, config).unsqueeze(1) * scenes.shows
     mean = (weights * share).sum(0) / weights.sum(0).clamp(min=1e-9)
-    return torch.where(weights.sum(0) > 0, mean, share.amin()).logit()
+    rate = torch.where(weights.sum(0) > 0, mean, share.amin())
+    return torch.where(count.sum(0) > 0, rate.logit(), torch.nan)
 
 
 def served_weights(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:

@@ -15,16 +15,18 @@ from training.fit.calibrate_objects import recalibrated
 @pytest.mark.parametrize(("alarms", "scenes"), [(0, 9), (3, 9), (9, 9), (30, 200)])
 def test_the_lower_bound_is_the_share_at_which_so_many_alarms_are_unlikely(alarms, scenes):
     """By the sum over the binomial distribution; P(at least so many alarms) is 5 %."""
-    p = Alarms("own", "medium", scenes, alarms).at_least
+    p = Alarms("own", "objects", "medium", scenes, alarms).at_least
     tail = sum(comb(scenes, k) * p**k * (1 - p) ** (scenes - k) for k in range(alarms, scenes + 1))
     assert tail == pytest.approx(0.05 if alarms else 1.0)
 
 
 def test_the_first_alarms_are_accepted_and_too_many_refused():
-    refused = [Alarms("own", "medium", 100, k).objection() is not None for k in range(101)]
+    refused = [
+        Alarms("own", "objects", "medium", 100, k).objection() is not None for k in range(101)
+    ]
     assert refused == sorted(refused)
     first = refused.index(True)
-    assert Alarms("own", "medium", 100, first).at_least > EXCESS * ALARMS["medium"]
+    assert Alarms("own", "objects", "medium", 100, first).at_least > EXCESS * ALARMS["medium"]
     assert 100 * EXCESS * ALARMS["medium"] < first < 30
 
 
@@ -37,7 +39,8 @@ def test_a_model_that_judges_upside_down_is_refused():
     groups = len({scene.group for scene in scenes})
     for model, share in ((calm, 0), (turned, 1)):
         for found in untouched_alarms(model, scenes):
-            assert (found.scenes, found.alarms) == (groups, share * groups)
-            assert (found.objection() is None) == (share == 0)
+            alarms = share * groups if found.about == "objects" else 0
+            assert (found.scenes, found.alarms) == (groups, alarms)
+            assert (found.objection() is None) == (alarms == 0)
     partly = [replace(scene, complete=False) for scene in scenes]
     assert not any(found.alarms for found in untouched_alarms(turned, partly))

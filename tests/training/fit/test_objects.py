@@ -469,7 +469,10 @@ def test_popularity_of_the_served_mix():
         share.append((own.sum(0) + 0.5) / (len(own) + 1))
     expected = (share[0] + 0.5 * share[1]) / 1.5
     expected[3] = share[1][3]
-    torch.testing.assert_close(objects.served_popularity(scenes, config), expected.logit())
+    popularity = objects.served_popularity(scenes, config)
+    is_seen = scenes.v.sum(0) > 0
+    torch.testing.assert_close(popularity[is_seen], expected.logit()[is_seen])
+    assert torch.equal(popularity.isnan(), ~is_seen)
 
 
 # -- stored samples ----------------------------------------------------------------------------
