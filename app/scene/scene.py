@@ -90,7 +90,7 @@ class Scene:
             to hold.
         room_type: index of the room type in the model's vocabulary. None means that the room type
             is unknown.
-        profile: index of the data source whose base rates apply. None means the model's own mix.
+        profile: index of the data source whose base rates apply. None: inferred from the objects.
         poses: relations derived from poses by `observe`. They include relations observed
             not to hold, and replace ``relations`` as evidence. ``relations`` must list the derived
             relations that hold, but the class does not check this condition. None means that no

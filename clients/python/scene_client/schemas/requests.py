@@ -278,8 +278,8 @@ class SceneRequest(Request):
     profile: Annotated[
         Name | None,
         Field(
-            description="name of a data source of the model. Its base rates of the classes replace "
-            "the model's own mix, which stands for real rooms"
+            description="name of a data source of the model. Its base rates of the classes apply. "
+            "Without it, the model infers the source from the listed objects"
         ),
     ] = None
     frame_id: Annotated[
