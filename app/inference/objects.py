@@ -84,12 +84,6 @@ class Gains:
         return gain
 
 
-def _row_sum(rows: Floats, presence: Floats) -> Floats:
-    """Return presence @ rows. Rows of zeros, such as those of structure, do not change a digit."""
-    total: Floats = (presence[:, None] * rows).sum(0)
-    return total
-
-
 def all_states(x: NDArray[Any], states: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the probabilities of all states of the hidden units with the logits x, (..., H1).
 
@@ -310,3 +304,9 @@ class ObjectScorer:
         weighted = start + raised.transpose(1, 0, 2) @ removed
         change: Floats = (with_class[:, None] - np.log(weighted / total).sum(0)).astype(np.float32)
         return change
+
+
+def _row_sum(rows: Floats, presence: Floats) -> Floats:
+    """Return presence @ rows. Rows of zeros, such as those of structure, do not change a digit."""
+    total: Floats = (presence[:, None] * rows).sum(0)
+    return total

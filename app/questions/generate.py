@@ -96,7 +96,7 @@ def generate(
     Returns:
         The fields `seed` and `scenes` of `scene_client.schemas.GenerateAnswer`. For `log_score`,
         see `ConditionedChains.log_score`. Only scores of the same model, for the same listed
-        classes, room type and profile, can be compared.
+        classes and profile, can be compared.
 
     Raises:
         ValueError: a number is out of range, or `context` has an invalid layer, unit or state.

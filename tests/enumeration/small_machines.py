@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -56,13 +58,20 @@ def random_weights(
     return machine.requires_grad_(False)
 
 
-def mean_rates(machine: BoltzmannMachine, v: Tensor) -> Tensor:
+def mean_rates(machine: BoltzmannMachine, v: Iterable[float]) -> Tensor:
     """sum_q p(q | v) a_q, (V,), by a loop over the sources; 0 for a machine without sources."""
     total, weights = torch.zeros(machine.spec.V, dtype=torch.float64), 0.0
     for f, a in zip(machine.f.double(), machine.a.double(), strict=True):
         weight = math.exp(f + sum(float(rate) for rate, on in zip(a, v, strict=True) if on))
         total, weights = total + weight * a, weights + weight
     return total / weights if weights else total
+
+
+def with_mean_rates(machine: BoltzmannMachine, classes: Sequence[int] = ()) -> BoltzmannMachine:
+    """A float64 copy whose biases contain the mean base rates given the listed classes."""
+    copied = copy.deepcopy(machine).double()
+    copied.b += mean_rates(machine, [i in classes for i in range(machine.spec.V)])
+    return copied
 
 
 def binary(units: int) -> Tensor:

@@ -23,10 +23,10 @@ from tests.enumeration.small_machines import (
     binary,
     check_frequencies,
     enumerate_joint,
-    mean_rates,
     random_weights,
     same,
     small_machine,
+    with_mean_rates,
 )
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
@@ -65,13 +65,6 @@ def code(*blocks):
     """One integer for each row of binary blocks."""
     bits = np.concatenate(blocks, -1).astype(np.int64)
     return (bits << np.arange(bits.shape[-1])).sum(-1)
-
-
-def with_mean_rates(machine, classes=()):
-    """A float64 copy whose biases contain the mean base rates given the listed classes."""
-    copied = copy.deepcopy(machine).double()
-    copied.b += mean_rates(machine, [i in classes for i in range(machine.spec.V)])
-    return copied
 
 
 def at_temperature(machine, beta):

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from app.scene import CANONICAL, contradiction, derive_relations
 from app.scene.scene import Scene
-from tests.enumeration.small_machines import enumerate_joint, mean_rates
+from tests.enumeration.small_machines import enumerate_joint, with_mean_rates
 from tests.questions.answers import generate, outliers
 from tests.questions.artifacts import (
     EXACT,
@@ -186,9 +186,8 @@ def with_joint(name, room=None, profile=None, evidence=()):
     """
     machine = random_machine(DRAWN[name], 1.3)
     double, source = copy.deepcopy(machine).double(), profile
-    if profile is None:
-        double.b += mean_rates(machine, [i in evidence for i in range(machine.spec.V)])
-        source = -1
+    if source is None:
+        double, source = with_mean_rates(machine, evidence), -1
     return artifact_of(machine), enumerate_joint(double, room, source=source)
 
 

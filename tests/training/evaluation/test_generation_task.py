@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine, with_mean_rates
 from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from training.evaluation.contradictions import contradiction_metrics, count_contradictions
@@ -185,7 +185,7 @@ def test_machines_are_sampled_from_their_distribution(name):
     machine = small_machine(name)
     if machine.spec.coupled:
         machine.L.copy_(machine.couplings)
-    joint = enumerate_joint(machine)
+    joint = enumerate_joint(with_mean_rates(machine))
     given = torch.zeros(2000, machine.spec.V, dtype=torch.bool)
     room = torch.full((2000,), -1)
     drawn = machine_sampler(artifact_of(machine.float()), steps=20)(given, room, 0)

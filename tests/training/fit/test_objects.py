@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch.nn.functional import softplus
 
 from app.inference.weights import unpack_scenes
-from tests.enumeration.small_machines import binary, mean_rates, random_weights, unit_states
+from tests.enumeration.small_machines import binary, random_weights, unit_states, with_mean_rates
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.parts import ALL_BUT_ONE
 from training.fit import objects
@@ -492,7 +492,7 @@ def test_stored_samples_follow_the_machine_under_their_room_types(name):
     )
     sets = (found @ torch.tensor([1.0, 2, 4, 8])).long()
     assert set(rooms.tolist()) == {-1, 0, 1}
-    machine.double().b += mean_rates(machine, torch.zeros(V))
+    machine = with_mean_rates(machine)
     for room in (-1, 0, 1):
         own = sets[rooms == room]
         share = torch.bincount(own, minlength=16).double() / len(own)
