@@ -77,9 +77,9 @@ def outliers(
     same score. Intruders are often common objects in the wrong room. The prior of an intruder is
     therefore proportional to popularity^alpha. The popularity of a class is the odds that a
     training scene has the class. So the function subtracts alpha times the log of the popularity.
-    Structural classes, such as wall, classes that belong anywhere, such as cat or bag, and classes
-    that no training scene has always have the probability 0. A scene with few objects gives little
-    evidence, so its threshold is higher.
+    From a class that no training scene has, it subtracts the log-odds in an empty scene. Structural
+    classes, such as wall, and classes that belong anywhere, such as cat or bag, always have the
+    probability 0. A scene with few objects gives little evidence, so its threshold is higher.
 
     Args:
         scene: the objects and stated relations to judge.
@@ -198,27 +198,14 @@ def _intruder_logits(
     The logit of a class that is not judged is -inf. `entry` is `Calibration.outlier`.
     """
     classes = posterior.present.classes
-    adjusted = _adjusted(artifact, classes, log_odds).astype(np.float64)
+    adjusted = log_odds - artifact.intruder_prior[classes]
     logits = calibrated(entry, adjusted, max(1, posterior.listed)).astype(np.float64)
-    logits[~artifact.judged[classes]] = -np.inf
+    logits[~artifact.vocabulary.judged[classes]] = -np.inf
     return logits
 
 
 def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isinf(logits), 0.0, sigmoid(logits))
-
-
-def _adjusted(
-    artifact: Artifact, classes: NDArray[np.int64], log_odds: NDArray[np.floating[Any]]
-) -> NDArray[np.floating[Any]]:
-    """Return log-odds of presence minus alpha times the class's log-odds in training scenes, (n,).
-
-    alpha is `Calibration.popularity_weight`.
-    """
-    popularity = artifact.popularity
-    if popularity is None:
-        return log_odds
-    return log_odds - artifact.calibration.popularity_weight * popularity[classes]
 
 
 def stated_log_odds(

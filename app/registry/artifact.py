@@ -99,19 +99,19 @@ class Artifact:
         return RelationSlopes.of(self.calibration)
 
     @cached_property
-    def popularity(self) -> NDArray[np.float64] | None:
-        """(V,) log-odds that a training scene has each class. None means that they are unknown.
+    def intruder_prior(self) -> NDArray[np.float64]:
+        """(V,) log prior that an intruder has each class, up to a constant.
 
-        The entry of a class that no training scene has is NaN.
+        It is alpha times the popularity. A class without a training scene has no popularity. Its
+        log-odds in an empty scene are used instead, so that only the other objects count.
         """
-        popularity = self.calibration.popularity
-        return np.array(popularity, dtype=np.float64) if popularity else None
-
-    @cached_property
-    def judged(self) -> NDArray[np.bool_]:
-        """(V,) True for classes that can be intruders and occur in a training scene."""
-        judged = self.vocabulary.judged
-        return judged if self.popularity is None else judged & ~np.isnan(self.popularity)
+        calibration, none = self.calibration, np.zeros(0, np.int64)
+        if not calibration.popularity:
+            return np.zeros(self.spec.V)
+        popularity = np.array(calibration.popularity, dtype=np.float64)
+        nothing = self.weights["c1"], none, none.astype(np.float32)
+        alone = self.objects.absent(*nothing, profile=None, coverage=1.0)
+        return np.where(np.isnan(popularity), alone, calibration.popularity_weight * popularity)
 
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from app.registry.description import AlarmLine, CountSlope, Thresholds
-from tests.questions.answers import misplaced, outliers
+from tests.questions.answers import misplaced, missing, outliers
 from tests.questions.artifacts import LABELS, STRUCTURE, larger_artifact, lines, scene_of
 from training.machines.arrays import machine_of
 
@@ -36,20 +36,19 @@ def test_the_popularity_of_a_class_counts_by_its_weight(alpha):
     assert probabilities == sorted(probabilities, reverse=True)
 
 
-def test_a_class_without_training_scene_is_never_an_outlier():
+def test_only_the_other_objects_count_for_a_class_without_training_scene():
+    """The log-odds of the class in an empty scene replace its popularity."""
     unseen = LABELS.index("lamp")
-    popularity = tuple(None if k == unseen else 0.0 for k in range(len(LABELS)))
-    entries = []
-    for known in ((0.0,) * len(LABELS), popularity):
-        artifact = larger_artifact(
-            "triway", outlier=LINE, outlier_lines=lines(-9, -9, -9), popularity=known
-        )
-        entries.append({e.label: e for e in outliers(artifact, scene_of([0, unseen, 2])).outliers})
-    before, after = entries
-    assert before["lamp"].is_outlier
-    assert not after["lamp"].is_outlier
-    assert after["lamp"].probability == 0
-    assert after["bed"].probability == before["bed"].probability
+    popularity = tuple(None if k == unseen else -1.0 for k in range(len(LABELS)))
+    artifact = larger_artifact(
+        "triway-states", outlier=LINE, popularity=popularity, popularity_weight=0.5
+    )
+    empty = missing(artifact, scene_of([]), coverage=1.0, top_k=len(LABELS))
+    (alone,) = (entry.log_odds for entry in empty if entry.label == "lamp")
+    priors = {"bed": -0.5, "lamp": alone, "desk": -0.5}
+    for entry in outliers(artifact, scene_of([0, unseen, 2])).outliers:
+        logit = 0.2 - 0.8 * (entry.log_odds - priors[entry.label]) + 0.1 * math.log(3)
+        assert entry.probability == pytest.approx(1 / (1 + math.exp(-logit)), rel=1e-4)
 
 
 def line(level: str, classes: int) -> float:

@@ -261,6 +261,12 @@ def fit_outliers(
     }
 
 
+def judged_classes(artifact: Artifact) -> Flags:
+    """Return the classes that can be intruders and occur in a training scene, (classes,) bool."""
+    popularity = np.array(artifact.calibration.popularity, dtype=np.float64)
+    return artifact.vocabulary.judged & ~np.isnan(popularity)
+
+
 def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = None) -> ListScores:
     """Return the scores of parts of scenes, each with an intruder (parts,) if these are given."""
     popularity = np.array(artifact.calibration.popularity, dtype=np.float64)
@@ -270,7 +276,7 @@ def score_lists(artifact: Artifact, parts: Parts, intruders: Tensor | None = Non
         if intruders is not None:
             classes = np.sort(np.append(classes, int(intruders[k])))
         values = Posterior(artifact, of_classes(classes.tolist())).log_odds_given_rest()
-        kept = artifact.judged[classes]
+        kept = judged_classes(artifact)[classes]
         classes, values = classes[kept], values[kept]
         rows.append(np.full(len(classes), k))
         log_odds.append(values)
@@ -293,7 +299,7 @@ def score_intruders(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, weights: Tensor | None
 ) -> ListScores:
     """Return the scores of random parts of scenes, each with an intruder drawn by the weights."""
-    unjudged = torch.from_numpy(~artifact.judged)
+    unjudged = torch.from_numpy(~judged_classes(artifact))
     intruders = draw_intruders(scenes, unjudged, weights)
     kept = (intruders >= 0).nonzero().squeeze(1)
     usable = subset(scenes, kept)
