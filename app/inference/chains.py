@@ -12,6 +12,9 @@ where h1 is the mean of the hidden units given the stored scene, and t is the re
 If the machine stores no scene of room type t, the last term is h1·Q[t]. The method is sampling
 importance resampling, followed by Gibbs sweeps. The sweeps rarely change the room type of a scene.
 
+The base rates stay the same in all sweeps: those of the profile, the mean over the data sources
+given the required classes, or those of the served mix if no class is required.
+
 A sweep takes microseconds and releases the interpreter's lock. The result of a chain depends only
 on its conditions and its random stream.
 
@@ -201,9 +204,11 @@ class ConditionedChains:
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
         self._chains, self._machine, self._w = chains, chains.machine, chains.arrays
         spec = chains.machine.spec
-        certain = np.ones(len(conditions.classes), np.float32)
-        bias = chains.machine.class_bias(conditions.classes, certain, conditions.profile)
-        self._w = self._w._replace(b=bias)
+        classes, profile = conditions.classes, conditions.profile
+        if len(classes) or profile is not None:
+            certain = np.ones(len(classes), np.float32)
+            bias = chains.machine.class_bias(classes, certain, profile)
+            self._w = self._w._replace(b=bias)
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
         self._required_classes = _indicator(spec.V, conditions.classes)

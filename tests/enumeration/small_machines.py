@@ -68,9 +68,10 @@ def mean_rates(machine: BoltzmannMachine, v: Iterable[float]) -> Tensor:
 
 
 def with_mean_rates(machine: BoltzmannMachine, classes: Sequence[int] = ()) -> BoltzmannMachine:
-    """A float64 copy whose biases contain the mean base rates given the listed classes."""
+    """A float64 copy whose biases contain the mean base rates given the listed classes, if any."""
     copied = copy.deepcopy(machine).double()
-    copied.b += mean_rates(machine, [i in classes for i in range(machine.spec.V)])
+    if len(classes):
+        copied.b += mean_rates(machine, [i in classes for i in range(machine.spec.V)])
     return copied
 
 
