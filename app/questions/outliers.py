@@ -77,9 +77,9 @@ def outliers(
     same score. Intruders are often common objects in the wrong room. The prior of an intruder is
     therefore proportional to popularity^alpha. The popularity of a class is the odds that a
     training scene has the class. So the function subtracts alpha times the log of the popularity.
-    From a class that no training scene has, it subtracts the log-odds in an empty scene. Structural
-    classes, such as wall, and classes that belong anywhere, such as cat or bag, always have the
-    probability 0. A scene with few objects gives little evidence, so its threshold is higher.
+    A class that no training scene shows counts as the rarest other class. Structural classes, such
+    as wall, and classes that belong anywhere, such as cat or bag, always have the probability 0. A
+    scene with few objects gives little evidence, so its threshold is higher.
 
     Args:
         scene: the objects and stated relations to judge.

@@ -102,8 +102,8 @@ class Artifact:
     def intruder_prior(self) -> NDArray[np.float64]:
         """(V,) log prior that an intruder has each class, up to a constant.
 
-        It is alpha times the popularity. A class without a training scene has no popularity. Its
-        log-odds in an empty scene are used instead, so that only the other objects count.
+        It is alpha times the popularity. A class that no training scene shows counts as the rarest
+        other class: its log-odds in an empty scene do not matter.
         """
         calibration, none = self.calibration, np.zeros(0, np.int64)
         if not calibration.popularity:
@@ -111,7 +111,8 @@ class Artifact:
         popularity = np.array(calibration.popularity, dtype=np.float64)
         nothing = self.weights["c1"], none, none.astype(np.float32)
         alone = self.objects.absent(*nothing, profile=None, coverage=1.0)
-        return np.where(np.isnan(popularity), alone, calibration.popularity_weight * popularity)
+        rarest, alpha = np.nanmin(popularity), calibration.popularity_weight
+        return np.where(np.isnan(popularity), alone - (1 - alpha) * rarest, alpha * popularity)
 
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:

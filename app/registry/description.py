@@ -104,8 +104,9 @@ class Calibration(Frozen):
             another value.
         missing: calibration of the log-odds that an unlisted class is present. n is the number of
             listed classes without structure.
-        popularity: (V,) log-odds that a training scene has each class. None means that no training
-            scene has the class. If the tuple is empty, all classes have the same popularity.
+        popularity: (V,) log-odds that a training scene has each class. None means that no
+            source shows the class in training. If the tuple is empty, all classes have the same
+            popularity.
         popularity_weight: exponent alpha. The prior probability of an intruder's class is
             proportional to popularity^alpha, where popularity is the odds of the class.
         outlier_lines: minimum log-odds of an outlier, by the number of listed classes without

@@ -36,16 +36,16 @@ def test_the_popularity_of_a_class_counts_by_its_weight(alpha):
     assert probabilities == sorted(probabilities, reverse=True)
 
 
-def test_only_the_other_objects_count_for_a_class_without_training_scene():
-    """The log-odds of the class in an empty scene replace its popularity."""
+def test_a_class_without_training_scene_counts_as_the_rarest():
+    """It counts as the rarest other class, whatever its log-odds in an empty scene."""
     unseen = LABELS.index("lamp")
-    popularity = tuple(None if k == unseen else -1.0 for k in range(len(LABELS)))
+    popularity = tuple(None if k == unseen else -1.0 - k for k in range(len(LABELS)))
     artifact = larger_artifact(
         "triway-states", outlier=LINE, popularity=popularity, popularity_weight=0.5
     )
     empty = missing(artifact, scene_of([]), coverage=1.0, top_k=len(LABELS))
     (alone,) = (entry.log_odds for entry in empty if entry.label == "lamp")
-    priors = {"bed": -0.5, "lamp": alone, "desk": -0.5}
+    priors = {"bed": -0.5, "lamp": alone + 0.5 * 9, "desk": -1.5}
     for entry in outliers(artifact, scene_of([0, unseen, 2])).outliers:
         logit = 0.2 - 0.8 * (entry.log_odds - priors[entry.label]) + 0.1 * math.log(3)
         assert entry.probability == pytest.approx(1 / (1 + math.exp(-logit)), rel=1e-4)

@@ -262,7 +262,7 @@ def fit_outliers(
 
 
 def judged_classes(artifact: Artifact) -> Flags:
-    """Return the classes that can be intruders and occur in a training scene, (classes,) bool."""
+    """Return the classes that can be intruders and that training shows, (classes,) bool."""
     popularity = np.array(artifact.calibration.popularity, dtype=np.float64)
     return artifact.vocabulary.judged & ~np.isnan(popularity)
 

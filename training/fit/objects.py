@@ -64,7 +64,6 @@ class ObjectScenes:
         source: index of the source in `sources`, (scenes,) int64.
         weight: weight of each scene, (scenes,).
         shows: True for classes that a source shows, (sources, classes) bool.
-        seen: True for classes that a scene of these sources has, (classes,) bool.
         sources: names of the sources of these scenes.
     """
 
@@ -73,7 +72,6 @@ class ObjectScenes:
     source: Tensor
     weight: Tensor
     shows: Tensor
-    seen: Tensor
     sources: tuple[str, ...]
 
     @classmethod
@@ -103,7 +101,6 @@ class ObjectScenes:
             source=index[train.source[kept]],
             weight=weight[kept],
             shows=shows[used],
-            seen=(counts[used] > 0).any(0),
             sources=tuple(q for q, u in zip(train.source_names, used.tolist(), strict=True) if u),
         )
 
@@ -375,7 +372,7 @@ def base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
     """Return the log-odds that a scene of the served mix has each class, (classes,).
 
-    The value is NaN for a class that no scene of the sources has.
+    The value is NaN for a class that no scene shows.
     """
     count = torch.zeros(scenes.shows.shape)
     count.index_add_(0, scenes.source, scenes.v * scenes.weight.unsqueeze(1))
@@ -383,7 +380,7 @@ def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
     weights = served_weights(scenes, config).unsqueeze(1) * scenes.shows
     mean = (weights * share).sum(0) / weights.sum(0).clamp(min=1e-9)
     rate = torch.where(weights.sum(0) > 0, mean, share.amin())
-    return torch.where(scenes.seen, rate.logit(), torch.nan)
+    return torch.where(scenes.v.any(0), rate.logit(), torch.nan)
 
 
 def served_weights(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:

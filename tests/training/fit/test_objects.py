@@ -74,7 +74,7 @@ def scenes_of(shows):
     v = v * shows[source]
     kept = v.sum(1) >= 2
     blocks = (block[kept] for block in (v, room, source, torch.ones(len(v))))
-    return ObjectScenes(*blocks, shows, shows.any(0), ("sunrgbd", "procthor"))
+    return ObjectScenes(*blocks, shows, ("sunrgbd", "procthor"))
 
 
 def target_scenes():
@@ -84,7 +84,7 @@ def target_scenes():
         1000 * TARGET[EVERY.sum(1) >= 2].float(),
         torch.zeros(len(v), dtype=torch.int64),
     )
-    return ObjectScenes(v, source - 1, source, weight, ALL[:1], ALL[0], ("sunrgbd",))
+    return ObjectScenes(v, source - 1, source, weight, ALL[:1], ("sunrgbd",))
 
 
 ALL = torch.ones(2, V, dtype=torch.bool)
@@ -107,7 +107,6 @@ def test_scenes_keep_classes_that_their_source_shows():
     assert found.v.tolist() == [[0, 1, 1, 1, 0]] * 3 + [[1, 0, 0, 1, 0]]
     assert found.source.tolist() == [0, 0, 0, 1]
     assert found.weight.tolist() == [0.5] * 3 + [1]
-    assert found.seen.tolist() == [True] * 5
     count, total = torch.tensor([1.0, 1.5, 1.5, 2.5]), torch.tensor([1.0, 2.5, 2.5, 2.5])
     expected = ((count + 0.5) / (total - count + 0.5)).log()
     torch.testing.assert_close(found.log_odds()[:4], expected)
@@ -438,7 +437,7 @@ def test_training_finds_the_sources_of_lists():
     share = torch.stack([(v[source == q] @ liking[q]).softmax(0) for q in range(2)])
     weight = (share * sizes.unsqueeze(1)).flatten()
     names = ("sunrgbd", "procthor")
-    scenes = ObjectScenes(v, torch.full((12,), -1), source, weight, ALL, ALL[0], names)
+    scenes = ObjectScenes(v, torch.full((12,), -1), source, weight, ALL, names)
     changes = {"leave_one_out": 1.0, "rate_prior": 0.0, "source_loss": 30.0}
     changes |= {"generative_weight": 0.0, "learning_rate": 0.02}
     machine = machine_of("coupled")
@@ -462,8 +461,9 @@ def test_weights_are_averaged_over_the_last_steps():
 
 
 def test_popularity_of_the_served_mix():
-    """A class that no scene has is NaN."""
-    scenes = replace(scenes_of(PARTIAL), seen=torch.tensor([True, False, True, True]))
+    """A class that no scene shows is NaN."""
+    scenes = scenes_of(PARTIAL)
+    scenes = replace(scenes, v=scenes.v * (torch.arange(V) != 1))
     config = CONFIG.model_copy(update={"served_sources": {"sunrgbd": 1.0, "procthor": 0.5}})
     share = []
     for q in range(2):
@@ -472,8 +472,9 @@ def test_popularity_of_the_served_mix():
     expected = (share[0] + 0.5 * share[1]) / 1.5
     expected[3] = share[1][3]
     popularity = objects.served_popularity(scenes, config)
-    torch.testing.assert_close(popularity[scenes.seen], expected.logit()[scenes.seen])
-    assert torch.equal(popularity.isnan(), ~scenes.seen)
+    is_shown = torch.arange(V) != 1
+    torch.testing.assert_close(popularity[is_shown], expected.logit()[is_shown])
+    assert torch.equal(popularity.isnan(), ~is_shown)
 
 
 # -- stored samples ----------------------------------------------------------------------------
