@@ -25,8 +25,8 @@ AT_LEAST = {
     "missing: an expected object is among five": 20,
     "missing_at: an expected object is among five": 10,
     "outliers: the intruder comes first": 67,
-    "outliers: the intruder is flagged at the default": 55,
-    "generate: the scene has what makes the room": 288,
+    "outliers: the intruder is flagged at the default": 60,
+    "generate: the scene has what makes the room": 308,
 }
 AT_MOST = {
     "outliers: plain scenes with an alarm at the default": 0,
