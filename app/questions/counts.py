@@ -20,17 +20,17 @@ import math
 import sys
 from collections.abc import Collection
 from functools import lru_cache
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.questions.answer import Fields, significant
-from app.questions.posterior import present
+from app.questions.posterior import Present
+from app.questions.ranking import best
 from app.registry.artifact import Artifact
 from app.registry.counts import INTERCEPT, ROOM, SEVERAL, SINGLE, Counts
-from app.scene.scene import Scene
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -43,7 +43,8 @@ _TAIL: Final = 0.1  # probability of a count below `low`, and of a count above `
 
 def more(
     artifact: Artifact,
-    scene: Scene,
+    listing: Present,
+    room: int | None = None,
     *,
     top_k: int = 10,
     candidates: Collection[int] | None = None,
@@ -55,7 +56,8 @@ def more(
     classes, classes without statistics, or classes with more listed objects than these cover.
 
     Args:
-        scene: the listed objects and the room type.
+        listing: the classes of the listed objects.
+        room: index of the room type, or None.
         top_k: maximum number of classes in the answer.
         candidates: indices of classes. The answer then contains these classes at any probability,
             and no others. None means all classes with a probability of at least `LIKELY`.
@@ -65,48 +67,37 @@ def more(
     Returns:
         The fields of `scene_client.schemas.MoreInstances`. `low` and `high` are limits of the
         number of instances, which is between them with a probability of at least 0.8.
-
-    Raises:
-        ValueError: the machine does not know the class of an object or the room type.
     """
     if artifact.counts is None:
         return []
-    listing = present(scene, artifact.spec)
     plain = ~artifact.vocabulary.structure[listing.classes]
     classes, listed = listing.classes[plain], listing.counts[plain]
     usual, unlisted = artifact.calibration.coverage, 1.0
     if coverage is not None and coverage > usual:
         unlisted = (1 - coverage) / (1 - usual)
-    rows, p = distribution(
-        artifact.counts, artifact.spec.V, classes, listed, scene.room_type, unlisted
-    )
+    rows, p = distribution(artifact.counts, artifact.spec.V, classes, listed, room, unlisted)
     classes, listed = classes[rows], listed[rows]
-    numbers, cumulative = np.arange(1, p.shape[1] + 1), p.cumsum(axis=1)
-    p_more = 1 - p[np.arange(len(p)), listed - 1]
+    p_more, expected, low, high = _summaries(p, listed)
     usable = p_more >= LIKELY if candidates is None else np.isin(classes, list(candidates))
-    order = np.flatnonzero(usable)
-    order = order[np.argsort(-p_more[order], kind="stable")][:top_k]
-    if not len(order):
-        return []
-    cumulative = cumulative[order]
+    order = best(p_more, usable, top_k)
     columns = (
         classes[order].tolist(),
         listed[order].tolist(),
-        significant(p[order] @ numbers),
-        ((cumulative < _TAIL).sum(axis=1) + 1).tolist(),
-        ((cumulative < 1 - _TAIL).sum(axis=1) + 1).tolist(),
+        significant(expected[order]),
+        low[order].tolist(),
+        high[order].tolist(),
         significant(p_more[order]),
     )
     return [
         {
             "label": artifact.vocabulary.labels[index],
             "listed_count": count,
-            "expected_count": expected,
-            "low": low,
-            "high": high,
+            "expected_count": mean,
+            "low": least,
+            "high": most,
             "probability": probability,
         }
-        for index, count, expected, low, high, probability in zip(*columns, strict=True)
+        for index, count, mean, least, most, probability in zip(*columns, strict=True)
     ]
 
 
@@ -132,70 +123,87 @@ def distribution(
         Indices into `classes` of the k classes with statistics that cover the listed number, (k,).
         Then the probability of 1, 2, ... M instances, (k, M).
     """
-    entry = np.searchsorted(counts.classes, classes)
-    entry[entry == len(counts.classes)] = 0
-    rows = np.flatnonzero((counts.classes[entry] == classes) & (listed <= counts.most[entry]))
-    is_several = listed > 1
-    has_others = is_several.sum() > is_several[rows]
-    first = counts.weights.shape[-1] - V
+    scene = classes, listed, -1 if room is None else room
     log_unlisted = math.log(max(unlisted, sys.float_info.min))
-    entry, k, room_index = entry[rows], listed[rows], -1 if room is None else room
-    tables = counts.log_share, counts.weights
-    scene = entry, k, has_others, classes, first, room_index, log_unlisted
-    return rows, _distributions(*tables, *scene)
+    tables = counts.classes, counts.most, counts.log_share, counts.weights
+    first = counts.weights.shape[-1] - V
+    rows, p = _distributions(*tables, *scene, first, log_unlisted)
+    return rows, p
 
 
 @compiled
 def _distributions(
+    known: NDArray[np.integer[Any]],
+    most: NDArray[np.integer[Any]],
     log_share: NDArray[np.float32],
     weights: NDArray[np.float32],
-    entry: Ints,
-    listed: Ints,
-    has_others: NDArray[np.bool_],
     classes: Ints,
-    first: int,
+    listed: Ints,
     room: int,
+    first: int,
     log_unlisted: float,
-) -> Floats:
-    """Return the distributions of `distribution`, (k, M).
+) -> tuple[Ints, Floats]:
+    """Return the classes and the distributions of `distribution`, (k,) and (k, M).
 
     Args:
-        entry, listed: (k,) rows of the statistics, and numbers of listed objects.
-        has_others: (k,) True if another class is listed several times.
-        classes: (n,) listed classes. `first` is the column of class 0 in the weights.
+        known, most, log_share, weights: see `Counts`. Column `first` of the weights is class 0.
+        classes, listed: (n,) listed classes, and numbers of listed objects.
         room: index of the room type, or -1.
     """
-    M = log_share.shape[1]
-    p, exponents = np.empty((len(entry), M), np.float64), np.empty(2, np.float64)
-    for row in range(len(entry)):
-        e, k, largest = entry[row], listed[row], -np.inf
+    n, M = len(classes), log_share.shape[1]
+    p, rows, k = np.empty((n, M), np.float64), np.empty(n, np.int64), 0
+    several = (listed > 1).sum()
+    entry = np.searchsorted(known, classes)
+    for i in range(n):
+        e = entry[i]
+        if e < len(known) and known[e] == classes[i] and listed[i] <= most[e]:
+            rows[k] = i
+            k += 1
+    for row in range(k):
+        e, number = entry[rows[row]], listed[rows[row]]
+        exponents = np.zeros(2)
         for x in range(2):
             # The effect of a class on itself is 0, so the sum over all listed classes is correct.
-            effects = 0.0
-            for j in range(len(classes)):
-                effects += weights[e, x, first + classes[j]]
-            total = weights[e, x, INTERCEPT] + effects / math.sqrt(max(len(classes) - 1, 1))
-            if k == 1:
-                total += weights[e, x, SINGLE]
-            if has_others[row]:
-                total += weights[e, x, SEVERAL]
+            for j in range(n):
+                exponents[x] += weights[e, x, first + classes[j]]
+            exponents[x] /= math.sqrt(max(n - 1, 1))
+            exponents[x] += weights[e, x, INTERCEPT]
+            if number == 1:
+                exponents[x] += weights[e, x, SINGLE]
+            if several > (number > 1):
+                exponents[x] += weights[e, x, SEVERAL]
             if room >= 0:
-                total += weights[e, x, ROOM + room]
-            exponents[x] = total
-        for n in range(1, M + 1):
-            log, value = math.log(n), -np.inf
-            if n >= k:
-                value = log_share[e, n - 1] + exponents[0] * log + (n - k) * log_unlisted
-                value += exponents[1] * log * (math.log(M) - log)
-            p[row, n - 1] = value
-            largest = max(largest, value)
-        sum_p = 0.0
-        for n in range(M):
-            p[row, n] = math.exp(p[row, n] - largest)
-            sum_p += p[row, n]
-        for n in range(M):
-            p[row, n] /= sum_p
-    return p
+                exponents[x] += weights[e, x, ROOM + room]
+        p[row] = -np.inf
+        for m in range(number, M + 1):
+            log = math.log(m)
+            value = log_share[e, m - 1] + exponents[0] * log + (m - number) * log_unlisted
+            p[row, m - 1] = value + exponents[1] * log * (math.log(M) - log)
+        p[row] = np.exp(p[row] - p[row].max())
+        p[row] /= p[row].sum()
+    return rows[:k], p[:k]
+
+
+@compiled
+def _summaries(p: Floats, listed: Ints) -> tuple[Floats, Floats, Ints, Ints]:
+    """Return the columns of `more` for k classes: P(n > listed), E[n], `low` and `high`.
+
+    Args:
+        p: (k, M) probability of 1, 2, ... M instances.
+        listed: (k,) number of listed objects of each class.
+    """
+    p_more, expected = np.zeros(len(p)), np.zeros(len(p))
+    low, high = np.ones(len(p), np.int64), np.ones(len(p), np.int64)
+    for row in range(len(p)):
+        cumulative = 0.0
+        for m in range(p.shape[1]):
+            cumulative += p[row, m]
+            expected[row] += (m + 1) * p[row, m]
+            low[row] += cumulative < _TAIL
+            high[row] += cumulative < 1 - _TAIL
+            if m + 1 == listed[row]:
+                p_more[row] = 1 - cumulative
+    return p_more, expected, low, high
 
 
 @lru_cache(maxsize=8)

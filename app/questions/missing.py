@@ -117,7 +117,10 @@ def missing(
                 entry["because"] = because
     further: list[Fields] = []
     if at is None:
-        further = more(artifact, scene, top_k=top_k, candidates=candidates, coverage=coverage)
+        listing, room = posterior.present, scene.room_type
+        further = more(
+            artifact, listing, room, top_k=top_k, candidates=candidates, coverage=coverage
+        )
     if size_limit is not None:
         size_limit.check("top_k", *_size(entries, further))
     return {"coverage": used_coverage, "missing": entries, "more": further}

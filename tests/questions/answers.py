@@ -13,6 +13,7 @@ import pytest
 
 from app import questions
 from app.questions import counts
+from app.questions.posterior import present
 from app.registry import Artifact
 from app.scene import Scene
 
@@ -41,11 +42,15 @@ def _question(function: Callable[..., Any], *path: str) -> Callable[..., Any]:
     return ask
 
 
+def _more(artifact: Artifact, scene: Scene, **options: Any) -> Any:
+    return counts.more(artifact, present(scene, artifact.spec), scene.room_type, **options)
+
+
 # The answer to `outliers` has all its fields. The other functions return one list of an answer.
 outliers = _question(questions.outliers)
 misplaced = _question(questions.misplaced)
 missing = _question(questions.missing, "missing")
-more = _question(counts.more)
+more = _question(_more)
 relations = _question(questions.relations, "relations")
 disagreements = _question(questions.relations, "disagreements")
 generate = _question(questions.generate, "scenes")

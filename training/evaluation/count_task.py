@@ -16,12 +16,12 @@ Intervals come from resampled groups of scenes, because the scenes of a group ar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from app.questions.counts import LIKELY, more
+from app.questions.posterior import present
 from app.registry import Artifact
 from app.registry.counts import Counts
 from training.datasets import EncodedScene
@@ -94,12 +94,13 @@ def _ask_counts(
     """
     part, asked = listed_cases(scene, counted, artifact.vocabulary.structure, seed)
     room = part.room if part.room >= 0 else None
-    listed = replace(of_classes(np.repeat(part.classes, part.listed).tolist()), room_type=room)
+    scene_part = of_classes(np.repeat(part.classes, part.listed).tolist())
+    listing = present(scene_part, artifact.spec)
     candidates = part.classes[asked].tolist()
     labels = artifact.vocabulary.labels
     pairs = zip(part.classes.tolist(), part.number.tolist(), strict=True)
     number_of = {labels[index]: (index, number) for index, number in pairs}
-    entries = more(artifact, listed, top_k=len(candidates), candidates=candidates)
+    entries = more(artifact, listing, room, top_k=len(candidates), candidates=candidates)
     fields = ("listed_count", "expected_count", "low", "high", "probability")
     return [(*number_of[entry["label"]], *(entry[name] for name in fields)) for entry in entries]
 
