@@ -32,7 +32,6 @@ from numpy.typing import NDArray
 
 from app.inference import chain_kernels as kernels
 from app.inference.elementary import sigmoid, softplus
-from app.inference.objects import all_states
 from app.inference.relation_kernels import draw_in_groups
 from app.inference.relations import (
     NEVER,
@@ -323,14 +322,15 @@ class ConditionedChains:
         """
         listed, machine = state.classes[shown], self._machine
         x, m = self._context(listed)
-        first, _ = all_states(x.astype(np.float64), machine.spec.states)
+        by_unit = x.astype(np.float64).reshape(-1, machine.spec.states - 1)
+        # The first state of each unit has the logit 0.
+        log_sums = np.logaddexp.reduce(by_unit, axis=1, initial=0.0)
         # A mean of exactly 0 or 1 has the entropy 0, but its logarithm would be infinite.
         uncertain = m[(m > 0) & (m < 1)].astype(np.float64)
         entropy = -(uncertain * np.log(uncertain) + (1 - uncertain) * np.log1p(-uncertain)).sum()
         logits = state.logits[:, shown][:, :, shown].astype(np.float64)
         on = kept[:, shown][:, :, shown]
-        # The log of the sum over the states of a unit is -log p(first state).
-        score = self._w.b[listed].sum() - np.log(first).sum() + machine["c2"] @ m
+        score = self._w.b[listed].sum() + log_sums.sum() + machine["c2"] @ m
         if machine.spec.coupled:
             score += 0.5 * machine["L"][np.ix_(listed, listed)].sum()
         if self._room is not None and machine.spec.C:

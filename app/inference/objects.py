@@ -19,14 +19,15 @@ keep the product within float32.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from bisect import bisect
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled
-from app.inference.elementary import exponent, log, mantissa, softmax
-from app.inference.weights import SHARES, Weights
+from app.compiling import compiled, compiled_in_any_order
+from app.inference.elementary import exp, exponent, log, mantissa
+from app.inference.weights import SHARES, Weights, all_states, odds
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -79,57 +80,41 @@ class Gains:
 
     def __call__(self, x: Floats) -> Floats:
         """Return the gain of each row of weights, (B, rows), at the logits x of h1, (B, H1)."""
-        first, others = all_states(x, self._states)
-        gain: Floats = _gains(first, others, self._factors, self._group, self._rows)
+        p = all_states(x, self._states)
+        gain: Floats = _gains(p, self._factors, self._group, self._rows)
         return gain
 
 
-def all_states(x: NDArray[Any], states: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the probabilities of all states of the hidden units with the logits x, (..., H1).
-
-    Returns:
-        The probability of the first state of each unit, (..., units), and those of its other
-        states, (..., units, states - 1).
-    """
-    logits = x.reshape(*x.shape[:-1], -1, states - 1)
-    top = np.maximum(logits.max(-1), 0)
-    others = np.exp(logits - top[..., None])
-    first = np.exp(-top)
-    total = first + others.sum(-1)
-    return first / total, others / total[..., None]
-
-
 @compiled
-def _gains(first, others, factors, group, rows):
+def _gains(p, factors, group, rows):
     """Return the gain of each row of weights, (B, rows); see `Gains`.
 
     After each group of sums, the function splits the product into mantissa and exponent, and adds
     the exponent to an integer. So one log at the end is enough.
 
     Args:
-        first: (B, units) probability of the first state of each unit.
-        others: (B, units, states - 1) probabilities of the other states.
+        p: (B, units, states) probabilities of the states of h1.
         factors: (tiles, units, states - 1, rows per tile) exponentials of the weights.
         group: maximum number of sums in a product.
         rows: number of rows of weights.
     """
     tiles, units, states, width = factors.shape
-    gain = np.empty((len(first), rows), np.float32)
+    gain = np.empty((len(p), rows), np.float32)
     product, exponents = np.empty(width, np.float32), np.empty(width, np.int32)
     total = np.empty(width, np.float32)
     for t in range(tiles):
-        for b in range(len(first)):
+        for b in range(len(p)):
             product[:], exponents[:] = _ONE, np.int32(0)
             for m in range(units):
-                total[:] = first[b, m]
+                total[:] = p[b, m, 0]
                 for z in range(0, states - 1, 2):
                     # The loop takes two states at a time. This halves the reads and writes.
-                    p1, row1 = others[b, m, z], factors[t, m, z]
-                    p2, row2 = others[b, m, z + 1], factors[t, m, z + 1]
+                    p1, row1 = p[b, m, z + 1], factors[t, m, z]
+                    p2, row2 = p[b, m, z + 2], factors[t, m, z + 1]
                     for i in range(width):
                         total[i] += p1 * row1[i] + p2 * row2[i]
                 if states % 2:
-                    p1, row1 = others[b, m, states - 1], factors[t, m, states - 1]
+                    p1, row1 = p[b, m, states], factors[t, m, states - 1]
                     for i in range(width):
                         total[i] += p1 * row1[i]
                 for i in range(width):
@@ -182,9 +167,9 @@ class ObjectScorer:
     def kappa(self, coverage: float) -> Floats:
         """Return the bias of each class for a listed share, interpolated between the bins, (V,)."""
         kappa = self._weights["kappa"]
-        position = float(np.interp(coverage, _MIDDLES, range(len(_MIDDLES))))
-        low = min(int(position), len(SHARES) - 1)
-        weight = np.float32(position - low)
+        low = bisect(_MIDDLES, coverage, 1, len(SHARES)) - 1
+        share = (coverage - _MIDDLES[low]) / (_MIDDLES[low + 1] - _MIDDLES[low])
+        weight = np.float32(min(max(share, 0.0), 1.0))
         mixed: Floats = (1 - weight) * kappa[low] + weight * kappa[low + 1]
         return mixed
 
@@ -200,13 +185,11 @@ class ObjectScorer:
         """
         weights = self._weights
         log_odds = weights["b"][classes] + weights["kappa"][-1, classes]
-        log_odds += self._gains_of_rows(x - shares, weights["W"][classes])
-        a = weights["a"][:, classes].T
+        log_odds += self._changes(x - shares, shares[:0], classes)[0]
         if profile is None:
-            logits = weights.source_logits(classes, presence) - a * presence[:, None]
-            log_odds += (softmax(logits) * a).sum(1)
+            log_odds += self._by_source(classes, presence, np.arange(len(classes)), classes)[0]
         else:
-            log_odds += a[:, profile]
+            log_odds += weights["a"][profile, classes]
         if self._weights.spec.coupled:
             log_odds += _row_sum(self._weights["L"][np.ix_(classes, classes)], presence)
         return log_odds
@@ -226,11 +209,11 @@ class ObjectScorer:
         j. An entry is the log-odds of i with class j, minus the log-odds of i without class j. An
         entry with i = j is 0.
         """
-        change = self._changes(x - shares[rows], shares, self._weights["W"][classes[rows]])
+        change = self._changes(x - shares[rows], shares, classes[rows])[1]
         if self._weights.spec.coupled:
-            change += self._weights["L"][np.ix_(classes[rows], classes)] * presence
+            change += self._weights["L"][classes[rows, None], classes] * presence
         if profile is None:
-            change += self._changes_by_source(classes, presence, rows, classes[rows])
+            change += self._by_source(classes, presence, rows, classes[rows])[1]
         change[np.arange(len(rows)), rows] = 0
         return change
 
@@ -244,66 +227,108 @@ class ObjectScorer:
         candidates: Indices,
     ) -> Floats:
         """Return how much each listed class changes the log-odds of N unlisted classes, (N, n)."""
-        logits = np.broadcast_to(x, (len(candidates), len(x)))
-        change = self._changes(logits, shares, self._weights["W"][candidates])
+        change, rows = self._changes(x[None], shares, candidates)[1], classes[:0]
         if self._weights.spec.coupled:
-            change += self._weights["L"][np.ix_(candidates, classes)] * presence
+            change += self._weights["L"][candidates[:, None], classes] * presence
         if profile is None:
-            change += self._changes_by_source(classes, presence, None, candidates)
+            change += self._by_source(classes, presence, rows, candidates)[1]
         return change
 
-    def _changes_by_source(
-        self, classes: Indices, presence: Floats, rows: Indices | None, targets: Indices
-    ) -> Floats:
-        """Return how much each listed class changes sum_q p_q a_qi of N classes i, (N, n).
-
-        Args:
-            rows: (N,) position of each class i among the listed classes, which is not evidence for
-                itself; None if the classes i are not listed.
-            targets: (N,) the classes i.
-        """
-        a = self._weights["a"]
-        logits = self._weights.source_logits(classes, presence)[None]
-        shares = a[:, classes].T * presence[:, None]
-        if rows is not None:
-            logits = logits - shares[rows]
-        # p with class j minus p without class j, (N or 1, n, sources).
-        change = softmax(logits)[:, None] - softmax(logits[:, None] - shares)
-        effect: Floats = (change * a[:, targets].T[:, None]).sum(2)
-        return effect
+    def _by_source(
+        self, classes: Indices, presence: Floats, rows: Indices, targets: Indices
+    ) -> tuple[Floats, Floats]:
+        """See `_source_effects`."""
+        f, a = self._weights["f"], self._weights["a"]
+        return _source_effects(f, a, classes, presence, rows, targets)
 
     def room_logits(self, x: Floats) -> Floats:
         """Return log p(t | listed classes) of each room type t, plus a constant, (C,)."""
         logits: Floats = self._weights["e"] + self.room_gains(x[None])[0]
         return logits
 
-    def _gains_of_rows(self, x: Floats, weights: Floats) -> Floats:
-        """Return the gain of each row of weights, (N, H1), at its row of logits x, (N, H1)."""
-        first, others = all_states(x, self._states)
-        factors = np.exp(weights).reshape(others.shape)
-        gain: Floats = np.log(first + (others * factors).sum(-1)).sum(-1)
-        return gain
-
-    def _changes(self, x: Floats, shares: Floats, weights: Floats) -> Floats:
-        """Return gain_c(x_c) - gain_c(x_c - share_j) for N rows c and n shares j, (N, n).
+    def _changes(self, x: Floats, shares: Floats, classes: Indices) -> tuple[Floats, Floats]:
+        """Return gain_c(x_c), (N,), and gain_c(x_c) - gain_c(x_c - share_j), (N, n).
 
         Args:
-            x: (N, H1) logits of h1.
-            shares: (n, H1) contribution of each listed class to the logits.
-            weights: (N, H1) weights of the class of each row.
+            x: (N, H1) logits of h1 for each of N classes c, or (1, H1) for all these classes.
+            shares: (n, H1) contribution of each of n classes j to the logits.
+            classes: (N,) indices of the classes c.
         """
-        # float64 covers the products of the exponentials.
-        first, others = all_states(x.astype(np.float64), self._states)
-        by_unit = (*others.shape[1:],)
-        removed = np.exp(-shares.astype(np.float64)).reshape(-1, *by_unit).transpose(1, 2, 0)
-        raised = others * np.exp(weights.astype(np.float64)).reshape(others.shape)
-        with_class = np.log(first + raised.sum(-1)).sum(-1)
-        # (units, N, states) by (units, states, n): the products sum over the states of each unit.
-        start = first.T[:, :, None]
-        total = start + others.transpose(1, 0, 2) @ removed
-        weighted = start + raised.transpose(1, 0, 2) @ removed
-        change: Floats = (with_class[:, None] - np.log(weighted / total).sum(0)).astype(np.float32)
-        return change
+        states = self._states
+        raised, removed = odds(self._weights["W"][classes], states), odds(-shares, states)
+        gain, ratio = _changes(all_states(x, states), raised, removed)
+        return np.log(gain).sum(1), -np.log(ratio).sum(2)
+
+
+@compiled_in_any_order
+def _changes(p, raised, removed):
+    """Return the factors of e^gain, (N, units), and of e^-change, (N, n, units).
+
+    A factor is the effect of one hidden unit; see `ObjectScorer._changes`.
+
+    Args:
+        p: (N or 1, units, states) probabilities of the states of h1.
+        raised: (N, units, states) exponentials of the weights of the classes c.
+        removed: (n, units, states) exponentials of the contributions of classes j, negated.
+    """
+    (N, units, states), n = raised.shape, len(removed)
+    gain, ratio = np.empty((N, units), np.float32), np.empty((N, n, units), np.float32)
+    for c in range(N):
+        for m in range(units):
+            row, factors = p[min(c, len(p) - 1), m], raised[c, m]
+            with_class = np.float32(0.0)
+            for z in range(states):
+                with_class += row[z] * factors[z]
+            gain[c, m] = with_class
+            for j in range(n):
+                without, before, after = removed[j, m], np.float32(0.0), np.float32(0.0)
+                for z in range(states):
+                    product = row[z] * without[z]
+                    before += product
+                    after += product * factors[z]
+                ratio[c, j, m] = after / (before * with_class)
+    return gain, ratio
+
+
+@compiled
+def _source_effects(f, a, classes, presence, rows, targets):
+    """Return sum_q p_q a_qi of N classes i, (N,), and its change by each listed class, (N, n).
+
+    Args:
+        f, a: weights of the data sources; see `weights.layout`.
+        classes, presence: see `ObjectScorer.absent`.
+        rows: (N,) index of each class i among the listed classes. A class is not evidence for
+            itself. `rows` is empty if the classes i are not listed.
+        targets: (N,) the classes i.
+    """
+    shares = np.empty((len(classes), len(f)), np.float32)
+    logits, rest = f.copy(), np.empty(len(f), np.float32)
+    for j in range(len(classes)):
+        for q in range(len(f)):
+            shares[j, q] = a[q, classes[j]] * presence[j]
+            logits[q] += shares[j, q]
+    mean = np.empty(len(targets), np.float32)
+    change = np.empty((len(targets), len(classes)), np.float32)
+    for i in range(len(targets)):
+        values = a[:, targets[i]]
+        rest[:] = logits - shares[rows[i]] if len(rows) else logits
+        mean[i] = _mean(rest, values)
+        for j in range(len(classes)):
+            change[i, j] = mean[i] - _mean(rest - shares[j], values)
+    return mean, change
+
+
+@compiled
+def _mean(logits, values):
+    """Return the mean of values with probabilities softmax(logits), or 0 without values."""
+    top, total, weighted = np.float32(-np.inf), np.float32(0.0), np.float32(0.0)
+    for q in range(len(logits)):
+        top = max(top, logits[q])
+    for q in range(len(logits)):
+        p = exp(logits[q] - top)
+        total += p
+        weighted += p * values[q]
+    return weighted / total if len(logits) else np.float32(0.0)
 
 
 def _row_sum(rows: Floats, presence: Floats) -> Floats:

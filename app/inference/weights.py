@@ -23,7 +23,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.elementary import sigmoid, softmax
+from app.compiling import compiled, compiled_in_any_order
+from app.inference.elementary import exp, sigmoid, softmax
 from app.inference.variants import MachineSpec
 
 SWEEPS: Final = 10
@@ -36,6 +37,8 @@ WORD: Final = 32
 SHARES: Final = (0.3, 0.6, 1.0)
 """Upper limits of the listed share of a scene in the bins of kappa. The last row of kappa is for
 lists of all classes but one."""
+
+_HALF: Final = np.float32(0.5)
 
 
 def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
@@ -132,15 +135,6 @@ class Weights:
         bias: NDArray[Any] = self["c1"]
         return bias if room is None or not self.spec.C else bias + self["Q"][room]
 
-    def source_logits(self, classes: NDArray[Any], presence: NDArray[Any]) -> NDArray[Any]:
-        """Return the logits of the data sources given the listed classes, (profiles,): f + a v.
-
-        The sum has float64 digits, so that listed structure, whose terms are 0, does not change it.
-        """
-        evidence = self["a"][:, classes].astype(np.float64) @ presence
-        logits: NDArray[Any] = (self["f"] + evidence).astype(self["f"].dtype)
-        return logits
-
     def class_bias(
         self, classes: NDArray[Any], presence: NDArray[Any], profile: int | None
     ) -> NDArray[Any]:
@@ -156,7 +150,7 @@ class Weights:
             profile: index of the data source whose base rates apply, or None.
         """
         if profile is None:
-            change = softmax(self.source_logits(classes, presence)) @ self["a"]
+            change = softmax(self["f"] + self["a"][:, classes] @ presence) @ self["a"]
         else:
             change = self["a"][profile]
         bias: NDArray[Any] = self["b"] + change
@@ -190,13 +184,68 @@ def state_means(x: NDArray[Any], states: int) -> NDArray[Any]:
 
     Each unit has `states` states. Its first state has the logit 0 and no entry in x.
     """
-    if states == 2:
-        return sigmoid(x)
-    logits = x.reshape(*x.shape[:-1], -1, states - 1)
-    top = np.maximum(logits.max(-1, keepdims=True), 0)
-    odds = np.exp(logits - top)
-    means: NDArray[Any] = odds / (np.exp(-top) + odds.sum(-1, keepdims=True))
-    return means.reshape(x.shape)
+    p: NDArray[Any] = all_states(x.reshape(-1, x.shape[-1]), states)
+    return p[:, :, 1:].reshape(x.shape)
+
+
+@compiled
+def all_states(x: NDArray[Any], states: int) -> NDArray[np.float32]:
+    """Return the probabilities of all states of the hidden units, (B, units, states).
+
+    Args:
+        x: (B, H1) logits of all states but the first of each unit.
+        states: number of states of a unit.
+    """
+    p: NDArray[np.float32] = _with_first(x, states)
+    for b in range(len(p)):
+        for m in range(p.shape[1]):
+            row = p[b, m]
+            top = _largest(row)
+            # The square of e^(x/2) covers subnormal numbers.
+            for z in range(states):
+                row[z] = exp((row[z] - top) * _HALF)
+                row[z] *= row[z]
+            scale = np.float32(1.0) / _total(row)
+            for z in range(states):
+                row[z] *= scale
+    return p
+
+
+@compiled
+def odds(x: NDArray[Any], states: int) -> NDArray[np.float32]:
+    """Return e^x of all states of the hidden units, (B, units, states). See `all_states`."""
+    p: NDArray[np.float32] = _with_first(x, states)
+    flat = p.reshape(-1)
+    for k in range(len(flat)):
+        flat[k] = exp(flat[k])
+    return p
+
+
+@compiled
+def _with_first(x: NDArray[Any], states: int) -> NDArray[np.float32]:
+    """Return x (B, H1) with a 0 for the first state of each unit, (B, units, states)."""
+    p = np.zeros((len(x), x.shape[1] // (states - 1), states), np.float32)
+    for b in range(len(p)):
+        for m in range(p.shape[1]):
+            for z in range(1, states):
+                p[b, m, z] = x[b, m * (states - 1) + z - 1]
+    return p
+
+
+@compiled_in_any_order
+def _largest(row: NDArray[np.float32]) -> np.float32:
+    largest: np.float32 = row[0]
+    for z in range(1, len(row)):
+        largest = max(largest, row[z])
+    return largest
+
+
+@compiled_in_any_order
+def _total(row: NDArray[np.float32]) -> np.float32:
+    total = np.float32(0.0)
+    for z in range(len(row)):
+        total += row[z]
+    return total
 
 
 def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:
