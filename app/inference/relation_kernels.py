@@ -102,6 +102,28 @@ def spreads(C, q):
     return spread
 
 
+@compiled
+def subtract_products(C, f):
+    """Subtract sum_u f_u f_u' from each symmetric matrix C, in place.
+
+    Args:
+        C: (B, R, r (r + 1) / 2); see `spreads`.
+        f: (units u, B, R, r) vectors f_u.
+    """
+    units, B, R, r = f.shape
+    for b in range(B):
+        for c in range(R):
+            lower = C[b, c]
+            for u in range(units):
+                row, t = f[u, b, c], 0
+                for d in range(r):
+                    double = row[d] + row[d]
+                    for e in range(d):
+                        lower[t + e] -= double * row[e]
+                    lower[t + d] -= row[d] * row[d]
+                    t += d + 1
+
+
 _ROOT_3 = np.float32(3.0**0.5)
 # Limit of √3 σ. Below this limit, a quadrature with three nodes is accurate enough.
 _NARROW = np.float32(0.75 * 3.0**0.5)

@@ -367,9 +367,10 @@ class SharedUnits(RelationUnits):
         self._G = np.concatenate([weights["M"], weights["P"][:, None]], 1)
         self._g = np.concatenate([weights["R"], weights["d"][:, None]], 1)
         F, self._Y = _directions(weights)
-        self._F = F.reshape(-1, F.shape[2])
+        # (units, states - 1, A r): a matrix product sums over the states of each unit.
+        self._F = _columns(F).reshape(-1, self._states - 1, A * F.shape[1])
         # Products of two directions give the lower half of C. Entries off the diagonal are doubled.
-        self._lower = p, q = np.tril_indices(F.shape[1])
+        p, q = np.tril_indices(F.shape[1])
         self._FF = _columns(F[:, p] * F[:, q] * np.where(p == q, 1, 2)[:, None])
         self._GT = _columns(self._G)
         self._B = weights["B"] if weights.spec.G else None
@@ -409,16 +410,10 @@ class SharedUnits(RelationUnits):
         """
         if self._states == 2:
             return self._products(chosen, means * (1 - means), self._FF)
-        C = self._products(chosen, means, self._FF)
-        (R, r), B = self._Y[chosen].shape[:2], len(means)
-        F = self._F.reshape(self._A, r, -1, self._states - 1)[chosen]
-        by_unit = means.reshape(B, -1, self._states - 1).transpose(1, 0, 2)
-        # (units, B, states) by (units, states, R r) sums over the states of each unit.
-        f = by_unit @ F.transpose(2, 3, 0, 1).reshape(len(by_unit), self._states - 1, R * r)
-        f = f.reshape(-1, B, R, r)
-        p, q = self._lower
-        products = (f[..., p] * f[..., q]).sum(0) * np.where(p == q, 1, 2).astype(np.float32)
-        C -= products
+        C, (R, r) = self._products(chosen, means, self._FF), self._Y[chosen].shape[:2]
+        by_unit = means.reshape(len(means), -1, self._states - 1).transpose(1, 0, 2)
+        f = by_unit @ self._F[:, :, chosen.start * r : chosen.stop * r]
+        kernels.subtract_products(C, f.reshape(-1, len(means), R, r))
         return C
 
     def _products(self, chosen: slice, rows: Floats, columns: Floats) -> Floats:
