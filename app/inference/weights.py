@@ -150,7 +150,9 @@ class Weights:
             profile: index of the data source whose base rates apply, or None.
         """
         if profile is None:
-            change = softmax(self["f"] + self["a"][:, classes] @ presence) @ self["a"]
+            # The sum has float64 digits, so that listed structure, whose terms are 0, changes none.
+            evidence = self["a"][:, classes].astype(np.float64) @ presence
+            change = softmax((self["f"] + evidence).astype(self["f"].dtype)) @ self["a"]
         else:
             change = self["a"][profile]
         bias: NDArray[Any] = self["b"] + change
