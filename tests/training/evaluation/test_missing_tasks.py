@@ -134,14 +134,19 @@ def test_a_model_that_knows_the_hidden_classes_is_caught(monkeypatch):
 
 
 def test_the_score_is_the_ranking_of_the_service():
-    """Unlisted classes without structure, by probability."""
+    """Unlisted classes without structure and without kinds of a listed class, by probability."""
     v = draw_parts(rooms(10, 1), STRUCTURE, one_quarter).v
+    parents = torch.from_numpy(room_model().vocabulary.parents)
+    kinds = 0
     for row, own in zip(v, missing_score(room_model())(v), strict=True):
         asked = of_classes(row.nonzero().squeeze(1).tolist())
         p = torch.from_numpy(missing_probabilities(room_model(), asked))
         usable = p > -torch.inf
-        assert torch.equal(usable, (row == 0) & ~STRUCTURE)
+        is_kind = (parents >= 0) & (row[parents.clamp(min=0)] > 0)
+        kinds += int((is_kind & (row == 0)).sum())
+        assert torch.equal(usable, (row == 0) & ~STRUCTURE & ~is_kind)
         assert torch.allclose(own[usable].exp(), p[usable])
+    assert kinds
 
 
 def test_the_change_by_structure_by_hand(monkeypatch):
