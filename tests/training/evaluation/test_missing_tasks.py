@@ -136,7 +136,7 @@ def test_a_model_that_knows_the_hidden_classes_is_caught(monkeypatch):
 def test_the_score_is_the_ranking_of_the_service():
     """Unlisted classes without structure and without kinds of a listed class, by probability."""
     v = draw_parts(rooms(10, 1), STRUCTURE, one_quarter).v
-    parents = torch.from_numpy(room_model().vocabulary.parents)
+    parents = torch.tensor(room_model().vocabulary.parents.tolist())
     kinds = 0
     for row, own in zip(v, missing_score(room_model())(v), strict=True):
         asked = of_classes(row.nonzero().squeeze(1).tolist())
