@@ -60,11 +60,14 @@ def training_step(
         coupling_prior=0,
         rate_prior=0,
     )
-    spec = MachineSpec("triway", V=V, A=1, units=units, states=states, K=1, coupled=True)
+    spec = MachineSpec(
+        "triway", V=V, A=1, units=units, states=states, K=1, profiles=1, coupled=True
+    )
     ours, other = (object_machine(spec, objects).requires_grad_(True) for _ in range(2))
     listed = random_parts(v, config.leave_one_out, generator).listed
     absent = listed == 0
-    difference = (free_energy_log_odds(ours, listed) - ours.object_log_odds(listed))[absent]
+    log_odds = ours.object_log_odds(listed, source=torch.zeros(scenes, dtype=torch.int64))
+    difference = (free_energy_log_odds(ours, listed) - log_odds)[absent]
     timings = interleave(
         {OURS: ObjectFit(ours, data, config, 0).step, COPIES: _copies_step(other, v, config)},
         rounds=rounds,
@@ -89,7 +92,9 @@ def free_energy_log_odds(machine: BoltzmannMachine, listed: Tensor) -> Tensor:
     rows = torch.arange(len(present))
     present[rows, rows % V] = 1
     absent[rows, rows % V] = 0
-    return (machine.free_energy(absent) - machine.free_energy(present)).view(-1, V)
+    source = torch.zeros(len(present), dtype=torch.int64)
+    free = [machine.free_energy(v, source=source) for v in (absent, present)]
+    return (free[0] - free[1]).view(-1, V)
 
 
 def _copies_step(machine: BoltzmannMachine, v: Tensor, config: ObjectsConfig) -> Callable[[], None]:
