@@ -139,11 +139,12 @@ def _ranked(
     Returns:
         The class indices, their probabilities, and their log-odds before calibration, each (k,).
     """
-    listed_classes = posterior.present.classes
-    usable = ~artifact.vocabulary.structure
-    usable[listed_classes] = False
+    # The last entry stands for no parent, which has the index -1.
+    is_listed = np.zeros(len(artifact.vocabulary) + 1, np.bool_)
+    is_listed[posterior.present.classes] = True
+    usable = ~(artifact.vocabulary.structure | is_listed[:-1])
     if candidates is None:
-        usable &= ~np.isin(artifact.vocabulary.parents, listed_classes)
+        usable &= ~is_listed[artifact.vocabulary.parents]
     absent = np.flatnonzero(usable)
     chosen = np.ones(len(absent), np.bool_)
     if candidates is not None:
