@@ -3,8 +3,8 @@
 A part lists one to twelve random classes without structure, and their relations. Every object and
 relation of an untouched scene is right, so each alarm is false. A sensitivity promises a maximum
 share of parts with an alarm about an object, and the same share of parts with an alarm about a
-relation (`ALARMS`). A model is refused only if its share is certainly too
-large: the exact 95 % lower bound must exceed `EXCESS` times the promise.
+relation (`ALARMS`). A model is refused only if its share is certainly too large: the exact 95 %
+lower bound must exceed `EXCESS` times the promise.
 
 Source: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of
 the binomial" (1934).
