@@ -9,8 +9,9 @@ The start of a chain is a random stored scene. Its weight, given the evidence, i
             - 6 [sampled under another room type than t],
 
 where h1 is the mean of the hidden units given the stored scene, and t is the requested room type.
-If the machine stores no scene of room type t, the last term is h1·Q[t]. The method is sampling
-importance resampling, followed by Gibbs sweeps. The sweeps rarely change the room type of a scene.
+If the machine stores no scene of room type t, the last term is h1·Q[t] + v·Y[t]. The method is
+sampling importance resampling, followed by Gibbs sweeps. The sweeps rarely change the room type of
+a scene.
 
 The base rates stay the same in all sweeps: those of the profile, the mean over the data sources
 given the required classes, or those of the served mix if no class is required.
@@ -181,6 +182,7 @@ class SceneChains:
                 log_weights += np.where(same_room, 0, -OTHER_ROOM)
             else:
                 log_weights += self.mean @ machine["Q"][room]
+                log_weights += self._stored @ machine.room_couplings(room)
         logits = machine["b"][classes] + self.mean @ machine["W"][classes].T
         if machine.spec.coupled:
             logits += self._stored @ machine["L"][:, classes]
@@ -206,8 +208,8 @@ class ConditionedChains:
         classes, profile = conditions.classes, conditions.profile
         if len(classes) or profile is not None:
             certain = np.ones(len(classes), np.float32)
-            bias = chains.machine.class_bias(classes, certain, profile)
-            self._w = self._w._replace(b=bias)
+            self._w = self._w._replace(b=chains.machine.class_bias(classes, certain, profile))
+        self._w = self._w._replace(b=self._w.b + chains.machine.room_couplings(conditions.room))
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
         self._required_classes = _indicator(spec.V, conditions.classes)
@@ -307,10 +309,11 @@ class ConditionedChains:
 
         The score is a log-probability up to a constant of the model:
 
-            b·v + v'Lv/2 + e_t + sum_m log sum_z exp(x_mz) + log p(kept | v, h1)
+            (b + Y_t)·v + v'Lv/2 + e_t + sum_m log sum_z exp(x_mz) + log p(kept | v, h1)
 
         b contains the base rates, which depend on the profile or on the listed classes. The first
-        terms are log p(v, t) + log Z, where t is the room type. An unknown room type has e_t = 0.
+        terms are log p(v, t) + log Z, where t is the room type. An unknown room type has e_t = 0
+        and Y_t = 0.
         The last term is the log-probability of the relations given the sampled h1. With a second
         layer, m is the mean field of h2. Then x contains J m, and the score also contains c2·m and
         the entropy of m. This score is a lower bound on the log of the sum over h2.

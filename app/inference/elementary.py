@@ -48,10 +48,17 @@ def softplus(x: Floats) -> Floats:
     return y
 
 
-def softmax(x: Floats) -> Floats:
+def softmax(x: NDArray[Any]) -> NDArray[Any]:
     """Compute e^x / sum e^x over the last axis, which may be empty."""
-    y: Floats = np.exp(x - x.max(-1, keepdims=True, initial=-np.inf))
+    y: NDArray[Any] = np.exp(x - x.max(-1, keepdims=True, initial=-np.inf))
     return y / y.sum(-1, keepdims=True)
+
+
+def log_softmax(x: NDArray[Any]) -> NDArray[Any]:
+    """Compute log softmax(x) over the last axis, which may be empty."""
+    shifted = x - x.max(-1, keepdims=True, initial=-np.inf)
+    y: NDArray[Any] = shifted - np.log(np.exp(shifted).sum(-1, keepdims=True))
+    return y
 
 
 @intrinsic

@@ -7,10 +7,13 @@ The gain of a row w of weights is the contribution of the hidden units m to the 
 
 The first state of a unit has the weight 0. The log-odds of class i given the other classes are
 
-    b_i + sum_q p_q a_qi + sum_j presence_j L_ij + gain_i,   p = softmax(f + a v)
+    b_i + Y_ti + sum_q p_q a_qi + sum_j presence_j L_ij + gain_i,   p = softmax(f + a v)
 
 at the logits x without class i, with the presence v of the other classes. p_q is the probability of
-the data source q. If a request names its profile q, p_q is 1.
+the data source q. If a request names its profile q, p_q is 1. An unknown room type t has Y_t = 0.
+The probability of a room type t given the listed classes is
+
+    p(t | v) = sum_q p_q softmax_t(e + y_q + Y v + gain)
 
 Both factors of a product p_m(z) exp(w) are positive, so their sum loses no digits. A kernel
 multiplies the sums of several units and takes one log of the product. The group is small enough to
@@ -26,10 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled, compiled_in_any_order
-from app.inference.elementary import exp, exponent, log, mantissa
+from app.inference.elementary import exp, exponent, log, log_softmax, mantissa
 from app.inference.weights import SHARES, Weights, all_states, odds
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 LARGEST_WEIGHT: Final = 40.0
@@ -46,6 +50,7 @@ _TILE: Final = 800
 _LANES: Final = 16
 _LN2 = np.float32(0.6931471805599453)
 _ONE = np.float32(1.0)
+_SMALLEST: Final = 1e-300  # least probability of a room type
 # Listed share in the middle of each bin of kappa. The last bin lists all classes but one.
 _MIDDLES: Final = (0.15, 0.45, 0.8, 1.0)
 
@@ -145,7 +150,13 @@ class ObjectScorer:
         self.room_gains = Gains(weights["Q"], self._states)
 
     def absent(
-        self, x: Floats, classes: Indices, presence: Floats, profile: int | None, coverage: float
+        self,
+        x: Floats,
+        classes: Indices,
+        presence: Floats,
+        profile: int | None,
+        coverage: float,
+        room: int | None = None,
     ) -> Floats:
         """Return the log-odds of each class given the listed classes, (V,).
 
@@ -157,8 +168,10 @@ class ObjectScorer:
                 are present.
             profile: index of a data source, whose base rates apply, or None.
             coverage: listed share of the scene. 1 means that all classes but one are listed.
+            room: index of the room type, or None if unknown.
         """
         bias = self._weights.class_bias(classes, presence, profile)
+        bias = bias + self._weights.room_couplings(room)
         log_odds: Floats = bias + self.gains(x[None])[0] + self.kappa(coverage)
         if self._weights.spec.coupled:
             log_odds += _row_sum(self._weights["L"][classes], presence)
@@ -174,17 +187,24 @@ class ObjectScorer:
         return mixed
 
     def given_rest(
-        self, x: Floats, shares: Floats, classes: Indices, presence: Floats, profile: int | None
+        self,
+        x: Floats,
+        shares: Floats,
+        classes: Indices,
+        presence: Floats,
+        profile: int | None,
+        room: int | None = None,
     ) -> Floats:
         """Return the log-odds of each listed class given the other listed classes, (n,).
 
         Args:
             x: (H1,) logits of h1 given all listed classes.
             shares: (n, H1) contribution of each class to x.
-            classes, presence, profile: see `absent`.
+            classes, presence, profile, room: see `absent`.
         """
         weights = self._weights
-        log_odds = weights["b"][classes] + weights["kappa"][-1, classes]
+        bias = weights["b"] + weights.room_couplings(room) + weights["kappa"][-1]
+        log_odds = bias[classes]
         log_odds += self._changes(x - shares, shares[:0], classes)[0]
         if profile is None:
             log_odds += self._by_source(classes, presence, np.arange(len(classes)), classes)[0]
@@ -241,10 +261,37 @@ class ObjectScorer:
         f, a = self._weights["f"], self._weights["a"]
         return _source_effects(f, a, classes, presence, rows, targets)
 
-    def room_logits(self, x: Floats) -> Floats:
-        """Return log p(t | listed classes) of each room type t, plus a constant, (C,)."""
-        logits: Floats = self._weights["e"] + self.room_gains(x[None])[0]
-        return logits
+    def room_evidence(self, x: Floats, classes: Indices, presence: Floats) -> Doubles:
+        """Return log p(v | t) of the listed classes v for each room type t, (N, C).
+
+        The values of a room type have a constant of their own.
+
+        Args:
+            x: (N, H1) logits of h1 given the listed classes of N scenes.
+            classes: (n,) indices of the listed classes.
+            presence: (N, n) probabilities that the classes are present.
+        """
+        # The sum has float64 digits, so that listed structure, whose terms are 0, changes none.
+        evidence: Doubles = self.room_gains(x).astype(np.float64)
+        if self._weights.spec.coupled:
+            Y = self._weights["Y"][:, classes].astype(np.float64)
+            evidence += presence.astype(np.float64) @ Y.T
+        return evidence
+
+    def room_log_p(
+        self, x: Floats, classes: Indices, presence: Floats, profile: int | None
+    ) -> Doubles:
+        """Return log p(t | listed classes) of each room type t, (N, C).
+
+        `room_evidence` and `absent` describe the arguments.
+        """
+        weights = self._weights
+        logits = weights["e"] + self.room_evidence(x, classes, presence)
+        if not weights.spec.profiles:
+            return log_softmax(logits)
+        by_source = np.exp(log_softmax(logits[:, None] + weights["y"]))
+        p = weights.source_weights(classes, presence, profile)[:, None] @ by_source
+        return np.log(np.maximum(p[:, 0], _SMALLEST))
 
     def _changes(self, x: Floats, shares: Floats, classes: Indices) -> tuple[Floats, Floats]:
         """Return gain_c(x_c), (N,), and gain_c(x_c) - gain_c(x_c - share_j), (N, n).

@@ -24,6 +24,7 @@ from app.inference.relations import Between, Context, ObservedRelations, Relatio
 from app.inference.weights import Weights
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
@@ -66,6 +67,7 @@ class ScenePosterior:
 
     Args:
         profile: index of the data source whose base rates apply, or None.
+        room: index of the room type, or None. It is the room type of the context.
     """
 
     def __init__(
@@ -74,9 +76,10 @@ class ScenePosterior:
         units: RelationUnits,
         context: Context,
         profile: int | None = None,
+        room: int | None = None,
     ) -> None:
         self.context = context
-        self._objects, self._units, self._profile = objects, units, profile
+        self._objects, self._units, self._profile, self._room = objects, units, profile, room
         self._scene = context.classes, context.presence
 
     def absent_log_odds(self, absent: Indices, coverage: float) -> Floats:
@@ -87,13 +90,14 @@ class ScenePosterior:
             coverage: listed share of the classes of the scene.
         """
         x, profile = self.context.x, self._profile
-        log_odds: Floats = self._objects.absent(x, *self._scene, profile, coverage)[absent]
-        return log_odds
+        log_odds = self._objects.absent(x, *self._scene, profile, coverage, self._room)
+        of_absent: Floats = log_odds[absent]
+        return of_absent
 
     def log_odds_given_rest(self) -> Floats:
         """Return the log-odds of each class given the scene without this class, (n,)."""
         x, shares = self.context.x, self.context.shares
-        return self._objects.given_rest(x, shares, *self._scene, self._profile)
+        return self._objects.given_rest(x, shares, *self._scene, self._profile, self._room)
 
     def reasons(self, rows: Indices) -> Floats:
         """Return how much each class j changes `log_odds_given_rest` of each class i, (N, n).
@@ -113,6 +117,26 @@ class ScenePosterior:
         x, shares = self.context.x, self.context.shares
         profile = self._profile
         return self._objects.reasons_for_absent(x, shares, *self._scene, profile, candidates)
+
+    def room_log_p(self) -> Doubles:
+        """Return log p(t | objects) of each room type t, (C,), in a scene of unknown room type."""
+        classes, presence = self._scene
+        x = self.context.x[None]
+        log_p: Doubles = self._objects.room_log_p(x, classes, presence[None], self._profile)[0]
+        return log_p
+
+    def room_reasons(self) -> Doubles:
+        """Return how much each class changes the log-odds of each room type, (C, n).
+
+        An entry is the log-odds of the room type given all classes, minus its log-odds given all
+        classes but one.
+        """
+        classes, presence = self._scene
+        x = self.context.x - self.context.shares
+        others = presence * (1 - np.eye(len(classes), dtype=np.float32))
+        without = self._objects.room_log_p(x, classes, others, self._profile)
+        change: Doubles = (_log_odds(self.room_log_p()) - _log_odds(without)).T
+        return change
 
     def relation_log_odds(self) -> Floats:
         """Return the log-odds of every relation between the classes of the scene, (A, n, n).
@@ -173,3 +197,9 @@ class ScenePosterior:
     @cached_property
     def _between(self) -> Between:
         return self._units.between(self.context)
+
+
+def _log_odds(log_p: Doubles) -> Doubles:
+    """Return log p - log(1 - p). A p of nearly 1 counts as 1 - 1e-12."""
+    log_odds: Doubles = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-12)))
+    return log_odds

@@ -51,7 +51,9 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
         f (profiles,): biases of the data sources; see `Weights.class_bias`
         W (V, H1), J (H1, H2), Q (C, H1): weights between h1 and objects, h2 and room types
         L (V, V): couplings between classes, symmetric with a diagonal of 0, if `coupled`
+        Y (C, V): couplings between room types and classes, if `coupled`
         a (profiles, V): change of b in scenes of a data source, 0 for classes that it cannot show
+        y (profiles, C): change of e in scenes of a data source
         kappa (4, V): change of the log-odds of unlisted classes by the listed share; see `SHARES`
         triples (T, 3): sorted triples (relation a, subject class i, object class j) with an own
             weight
@@ -63,10 +65,10 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     floats: dict[str, tuple[int, ...]] = {
         "b": (V,), "c1": (H1,), "c2": (H2,), "e": (spec.C,), "W": (V, H1), "J": (H1, H2),
         "Q": (spec.C, H1), "f": (spec.profiles,), "a": (spec.profiles, V),
-        "kappa": (len(SHARES) + 1, V),
+        "y": (spec.profiles, spec.C), "kappa": (len(SHARES) + 1, V),
     }  # fmt: skip
     if spec.coupled:
-        floats["L"] = (V, V)
+        floats |= {"L": (V, V), "Y": (spec.C, V)}
     ints: dict[str, tuple[int, ...]] = {"triples": (spec.T, 3)}
     if spec.N:
         ints |= {"fantasies": (spec.N, -(-V // WORD)), "fantasy_rooms": (spec.N,)}
@@ -135,13 +137,40 @@ class Weights:
         bias: NDArray[Any] = self["c1"]
         return bias if room is None or not self.spec.C else bias + self["Q"][room]
 
+    def room_couplings(self, room: int | None) -> NDArray[Any]:
+        """Return the change of the log-odds of each class by a room type t, (V,): Y[t] or 0."""
+        if room is None or not self.spec.C or not self.spec.coupled:
+            return np.zeros(self.spec.V, self["b"].dtype)
+        couplings: NDArray[Any] = self["Y"][room]
+        return couplings
+
+    def source_weights(
+        self, classes: NDArray[Any], presence: NDArray[Any], profile: int | None
+    ) -> NDArray[np.float64]:
+        """Return p(q | listed classes) of each data source q, (N, profiles).
+
+        It is softmax(f + a v), or 1 for the source of a profile.
+
+        Args:
+            classes: (n,) indices of the listed classes.
+            presence: (N, n) probabilities that the classes are present, in N scenes.
+            profile: index of the data source whose base rates apply, or None.
+        """
+        if profile is not None:
+            one = np.zeros((len(presence), self.spec.profiles))
+            one[:, profile] = 1.0
+            return one
+        # The sum has float64 digits, so that listed structure, whose terms are 0, changes none.
+        evidence = presence.astype(np.float64) @ self["a"][:, classes].astype(np.float64).T
+        weights: NDArray[np.float64] = softmax(self["f"] + evidence)
+        return weights
+
     def class_bias(
         self, classes: NDArray[Any], presence: NDArray[Any], profile: int | None
     ) -> NDArray[Any]:
         """Return the bias of each class given the listed classes, (V,).
 
-        For a profile q, the bias is b + a[q]. Otherwise it is b + sum_q p(q) a[q] with the
-        probabilities p = softmax(f + a v) of the data sources. b alone is the bias for the mix of
+        The bias is b + sum_q p(q) a[q]; see `source_weights`. b alone is the bias for the mix of
         data sources that the model serves.
 
         Args:
@@ -149,13 +178,8 @@ class Weights:
                 are present.
             profile: index of the data source whose base rates apply, or None.
         """
-        if profile is None:
-            # The sum has float64 digits, so that listed structure, whose terms are 0, changes none.
-            evidence = self["a"][:, classes].astype(np.float64) @ presence
-            change = softmax((self["f"] + evidence).astype(self["f"].dtype)) @ self["a"]
-        else:
-            change = self["a"][profile]
-        bias: NDArray[Any] = self["b"] + change
+        weights = self.source_weights(classes, presence[None], profile)[0]
+        bias: NDArray[Any] = self["b"] + weights.astype(self["b"].dtype) @ self["a"]
         return bias
 
     def state_means(self, x: NDArray[Any]) -> NDArray[Any]:

@@ -1,13 +1,14 @@
-"""The four questions about a scene. The module of a question contains everything about it.
+"""The five questions about a scene. The module of a question contains everything about it.
 
     relations   Which spatial relations hold between the objects of the scene?
     missing     Which unlisted objects are probably in the scene, and where? `more` adds the listed
                 classes with probably more instances than listed.
     outliers    Which objects do not belong to the scene, and which stated relations are wrong?
+    rooms       Of which room type is the scene, or where is such an object?
     generate    Which other scenes contain these objects and relations?
 
 The function of a question takes a published model and a scene. It returns the fields of the answer,
-as `scene_client.schemas` defines them. The first three questions compute expectations, in closed
+as `scene_client.schemas` defines them. The first four questions compute expectations, in closed
 form or with fixed random numbers. So the same scene always gets the same answer. `generate` draws
 random scenes. To add a question, add a module to this package and its record to `QUESTIONS`.
 """
@@ -21,8 +22,9 @@ from app.questions.missing import MISSING, missing
 from app.questions.outliers import OUTLIERS, Sensitivity, misplaced, outliers
 from app.questions.question import Question
 from app.questions.relations import RELATIONS, relations
+from app.questions.rooms import ROOMS, rooms
 
-QUESTIONS: Final[tuple[Question[Any], ...]] = (RELATIONS, MISSING, OUTLIERS, GENERATE)
+QUESTIONS: Final[tuple[Question[Any], ...]] = (RELATIONS, MISSING, OUTLIERS, ROOMS, GENERATE)
 """All questions, in the order of the documentation."""
 
 __all__ = [
@@ -34,4 +36,5 @@ __all__ = [
     "missing",
     "outliers",
     "relations",
+    "rooms",
 ]

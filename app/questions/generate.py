@@ -343,8 +343,6 @@ class Plausible:
 def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
     """Return how well a scene fits a room type t: log p(v | t) / p(v), plus a constant of t.
 
-    The result is the gain of the weights Q_t (`app.inference.objects`).
-
     Args:
         classes: indices of the classes in the scene.
         room: index t of the room type.
@@ -352,7 +350,7 @@ def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
     presence = np.ones(len(classes), np.float32)
     index = np.array(classes, dtype=np.int64)
     context = context_of(artifact.weights, index, presence, np.zeros_like(presence))
-    return float(artifact.objects.room_gains(context.x[None])[0, room])
+    return float(artifact.objects.room_evidence(context.x[None], index, presence[None])[0, room])
 
 
 def _size(scenes: Sequence[Fields]) -> tuple[int, int]:

@@ -8,7 +8,6 @@ placements.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
@@ -29,7 +28,7 @@ from app.questions.answer import (
 from app.questions.counts import more
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
-from app.questions.posterior import Posterior, calibrated, placed_logits
+from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated, placed_logits
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.ranking import likeliest_classes
 from app.questions.reading import Reading
@@ -43,7 +42,6 @@ VIEWER = viewer_axes()
 """Axes of a viewer who looks along the x axis of the frame."""
 
 _BLOCK: Final = 32
-LEAST_CHANGE: Final = math.log(3)  # substantial evidence: a Bayes factor of at least 3
 _OFFSET_BYTES: Final = 250
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from app.scene.scene import Scene, instance_evidence, pool_classes, pool_relatio
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
+
+LEAST_CHANGE: Final = math.log(3)
+"""Minimum change of log-odds by a reason: substantial evidence is a Bayes factor of at least 3."""
 
 
 class Present(NamedTuple):
@@ -106,7 +109,8 @@ class Posterior(ScenePosterior):
             artifact.weights,
             *(listing.classes, listing.presence, listing.log_counts, scene.room_type, observed),
         )
-        super().__init__(artifact.objects, artifact.relation_units, context, scene.profile)
+        units, room = artifact.relation_units, scene.room_type
+        super().__init__(artifact.objects, units, context, scene.profile, room)
 
 
 # --------------------------------------------------------------------------------- calibration

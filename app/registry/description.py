@@ -57,6 +57,20 @@ class Slope(Frozen):
     slope: float
 
 
+class Sharpness(Frozen):
+    """Calibration of probabilities p of exclusive answers: p^(slope + log_count·log n) / sum.
+
+    n is the number of listed classes without structure, at least 1.
+    """
+
+    slope: float = 1.0
+    log_count: float = 0.0
+
+    def of(self, n: int) -> float:
+        """Return the exponent for a list of n classes. It is at least 0.05."""
+        return max(self.slope + self.log_count * math.log(max(n, 1)), 0.05)
+
+
 class Thresholds(Frozen):
     """Minimum probability at which the service reports an outlier or a misplaced relation.
 
@@ -113,6 +127,7 @@ class Calibration(Frozen):
             structure. None exactly if `outlier` is None.
         misplaced_thresholds: minimum probability of a misplaced (probably false) relation. None
             exactly if `misplaced` is None.
+        rooms: calibration of the probabilities of the room types.
         smallest: (C + 1,) minimum number of classes in a generated scene of each room type. 90 % of
             the real rooms reach this number. The last entry is for scenes without a room type. If
             the tuple is empty, there is no minimum.
@@ -139,6 +154,7 @@ class Calibration(Frozen):
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
     outlier_lines: AlarmLines | None = None
     misplaced_thresholds: Thresholds | None = None
+    rooms: Sharpness = Sharpness()
     smallest: Many[Count] = ()
     room_fit: Many[float] = ()
     outlier: CountSlope | None = None

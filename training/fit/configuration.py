@@ -96,12 +96,15 @@ class ObjectsConfig(_Section):
     learning_rate: float = Field(default=0.01, gt=0)
     warm_up: int = Field(default=50, ge=1, description="steps in which the rate rises")
     leave_one_out: float = Field(default=0.3, ge=0, le=1, description="share of such parts")
-    room_share: float = Field(default=0.5, ge=0, le=1, description="share of listed room types")
+    room_share: float = Field(default=0.3, ge=0, le=1, description="share of listed room types")
     weight_prior: float = Field(
         default=1.5, ge=0, description="precision of W, J and Q, in numbers of scenes"
     )
     coupling_prior: float = Field(default=2.5, ge=0, description="precision of L")
     rate_prior: float = Field(default=7.5, ge=0, description="precision of a and kappa")
+    room_loss: float = Field(
+        default=8.0, ge=0, description="weight of the log-likelihood of the room type"
+    )
     source_loss: float = Field(
         default=3.0, ge=0, description="weight of the log-likelihood of the data source"
     )
@@ -127,9 +130,8 @@ class ObjectsConfig(_Section):
         """Return the precision of the normal prior of an object weight, by the name of it."""
         if name in ("W", "J", "Q") or name.startswith("parametrizations.W"):
             return self.weight_prior
-        return {"L": self.coupling_prior, "a": self.rate_prior, "kappa": self.rate_prior}.get(
-            name, 0.0
-        )
+        rates = dict.fromkeys(("a", "y", "kappa"), self.rate_prior)
+        return (dict.fromkeys(("L", "Y"), self.coupling_prior) | rates).get(name, 0.0)
 
 
 class RelationsConfig(_Section):

@@ -3,7 +3,7 @@
 A robot lists a few objects of a room and asks for the rest. Each step shows a random part of each
 scene. The loss is the negative log-likelihood of every class that is not listed:
 
-    loss = mean over scenes of sum_i [ζ(λ_i) - v_i λ_i] - log p(t | listed) - s log p(q | listed)
+    loss = mean over scenes of sum_i [ζ(λ_i) - v_i λ_i] - k log p(t | listed) - s log p(q | listed)
            + g [F(v) - F(chains)]
 
 λ_i is the closed-form log-odds of class i given the listed classes (`BoltzmannMachine`), and ζ the
@@ -12,7 +12,7 @@ softplus.
 - 30 % of the parts list all classes but one. The class left out counts as often as the scene has
   classes. The other parts list a share of U(.05, 1) of the classes.
 - The room type t is listed in half of the parts. If it is not listed, the loss contains its
-  cross-entropy.
+  cross-entropy, with the weight k.
 - A class that a source shows in fewer than 3 scenes says nothing there: it has no term in the loss
   (partial labels). Structure is neither listed nor asked for.
 - Each source q has its own base rates a_q, and each listed share its own bias kappa. The machine
@@ -36,7 +36,7 @@ from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
-from torch.nn.functional import cross_entropy, softplus
+from torch.nn.functional import cross_entropy, nll_loss, softplus
 from torch.nn.utils.parametrize import cached
 
 from training.datasets.batches import SceneTensors
@@ -261,8 +261,8 @@ class ObjectFit:
         loss = loss + self.config.source_loss * cross_entropy(logits, source, reduction="sum")
         asked = (listed_room < 0) & (room >= 0)
         if bool(asked.any()):
-            logits = machine.room_logits(parts.listed[asked])
-            loss = loss + cross_entropy(logits, room[asked], reduction="sum")
+            log_p = machine.room_log_p(parts.listed[asked], source[asked])
+            loss = loss + self.config.room_loss * nll_loss(log_p, room[asked], reduction="sum")
         return loss / len(v)
 
     def _some_rooms(self, room: Tensor) -> Tensor:
@@ -289,9 +289,7 @@ class ObjectFit:
     def _free_energy(self, v: Tensor, h2: Tensor | None, room: Tensor, source: Tensor) -> Tensor:
         """Return the mean free energy given the room types, which the chains do not draw."""
         free = self.machine.free_energy(v, h2, room=room, source=source)
-        if self.machine.spec.C:
-            free = free + self.machine.e[room.clamp(min=0)] * (room >= 0)
-        return free.mean()
+        return (free + self.machine.room_rate(room, source)).mean()
 
     def _prior(self) -> Tensor:
         """Return the negative log prior of the weights, divided by the number of scenes."""
@@ -330,6 +328,9 @@ class ObjectFit:
         mix = served_base_rates(machine.a, self.scenes, self.config)
         machine.a.copy_(base_rates(machine.a, self.scenes, self.config) - mix)
         machine.b.add_(mix)
+        mix = served_room_rates(machine.y, self.scenes, self.config)
+        machine.y.copy_(room_rates(machine.y, self.scenes, self.config) - mix)
+        machine.e.add_(mix)
         served = served_weights(self.scenes, self.config).clamp(min=_UNSERVED)
         mixed = served / served.sum()
         machine.f.add_((mixed * self.scenes.size / self.scenes.source_sizes).log())
@@ -367,6 +368,23 @@ def served_base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) ->
 def base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
     """Return a[q], with the served base rate of the classes that q does not show; same shape."""
     return torch.where(scenes.shows, a, served_base_rates(a, scenes, config))
+
+
+def served_room_rates(y: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
+    """Return the weighted mean of y[q] over the sources with room types, (room types,)."""
+    weights = served_weights(scenes, config) * _sources_with_rooms(scenes)
+    return (weights / weights.sum().clamp(min=1e-9)) @ y
+
+
+def room_rates(y: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
+    """Return y[q], with the served rates for a source without room types; same shape."""
+    known = _sources_with_rooms(scenes).unsqueeze(1)
+    return torch.where(known, y, served_room_rates(y, scenes, config))
+
+
+def _sources_with_rooms(scenes: ObjectScenes) -> Tensor:
+    """Return True for each source whose scenes have a room type, (sources,) bool."""
+    return scenes.source[scenes.room >= 0].bincount(minlength=len(scenes.sources)) > 0
 
 
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:

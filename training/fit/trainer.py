@@ -260,3 +260,4 @@ def silence(machine: BoltzmannMachine, structure: Tensor) -> None:
             machine.get_parameter(name)[structure] = 0
     if machine.spec.coupled:
         machine.L[:, structure] = 0
+        machine.Y[:, structure] = 0

@@ -78,7 +78,8 @@ def sweep(
     if machine.spec.H2:
         logits = beta * machine.second_layer_logits(h1)
         chains.h2 = torch.bernoulli(logits.sigmoid(), generator=generator)
-    field = beta * (machine.class_bias(chains.source) + h1 @ machine.W.T)
+    bias = machine.class_bias(chains.source) + machine.room_bias(chains.room)
+    field = beta * (bias + h1 @ machine.W.T)
     if base is not None:
         field = field + (1 - beta) * base
     couplings = machine.couplings

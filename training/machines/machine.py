@@ -1,13 +1,13 @@
 """The common interface of the machines, and the whole energy except its relation logits.
 
-    E(v,r,h1,h2,t | q) = - (b + a_q)·v - v'Lv/2 - c1·h1 - v'W h1 - h1'J h2 - c2·h2 - e_t - Q_t·h1
-                         - sum_e g_e (r_e ℓ_e(v, h1) - log(1 + exp ℓ_e(v, h1)))
+    E(v,r,h1,h2,t | q) = - (b + a_q + Y_t)·v - v'Lv/2 - (c1 + Q_t)·h1 - v'W h1 - h1'J h2 - c2·h2
+                         - (e + y_q)_t - sum_e g_e (r_e ℓ_e(v, h1) - log(1 + exp ℓ_e(v, h1)))
 
 q is the data source of the scene, and t its room type. A hidden unit of the first layer has Z
 states. h1 has one entry for each state but the first: 1 for the state of the unit, else 0. The
 first state has the energy 0. For Z = 2, the units are binary, as in the paper. An unknown room type
-has e_t = 0 and Q_t = 0. The last sum runs over the relation units e = (a, i, j). A variant defines
-its relation units, the gate g_e of a unit and the logit ℓ_e. A gate of 0 forces its unit to 0.
+has the weights 0. The last sum runs over the relation units e = (a, i, j). A variant defines its
+relation units, the gate g_e of a unit and the logit ℓ_e. A gate of 0 forces its unit to 0.
 
 The term log(1 + exp ℓ_e) normalises each relation separately. So the sum over an unobserved
 relation is 1, and relations have no effect on objects and hidden units. The published machine lacks
@@ -15,10 +15,12 @@ this term; `training.seed` has it as published.
 
 Given the objects, the log-odds of an unlisted class i have a closed form (one hidden layer):
 
-    log-odds_i = b_i + a_qi + (vL)_i + sum_m log sum_z p_m(z | v, t) exp(W_i[m, z])
+    log-odds_i = b_i + a_qi + Y_ti + (vL)_i + sum_m log sum_z p_m(z | v, t) exp(W_i[m, z])
 
 If the source is unknown, a_qi is replaced by its mean over the sources given the listed classes,
-with the probabilities p(q | v) = softmax(f + a v).
+with the probabilities p(q | v) = softmax(f + a v). A room type has the probability
+
+    p(t | v) = sum_q p(q | v) softmax_t(e + y_q + Y v + sum_m log sum_z p_m(z | v) exp(Q_t[m, z]))
 
 p_m are the probabilities of the states of unit m, with the logits x = c1 + Q_t + v'W + J m2. With a
 second layer, m2 are its mean-field means given v. They stay the same for v_i = 0 and v_i = 1.
@@ -39,7 +41,7 @@ from app.inference.variants import MachineSpec
 from app.inference.weights import SHARES, SWEEPS
 from training.machines.edges import Edges, triple_keys
 
-OBJECT_WEIGHTS = ("b", "c1", "c2", "e", "W", "J", "Q", "L", "f", "a", "kappa")
+OBJECT_WEIGHTS = ("b", "c1", "c2", "e", "W", "J", "Q", "L", "Y", "f", "a", "y", "kappa")
 """Names of the weights without relations."""
 
 
@@ -64,9 +66,11 @@ class BoltzmannMachine(nn.Module, ABC):
         self.Q = nn.Parameter(torch.zeros(spec.C, spec.H1))
         self.f = nn.Parameter(torch.zeros(spec.profiles))
         self.a = nn.Parameter(torch.zeros(spec.profiles, spec.V))
+        self.y = nn.Parameter(torch.zeros(spec.profiles, spec.C))
         self.kappa = nn.Parameter(torch.zeros(len(SHARES) + 1, spec.V))
         if spec.coupled:
             self.L = nn.Parameter(torch.zeros(spec.V, spec.V))
+            self.Y = nn.Parameter(torch.zeros(spec.C, spec.V))
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         self.triples: Tensor
         if spec.N:
@@ -112,7 +116,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def initialise(self, generator: torch.Generator, scale: float = 0.05) -> Self:
         """Draw W, J and the factors of relations from N(0, scale²). Other weights keep 0."""
         for name, parameter in self.named_parameters():
-            if parameter.dim() > 1 and name not in ("Q", "a", "kappa", "L"):
+            if parameter.dim() > 1 and name not in ("Q", "a", "y", "kappa", "L", "Y"):
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
         return self
 
@@ -225,16 +229,43 @@ class BoltzmannMachine(nn.Module, ABC):
                 adds kappa to the log-odds.
         """
         x, _ = self.context(v, room)
-        log_odds = self.b + self.source_weights(v, source) @ self.a + self.gain(x, self.W)
+        bias = self.b + self.source_weights(v, source) @ self.a + self.room_bias(room)
+        log_odds = bias + self.gain(x, self.W)
         couplings = self.couplings
         if couplings is not None:
             log_odds = log_odds + sums(v, couplings)
         return log_odds if share is None else log_odds + self.kappa[share]
 
-    def room_logits(self, v: Tensor) -> Tensor:
-        """Return log p(t | v) of each room type t, plus a constant of each scene, (scenes, C)."""
+    def room_bias(self, room: Tensor | None) -> Tensor:
+        """Return the couplings Y[t] of the room type t to the classes, (scenes or 1, classes)."""
+        if room is None or not self.spec.C or not self.spec.coupled:
+            return torch.zeros(1, self.spec.V)
+        return self.Y[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
+
+    def room_rate(self, room: Tensor | None, source: Tensor | None) -> Tensor:
+        """Return the bias e_t + y_qt of the room type of each scene, (scenes or 1,)."""
+        if room is None or not self.spec.C:
+            return torch.zeros(1)
+        rate = self.e[room.clamp(min=0)]
+        if source is not None and self.spec.profiles:
+            by_source = self.y[source.clamp(min=0), room.clamp(min=0)]
+            rate = rate + by_source * (source >= 0)
+        return rate * (room >= 0)
+
+    def room_log_p(self, v: Tensor, source: Tensor | None = None) -> Tensor:
+        """Return log p(t | v, source) of each room type t, (scenes, C), for an unlisted type.
+
+        The mean over the sources has the probabilities of `source_weights`.
+        """
         x, _ = self.context(v)
-        return self.e + self.gain(x, self.Q)
+        logits = self.e + self.gain(x, self.Q)
+        if self.spec.coupled:
+            logits = logits + sums(v, self.Y.T)
+        if not self.spec.profiles:
+            return logits.log_softmax(-1)
+        by_source = (logits.unsqueeze(-2) + self.y).log_softmax(-1)
+        weights = self.source_weights(v, source).unsqueeze(-1)
+        return (weights.log() + by_source).logsumexp(-2)
 
     def free_energy(
         self,
@@ -259,9 +290,8 @@ class BoltzmannMachine(nn.Module, ABC):
         couplings = self.couplings
         if couplings is not None:
             free = free - 0.5 * (sums(v, couplings) * v).sum(-1)
-        if room is not None and self.spec.C:
-            free = free - self.e[room.clamp(min=0)] * (room >= 0)
-        return free - self.log_states(x)
+            free = free - (v * self.room_bias(room)).sum(-1)
+        return free - self.room_rate(room, source) - self.log_states(x)
 
     def log_states(self, x: Tensor) -> Tensor:
         """Return the log of the sum over the states of h1 of exp(h1·x), (scenes,)."""
@@ -351,8 +381,8 @@ class BoltzmannMachine(nn.Module, ABC):
         couplings = self.couplings
         if couplings is not None:
             log_weight = log_weight + 0.5 * ((v @ couplings) * v).sum(-1)
-        if room is not None and self.spec.C:
-            log_weight = log_weight + self.e[room.clamp(min=0)] * (room >= 0)
+            log_weight = log_weight + (v * self.room_bias(room)).sum(-1)
+        log_weight = log_weight + self.room_rate(room, source)
         energy = -log_weight - self.relation_term(edges, v, r, h1)
         return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, energy)
 

@@ -12,3 +12,4 @@ from scene_client.schemas.models import *  # noqa: F403
 from scene_client.schemas.outliers import *  # noqa: F403
 from scene_client.schemas.relations import *  # noqa: F403
 from scene_client.schemas.requests import *  # noqa: F403
+from scene_client.schemas.rooms import *  # noqa: F403

@@ -1,0 +1,194 @@
+"""The question `rooms`: of which room type is a room with these objects?
+
+For a single object, the answer is where such an object usually is. The room type of the request is
+no evidence. The machine's probability of a room type t (`app.inference.objects`) is calibrated:
+
+    p(t) ∝ p_machine(t | objects)^s,   s = slope + log_count · log(number of listed classes)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.inference.elementary import softmax
+from app.questions.answer import (
+    CAUSE_BYTES,
+    OBJECT_BYTES,
+    Fields,
+    SizeLimit,
+    reasons,
+    significant,
+)
+from app.questions.names import ErrorList
+from app.questions.posterior import LEAST_CHANGE, Posterior
+from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
+from app.questions.reading import Reading
+from app.registry.artifact import Artifact
+from app.registry.description import Sharpness
+from app.scene.scene import Scene
+from scene_client.schemas import RoomsAnswer, RoomsRequest, SceneWarning
+
+
+def rooms(
+    artifact: Artifact,
+    scene: Scene,
+    *,
+    top_k: int = 5,
+    candidates: Sequence[int] | None = None,
+    details: bool = True,
+    size_limit: SizeLimit | None = None,
+) -> Fields:
+    """Rank the room types by their probability, likeliest first.
+
+    Args:
+        scene: the listed objects. Its relations and its room type are not used.
+        top_k: maximum number of room types in the answer.
+        candidates: indices of the possible room types; their probabilities sum to 1. None means all
+            room types.
+        details: whether the answer contains `because`.
+        size_limit: limit on the size of the answer, or None.
+
+    Returns:
+        The field `room_types` of `scene_client.schemas.RoomsAnswer`. The list is empty if the model
+        has no room types. Then the field `warnings` says so.
+
+    Raises:
+        ValueError: top_k is below 1, or a candidate is not a room type.
+        RequestError: the answer would exceed `size_limit`.
+    """
+    if top_k < 1:
+        raise ValueError(f"top_k must be at least 1, not {top_k}")
+    C = artifact.spec.C
+    among = np.arange(C) if candidates is None else np.array(candidates, dtype=np.int64)
+    if ((among < 0) | (among >= C)).any():
+        raise ValueError(f"a candidate is not a room type; indices are below C = {C}")
+    if not len(among):
+        return {"warnings": [] if C else [_NO_ROOM_TYPES], "room_types": []}
+    posterior = Posterior(artifact, replace(scene, room_type=None))
+    p = room_probabilities(artifact.calibration.rooms, posterior, among)
+    first = np.argsort(-p, kind="stable")[:top_k]
+    names = [artifact.vocabulary.room_types[t] for t in among[first].tolist()]
+    entries: list[Fields] = [
+        {"room_type": name, "probability": probability}
+        for name, probability in zip(names, significant(p[first]), strict=True)
+    ]
+    if details:
+        change = posterior.room_reasons()[among[first]]
+        causes = reasons(scene, posterior.present, change, least=LEAST_CHANGE)
+        for entry, because in zip(entries, causes, strict=True):
+            entry["because"] = because
+    if size_limit is not None:
+        size_limit.check("top_k", *_size(entries))
+    return {"room_types": entries}
+
+
+def room_probabilities(
+    entry: Sharpness, posterior: Posterior, among: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the probability of each of these room types, (N,); see the module."""
+    sharpness = entry.of(posterior.listed)
+    p: NDArray[np.float64] = softmax(sharpness * posterior.room_log_p()[among])
+    return p
+
+
+def _size(entries: Sequence[Fields]) -> tuple[int, int]:
+    """Return the size of the list in bytes without names, and the number of names."""
+    causes = sum([len(entry.get("because", ())) for entry in entries])
+    return causes * CAUSE_BYTES + len(entries) * OBJECT_BYTES, causes + len(entries)
+
+
+def _read(request: RoomsRequest, _: Artifact, reading: Reading) -> Options:
+    """Return the arguments of `rooms` for a request."""
+    candidates = None
+    if request.candidates is not None:
+        errors = ErrorList()
+        candidates = _candidates(request.candidates, reading, errors)
+        errors.raise_any()
+    return {
+        "top_k": request.top_k,
+        "candidates": candidates,
+        "details": request.detail == "full",
+    }
+
+
+def _candidates(names: Sequence[str], reading: Reading, errors: ErrorList) -> list[int]:
+    """Return the indices of the room types in the request's field `candidates`."""
+    indices: dict[int, None] = {}
+    for position, name in enumerate(names):
+        index = reading.unknown.vocabulary.room_index(name)
+        if index is None:
+            place = ("candidates", position)
+            index = reading.unknown.resolve(name, name, place, errors, is_room=True)
+        if index is not None:
+            indices[index] = None
+    return list(indices)
+
+
+def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> Iterator[Fields]:
+    for scene in scenes:
+        yield rooms(artifact, scene)
+
+
+_NO_ROOM_TYPES: Final = SceneWarning(
+    code="not-judged",
+    message="The training scenes of this model have no room types.",
+    objects=[],
+)
+
+_EXAMPLES: Final[dict[str, Any]] = {
+    "labels": Example("which room is this?", LABELS),
+    "object": Example("where is such an object usually?", {"objects": ["toothbrush"]}),
+    "candidates": Example(
+        "only the rooms of this flat",
+        {
+            "objects": ["sofa", "plant"],
+            "candidates": ["bedroom", "kitchen", "living room", "bathroom"],
+        },
+    ),
+    "scores": Example(
+        "probabilities only, for a fast and short answer", {**LABELS, "detail": "scores"}
+    ),
+    "relations": Example("relations and the room type of the request are not used", BEDROOM),
+    **{name: SCENES[name] for name in ("poses", "ignore", "nearest", "training")},
+    **REFUSED,
+    "unknown-room-type": Example(
+        "a candidate that the model does not know",
+        {**LABELS, "candidates": ["bedroom", "engine room"]},
+        "unknown-labels",
+    ),
+}
+_EXAMPLE_ANSWER: Final = {
+    "room_types": [
+        {
+            "room_type": "bedroom",
+            "probability": 0.93,
+            "because": [
+                {"object": "bed", "log_odds_change": 3.9},
+                {"object": "nightstand", "log_odds_change": 1.4},
+            ],
+        },
+        {"room_type": "living room", "probability": 0.02, "because": []},
+    ],
+}
+
+ROOMS: Final = Question(
+    rooms,
+    _read,
+    _warm_up,
+    RoomsRequest,
+    RoomsAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+    description="""
+Rank the room types by their probability given the objects, most probable first.
+
+For a single object, the answer is where such an object usually is. The probabilities of all room
+types, or of all candidates, sum to one. The answer uses neither relations nor the room type of the
+request.
+""",
+)
