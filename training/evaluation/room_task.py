@@ -109,6 +109,9 @@ def mean_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> flo
         sample = subset(scenes, torch.from_numpy(np.flatnonzero(names == source)))
         for size, seeds in LISTS.values():
             parts = draw_parts(sample, structure, size, seeds)
-            for profile in ("", str(source)) if len(parts.v) else ():
-                values.append(-room_figures(sample, parts, score, profile)["log-loss"].value)
+            values += [
+                -room_figures(sample, parts, score, profile)["log-loss"].value
+                for profile in ("", str(source))
+                if len(parts.v)
+            ]
     return float(np.mean(values)) if values else float("nan")

@@ -151,7 +151,7 @@ def hidden_loss(network: nn.Module, v: Tensor, labelled: Tensor, loss: str) -> T
 # P. Vincent et al., "Extracting and composing robust features with denoising autoencoders",
 # ICML 2008. `train_network` trains the network.
 
-_RUNGS = ((TRIALS, 0.25), (6, 1.0))
+_RUNGS = ((TRIALS, 0.25), (4, 1.0))
 _AUTOENCODER: Final[dict[str, Sequence[Any]]] = {
     "width": (300, 600),
     "dropout": (0.0, 0.15, 0.3, 0.5),
@@ -189,7 +189,7 @@ def autoencoder(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[
 # embeddings. `train_network` trains the network.
 
 _HEADS = 4
-_SHORT_RUNGS = ((TRIALS, 0.125), (4, 0.5), (2, 1.0))
+_SHORT_RUNGS = ((TRIALS, 0.125), (2, 1.0))
 _TRANSFORMER: Final[dict[str, Sequence[Any]]] = {
     "width": (64, 96),
     "layers": (1, 2),

@@ -112,7 +112,7 @@ def nearest(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[Obj
 
 _PAIRWISE_L2 = (100.0, 70.0, 50.0, 40.0, 30.0, 20.0, 15.0, 10.0, 7.0, 5.0, 3.0, 1.0)
 _DENSITY_L2 = (30.0, 10.0, 3.0)
-_ITERATIONS = 40
+_ITERATIONS = 25
 # Settings for the estimate of log Z. A Gibbs sweep of this model updates one class at a time and is
 # slow, so the number of temperatures is below the default. The error of log Z is about 0.01 nats.
 _EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)

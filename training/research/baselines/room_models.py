@@ -94,11 +94,8 @@ def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals
                 source: count.table(source_alpha if source else alpha, s, absent)
                 for source, count in counts.items()
             }
-            parameters: Parameters = {
-                **{"scenes": name, "alpha": alpha, "source_alpha": source_alpha},
-                **{"absent": absent, "exponent": s},
-            }
-            yield parameters, RoomTable(tables)
+            kind: Parameters = {"scenes": name, "absent": absent, "exponent": s}
+            yield {**kind, "alpha": alpha, "source_alpha": source_alpha}, RoomTable(tables)
 
 
 def most_common(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RoomScore]:
