@@ -30,7 +30,7 @@ from torch import Tensor
 from app.inference.chains import Conditions, random_stream
 from app.questions.generate import STEPS
 from app.registry import Artifact
-from training.datasets.array_types import Floats
+from training.datasets.array_types import Floats, Ints
 from training.datasets.batches import SceneTensors, subset
 from training.datasets.cases import some_scenes
 from training.evaluation.contradictions import contradiction_metrics, count_contradictions
@@ -225,7 +225,8 @@ def copies(drawn: Tensor, train: Tensor) -> Floats:
 
 def generation_metrics(
     drawn: Drawn,
-    held_out: SceneTensors,
+    held_out: Tensor,
+    groups: Ints,
     train: Tensor,
     mask: Tensor,
     bandwidth: float,
@@ -235,16 +236,16 @@ def generation_metrics(
 
     Args:
         drawn: at least two generated scenes.
+        groups: (held-out scenes,) group of each held-out scene.
         mask: (classes,) bool, the classes that the metrics use.
         bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
         emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
     """
-    x, y, training = drawn.v[:, mask], held_out.v[:, mask], train[:, mask]
+    x, y, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
     ours, theirs = x.double().numpy(), y.double().numpy()
     base = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
 
     def resampled(statistic: Callable[[Floats], float]) -> Resampled:
-        groups = held_out.group_ids
         return Resampled.of(lambda weight: statistic(weight * base), groups, len(x), _RESAMPLES)
 
     metrics: dict[str, Metric] = {
@@ -294,7 +295,8 @@ def generation_task(model: Model, setting: Setting) -> Outcome | None:
     metrics: dict[str, Metric] = {}
     for name, (given, room, emphasis) in conditions.items():
         drawn = sampler(given, room, setting.seed)
-        values = generation_metrics(drawn, first, setting.train.v, mask, bandwidth, emphasis)
+        truth = first.v, first.group_ids
+        values = generation_metrics(drawn, *truth, setting.train.v, mask, bandwidth, emphasis)
         metrics |= {f"{metric}, {name}": value for metric, value in values.items()}
     notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
     return Outcome(metrics, len(first), 0, notes)

@@ -29,7 +29,7 @@ def scene(
     source: str = "toy",
     unknown: tuple[str, ...] = (),
     room: int = -1,
-    group: str = "g",
+    group: str | None = None,
     name: str | None = None,
     relations: int = 4,
     annotated: bool = True,
@@ -43,10 +43,11 @@ def scene(
     observed = np.broadcast_to(~np.eye(n, dtype=np.bool_) & annotated, holds.shape).copy()
     evidence = pool_instances(labels, np.ones(n), holds, observed)
     cut = {"holds": evidence.holds[:relations], "observed": evidence.observed[:relations]}
+    scene_id = name or f"scene {next(_names)}"
     return EncodedScene(
-        scene_id=name or f"scene {next(_names)}",
+        scene_id=scene_id,
         source=source,
-        group=group,
+        group=group or scene_id,
         room_type=room,
         evidence=replace(evidence, **cut),
         instance_classes=labels,

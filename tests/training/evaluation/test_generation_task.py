@@ -120,7 +120,7 @@ def test_held_out_scenes_are_their_own_floor():
     asked = torch.ones(WIDE, dtype=torch.bool)
 
     def figures(drawn: Drawn):
-        metrics = generation_metrics(drawn, held_out.v, train.v, asked, 2.0)
+        metrics = generation_metrics(drawn, held_out.v, np.arange(60), train.v, asked, 2.0)
         return {name: metric.value for name, metric in metrics.items()}
 
     nothing = torch.zeros(60, WIDE, dtype=torch.bool)
@@ -161,7 +161,7 @@ def test_given_one_class_scenes_count_by_their_size():
     size = held_out.sum(1)
     for emphasis, expected in ((size, 0.0), (None, 1 / 6)):
         metrics = generation_metrics(
-            Drawn(torch.stack(drawn)), held_out, held_out, asked, 2.0, emphasis
+            Drawn(torch.stack(drawn)), held_out, np.arange(3), held_out, asked, 2.0, emphasis
         )
         assert metrics["marginal error"].value == pytest.approx(expected, abs=1e-9)
 

@@ -162,7 +162,8 @@ def test_the_change_by_structure_by_hand(monkeypatch):
     # Class 3 itself is no candidate of the second request.
     first = [k for k in np.argsort(-p, kind="stable")[:10] if k != 3]
     metric = outcome.metrics["change of p"]
-    assert metric.numerators[parts.scene[0]] == pytest.approx(np.abs(p[first] - q[first]).mean())
+    group = np.flatnonzero(metric.groups == setting.some().group_ids[parts.scene[0]])
+    assert metric.numerators[group] == pytest.approx(np.abs(p[first] - q[first]).mean())
     assert metric.value > 0
     assert structure_task(Model(missing=in_order), setting) is None
 

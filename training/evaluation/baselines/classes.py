@@ -56,11 +56,13 @@ class Lists:
         v: (scenes, classes) presence, without structure classes.
         labelled: (scenes, classes) bool, False for classes that the data source cannot show.
         weight: (scenes,) weight of each scene. The mean is 1.
+        index: (scenes,) position of each scene in the training scenes.
     """
 
     v: Tensor
     labelled: Tensor
     weight: Tensor
+    index: Tensor
 
     def frequency(self) -> Tensor:
         """Return the share of scenes with each class, (classes,), among the labelled scenes."""
@@ -72,16 +74,20 @@ class Lists:
 
 
 def training_lists(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, Lists]]:
-    """Yield sets of training scenes with their names: all scenes, and complete object lists only.
+    """Yield sets of training scenes with their names. A baseline chooses between the sets.
 
-    A baseline chooses between both sets. The other sources mention only some objects of a scene.
+    A set has all scenes, or only complete object lists. The other sources mention only some objects
+    of a scene. A class that a data source cannot show is unlabelled, or it is absent.
     """
-    labelled = train.annotated_classes[train.source] & ~structure
+    able = train.annotated_classes[train.source] & ~structure
     v, weight = train.v * ~structure, train.weight
-    for name, mask in (("all", torch.ones_like(train.complete)), ("complete", train.complete)):
-        if mask.any() and (name == "all" or not mask.all()):
-            share = weight[mask] / weight[mask].mean()
-            yield name, Lists(v[mask], labelled[mask] | (v[mask] > 0), share)
+    for absent, labelled in (("", able | (v > 0)), (", unlisted absent", ~structure.expand_as(v))):
+        for name, mask in (("all", torch.ones_like(train.complete)), ("complete", train.complete)):
+            is_new = name == "all" or not mask.all()
+            if mask.any() and is_new and not (absent and able[mask].all(0)[~structure].all()):
+                share = weight[mask] / weight[mask].mean()
+                index = mask.nonzero().squeeze(1)
+                yield name + absent, Lists(v[mask], labelled[mask], share, index)
 
 
 def frequency(v: Tensor, weight: Tensor | None = None, labelled: Tensor | None = None) -> Tensor:
@@ -101,7 +107,7 @@ def popularity(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[
         yield {"scenes": name}, LinearScore(lists.frequency().logit(), torch.zeros(V, V))
 
 
-_EASE_L2 = (1.0, 3.0, 5.0, 10.0, 20.0, 30.0, 50.0, 70.0, 100.0, 200.0, 300.0, 1000.0)
+_EASE_L2 = (3.0, 10.0, 30.0, 50.0, 100.0, 300.0)
 
 
 def fit_ease(v: Tensor, l2: float, weight: Tensor | None = None) -> LinearScore:

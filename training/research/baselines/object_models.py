@@ -30,8 +30,8 @@ from training.evaluation.model import ObjectDensity, ObjectScore, Parameters
 # Absent classes are no evidence, because annotators do not mention every object. The formula treats
 # classes that often occur together as independent evidence. A factor t < 1 corrects for this.
 
-_SMOOTHING = (10.0, 100.0, 300.0)
-_EXPONENTS = (0.2, 0.3, 0.5, 1.0)
+_SMOOTHING = (30.0, 300.0)
+_EXPONENTS = (0.2, 0.3, 0.5)
 
 
 def evidence(v: Tensor, smoothing: float, weight: Tensor | None = None) -> Tensor:
@@ -70,8 +70,8 @@ def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals
 # The score is the logit of p(i). The vote of a neighbour is (cosine similarity of the neighbour /
 # cosine similarity of the nearest neighbour) ** sharpness, times the weight of the scene.
 
-_NEIGHBOURS = (100, 200, 400)
-_SHARPNESS = (2.0, 4.0, 8.0, 12.0)
+_NEIGHBOURS = (100, 200)
+_SHARPNESS = (4.0, 8.0, 12.0)
 
 
 def nearest_score(lists: Lists, *, neighbours: int, sharpness: float) -> ObjectScore:
@@ -110,7 +110,7 @@ def nearest(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[Obj
 #
 # The problem is convex. L-BFGS finds its optimum.
 
-_PAIRWISE_L2 = (100.0, 70.0, 50.0, 40.0, 30.0, 20.0, 15.0, 10.0, 7.0, 5.0, 3.0, 1.0)
+_PAIRWISE_L2 = (50.0, 30.0, 20.0, 10.0, 5.0, 3.0)
 _DENSITY_L2 = (30.0, 10.0, 3.0)
 _ITERATIONS = 25
 # Settings for the estimate of log Z. A Gibbs sweep of this model updates one class at a time and is
@@ -175,7 +175,8 @@ def pairwise_densities(
     classes. This mode has no effect on the conditionals of real scenes.
     """
     everything = torch.ones(train.v.shape, dtype=torch.bool)
-    lists, score = Lists(train.v, everything, torch.ones(len(train))), None
+    weight, index = torch.ones(len(train)), torch.arange(len(train))
+    lists, score = Lists(train.v, everything, weight, index), None
     for l2 in _DENSITY_L2:
         score = fit_pairwise(lists, l2, start=score)
         yield {"l2": l2}, ising_density(score.bias, score.weights, train, _EFFORT, seed)
@@ -189,7 +190,6 @@ def pairwise_densities(
 # Initial learning rates. With higher rates, persistent contrastive divergence learns only the class
 # frequencies, without an error.
 _RBM_GRID: Final[dict[str, Sequence[Any]]] = {
-    "scenes": ("all", "complete"),
     "hidden": (100, 200),
     "learning_rate": (0.05, 0.1, 0.2, 0.4),
     "batch_size": (32, 64),
@@ -253,4 +253,4 @@ def bernoulli_rbm(train: SceneTensors, structure: Tensor, seed: int) -> Proposal
         score = fit_annealed(lists[setting["scenes"]], **options, epochs=epochs, seed=seed)
         yield {"epochs": epochs}, score
 
-    return halving(drawn_settings(**_RBM_GRID | {"scenes": tuple(lists)}), fit, _RBM_RUNGS)
+    return halving(drawn_settings(scenes=tuple(lists), **_RBM_GRID), fit, _RBM_RUNGS)

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from training.datasets.batches import SceneTensors, subset
+from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.classes import Lists, training_lists
 from training.evaluation.baselines.fitting import Proposals
 from training.evaluation.model import Parameters, RoomScore
-from training.evaluation.report import by_source
 from training.evaluation.room_task import with_room_type
 
 # Naive Bayes over room types:
@@ -29,7 +28,7 @@ from training.evaluation.room_task import with_room_type
 
 _ALPHA = (10.0, 30.0, 100.0, 300.0)
 _SOURCE_ALPHA = (1.0, 3.0, 10.0)
-_EXPONENTS = (0.5, 0.75, 1.0)
+_EXPONENTS = (0.5, 0.75)
 
 
 class _Counts(NamedTuple):
@@ -41,6 +40,7 @@ class _Counts(NamedTuple):
 
     @classmethod
     def of(cls, lists: Lists, room: Tensor, types: int) -> _Counts:
+        """Count lists whose scenes have these room types, (scenes,)."""
         member = one_hot(room, types).float().T * lists.weight
         return cls(member.sum(1), member @ lists.v, member @ lists.labelled.float())
 
@@ -71,18 +71,13 @@ def _counts(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, dict[
     if not len(scenes):
         raise ValueError("no training scene has a room type")
     types = int(scenes.room.max()) + 1
-    complete = subset(scenes, scenes.complete.nonzero().squeeze(1))
-    for name, chosen in (("all", scenes), ("complete", complete)):
-        if not len(chosen) or (name == "complete" and len(chosen) == len(scenes)):
-            continue
-        parts = {"": chosen, **dict(by_source(chosen))}
-        yield (
-            name,
-            {
-                source: _Counts.of(next(training_lists(part, structure))[1], part.room, types)
-                for source, part in parts.items()
-            },
-        )
+    for name, lists in training_lists(scenes, structure):
+        room, source = scenes.room[lists.index], scenes.source[lists.index]
+        counts = {"": _Counts.of(lists, room, types)}
+        for k in source.unique().tolist():
+            part = Lists(*(values[source == k] for values in vars(lists).values()))
+            counts[scenes.source_names[k]] = _Counts.of(part, room[source == k], types)
+        yield name, counts
 
 
 def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RoomScore]:

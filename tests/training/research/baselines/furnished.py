@@ -21,8 +21,8 @@ tensors = partial(evaluation.tensors, classes=V)
 def furnished(count: int, seed: int) -> SceneTensors:
     """Kitchens and bedrooms, each class of the room there with probability .7.
 
-    In both, the first class is on top of the second and left of the third, and the third is left of
-    the fourth (so, by transitivity, the first is too).
+    The room types are 0 and 1. In both, the first class is on top of the second and left of the
+    third, and the third is left of the fourth (so, by transitivity, the first is too).
     """
     rng = np.random.default_rng(seed)
     scenes = []
@@ -39,5 +39,6 @@ def furnished(count: int, seed: int) -> SceneTensors:
         ]
         present = [t for t in triples if t[1] in classes and t[2] in classes]
         name = f"{seed}-{len(scenes)}"
-        scenes.append(scene(classes, present, name=name, group=name))
+        index = (KITCHEN, BEDROOM).index(room)
+        scenes.append(scene(classes, present, name=name, group=name, room=index))
     return tensors(scenes)

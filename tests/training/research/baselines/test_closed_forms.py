@@ -48,7 +48,8 @@ from training.research.baselines.relation_models import ClosureScore, complex_lo
 
 def lists_of(v):
     """Scenes of equal weight, of a source that can show every class."""
-    return Lists(v, torch.ones(v.shape, dtype=torch.bool), torch.ones(len(v)))
+    everything = torch.ones(v.shape, dtype=torch.bool)
+    return Lists(v, everything, torch.ones(len(v)), torch.arange(len(v)))
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +125,7 @@ def test_pairwise_weights_are_a_stationary_point(v):
 def test_the_rbms_log_odds_are_scikit_learns_free_energies(v):
     """F(v without i) - F(v with i), by scikit-learn's own function."""
     scenes = tensors([scene([k for k in range(6) if row[k]]) for row in v[:60]])
-    *_, (_, score) = bernoulli_rbm(scenes, STRUCTURE, 0)
+    _, score = next(bernoulli_rbm(scenes, STRUCTURE, 0))
     rbm = BernoulliRBM(n_components=len(score.c))
     rbm.components_ = score.W.numpy()
     rbm.intercept_hidden_ = score.c.numpy()
@@ -175,15 +176,16 @@ def test_scenes_have_their_weights_and_partial_labels():
     able[0, 1] = False
     train = replace(tensors(some), annotated_classes=able)
     assert train.source_names == ("b", "toy")
-    (_, every), (_, complete) = training_lists(train, STRUCTURE)
+    every, complete, absent, complete_absent = dict(training_lists(train, STRUCTURE)).values()
     assert every.weight.tolist() == pytest.approx([0.6, 0.6, 1.8])
     assert not every.v[:, 9].any()
     assert not every.labelled[:, 9].any()
     assert every.frequency()[1] == pytest.approx((0.6 + 0.5) / (0.6 + 1))
     assert every.frequency()[2] == pytest.approx((1.8 + 0.5) / (3 + 1))
     assert every.filled()[:, 1].tolist() == pytest.approx([1, 1.1 / 1.6, 1.1 / 1.6])
-    assert len(complete.v) == 2
+    assert complete.index.tolist() == complete_absent.index.tolist() == [0, 1]
     assert complete.weight.tolist() == [1, 1]
+    assert torch.equal(absent.labelled, (~STRUCTURE).expand_as(absent.v))
 
 
 def test_a_scene_of_weight_two_counts_twice(v):
@@ -192,7 +194,7 @@ def test_a_scene_of_weight_two_counts_twice(v):
     for ours, theirs in (
         (fit_ease(v, 7.0, weight), fit_ease(twice, 7.0)),
         (
-            fit_pairwise(Lists(v, lists_of(v).labelled, weight), 5.0, iterations=200),
+            fit_pairwise(replace(lists_of(v), weight=weight), 5.0, iterations=200),
             fit_pairwise(lists_of(twice), 5.0, iterations=200),
         ),
     ):
