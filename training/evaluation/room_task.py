@@ -62,8 +62,11 @@ def room_figures(
     """Return `FIGURES` for lists of scenes with a room type."""
     scene, target, count = parts.scene.numpy(), scenes.room[parts.scene], len(scenes)
     log_p = ask_rows(partial(score, profile=profile), parts.v)
-    unnamed = max(0, int(target.max()) + 1 - log_p.shape[1])
-    log_p = torch.nn.functional.pad(log_p, (0, unnamed), value=-torch.inf)
+    # At least three other types rank before a type that the model cannot name.
+    is_named = (target < log_p.shape[1]).unsqueeze(1)
+    lowest, added = torch.finfo(log_p.dtype).min, int(target.max()) + 4
+    log_p = torch.nn.functional.pad(log_p, (0, added), value=lowest)
+    log_p = torch.where(is_named, log_p, log_p.scatter(1, target.unsqueeze(1), -torch.inf))
     ranking = Ranking.of(parts.scene, target, log_p, count, parts.skipped)
     p, first = log_p.exp().double().max(1)
     hit = (first == target).numpy()
