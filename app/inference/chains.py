@@ -13,8 +13,7 @@ If the machine stores no scene of room type t, the last term is h1·Q[t] + v·Y[
 sampling importance resampling, followed by Gibbs sweeps. The sweeps rarely change the room type of
 a scene.
 
-The base rates stay the same in all sweeps: those of the profile, the mean over the data sources
-given the required classes, or those of the served mix if no class is required.
+The base rates are those of whole scenes (`Weights.scene_bias`). They stay the same in all sweeps.
 
 A sweep takes microseconds and releases the interpreter's lock. The result of a chain depends only
 on its conditions and its random stream.
@@ -203,13 +202,10 @@ class ConditionedChains:
     """
 
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
-        self._chains, self._machine, self._w = chains, chains.machine, chains.arrays
+        self._chains, self._machine = chains, chains.machine
         spec = chains.machine.spec
-        classes, profile = conditions.classes, conditions.profile
-        if len(classes) or profile is not None:
-            certain = np.ones(len(classes), np.float32)
-            self._w = self._w._replace(b=chains.machine.class_bias(classes, certain, profile))
-        self._w = self._w._replace(b=self._w.b + chains.machine.room_couplings(conditions.room))
+        of = conditions.classes, conditions.profile, conditions.room
+        self._w = chains.arrays._replace(b=chains.machine.scene_bias(*of))
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
         self._required_classes = _indicator(spec.V, conditions.classes)

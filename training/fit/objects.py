@@ -11,12 +11,12 @@ softplus.
 
 - 30 % of the parts list all classes but one. The class left out counts as often as the scene has
   classes. The other parts list a share of U(.05, 1) of the classes.
-- The room type t is listed in half of the parts. If it is not listed, the loss contains its
+- The room type t is listed in 15 % of the parts. If it is not listed, the loss contains its
   cross-entropy, with the weight k.
 - A class that a source shows in fewer than 3 scenes says nothing there: it has no term in the loss
   (partial labels). Structure is neither listed nor asked for.
-- Each source q has its own base rates a_q, and each listed share its own bias kappa. The machine
-  also learns p(q | listed), with the weight s, because a robot's list names no source.
+- Each source q has its own base rates a_q and y_q, and each listed share its own bias kappa. The
+  machine also learns p(q | listed), with the weight s, because a robot's list names no source.
 - With the weight g, persistent Gibbs chains (PCD) keep samples of the machine like scenes. The
   chains of a source have its base rates.
 
