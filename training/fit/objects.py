@@ -371,20 +371,24 @@ def base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor
 
 
 def served_room_rates(y: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return the weighted mean of y[q] over the sources with room types, (room types,)."""
-    weights = served_weights(scenes, config) * _sources_with_rooms(scenes)
+    """Return the weighted mean of y[q] over the sources with room rates, (room types,)."""
+    weights = served_weights(scenes, config) * _has_room_rates(scenes)
     return (weights / weights.sum().clamp(min=1e-9)) @ y
 
 
 def room_rates(y: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return y[q], with the served rates for a source without room types; same shape."""
-    known = _sources_with_rooms(scenes).unsqueeze(1)
-    return torch.where(known, y, served_room_rates(y, scenes, config))
+    """Return y[q], with the served rates for a source without room rates; same shape."""
+    rates = served_room_rates(y, scenes, config)
+    return torch.where(_has_room_rates(scenes).unsqueeze(1), y, rates)
 
 
-def _sources_with_rooms(scenes: ObjectScenes) -> Tensor:
-    """Return True for each source whose scenes have a room type, (sources,) bool."""
-    return scenes.source[scenes.room >= 0].bincount(minlength=len(scenes.sources)) > 0
+def _has_room_rates(scenes: ObjectScenes) -> Tensor:
+    """Return True for each source with scenes of two room types, (sources,) bool.
+
+    A source of bedrooms alone does not tell how common bedrooms are.
+    """
+    kinds = [scenes.room[scenes.source == q] for q in range(len(scenes.sources))]
+    return torch.tensor([len(room[room >= 0].unique()) > 1 for room in kinds])
 
 
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
