@@ -93,12 +93,9 @@ def _ask(test: OutsideTest, artifacts: dict[str, Artifact]) -> Figures:
         with console.status(name) as status:
             say: Progress = status.update
             figures[name] = test.measure(artifact, say)
-        remarks = [test.remark(artifact)] if test.remark(artifact) else []
-        remarks += [
-            f"{source} is training data of this model, so its figures are no outside test"
-            for source in test.trained(artifact)
-        ]
-        for remark in remarks:
+        learnt = test.trained(artifact)
+        remarks = [f"{source} is training data of this model, not new data" for source in learnt]
+        for remark in filter(None, [test.remark(artifact), *remarks]):
             console.print(f"{name}: {remark}", markup=False, highlight=False, soft_wrap=True)
     return figures
 
