@@ -82,14 +82,23 @@ class Metric(ABC):
         """The metric over all scenes."""
         return self.at(np.ones(self.scenes))
 
+    @property
+    def is_centred(self) -> bool:
+        """True if resampling inflates the metric; its resamples are then centred on the value."""
+        return False
+
     @cached_property
     def draws(self) -> Floats:
         """The metric over resampled scenes, (resamples,); NaN where undefined."""
-        return resample(self.at, self.scenes)
+        draws = resample(self.at, self.scenes)
+        return _centred(draws, self.value) if self.is_centred else draws
 
-    def figure(self) -> Figure:
-        """Return the value with its interval."""
-        return Figure.of(self.value, self.draws, self.n)
+    def figure(self, groups: Sequence[str] | None = None) -> Figure:
+        """Return the value with its interval, over groups of scenes as in `paired_difference`."""
+        if groups is None:
+            return Figure.of(self.value, self.draws, self.n)
+        draws = _group_draws(self.at, self.value, groups, RESAMPLES, centred=self.is_centred)
+        return Figure.of(self.value, draws, self.n)
 
 
 def paired_difference(
@@ -113,14 +122,31 @@ def paired_difference(
         count = min(len(a.draws), len(b.draws))
         draws = a.draws[:count] - b.draws[:count]
     else:
-        names, group_of = np.unique(np.array(groups), return_inverse=True)
-        if len(names) < 2:
-            raise ValueError("an interval needs scenes of at least two groups")
-        weights = scene_weights(len(names), resamples)
-        draws = np.array([a.at(weight[group_of]) - b.at(weight[group_of]) for weight in weights])
-        value = a.value - b.value
-        draws = value + _widening(len(names)) * (draws - value)
+        draws = _group_draws(lambda w: a.at(w) - b.at(w), a.value - b.value, groups, resamples)
     return Figure.of(a.value - b.value, draws, min(a.n, b.n))
+
+
+def _group_draws(
+    statistic: Callable[[Floats], float],
+    value: float,
+    groups: Sequence[str],
+    resamples: int,
+    *,
+    centred: bool = False,
+) -> Floats:
+    """Return a statistic of the scene weights over resampled groups, widened by `_widening`.
+
+    Raises:
+        ValueError: all scenes belong to one group.
+    """
+    names, group_of = np.unique(np.array(groups), return_inverse=True)
+    if len(names) < 2:
+        raise ValueError("an interval needs scenes of at least two groups")
+    weights = scene_weights(len(names), resamples)
+    draws = np.array([statistic(weight[group_of]) for weight in weights])
+    draws = _centred(draws, value) if centred else draws
+    widened: Floats = value + _widening(len(names)) * (draws - value)
+    return widened
 
 
 def _widening(groups: int) -> float:
@@ -290,11 +316,9 @@ class Scored(Metric):
     def at(self, weight: Floats) -> float:
         return self._prepared(weight[self.scene])
 
-    @cached_property
-    def draws(self) -> Floats:
-        values = resample(self.at, self.scenes)
-        # Resampling inflates calibration errors, so these resamples are centred on the value.
-        return _centred(values, self.value) if self.statistic == "ECE" else values
+    @property
+    def is_centred(self) -> bool:
+        return self.statistic == "ECE"
 
 
 @dataclass(frozen=True, eq=False)

@@ -211,7 +211,23 @@ def test_intervals_over_few_groups_hold_the_truth_in_95_percent(groups):
     assert 919 <= sum(figure.low <= 0 <= figure.high for figure in figures) <= 976
 
 
+@pytest.mark.parametrize("statistic", ["Brier skill", "ECE"])
+def test_a_figure_over_groups_of_one_scene_is_that_over_scenes_but_wider(statistic):
+    probability, scene = RNG.random(300), np.arange(300) % 20
+    truth = RNG.random(300) < probability
+    metric = Scored(statistic, scene, probability, truth, 20)
+    names = [f"{k:02}" for k in range(20)]
+    over_scenes, over_groups = metric.figure(), metric.figure(names)
+    wider = 2.0930 / 1.9600 * np.sqrt(20 / 19)
+    for end in ("low", "high"):
+        distance = getattr(over_scenes, end) - metric.value
+        assert getattr(over_groups, end) - metric.value == pytest.approx(wider * distance, rel=1e-4)
+    assert (over_groups.value, over_groups.n) == (over_scenes.value, 300)
+
+
 def test_one_group_has_no_interval():
+    with pytest.raises(ValueError, match="at least two groups"):
+        mean_of([1, 2]).figure(["a", "a"])
     with pytest.raises(ValueError, match="at least two groups"):
         paired_difference(mean_of([1, 2]), mean_of([0, 0]), groups=["a", "a"])
 
