@@ -70,7 +70,7 @@ def code(*blocks):
 def at_temperature(machine, beta):
     """The machine whose weights between objects and hidden units are multiplied by beta."""
     scaled = copy.deepcopy(machine)
-    for name in set(OBJECT_WEIGHTS) & dict(machine.named_parameters()).keys():
+    for name in {*OBJECT_WEIGHTS, "u"} & dict(machine.named_parameters()).keys():
         scaled.get_parameter(name).mul_(beta)
     return scaled
 
@@ -268,7 +268,7 @@ def test_log_score_is_the_log_probability(name, room):
         logits = np.full(r.shape, -1e4)
         of_units = machine.relation_logits(e, joint.v[n][None], joint.h1[n][None])[0]
         logits[e.relation[0], e.subject[0], e.object[0]] = of_units
-        state = ChainState(every, every, every, logits, r)
+        state = ChainState(every, room, every, every, logits, r)
         score = chains.log_score(state, v, r)
         between = r[:, v][:, :, v], logits[:, v][:, :, v]
         log_p = np.where(between[0], between[1], 0).sum() - np.logaddexp(0, between[1]).sum()
