@@ -219,7 +219,8 @@ class ConditionedChains:
         self._conditions, self._temperature = conditions, temperature
         spec = chains.machine.spec
         of = conditions.classes, conditions.profile, conditions.room
-        self._w = chains.arrays._replace(b=chains.machine.scene_bias(*of))
+        bias, self._room_bias = chains.machine.scene_bias(*of)
+        self._w = chains.arrays._replace(b=bias)
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
         self._required_classes = _indicator(spec.V, conditions.classes)
@@ -365,9 +366,7 @@ class ConditionedChains:
         score = self._w.b[listed].sum() + log_sums.sum() + machine["c2"] @ m
         if machine.spec.coupled:
             score += 0.5 * machine["L"][np.ix_(listed, listed)].sum()
-        if self._room is not None and machine.spec.C:
-            score += machine["e"][self._room]
-        return float(score + entropy + (on * logits - softplus(logits)).sum())
+        return float(score + self._room_bias + entropy + (on * logits - softplus(logits)).sum())
 
 
 def _indicator(size: int, units: Indices) -> Bits:

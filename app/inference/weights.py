@@ -186,23 +186,26 @@ class Weights:
 
     def scene_bias(
         self, classes: NDArray[Any], profile: int | None, room: int | None
-    ) -> NDArray[Any]:
-        """Return the bias of each class in whole scenes, (V,), for Gibbs chains.
+    ) -> tuple[NDArray[Any], float]:
+        """Return the biases of whole scenes for Gibbs chains: of each class, (V,), and of the room.
 
-        The bias is b + sum_q p(q) (a[q] + u[q]) + Y[t]; see `source_weights`. Without a required
-        class and without a profile, the mix of data sources determines it.
+        The bias of a class is b + sum_q p(q) (a[q] + u[q]) + Y[t], and that of the room type t is
+        e[t] + sum_q p(q) y[q, t]; see `source_weights`. Without a required class and without a
+        profile, the mix of data sources determines them.
 
         Args:
             classes: (n,) indices of the required classes.
             profile, room: index of the data source and of the room type, or None.
         """
         bias: NDArray[Any] = self["b"] + self.room_couplings(room)
-        if len(classes) or profile is not None:
+        of_room = self["e"] if self.spec.C else np.zeros(1)
+        if self.spec.profiles and (len(classes) or profile is not None):
             p = self.source_weights(classes, np.ones((1, len(classes))), profile)[0]
             bias = bias + p.astype(bias.dtype) @ (self["a"] + self["u"][:-1])
+            of_room = of_room + p @ self["y"] if self.spec.C else of_room
         else:
             bias = bias + self["u"][-1]
-        return bias
+        return bias, 0.0 if room is None or not self.spec.C else float(of_room[room])
 
     def state_means(self, x: NDArray[Any]) -> NDArray[Any]:
         """Return the probabilities of the states of h1 with the logits x, both (..., H1)."""

@@ -75,7 +75,7 @@ def mean_rates(
 def with_mean_rates(machine: BoltzmannMachine, classes: Sequence[int] = ()) -> BoltzmannMachine:
     """A float64 copy whose biases are those of whole scenes given the required classes, if any."""
     copied = copy.deepcopy(machine).double()
-    if len(classes):
+    if len(classes) and machine.spec.profiles:
         required = [i in classes for i in range(machine.spec.V)]
         copied.b += mean_rates(machine, required, whole_scenes=True)
         copied.u[-1] = 0

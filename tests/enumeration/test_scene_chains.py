@@ -223,7 +223,8 @@ def log_weights_by_hand(machine, v, rooms, condition):
     if condition.room is not None:
         has_room = rooms == condition.room
         log_w -= 0 if not has_room.any() else float(OTHER_ROOM) * ~has_room
-        log_w += 0 if has_room.any() else h1 @ machine.Q[condition.room]
+        evidence = h1 @ machine.Q[condition.room] + v @ machine.Y[condition.room]
+        log_w += 0 if has_room.any() else evidence
     return log_w
 
 
