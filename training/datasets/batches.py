@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from zlib import crc32
 
 import numpy as np
 import torch
@@ -79,6 +80,11 @@ class SceneTensors:
     @cached_property
     def complete(self) -> Tensor:
         return torch.tensor([scene.complete for scene in self.scenes], dtype=torch.bool)
+
+    @property
+    def group_ids(self) -> np.ndarray:
+        """Id of the group of each scene, (scenes,) int64. Data sources can share a group."""
+        return np.array([crc32(scene.group.encode()) for scene in self.scenes], dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.scenes)

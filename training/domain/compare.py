@@ -31,7 +31,7 @@ from training.evaluation.parts import all_but_one, draw_parts, rank_hidden
 from training.evaluation.report import Progress, measure, silent
 from training.evaluation.results import Difference, Results, only, summarise
 from training.evaluation.setting import Setting
-from training.evaluation.tasks import TASKS, in_words
+from training.evaluation.tasks import in_words
 from training.fit.checkpoint import RunError
 from training.fit.configuration import ConfigError
 from training.runs.pipeline import read_sources, split_and_encode
@@ -50,8 +50,6 @@ higher is better."""
 RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
 """Tasks that need scenes with relations."""
 
-# Tasks that leave out scenes without relations.
-_RELATED = ("T2-at missing at a place", "T3b placement")
 # Number of answers per model in an example.
 _FIRST = 3
 _COLOURS = {"better": "green", "worse": "red"}
@@ -277,23 +275,17 @@ def side_by_side(
     """Measure every metric that both models support, and the differences, paired by group.
 
     Raises:
-        ValueError: for every task, the scenes belong to fewer than two groups.
+        ValueError: all scenes belong to one group, or the models share no metric.
     """
     setting = Setting(scenes, structure, limit=None)
-
-    def groups(task: str) -> list[str]:
-        task_setting = setting.complete if TASKS[task].of_objects else setting
-        return [scene.group for scene in task_setting.some(task in _RELATED).scenes]
-
-    tasks = [task for task in COMPARED if len(set(groups(task))) > 1]
-    if not tasks:
+    if len(np.unique(scenes.group_ids)) < 2:
         raise ValueError("the scenes belong to one group, but intervals need at least two groups")
     reports = {}
     for title, model in zip(titles, models, strict=True):
-        report = measure(model, setting, "held out", tasks=tasks, progress=progress)
+        report = measure(model, setting, "held out", tasks=COMPARED, progress=progress)
         reports[title, 0] = {"held out": only(report, COMPARED)}
     progress("resampling groups")
-    return summarise(reports, titles[0], groups=groups)
+    return summarise(reports, titles[0])
 
 
 def unmeasured(rows: Sequence[Difference], other: Candidate) -> tuple[str, ...]:

@@ -15,6 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from app.registry import Artifact, ArtifactError, Store, StoreError
 from app.registry.references import AliasTarget
 from training.datasets.batches import TrainingData, subset
@@ -111,15 +113,14 @@ def measure_usefulness(
     # A question hides one class and lists the others.
     has_two_classes = ((scenes.v > 0) & ~data.structure).sum(1) > 1
     scenes = subset(scenes, has_two_classes.nonzero().squeeze(1))
-    groups = [scene.group for scene in scenes.scenes]
-    usefulness = Usefulness(scenes=len(scenes), groups=len(set(groups)))
+    usefulness = Usefulness(scenes=len(scenes), groups=len(np.unique(scenes.group_ids)))
     if usefulness.groups < FEWEST_GROUPS:
         return usefulness
 
     def mrr(score: ObjectScore | None) -> Ratio:
         if score is None:
             raise ValueError("the model has no score of missing objects")
-        return rank_missing(scenes, data.structure, score).mrr()
+        return rank_missing(scenes, data.structure, score).mrr().by(scenes.group_ids)
 
     ours = mrr(missing_score(artifact))
     theirs = {}
@@ -128,7 +129,7 @@ def measure_usefulness(
         model = baseline.fit(data.train, data.validation, data.structure)
         theirs[baseline.name] = mrr(model.missing)
     values = {name: ratio.value for name, ratio in theirs.items()}
-    gaps = {name: paired_difference(ours, ratio, groups=groups) for name, ratio in theirs.items()}
+    gaps = {name: paired_difference(ours, ratio) for name, ratio in theirs.items()}
     return replace(usefulness, ours=ours.value, theirs=values, differences=gaps)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache, partial
 
 import numpy as np
@@ -17,6 +18,7 @@ from training.evaluation.asking import (
     missing_score,
     of_classes,
     outlier_flags,
+    room_score,
     suspicion_score,
 )
 from training.evaluation.density_task import DensitySettings, independent_density, machine_density
@@ -45,8 +47,13 @@ def artifact_model(
     seed: int = 0,
     *,
     calibrated: bool = True,
+    profiles: Sequence[str] = (),
 ) -> Model:
-    """Return the answers of a trained model; only a `calibrated` model judges outliers."""
+    """Return the answers of a trained model; only a `calibrated` model judges outliers.
+
+    Args:
+        profiles: names of the profiles that requests about rooms may name.
+    """
     machine = machine_of(artifact.weights)
     completion = relation_score(artifact, given=True)
     sampler = machine_sampler(artifact)
@@ -59,6 +66,7 @@ def artifact_model(
         relations=relation_score(artifact, given=False),
         completion=completion,
         false_relations=completion,
+        rooms=room_score(artifact, profiles),
         generate=lambda _: sampler,
         density=lambda _: density(),
         parameters=machine.parameter_count,

@@ -22,6 +22,7 @@ from app.scene import CANONICAL, Scene, SceneObject, canonicalise
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats
 from training.datasets.cases import scene_of
+from training.evaluation.model import RoomScore
 
 Case = TypeVar("Case")
 
@@ -164,6 +165,28 @@ def missing_score(artifact: Artifact) -> Callable[[Tensor], Tensor]:
 
     def score(v: Tensor) -> Tensor:
         p = np.stack([missing_probabilities(artifact, scene) for scene in _scenes(v)])
+        return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
+
+    return score
+
+
+def room_score(artifact: Artifact, profiles: Sequence[str]) -> RoomScore | None:
+    """Return a function for the log-probabilities of `/rooms`, or None without room types.
+
+    A profile that is not in `profiles`, the names of the model's profiles, is not named.
+    """
+    types, names = artifact.spec.C, artifact.vocabulary.room_types
+    if not types:
+        return None
+
+    def score(v: Tensor, profile: str) -> Tensor:
+        index = profiles.index(profile) if profile in profiles else None
+        p = np.zeros((len(v), types))
+        for row, scene in zip(p, _scenes(v), strict=True):
+            scene = replace(scene, profile=index)
+            answer = questions.rooms(artifact, scene, top_k=types, details=False)
+            for entry in answer["room_types"]:
+                row[names.index(entry["room_type"])] = entry["probability"]
         return torch.from_numpy(np.log(np.maximum(p, np.finfo(np.float64).tiny)))
 
     return score

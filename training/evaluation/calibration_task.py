@@ -286,24 +286,23 @@ def calibration_task(model: Model, setting: Setting) -> Outcome | None:
     train = setting.complete.train
     intruders = draw_intruder_choices(complete, setting.structure, train, setting.seed)
     asks = QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
-    collects = {
-        name: partial(collect, scenes=scenes_of.get(name, related), ask=ask, seed=setting.seed)
+    collects: dict[str, tuple[SceneTensors, Callable[..., Items]]] = {
+        name: (scenes_of.get(name, related), partial(collect, ask=ask))
         for name, ask in asks.items()
-    } | {
-        f"missing, {listed} classes": partial(
-            collect_missing, scenes=setting.complete.some(), size=exactly(listed), seed=setting.seed
-        )
-        for listed in LISTED
     }
-    for name, ask_all in collects.items():
-        answers = ask_all(model.artifact)
+    for n in LISTED:
+        ask_parts = partial(collect_missing, size=exactly(n))
+        collects[f"missing, {n} classes"] = (setting.complete.some(), ask_parts)
+    for name, (scenes, ask_all) in collects.items():
+        answers = ask_all(model.artifact, scenes, seed=setting.seed)
         skipped += answers.skipped
         if len(answers.scene):
-            raw_answers = ask_all(uncalibrated(model.artifact))
+            raw_answers = ask_all(uncalibrated(model.artifact), scenes, seed=setting.seed)
             for figure in ("ECE", "Brier skill"):
-                metrics[f"{figure}, {name}"] = answers.metric(figure)
+                metrics[f"{figure}, {name}"] = answers.metric(figure).by(scenes.group_ids)
                 if len(raw_answers.scene):
-                    metrics[f"{figure}, {name}, uncalibrated"] = raw_answers.metric(figure)
+                    raw = raw_answers.metric(figure).by(scenes.group_ids)
+                    metrics[f"{figure}, {name}, uncalibrated"] = raw
     # Brier skill is undefined if all answers are true or all answers are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None

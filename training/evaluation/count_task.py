@@ -9,9 +9,7 @@ It compares the error with the errors of two means:
 - the mean of the source: the mean number in the training scenes of the same data source. If it is
   smaller than the listed number, the listed number takes its place.
 
-Classes without statistics, and classes whose instances the source does not count, are left out.
-Intervals come from resampled groups of scenes, because the scenes of a group are near-duplicates.
-"""
+Classes without statistics, and classes whose instances the source does not count, are left out."""
 
 from __future__ import annotations
 
@@ -19,6 +17,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+import torch
 
 from app.questions.counts import LIKELY, more
 from app.questions.posterior import present
@@ -51,21 +50,20 @@ def counts_task(model: Model, setting: Setting) -> Outcome | None:
     if artifact is None or artifact.counts is None or train is None:
         return None
     counting = counted_classes(train.scenes, artifact.vocabulary)
-    scenes = [scene for scene in setting.scenes.scenes if scene.source in counting]
+    is_counted = torch.tensor([scene.source in counting for scene in setting.scenes.scenes])
+    scenes = setting.at(is_counted.nonzero().squeeze(1)).scenes
     answers = [
         (scene_index, *answer)
-        for scene_index, scene in enumerate(scenes)
+        for scene_index, scene in enumerate(scenes.scenes)
         for answer in _ask_counts(artifact, scene, counting[scene.source], setting.seed)
     ]
     if not answers:
         return None
     scene_index, index, number, listed, expected, low, high, p = np.array(answers).T
-    _, group = np.unique([scene.group for scene in scenes], return_inverse=True)
-    unit, units = group[scene_index.astype(np.int64)], int(group.max()) + 1
-    index, k = index.astype(np.int64), listed.astype(np.int64)
+    scene_index, index, k = (x.astype(np.int64) for x in (scene_index, index, listed))
 
     def error(guess: Floats) -> Ratio:
-        return Ratio.of_items(unit, np.abs(guess - number), units)
+        return Ratio.of_items(scene_index, np.abs(guess - number), len(scenes))
 
     row = np.searchsorted(artifact.counts.classes, index)
     ours, mean_error = error(expected), error(class_mean(artifact.counts, row, k))
@@ -77,11 +75,12 @@ def counts_task(model: Model, setting: Setting) -> Outcome | None:
         "change of error, class mean": ours - mean_error,
         "change of error, mean of the source": ours - of_source,
     }
-    metrics["count in the interval"] = Ratio.of_items(unit, is_inside, units)
+    metrics["count in the interval"] = Ratio.of_items(scene_index, is_inside, len(scenes))
     if (is_likely := p >= LIKELY).any():
         is_right = (number > listed)[is_likely].astype(np.float64)
-        metrics["proposals that are right"] = Ratio.of_items(unit[is_likely], is_right, units)
-    return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(scene_index)))
+        hits = Ratio.of_items(scene_index[is_likely], is_right, len(scenes))
+        metrics["proposals that are right"] = hits
+    return Outcome.over(scenes, metrics, len(scenes) - len(np.unique(scene_index)))
 
 
 def _ask_counts(

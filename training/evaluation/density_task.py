@@ -157,7 +157,7 @@ def density_task(model: Model, setting: Setting) -> Outcome | None:
         ),
     }
     notes = {"log Z, upper": density.upper, "log Z, lower": density.lower} | density.notes
-    return Outcome(metrics, len(scenes), 0, notes)
+    return Outcome.over(scenes, metrics, 0, notes)
 
 
 @dataclass(frozen=True, eq=False)

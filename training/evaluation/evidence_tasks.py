@@ -230,4 +230,4 @@ def _changes(
             f"{metric}, {kind} withheld": Ratio(without, items),
         }
         skipped.append(int((items == 0).sum()))
-    return Outcome(metrics, len(scenes), skipped[0]) if metrics else None
+    return Outcome.over(scenes, metrics, skipped[0]) if metrics else None

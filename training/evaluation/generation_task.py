@@ -22,7 +22,6 @@ Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
 from __future__ import annotations
 
 from collections.abc import Callable
-from zlib import crc32
 
 import numpy as np
 import torch
@@ -131,7 +130,7 @@ def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
     half.
     """
     scenes = setting.scenes
-    is_odd = torch.tensor([crc32(scene.group.encode()) % 2 for scene in scenes.scenes]).bool()
+    is_odd = torch.from_numpy(scenes.group_ids % 2 > 0)
     first, second = (subset(scenes, mask.nonzero().squeeze(1)) for mask in (~is_odd, is_odd))
     return (
         some_scenes(first, setting.limit, setting.seed),
@@ -226,7 +225,7 @@ def copies(drawn: Tensor, train: Tensor) -> Floats:
 
 def generation_metrics(
     drawn: Drawn,
-    held_out: Tensor,
+    held_out: SceneTensors,
     train: Tensor,
     mask: Tensor,
     bandwidth: float,
@@ -240,12 +239,13 @@ def generation_metrics(
         bandwidth: bandwidth of the MMD kernel, as a Hamming distance.
         emphasis: (held-out scenes,) weights of the held-out scenes. None means equal weights.
     """
-    x, y, training = drawn.v[:, mask], held_out[:, mask], train[:, mask]
+    x, y, training = drawn.v[:, mask], held_out.v[:, mask], train[:, mask]
     ours, theirs = x.double().numpy(), y.double().numpy()
     base = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
 
     def resampled(statistic: Callable[[Floats], float]) -> Resampled:
-        return Resampled.of(lambda weight: statistic(weight * base), len(y), len(x), _RESAMPLES)
+        groups = held_out.group_ids
+        return Resampled.of(lambda weight: statistic(weight * base), groups, len(x), _RESAMPLES)
 
     metrics: dict[str, Metric] = {
         "MMD²": resampled(discrepancy(y, x, bandwidth)),
@@ -294,7 +294,7 @@ def generation_task(model: Model, setting: Setting) -> Outcome | None:
     metrics: dict[str, Metric] = {}
     for name, (given, room, emphasis) in conditions.items():
         drawn = sampler(given, room, setting.seed)
-        values = generation_metrics(drawn, first.v, setting.train.v, mask, bandwidth, emphasis)
+        values = generation_metrics(drawn, first, setting.train.v, mask, bandwidth, emphasis)
         metrics |= {f"{metric}, {name}": value for metric, value in values.items()}
     notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
     return Outcome(metrics, len(first), 0, notes)

@@ -1,20 +1,21 @@
-"""Metrics that keep their values per scene, with bootstrap intervals.
+"""Metrics that keep their values per scene or group of scenes, with bootstrap intervals.
 
-The values per scene allow resampling, pairing with another model, pooling over sources, and storage
-as JSON.
+The values allow resampling, pairing with another model, pooling over sources, and storage as JSON.
 
-A resample draws scenes with replacement, as many as the set has. It is stored as the number of
-times that each scene was drawn. The draws depend only on the number of scenes. So two
-metrics of the same scenes use the same resamples, and their difference is paired.
+The scenes of a group are near-duplicates. So a task counts a metric per scene, and `by` sums it per
+group. A resample draws groups with replacement, as many as the set has. It is stored as the number
+of times that each group was drawn. The draws depend only on the number of groups. So two metrics of
+the same groups use the same resamples, and their difference is paired.
 
-Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993).
+Sources: Efron and Tibshirani, "An introduction to the bootstrap" (1993); Field and Welsh,
+"Bootstrapping clustered data" (2007), on the resampling of groups.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, Self
 
@@ -38,7 +39,7 @@ class Figure:
 
     Attributes:
         value: the metric over all scenes.
-        low, high: percentiles 2.5 and 97.5 over resampled scenes.
+        low, high: percentiles 2.5 and 97.5 over resampled groups, widened by `_widening`.
         n: number of scored items (removed objects, relations, scenes).
     """
 
@@ -48,9 +49,15 @@ class Figure:
     n: int
 
     @classmethod
-    def of(cls, value: float, draws: Floats, n: int) -> Figure:
-        """Compute the interval from resampled values; undefined values are left out."""
-        low, high = np.nanpercentile(draws, [2.5, 97.5])
+    def of(cls, value: float, draws: Floats, n: int, groups: int) -> Figure:
+        """Compute the interval from resampled values; undefined values are left out.
+
+        Raises:
+            ValueError: the number of groups is below 2.
+        """
+        if groups < 2:
+            raise ValueError("an interval needs scenes of at least two groups")
+        low, high = value + _widening(groups) * (np.nanpercentile(draws, [2.5, 97.5]) - value)
         return cls(value, float(low), float(high), n)
 
     def __str__(self) -> str:
@@ -61,92 +68,53 @@ class Metric(ABC):
     """A metric over a set of scenes that can be resampled.
 
     Attributes:
-        scenes: number of scenes, including scenes that could not be scored.
+        groups: (G,) int64 ids of the groups of scenes, with groups that could not be scored. A
+            metric per scene has one group for each scene.
         n: number of scored items.
     """
 
-    scenes: int
+    groups: Ints
     n: int
 
     @abstractmethod
     def at(self, weight: Floats) -> float:
-        """Return the metric with scene k counted weight[k] times; NaN if undefined."""
+        """Return the metric with group k counted weight[k] times; NaN if undefined."""
+
+    def by(self, groups: Ints) -> Metric:
+        """Return the metric with its values summed by group; `groups` (G,) has the new ids."""
+        return self
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Metric | None:
-        """Return the metric over the scenes of all parts; None for metrics of whole sets."""
+        """Return the metric over the groups of all parts; None for metrics of whole sets."""
         return None
 
     @property
     def value(self) -> float:
         """The metric over all scenes."""
-        return self.at(np.ones(self.scenes))
-
-    @property
-    def is_centred(self) -> bool:
-        """True if resampling inflates the metric; its resamples are then centred on the value."""
-        return False
+        return self.at(np.ones(len(self.groups)))
 
     @cached_property
     def draws(self) -> Floats:
-        """The metric over resampled scenes, (resamples,); NaN where undefined."""
-        draws = resample(self.at, self.scenes)
-        return _centred(draws, self.value) if self.is_centred else draws
+        """The metric over resampled groups, (resamples,); NaN where undefined."""
+        return resample(self.at, len(self.groups))
 
-    def figure(self, groups: Sequence[str] | None = None) -> Figure:
-        """Return the value with its interval, over groups of scenes as in `paired_difference`."""
-        if groups is None:
-            return Figure.of(self.value, self.draws, self.n)
-        draws = _group_draws(self.at, self.value, groups, RESAMPLES, centred=self.is_centred)
-        return Figure.of(self.value, draws, self.n)
+    def figure(self) -> Figure:
+        """Return the value with its interval."""
+        return Figure.of(self.value, self.draws, self.n, len(self.groups))
 
 
-def paired_difference(
-    a: Metric, b: Metric, *, groups: Sequence[str] | None = None, resamples: int = RESAMPLES
-) -> Figure:
+def paired_difference(a: Metric, b: Metric) -> Figure:
     """Return a minus b on the same scenes, with the interval of the difference.
 
-    Args:
-        groups: group of each scene. With groups, a resample draws groups instead of scenes, because
-            scenes of one group are near-duplicates (Field and Welsh, "Bootstrapping clustered
-            data", 2007). The draws are widened by `_widening`.
-        resamples: number of draws of groups.
-
     Raises:
-        ValueError: the numbers of scenes differ, or all scenes belong to one group.
+        ValueError: the groups differ, or all scenes belong to one group.
     """
-    if a.scenes != b.scenes or (groups is not None and len(groups) != a.scenes):
-        of = "" if groups is None else f" and {len(groups)} group labels"
-        raise ValueError(f"cannot pair {a.scenes} scenes with {b.scenes} scenes{of}")
-    if groups is None:
-        count = min(len(a.draws), len(b.draws))
-        draws = a.draws[:count] - b.draws[:count]
-    else:
-        draws = _group_draws(lambda w: a.at(w) - b.at(w), a.value - b.value, groups, resamples)
-    return Figure.of(a.value - b.value, draws, min(a.n, b.n))
-
-
-def _group_draws(
-    statistic: Callable[[Floats], float],
-    value: float,
-    groups: Sequence[str],
-    resamples: int,
-    *,
-    centred: bool = False,
-) -> Floats:
-    """Return a statistic of the scene weights over resampled groups, widened by `_widening`.
-
-    Raises:
-        ValueError: all scenes belong to one group.
-    """
-    names, group_of = np.unique(np.array(groups), return_inverse=True)
-    if len(names) < 2:
-        raise ValueError("an interval needs scenes of at least two groups")
-    weights = scene_weights(len(names), resamples)
-    draws = np.array([statistic(weight[group_of]) for weight in weights])
-    draws = _centred(draws, value) if centred else draws
-    widened: Floats = value + _widening(len(names)) * (draws - value)
-    return widened
+    if not np.array_equal(a.groups, b.groups):
+        raise ValueError(f"cannot pair {len(a.groups)} groups with {len(b.groups)} other groups")
+    count = min(len(a.draws), len(b.draws))
+    draws = a.draws[:count] - b.draws[:count]
+    return Figure.of(a.value - b.value, draws, min(a.n, b.n), len(a.groups))
 
 
 def _widening(groups: int) -> float:
@@ -163,22 +131,22 @@ def _widening(groups: int) -> float:
     return float(quantiles * np.sqrt(groups / (groups - 1)))
 
 
-@lru_cache(maxsize=4)  # many metrics resample the same scenes one after the other
-def scene_weights(scenes: int, resamples: int = RESAMPLES) -> Floats:
-    """Return how often each resample draws each scene, (resamples, scenes); read-only."""
+@lru_cache(maxsize=4)  # many metrics resample the same groups one after the other
+def group_weights(groups: int, resamples: int = RESAMPLES) -> Floats:
+    """Return how often each resample draws each group, (resamples, groups); read-only."""
     rng = np.random.default_rng(0)
-    weights = np.empty((resamples, scenes))
+    weights = np.empty((resamples, groups))
     for row in weights:
-        row[:] = np.bincount(rng.integers(scenes, size=scenes), minlength=scenes)
+        row[:] = np.bincount(rng.integers(groups, size=groups), minlength=groups)
     weights.flags.writeable = False
     return weights
 
 
 def resample(
-    statistic: Callable[[Floats], float], scenes: int, resamples: int = RESAMPLES
+    statistic: Callable[[Floats], float], groups: int, resamples: int = RESAMPLES
 ) -> Floats:
-    """Return a statistic of the scene weights for each resample, (resamples,)."""
-    return np.array([statistic(weight) for weight in scene_weights(scenes, resamples)])
+    """Return a statistic of the group weights for each resample, (resamples,)."""
+    return np.array([statistic(weight) for weight in group_weights(groups, resamples)])
 
 
 def _centred(drawn: Floats, value: float) -> Floats:
@@ -190,7 +158,7 @@ def _centred(drawn: Floats, value: float) -> Floats:
 class Ratio(Metric):
     """Micro-average: sum(numerators) / sum(denominators) over scenes.
 
-    Both arrays have the shape (scenes,). A skipped scene has denominator 0.
+    All arrays have the shape (G,). A skipped scene has denominator 0.
 
     Raises:
         ValueError: all denominators are 0.
@@ -198,10 +166,13 @@ class Ratio(Metric):
 
     numerators: Floats
     denominators: Floats
+    groups: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         if not self.denominators.sum() > 0:
             raise ValueError("no scene could be scored")
+        if not len(self.groups):
+            object.__setattr__(self, "groups", np.arange(len(self.numerators)))
 
     @classmethod
     def of_items(cls, scene: Ints, values: NDArray[Any], scenes: int) -> Ratio:
@@ -216,10 +187,6 @@ class Ratio(Metric):
         return cls(values.astype(np.float64), below)
 
     @property
-    def scenes(self) -> int:  # type: ignore[override]
-        return len(self.numerators)
-
-    @property
     def n(self) -> int:  # type: ignore[override]
         return round(float(self.denominators.sum()))
 
@@ -227,17 +194,24 @@ class Ratio(Metric):
         below = float(weight @ self.denominators)
         return float(weight @ self.numerators) / below if below > 0 else float("nan")
 
+    def by(self, groups: Ints) -> Ratio:
+        ids, index = np.unique(groups, return_inverse=True)
+        top, below = np.zeros((2, len(ids)))
+        np.add.at(top, index, self.numerators)
+        np.add.at(below, index, self.denominators)
+        return Ratio(top, below, ids)
+
     @cached_property
     def draws(self) -> Floats:
         # Two matrix products compute all resamples.
-        weights = scene_weights(self.scenes)
+        weights = group_weights(len(self.groups))
         top, below = weights @ self.numerators, weights @ self.denominators
         return np.divide(top, below, where=below > 0, out=np.full(len(weights), np.nan))
 
     def mean_over_scenes(self) -> Ratio:
         """Return the metric with equal weight for every scored scene."""
         is_scored = self.denominators > 0
-        share = np.zeros(self.scenes)
+        share = np.zeros(len(self.groups))
         np.divide(self.numerators, self.denominators, where=is_scored, out=share)
         return Ratio.of_scenes(share, is_scored)
 
@@ -249,14 +223,15 @@ class Ratio(Metric):
         """
         if not np.array_equal(self.denominators, other.denominators):
             raise ValueError("cannot subtract metrics with different items")
-        return Ratio(self.numerators - other.numerators, self.denominators)
+        return Ratio(self.numerators - other.numerators, self.denominators, self.groups)
 
     @classmethod
-    def join(cls, parts: Sequence[Self]) -> Self:
-        return cls(
+    def join(cls, parts: Sequence[Self]) -> Ratio:
+        whole = cls(
             np.concatenate([part.numerators for part in parts]),
             np.concatenate([part.denominators for part in parts]),
         )
+        return whole.by(np.concatenate([part.groups for part in parts]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,48 +240,47 @@ class Scored(Metric):
 
     Attributes:
         statistic: name in `STATISTICS`.
-        scene: (N,) scene of each item.
+        unit: (N,) position of the scene or group of each item in `groups`.
         score, truth: (N,) score and truth value of each item.
-        count: number of scenes.
 
     Raises:
         ValueError: there are no items, or the statistic is unknown.
     """
 
     statistic: str
-    scene: Ints
+    unit: Ints
     score: Floats
     truth: Flags
-    count: int
+    groups: Ints
 
     def __post_init__(self) -> None:
         if self.statistic not in STATISTICS:
             raise ValueError(
                 f"unknown statistic {self.statistic!r}: must be one of {sorted(STATISTICS)}"
             )
-        if not len(self.scene):
+        if not len(self.unit):
             raise ValueError("no scene could be scored")
 
+    def by(self, groups: Ints) -> Scored:
+        ids, index = np.unique(groups, return_inverse=True)
+        return replace(self, unit=index[self.unit], groups=ids)
+
     @classmethod
-    def join(cls, parts: Sequence[Self]) -> Self:
-        # The scene indices of a part are shifted by the number of scenes in earlier parts.
-        starts = np.cumsum([0, *(part.count for part in parts)]).tolist()
-        shifted = [part.scene + start for part, start in zip(parts, starts[:-1], strict=True)]
+    def join(cls, parts: Sequence[Self]) -> Scored:
+        groups = np.concatenate([part.groups for part in parts])
+        starts = np.cumsum([0, *(len(part.groups) for part in parts)]).tolist()
+        shifted = [part.unit + start for part, start in zip(parts, starts[:-1], strict=True)]
         return cls(
             parts[0].statistic,
             np.concatenate(shifted).astype(np.int64),
             np.concatenate([part.score for part in parts]),
             np.concatenate([part.truth for part in parts]),
-            starts[-1],
-        )
-
-    @property
-    def scenes(self) -> int:  # type: ignore[override]
-        return self.count
+            groups,
+        ).by(groups)
 
     @property
     def n(self) -> int:  # type: ignore[override]
-        return len(self.scene)
+        return len(self.unit)
 
     @cached_property
     def _prepared(self) -> Callable[[Floats], float]:
@@ -314,11 +288,13 @@ class Scored(Metric):
         return STATISTICS[self.statistic](self.score, self.truth)
 
     def at(self, weight: Floats) -> float:
-        return self._prepared(weight[self.scene])
+        return self._prepared(weight[self.unit])
 
-    @property
-    def is_centred(self) -> bool:
-        return self.statistic == "ECE"
+    @cached_property
+    def draws(self) -> Floats:
+        values = resample(self.at, len(self.groups))
+        # Resampling inflates calibration errors, so these resamples are centred on the value.
+        return _centred(values, self.value) if self.statistic == "ECE" else values
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,7 +325,7 @@ class Items:
 
     def metric(self, statistic: str) -> Scored:
         """Return one of `STATISTICS`."""
-        return Scored(statistic, self.scene, self.score, self.truth, self.scenes)
+        return Scored(statistic, self.scene, self.score, self.truth, np.arange(self.scenes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,21 +339,22 @@ class Resampled(Metric):
 
     point: float
     drawn: Floats
-    count: int
+    groups: Ints
     items: int
 
     @classmethod
     def of(
-        cls, statistic: Callable[[Floats], float], scenes: int, items: int, resamples: int
+        cls, statistic: Callable[[Floats], float], groups: Ints, items: int, resamples: int
     ) -> Resampled:
-        """Create the metric from a statistic of scene weights. The resamples are centred."""
-        point = statistic(np.ones(scenes))
-        drawn = resample(statistic, scenes, resamples)
-        return cls(point, _centred(drawn, point), scenes, items)
+        """Create the metric from a statistic of scene weights. The resamples are centred.
 
-    @property
-    def scenes(self) -> int:  # type: ignore[override]
-        return self.count
+        Args:
+            groups: (scenes,) id of the group of each scene.
+        """
+        ids, index = np.unique(groups, return_inverse=True)
+        point = statistic(np.ones(len(groups)))
+        drawn = resample(lambda weight: statistic(weight[index]), len(ids), resamples)
+        return cls(point, _centred(drawn, point), ids, items)
 
     @property
     def n(self) -> int:  # type: ignore[override]
@@ -388,7 +365,7 @@ class Resampled(Metric):
         return self.point
 
     def at(self, weight: Floats) -> float:
-        raise NotImplementedError("a metric of whole sets cannot be computed for scene weights")
+        raise NotImplementedError("a metric of whole sets cannot be computed for weights")
 
     @cached_property
     def draws(self) -> Floats:
@@ -401,10 +378,10 @@ class MeanOverSeeds(Metric):
     def __init__(self, members: Sequence[Metric]) -> None:
         if not members:
             raise ValueError("a mean over seeds needs at least one metric")
-        if len({member.scenes for member in members}) > 1:
-            raise ValueError("all seeds must have results on the same number of scenes")
+        if not all(np.array_equal(member.groups, members[0].groups) for member in members):
+            raise ValueError("all seeds must have results on the same groups of scenes")
         self.members = tuple(members)
-        self.scenes, self.n = members[0].scenes, members[0].n
+        self.groups, self.n = members[0].groups, members[0].n
 
     @property
     def value(self) -> float:

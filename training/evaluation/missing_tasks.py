@@ -85,7 +85,7 @@ def missing_task(model: Model, setting: Setting) -> Outcome | None:
             metrics["MRR, unknown labels score 0"] = _with_unknown(ranking.mrr(), scenes, structure)
         listed = rank_missing(scenes, structure, model.missing, size, structure_listed=True)
         metrics[f"MRR, {name}, structure listed"] = listed.mrr()
-    return Outcome(metrics, len(scenes), skipped)
+    return Outcome.over(scenes, metrics, skipped)
 
 
 def _with_unknown(mrr: Ratio, scenes: SceneTensors, structure: Tensor) -> Ratio:
@@ -116,7 +116,7 @@ def structure_task(model: Model, setting: Setting) -> Outcome | None:
 
     changes = np.concatenate(ask_every(change, lists))
     metric = Ratio.of_items(parts.scene.numpy(), changes, len(scenes))
-    return Outcome({"change of p": metric}, len(scenes), parts.skipped)
+    return Outcome.over(scenes, {"change of p": metric}, parts.skipped)
 
 
 def removed_places(
@@ -175,4 +175,4 @@ def placed_task(model: Model, setting: Setting) -> Outcome | None:
     for a, name in enumerate(CANONICAL):
         if (relation == a).any():
             metrics[f"MRR, {name}"] = ranking.mrr(relation == a)
-    return Outcome(metrics, len(scenes), ranking.skipped)
+    return Outcome.over(scenes, metrics, ranking.skipped)

@@ -16,6 +16,14 @@ from training.evaluation.setting import Setting
 
 # Function that takes presence (scenes, classes) and returns log-odds (scenes, classes).
 ObjectScore = Callable[[Tensor], Tensor]
+
+
+class RoomScore(Protocol):
+    """Function from lists (B, V) and the name of a profile, or "", to log p (B, room types)."""
+
+    def __call__(self, v: Tensor, profile: str) -> Tensor: ...
+
+
 # Function that takes lists (B, V) and a sensitivity, and returns the reported outliers (B, V) bool.
 Flagged = Callable[[Tensor, Sensitivity], Tensor]
 
@@ -122,6 +130,7 @@ class Model:
         relations: score of T1a, relations of a scene.
         completion: score of T1b; the batch observes the given triples.
         false_relations: score of T3b; the batch observes all triples, one of them false.
+        rooms: log-probabilities of the room types.
         generate: function that takes the setting and returns the sampler of T4, or None.
         density: function that takes the setting and returns the density of objects, or None.
         artifact: model for Calibration and for all questions to the service.
@@ -136,6 +145,7 @@ class Model:
     relations: RelationScore | None = None
     completion: RelationScore | None = None
     false_relations: RelationScore | None = None
+    rooms: RoomScore | None = None
     generate: Callable[[Setting], Sampler | None] | None = None
     density: Callable[[Setting], ObjectDensity | None] | None = None
     artifact: Artifact | None = None

@@ -63,4 +63,5 @@ def offsets_task(model: Model, setting: Setting) -> Outcome | None:
     for name, vectors in (("distance (m)", deviation), ("distance (m), relation alone", residual)):
         distance = np.linalg.norm(vectors, axis=1)
         metrics[name] = Ratio.of_items(observed.scene, distance, len(scenes))
-    return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(observed.scene)))
+    skipped = len(scenes) - len(np.unique(observed.scene))
+    return Outcome.over(setting.scenes, metrics, skipped)

@@ -90,7 +90,7 @@ def outliers_task(model: Model, setting: Setting) -> Outcome | None:
             flagged = ask_rows(lambda v: flags(v, "medium").float(), v)
             caught = flagged.gather(1, intruder.unsqueeze(1)).squeeze(1).numpy()
             metrics[f"flagged, {law}"] = Ratio.of_items(scene.numpy(), caught, len(scenes))
-    return Outcome(metrics, len(scenes), skipped) if metrics else None
+    return Outcome.over(scenes, metrics, skipped) if metrics else None
 
 
 def alarms_task(model: Model, setting: Setting) -> Outcome | None:
@@ -110,4 +110,4 @@ def alarms_task(model: Model, setting: Setting) -> Outcome | None:
             alarm = ask_rows(lambda v: flags(v, name).any(1).float(), parts.v).numpy()  # noqa: B023
             metric = Ratio.of_items(parts.scene.numpy(), alarm, len(scenes))
             metrics[f"alarms, {name}, {length} classes"] = metric
-    return Outcome(metrics, len(scenes), skipped) if metrics else None
+    return Outcome.over(scenes, metrics, skipped) if metrics else None

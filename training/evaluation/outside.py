@@ -93,7 +93,7 @@ class PlacingTable(OutsideTest):
         figures: list[CardMetric] = []
         for source, rooms in self.rooms.items():
             progress(f"{source}: {TASK}")
-            figures += _figures(TASK, source, *placing_metrics(artifact, rooms))
+            figures += _figures(TASK, source, placing_metrics(artifact, rooms))
         return figures
 
     def trained(self, artifact: Artifact) -> list[str]:
@@ -116,22 +116,24 @@ class RoomList(OutsideTest):
     def measure(self, artifact: Artifact, progress: Progress = silent) -> list[CardMetric]:
         """Return the metrics of `ROOM_TASKS` that the scenes support.
 
-        The intruders of task T3 have the popularity and the typical rooms of the file itself.
+        Intervals are over groups, or over rooms if the file has one group. The intruders of T3
+        have the popularity and the typical rooms of the file itself.
         """
         vocabulary = artifact.vocabulary
         encoded = encode(self.scenes, vocabulary)
+        if len({scene.group for scene in encoded}) == 1:
+            encoded = [replace(scene, group=scene.scene_id) for scene in encoded]
         annotated = annotated_classes(encoded, vocabulary)
         scenes = scene_tensors(encoded, annotated, len(vocabulary))
         structure = torch.from_numpy(vocabulary.structure.copy())
         setting = Setting(scenes, structure, train=scenes, limit=None)
         model = artifact_model(artifact, scenes)
         report = measure(model, setting, self.source, tasks=ROOM_TASKS, progress=progress)
-        groups = [scene.group for scene in encoded]
         figures: list[CardMetric] = []
         for task, outcome in report.outcomes.items():
             metrics = {} if outcome is None else outcome.metrics
             shown = {name: metrics[name] for name in TASKS[task].card if name in metrics}
-            figures += _figures(task, self.source, shown, groups)
+            figures += _figures(task, self.source, shown)
         return figures
 
     def trained(self, artifact: Artifact) -> list[str]:
@@ -155,16 +157,8 @@ class RoomList(OutsideTest):
         )
 
 
-def _figures(
-    task: str, source: str, metrics: Mapping[str, Metric], groups: Sequence[str]
-) -> Iterator[CardMetric]:
-    """Generate the figures of a task.
-
-    The intervals resample scenes instead of groups if the file has one group, or if the task leaves
-    out scenes without relations.
-    """
-    has_groups = len(set(groups)) > 1
+def _figures(task: str, source: str, metrics: Mapping[str, Metric]) -> Iterator[CardMetric]:
+    """Generate the figures of a task with an interval, which needs two groups."""
     for name, metric in metrics.items():
-        is_grouped = has_groups and metric.scenes == len(groups)
-        figure = metric.figure(groups if is_grouped else None)
-        yield CardMetric(task=task, source=source, metric=name, **asdict(figure))
+        if len(metric.groups) > 1:
+            yield CardMetric(task=task, source=source, metric=name, **asdict(metric.figure()))

@@ -149,7 +149,7 @@ def pairs_task(model: Model, setting: Setting) -> Outcome | None:
         if mask.any():
             metrics[f"accuracy, {name}"] = Ratio.of_items(scene[mask], hits[mask], len(scenes))
             metrics[f"log-loss, {name}"] = Ratio.of_items(scene[mask], loss[mask], len(scenes))
-    return Outcome(metrics, len(scenes), 0)
+    return Outcome.over(scenes, metrics, 0)
 
 
 def _hard_pairs(classes: Ints, setting: Setting) -> dict[str, Flags]:

@@ -143,10 +143,11 @@ def ask_places(artifact: Artifact, room: Room, *, with_room: bool) -> Floats:
     return scores
 
 
-def placing_metrics(artifact: Artifact, rooms: list[Room]) -> tuple[dict[str, Metric], list[str]]:
-    """Return the metrics over all questions of a source, and the group of each question.
+def placing_metrics(artifact: Artifact, rooms: list[Room]) -> dict[str, Metric]:
+    """Return the metrics over all questions of a source.
 
-    The group is the class of the object, because all objects of a class get the same answers.
+    Intervals are over the classes of the objects, because all objects of a class get the same
+    answers.
     """
     answers = [answer for room in rooms for answer in _answer(artifact, room)]
     scored = [answer for answer in answers if not answer.reason]
@@ -168,7 +169,8 @@ def placing_metrics(artifact: Artifact, rooms: list[Room]) -> tuple[dict[str, Me
     for reason in (_UNKNOWN, _TRIVIAL):
         is_left_out = np.array([answer.reason == reason for answer in answers])
         metrics[reason] = Ratio.of_scenes(is_left_out)
-    return metrics, [answer.group for answer in answers]
+    _, groups = np.unique([answer.group for answer in answers], return_inverse=True)
+    return {name: metric.by(groups) for name, metric in metrics.items()}
 
 
 def _answer(artifact: Artifact, room: Room) -> list[_Answer]:

@@ -275,7 +275,7 @@ def relations_task(model: Model, setting: Setting) -> Outcome | None:
         "R-precision, mean over scenes": counted.per_scene(),
     }
     metrics |= _details(with_counts, setting, FIRST)
-    return Outcome(metrics, len(scenes), ranking.skipped)
+    return Outcome.over(scenes, metrics, ranking.skipped)
 
 
 def completion_task(model: Model, setting: Setting) -> Outcome | None:
@@ -292,7 +292,7 @@ def completion_task(model: Model, setting: Setting) -> Outcome | None:
         "R-precision, mean over scenes": ranking.per_scene(),
     }
     metrics |= _details(candidates, setting, _RECALLS)
-    return Outcome(metrics, len(scenes), ranking.skipped)
+    return Outcome.over(scenes, metrics, ranking.skipped)
 
 
 def _any_true(scored: list[Candidates]) -> bool:
@@ -324,4 +324,4 @@ def placement_task(model: Model, setting: Setting) -> Outcome | None:
     scores = placement_scores(scenes, setting.structure, model.false_relations, seed=setting.seed)
     if not len(scores.scene):
         return None
-    return Outcome({"hit@1": scores.hit_at_1()}, len(scenes), scores.skipped)
+    return Outcome.over(scenes, {"hit@1": scores.hit_at_1()}, scores.skipped)

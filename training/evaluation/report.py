@@ -2,8 +2,8 @@
 
 A `SourceReport` holds the results of one model, training seed and data source. `measure` writes the
 report into a file after each task. A later run skips the tasks in the file. The report stores the
-values of each scene. Reports can therefore be pooled over data sources, and compared by paired
-resampling, without the models.
+values of each group of near-duplicate scenes. Reports can therefore be pooled over data sources,
+and compared by paired resampling, without the models.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class SourceReport:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-serialisable dictionary, with intervals for human readers."""
+        """Return a JSON-serialisable dictionary."""
         return {
             "source": self.source,
             "scenes": self.scenes,
@@ -223,6 +223,8 @@ def evaluate(
             for name in EVERY_TASK[task].card
             # A metric is missing if the data source lacks data for it, such as listed relations.
             if (metric := outcome.metrics.get(name)) is not None
+            # The scenes of a single group give no interval.
+            and len(metric.groups) > 1
         )
 
     settings = dict(settings_by_source(scenes, structure, train, None, limit=limit))
@@ -243,10 +245,7 @@ def _to_dict(outcome: Outcome | None) -> dict[str, Any] | None:
         "scenes": outcome.scenes,
         "skipped": outcome.skipped,
         "notes": outcome.notes,
-        "metrics": {
-            name: {"figure": asdict(metric.figure()), "made_of": metric_to_dict(metric)}
-            for name, metric in outcome.metrics.items()
-        },
+        "metrics": {name: metric_to_dict(metric) for name, metric in outcome.metrics.items()},
     }
 
 
@@ -255,7 +254,7 @@ def _from_dict(values: dict[str, Any] | None) -> Outcome | None:
         return None
     metrics = values["metrics"].items()
     return Outcome(
-        {name: metric_from_dict(entry["made_of"]) for name, entry in metrics},
+        {name: metric_from_dict(entry) for name, entry in metrics},
         values["scenes"],
         values["skipped"],
         values["notes"],
@@ -275,7 +274,7 @@ def pool(parts: Sequence[Metric]) -> Metric | None:
 
 
 _KINDS: dict[str, type[Any]] = {cls.__name__.lower(): cls for cls in (Ratio, Scored, Resampled)}
-_TYPES: dict[str, type] = {"scene": np.int64, "truth": np.bool_}
+_TYPES: dict[str, type] = {"unit": np.int64, "groups": np.int64, "truth": np.bool_}
 
 
 def metric_to_dict(metric: Metric) -> dict[str, Any]:

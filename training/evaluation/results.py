@@ -6,11 +6,12 @@ A row of a result table is a model: a machine, a baseline or a reference.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.table import Table
 
@@ -51,7 +52,7 @@ class Cell:
     """One metric of one row on one data source.
 
     Attributes:
-        figure: mean over training seeds, with the bootstrap interval over scenes.
+        figure: mean over training seeds, with the bootstrap interval over groups.
         seeds: value of the metric for each training seed.
     """
 
@@ -219,14 +220,10 @@ def summarise(
     reports: Reports,
     ours: str,
     parameters: Mapping[str, int] | None = None,
-    *,
-    groups: Callable[[str], Sequence[str]] | None = None,
 ) -> Results:
     """Compute the metrics of every row, and the paired differences from the reference row.
 
-    Args:
-        groups: function that takes a task name and returns the group of each scene. With this
-            function, the bootstrap of differences resamples groups instead of scenes.
+    Metrics over the scenes of a single group are left out, because they have no interval.
 
     Raises:
         ValueError: the reports lack the reference row.
@@ -243,7 +240,7 @@ def summarise(
     means = {
         key: MeanOverSeeds(metrics)
         for key, metrics in members.items()
-        if len({metric.scenes for metric in metrics}) == 1
+        if len(metrics[0].groups) > 1 and all(_same_groups(m, metrics[0]) for m in metrics)
     }
     if not any(key[0] == ours for key in means):
         raise ValueError(f"the reports contain no metric of the reference row {ours}")
@@ -254,15 +251,19 @@ def summarise(
     differences = tuple(
         Difference(
             *(row, task, source, name),
-            paired_difference(mine, mean, groups=None if groups is None else groups(task)),
+            paired_difference(mine, mean),
         )
         for (row, source, task, name), mean in means.items()
         if row != ours
         and (mine := means.get((ours, source, task, name))) is not None
         # A row may lack a pooled metric on some data sources. Its scenes then cannot be paired.
-        and mine.scenes == mean.scenes
+        and _same_groups(mine, mean)
     )
     return Results(ours, cells, differences, parameters or {}, tuple(_scene_counts(reports)))
+
+
+def _same_groups(a: Metric, b: Metric) -> bool:
+    return np.array_equal(a.groups, b.groups)
 
 
 def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -77,3 +78,16 @@ class Outcome:
     scenes: int
     skipped: int
     notes: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def over(
+        cls,
+        scenes: SceneTensors,
+        metrics: Mapping[str, Metric],
+        skipped: int,
+        notes: Mapping[str, float] | None = None,
+    ) -> Outcome:
+        """Return an outcome whose metrics per scene are summed by group of near-duplicates."""
+        groups = scenes.group_ids
+        by_group = {name: metric.by(groups) for name, metric in metrics.items()}
+        return cls(by_group, len(scenes), skipped, dict(notes or {}))

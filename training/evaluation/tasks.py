@@ -27,6 +27,7 @@ from training.evaluation.model import Model
 from training.evaluation.outlier_tasks import LAWS, LENGTHS, alarms_task, outliers_task
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
+from training.evaluation.room_task import FIGURES, LISTS, rooms_task
 from training.evaluation.setting import Outcome, Setting
 
 Ask = Callable[[Model, Setting], Outcome | None]
@@ -110,6 +111,16 @@ TASKS: dict[str, Task] = {
     ),
     "T2-at missing at a place": _objects(
         "missing object at a place", placed_task, ("MRR", "MRR, on-top"), ("MRR",)
+    ),
+    "Rooms": _objects(
+        "room type",
+        rooms_task,
+        (
+            *(f"{figure}, {lists}" for lists in LISTS for figure in FIGURES),
+            *(f"top-1, {lists}, profile named" for lists in LISTS),
+            *(f"{figure}, {lists}, real rooms" for lists in LISTS for figure in FIGURES),
+        ),
+        tuple(f"{figure}, {lists}" for lists in LISTS for figure in FIGURES),
     ),
     "T3 outliers": _carded(
         "intruder", outliers_task, (*_each(("hit@1",), LAWS), *_each(("flagged",), LAWS))

@@ -75,11 +75,6 @@ class Domain:
     name: str
     configs: tuple[Config, ...]
 
-    @property
-    def source_weights(self) -> dict[str, float]:
-        """Weights of the scenes of the data sources in the training of the first configuration."""
-        return self.configs[0].objects.source_weights
-
 
 @dataclass(frozen=True)
 class Options:
@@ -243,7 +238,7 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> None:
     for seed in range(options.seeds):
         entries += [machine_entry(config) for config in options.configs(domain, seed)]
         entries += baseline_entries(
-            seed, options.baselines, related=plan.data.related, source_weights=domain.source_weights
+            seed, options.baselines, related=plan.data.related, learning=domain.configs[0].objects
         )
     entries += reference_entries()
     reports = _measure_all(plan, entries, options, domain.name)
@@ -287,7 +282,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> None:
         names = [name for name in names if name in yardsticks | set(options.baselines)]
     entries += baseline_entries(
         *(0, names),
-        related=plan.data.related, whole=False, source_weights=domain.source_weights,
+        related=plan.data.related, whole=False, learning=domain.configs[0].objects,
     )  # fmt: skip
     reports = _measure_all(plan, entries, options, f"{domain.name}, shuffled")
     weights = plan.parameters(entries)

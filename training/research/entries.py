@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+
+import torch
+from torch import Tensor
 
 from app.registry import Calibration
 from training.datasets.batches import SceneTensors, TrainingData, subset
@@ -21,8 +24,9 @@ from training.evaluation.outlier_tasks import first_shares, intruder_weights, wi
 from training.evaluation.report import Progress, write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
-from training.fit.configuration import Config
+from training.fit.configuration import Config, ObjectsConfig
 from training.fit.draft import as_stored, draft_artifact
+from training.fit.objects import ObjectScenes
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
 from training.research.baselines import BASELINES
@@ -60,7 +64,7 @@ def baseline_entries(
     *,
     related: bool = True,
     whole: bool = True,
-    source_weights: Mapping[str, float] | None = None,
+    learning: ObjectsConfig | None = None,
 ) -> Iterator[Entry]:
     """Generate the entries of the baselines in `names`; None means all baselines.
 
@@ -69,8 +73,8 @@ def baseline_entries(
     Args:
         related: False leaves out relation baselines.
         whole: True adds place scores to object baselines.
-        source_weights: weights of the scenes of a data source in the training of the machines, by
-            source name. The baselines use the same weights. By default, a weight is 1.
+        learning: settings of the machines for objects. Baselines for objects and rooms learn from
+            the scenes of the machines, with their weights and masks.
 
     Raises:
         ValueError: a name is not in `BASELINES`.
@@ -81,9 +85,9 @@ def baseline_entries(
         is_usable = related or not baseline.learns_relations
         is_selected = names is None or name in names
         if is_usable and is_selected and (baseline.stochastic or seed == 0):
-            weights = dict(source_weights or {})
-            make = partial(_baseline_model, baseline, seed, whole, weights)
-            yield Entry(name, seed, f"{name}, seed {seed}, {weights}", make)
+            config = learning or ObjectsConfig()
+            make = partial(_baseline_model, baseline, seed, whole, config)
+            yield Entry(name, seed, f"{name}, seed {seed}, {_decisive(config)}", make)
 
 
 def reference_entries() -> Iterator[Entry]:
@@ -108,39 +112,48 @@ def _baseline_model(
     baseline: Baseline,
     seed: int,
     whole: bool,
-    source_weights: Mapping[str, float],
+    learning: ObjectsConfig,
     data: TrainingData,
     folder: Path,
     say: Progress,
 ) -> Model:
-    """Fit a baseline to the scenes and weights of the machines.
+    """Fit a baseline; a baseline for objects or rooms to the scenes, weights and masks of machines.
 
     An object baseline ranks intruders with a prior of popularity, as `/outliers` does. It also
     supports T2-at (missing object at a place): its score is multiplied by a frequency table.
     """
-    data = replace(data, train=weighted(data.train, source_weights))
-    model = _fit(baseline, data, seed, folder, say)
+    if baseline.scores not in (("missing",), ("rooms",)):
+        return _fit(baseline, data, seed, folder, say)
+    objects = replace(data, train=object_scenes(data.train, data.structure, learning))
+    model = _fit(baseline, objects, seed, folder, say)
     if model.missing is None:
         return model
-    model = replace(model, suspicion=tuned_suspicion(model.missing, data, seed))
+    model = replace(model, suspicion=tuned_suspicion(model.missing, objects, seed))
     if not whole or not data.related:
         return model
     table = _fit(PLACED, data, seed, folder, say)
-    product = _fit(placed_product(baseline.name, model, table), data, seed, folder, say)
+    product = _fit(placed_product(baseline.name, model, table), objects, seed, folder, say)
     return replace(model, at_place=product.at_place)
 
 
-def weighted(scenes: SceneTensors, source_weights: Mapping[str, float]) -> SceneTensors:
-    """Return the scenes with their weights multiplied by the weights of their data sources."""
-    if not source_weights:
-        return scenes
-    return replace(
-        scenes,
-        scenes=[
-            replace(scene, weight=scene.weight * source_weights.get(scene.source, 1.0))
-            for scene in scenes.scenes
-        ],
-    )
+def _decisive(config: ObjectsConfig) -> str:
+    return str(config.model_dump(include={"source_weights", "open_sources"}))
+
+
+def object_scenes(train: SceneTensors, structure: Tensor, config: ObjectsConfig) -> SceneTensors:
+    """Return the scenes from which a machine learns objects, with its weights and masks."""
+    learnt = ObjectScenes.of(train, structure, config)
+    shows = torch.zeros_like(train.annotated_classes)
+    shows[[train.source_names.index(name) for name in learnt.sources]] = learnt.shows
+    weights = [config.source_weights.get(scene.source, 1.0) for scene in train.scenes]
+    weighted = [
+        replace(scene, weight=scene.weight * weight)
+        for scene, weight in zip(train.scenes, weights, strict=True)
+    ]
+    v = train.v * shows[train.source]
+    kept = (v.sum(1) >= 2) & torch.tensor([scene.weight > 0 for scene in weighted])
+    masked = replace(train, scenes=weighted, v=v, annotated_classes=shows)
+    return subset(masked, kept.nonzero().squeeze(1))
 
 
 def tuned_suspicion(score: ObjectScore, data: TrainingData, seed: int) -> ObjectScore:
@@ -188,7 +201,8 @@ def _machine_model(
         calibration = calibrate(draft, data, config.objects, seed)
         write_whole(path, calibration.model_dump_json(indent=1))
     artifact = draft_artifact(machine, data.classes, calibration)
-    return artifact_model(artifact, data.train, seed=seed)
+    profiles = ObjectScenes.of(data.train, data.structure, config.objects).sources
+    return artifact_model(artifact, data.train, seed=seed, profiles=profiles)
 
 
 def _train_once(config: Config, data: TrainingData, run: Path, say: Progress) -> BoltzmannMachine:

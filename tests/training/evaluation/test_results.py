@@ -51,7 +51,7 @@ def test_a_verdict_needs_the_whole_interval_on_the_better_side(metric, low, high
 
 
 def test_results_list_the_questions():
-    metrics = {"MMD²": Ratio(np.array([0.5]), np.ones(1))}
+    metrics = {"MMD²": Ratio(np.array([0.5, 0.5]), np.ones(2))}
     outcome = Outcome(metrics, 7, 2, {"bandwidth": 4.0})
     report = SourceReport("x", "", {"T4 generate": outcome, "Density": None})
     (asked,) = summarise({("a", 0): {"x": report}}, "a").to_dict()["asked"]

@@ -101,7 +101,7 @@ def popularity(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[
         yield {"scenes": name}, LinearScore(lists.frequency().logit(), torch.zeros(V, V))
 
 
-_EASE_L2 = (10.0, 30.0, 100.0, 300.0)
+_EASE_L2 = (1.0, 3.0, 5.0, 10.0, 20.0, 30.0, 50.0, 70.0, 100.0, 200.0, 300.0, 1000.0)
 
 
 def fit_ease(v: Tensor, l2: float, weight: Tensor | None = None) -> LinearScore:

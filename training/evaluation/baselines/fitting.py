@@ -3,21 +3,24 @@
 A baseline is a generator function. It fits a model on the training scenes for each point of a
 hyperparameter grid, and yields pairs (parameters, score). A neural network yields a pair for each
 candidate number of steps. `Baseline.fit` evaluates each score on the validation scenes: objects by
-`validation_score`, others by the primary metric of the task. The generator function never sees the
-validation scenes.
+`validation_score`, others by the primary metric of the task. It sends the value back to the
+generator function, which never sees the validation scenes.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias, TypeVar
+from itertools import product
+from typing import Any, Final, TypeAlias, TypeVar
 
+import numpy as np
 from torch import Tensor
 
 from training.datasets.batches import SceneTensors
+from training.datasets.cases import some_scenes
 from training.evaluation.missing_tasks import leave_one_out_at
 from training.evaluation.model import (
     Model,
@@ -26,13 +29,52 @@ from training.evaluation.model import (
     Parameters,
     PlacedScore,
     RelationScore,
+    RoomScore,
     Trial,
 )
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import complete_scenes, rank, rank_relations
+from training.evaluation.room_task import mean_log_p
+
+_SCENES = 1000  # maximum scenes in `placed_mrr`
 
 Score = TypeVar("Score")
-Proposals: TypeAlias = Iterator[tuple[Parameters, Score]]
+Proposals: TypeAlias = Generator[tuple[Parameters, Score], float, None]
+
+TRIALS: Final = 24
+"""Number of settings that each baseline tries at least, if its method has so many."""
+
+
+def drawn_settings(**grid: Sequence[Any]) -> list[dict[str, Any]]:
+    """Return `TRIALS` random points of a grid of hyperparameters."""
+    points = list(product(*grid.values()))
+    order = np.random.default_rng(0).permutation(len(points))[:TRIALS]
+    return [dict(zip(grid, points[k], strict=True)) for k in order.tolist()]
+
+
+def halving(
+    settings: Sequence[dict[str, Any]],
+    fit: Callable[[dict[str, Any], float], Iterator[tuple[Parameters, Score]]],
+    rungs: Sequence[tuple[int, float]],
+) -> Proposals[Score]:
+    """Yield short fits of all settings, and longer fits of the best settings.
+
+    Source: K. Jamieson and A. Talwalkar, "Non-stochastic best arm identification and hyperparameter
+    optimization", AISTATS 2016.
+
+    Args:
+        fit: function of a setting and the share of the full length of the training. It yields
+            scores, with parameters in addition to the setting.
+        rungs: number of settings, and share of the full length, of each round.
+    """
+    for count, share in rungs:
+        best: list[float] = []
+        for setting in settings[:count]:
+            values = []
+            for parameters, score in fit(setting, share):
+                values.append((yield {**setting, **parameters}, score))
+            best.append(max(values))
+        settings = [settings[k] for k in np.argsort(best)[::-1]]
 
 
 def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
@@ -47,9 +89,24 @@ def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> 
     return value
 
 
+def room_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> float:
+    """Return the mean of log p of the room type, see `mean_log_p`.
+
+    Raises:
+        ValueError: no scene has a room type.
+    """
+    value = mean_log_p(scenes, structure, score)
+    if math.isnan(value):
+        raise ValueError("no validation scene has a room type")
+    return value
+
+
 def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
-    """Return the mean reciprocal rank (MRR) of removed objects at a known place (T2-at)."""
-    return leave_one_out_at(scenes, structure, score)[0].mrr().value
+    """Return the mean reciprocal rank (MRR) of removed objects at a known place (T2-at).
+
+    At most `_SCENES` scenes take part.
+    """
+    return leave_one_out_at(some_scenes(scenes, _SCENES), structure, score)[0].mrr().value
 
 
 def r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
@@ -87,7 +144,7 @@ class Baseline:
     @property
     def learns_relations(self) -> bool:
         """True if the baseline needs scenes with annotated relations."""
-        return self.scores not in (("missing",), ("density",))
+        return self.scores not in (("missing",), ("rooms",), ("density",))
 
     def fit(
         self,
@@ -122,7 +179,10 @@ class Baseline:
         best_scores: list[Any] = []
         highest = -math.inf
         start = time.perf_counter()
-        for parameters, score in self.propose(train, structure, seed):
+        proposals = self.propose(train, structure, seed)
+        proposal = next(proposals, None)
+        while proposal is not None:
+            parameters, score = proposal
             metric = self.judge(validation, structure, score)
             if math.isnan(metric):
                 raise FloatingPointError(
@@ -136,6 +196,10 @@ class Baseline:
             text = ", ".join(f"{key} {value}" for key, value in parameters.items())
             progress(f"{self.name} {text}: {metric:.4f}")
             start = now
+            try:
+                proposal = proposals.send(metric)
+            except StopIteration:
+                proposal = None
         best_score = best_scores[0]
         answers = dict.fromkeys(self.scores, best_score)
         if "density" in answers:

@@ -129,10 +129,10 @@ def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Propo
                 yield parameters, TripleTable(table, weight)
 
 
-_PLACE = (0.3, 1.0, 3.0, 10.0)
-_RELATION = (1.0, 10.0)
-_WEIGHTS = (0.25, 0.5, 0.75, 1.0)
-_CORRECTIONS = (0.0, 0.5, 1.0)
+_PLACE = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+_RELATION = (0.3, 1.0, 3.0, 10.0)
+_WEIGHTS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
+_CORRECTIONS = (0.0, 0.25, 0.5, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ def times(
         raise ValueError("the product needs an object score and a table of places")
 
     def placed_table(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
-        log_popularity = frequency(train.v).log()
+        log_popularity = frequency(train.v, train.weight).log()
         for weight in _WEIGHTS:
             for correction in _CORRECTIONS:
                 score = PlacedProduct(objects, table, log_popularity, weight, correction)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
@@ -15,8 +15,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from training.datasets.batches import SceneTensors
 from training.evaluation.baselines.classes import Lists, training_lists
-from training.evaluation.baselines.fitting import Proposals
-from training.evaluation.model import ObjectScore
+from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
+from training.evaluation.model import ObjectScore, Parameters
 
 # Both networks learn to predict the hidden classes of random parts of scenes, as a machine does.
 #
@@ -35,6 +35,7 @@ _AVERAGING = 0.998
 _WARM_UP = 0.1
 _ONE_HIDDEN = 0.3
 _LEAST_SHARE = 0.05
+_STEPS = 800
 LOSSES: Final = ("softmax", "binary")
 
 
@@ -51,7 +52,7 @@ class Course:
     learning_rate: float
     weight_decay: float
     loss: str = "softmax"
-    steps: int = 800
+    steps: int = _STEPS
     batch_size: int = 256
     offers: tuple[float, ...] = (0.6, 0.8, 1.0)
 
@@ -150,9 +151,13 @@ def hidden_loss(network: nn.Module, v: Tensor, labelled: Tensor, loss: str) -> T
 # P. Vincent et al., "Extracting and composing robust features with denoising autoencoders",
 # ICML 2008. `train_network` trains the network.
 
-_HIDDEN = 600
-_HIDDEN_DROPOUT = (0.15, 0.3)
-_AUTOENCODER = Course(learning_rate=3e-3, weight_decay=0.1)
+_RUNGS = ((TRIALS, 0.25), (4, 1.0))
+_AUTOENCODER: Final[dict[str, Sequence[Any]]] = {
+    "width": (300, 600),
+    "dropout": (0.0, 0.15, 0.3, 0.5),
+    "learning_rate": (1e-3, 3e-3, 6e-3),
+    "weight_decay": (0.03, 0.1, 0.3),
+}
 
 
 def build_autoencoder(popularity: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
@@ -172,14 +177,8 @@ def build_autoencoder(popularity: Tensor, width: int, dropout: float, seed: int)
 
 
 def autoencoder(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Yield the score of an autoencoder for each set of scenes, loss, dropout and step."""
-    for name, lists in training_lists(train, structure):
-        for loss in LOSSES:
-            course = replace(_AUTOENCODER, loss=loss)
-            for dropout in _HIDDEN_DROPOUT:
-                network = build_autoencoder(lists.frequency(), _HIDDEN, dropout, seed)
-                for step, score in train_network(network, lists, structure, course, seed):
-                    yield {"scenes": name, "loss": loss, "dropout": dropout, "steps": step}, score
+    """Yield the score of an autoencoder for each setting and step."""
+    return _networks(build_autoencoder, _AUTOENCODER, _RUNGS, train, structure, seed)
 
 
 # Masked transformer. The classes of a scene are tokens, and one query token predicts the removed
@@ -189,9 +188,15 @@ def autoencoder(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[
 # NAACL 2019, for masking. The classes of a scene have no order, so the network has no position
 # embeddings. `train_network` trains the network.
 
-_WIDTH, _HEADS, _LAYERS = 64, 4, 2
-_DROPOUT = (0.0, 0.1)
-_TRANSFORMER = Course(learning_rate=5e-3, weight_decay=0.05)
+_HEADS = 4
+_SHORT_RUNGS = ((TRIALS, 0.125), (2, 1.0))
+_TRANSFORMER: Final[dict[str, Sequence[Any]]] = {
+    "width": (64, 96),
+    "layers": (1, 2),
+    "dropout": (0.0, 0.1, 0.2),
+    "learning_rate": (2e-3, 5e-3),
+    "weight_decay": (0.05, 0.2),
+}
 
 
 class SetTransformer(nn.Module):
@@ -233,14 +238,39 @@ class SetTransformer(nn.Module):
         return encoded[:, 0] @ self.embedding.weight[: self.classes].T + self.bias
 
 
+def build_transformer(
+    popularity: Tensor, width: int, dropout: float, seed: int, layers: int
+) -> SetTransformer:
+    """Return an untrained transformer."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return SetTransformer(popularity, width=width, heads=_HEADS, layers=layers, dropout=dropout)
+
+
 def transformer(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Yield the score of a transformer for each set of scenes, dropout rate and step."""
-    for name, lists in training_lists(train, structure):
-        for dropout in _DROPOUT:
-            with torch.random.fork_rng(devices=[]):
-                torch.manual_seed(seed)
-                network = SetTransformer(
-                    lists.frequency(), width=_WIDTH, heads=_HEADS, layers=_LAYERS, dropout=dropout,
-                )  # fmt: skip
-            for step, score in train_network(network, lists, structure, _TRANSFORMER, seed):
-                yield {"scenes": name, "dropout": dropout, "steps": step}, score
+    """Yield the score of a transformer for each setting and step."""
+    return _networks(build_transformer, _TRANSFORMER, _SHORT_RUNGS, train, structure, seed)
+
+
+def _networks(
+    build: Callable[..., nn.Module],
+    grid: dict[str, Sequence[Any]],
+    rungs: Sequence[tuple[int, float]],
+    train: SceneTensors,
+    structure: Tensor,
+    seed: int,
+) -> Proposals[ObjectScore]:
+    """Yield the scores of networks for `TRIALS` settings of the grid, losses and sets of scenes."""
+    lists = dict(training_lists(train, structure))
+
+    def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
+        names = {field.name for field in fields(Course)}
+        options = {key: value for key, value in setting.items() if key in names}
+        sizes = {key: setting[key] for key in grid if key not in names}
+        course, chosen = Course(**options, steps=round(share * _STEPS)), lists[setting["scenes"]]
+        network = build(chosen.frequency(), seed=seed, **sizes)
+        for step, score in train_network(network, chosen, structure, course, seed):
+            yield {"steps": step}, score
+
+    settings = drawn_settings(scenes=tuple(lists), loss=LOSSES, **grid)
+    return halving(settings, fit, rungs)

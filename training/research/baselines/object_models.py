@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -17,9 +19,9 @@ from training.evaluation.baselines.classes import (
     frequency,
     training_lists,
 )
-from training.evaluation.baselines.fitting import Proposals
+from training.evaluation.baselines.fitting import TRIALS, Proposals, drawn_settings, halving
 from training.evaluation.density_task import DensitySettings, ising_density
-from training.evaluation.model import ObjectDensity, ObjectScore
+from training.evaluation.model import ObjectDensity, ObjectScore, Parameters
 
 # Co-occurrence: Bernoulli naive Bayes, with the present classes as evidence.
 #
@@ -68,7 +70,7 @@ def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals
 # The score is the logit of p(i). The vote of a neighbour is (cosine similarity of the neighbour /
 # cosine similarity of the nearest neighbour) ** sharpness, times the weight of the scene.
 
-_NEIGHBOURS = (100, 200)
+_NEIGHBOURS = (100, 200, 400)
 _SHARPNESS = (2.0, 4.0, 8.0, 12.0)
 
 
@@ -108,8 +110,9 @@ def nearest(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[Obj
 #
 # The problem is convex. L-BFGS finds its optimum.
 
-_PAIRWISE_L2 = (30.0, 10.0, 3.0)
-_ITERATIONS = 40
+_PAIRWISE_L2 = (100.0, 70.0, 50.0, 40.0, 30.0, 20.0, 15.0, 10.0, 7.0, 5.0, 3.0, 1.0)
+_DENSITY_L2 = (30.0, 10.0, 3.0)
+_ITERATIONS = 25
 # Settings for the estimate of log Z. A Gibbs sweep of this model updates one class at a time and is
 # slow, so the number of temperatures is below the default. The error of log Z is about 0.01 nats.
 _EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)
@@ -118,11 +121,18 @@ _EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)
 def fit_pairwise(
     lists: Lists, l2: float, *, start: LinearScore | None = None, iterations: int = _ITERATIONS
 ) -> LinearScore:
-    """Fit the pairwise model by penalised pseudo-likelihood, from `start` or no interaction."""
-    v, V = lists.filled(), lists.v.shape[1]
+    """Fit the pairwise model by penalised pseudo-likelihood, from `start` or no interaction.
+
+    Unlabelled classes have their frequency as evidence, and no term in the likelihood.
+    """
+    v, V = lists.v, lists.v.shape[1]
     if start is None:
         start = LinearScore(lists.frequency().logit(), torch.zeros(V, V))
     weight = lists.weight.unsqueeze(1) * lists.labelled
+    # Sparse lists, and the unlabelled classes of each data source, are faster than dense lists.
+    sparse = v.to_sparse()
+    labelled, pattern = lists.labelled.unique(dim=0, return_inverse=True)
+    unlabelled = ~labelled * lists.frequency()
     bias = start.bias.clone().requires_grad_()
     half = (start.weights / 2).requires_grad_()
     optimiser = torch.optim.LBFGS(
@@ -135,7 +145,8 @@ def fit_pairwise(
     def loss() -> Tensor:
         optimiser.zero_grad()
         W = symmetric()
-        misfit = binary_cross_entropy_with_logits(bias + v @ W, v, weight, reduction="sum")
+        logits = bias + torch.sparse.mm(sparse, W) + (unlabelled @ W)[pattern]
+        misfit = binary_cross_entropy_with_logits(logits, v, weight, reduction="sum")
         total = (misfit + l2 / 4 * W.square().sum()) / len(v)
         total.backward()
         return total
@@ -165,22 +176,26 @@ def pairwise_densities(
     """
     everything = torch.ones(train.v.shape, dtype=torch.bool)
     lists, score = Lists(train.v, everything, torch.ones(len(train))), None
-    for l2 in _PAIRWISE_L2:
+    for l2 in _DENSITY_L2:
         score = fit_pairwise(lists, l2, start=score)
         yield {"l2": l2}, ising_density(score.bias, score.weights, train, _EFFORT, seed)
 
 
-# `BernoulliRBM` of scikit-learn, trained on objects only, on scenes with complete object lists if
-# there are any. Each epoch draws scenes by their weights. The library has no partial labels.
+# `BernoulliRBM` of scikit-learn, trained on objects only. Each epoch draws scenes by their weights.
+# Unlabelled classes have their frequency, because the library has no partial labels.
 #
 #     log-odds of i = b_i + sum_k [softplus(x_k + W_ki) - softplus(x_k)],   x = c + W v
 
-_HIDDEN = 200
-# Tested initial learning rates. With higher rates, persistent contrastive divergence learns only
-# the class frequencies, without an error.
-_LEARNING_RATES = (0.1, 0.2, 0.4)
+# Initial learning rates. With higher rates, persistent contrastive divergence learns only the class
+# frequencies, without an error.
+_RBM_GRID: Final[dict[str, Sequence[Any]]] = {
+    "scenes": ("all", "complete"),
+    "hidden": (100, 200),
+    "learning_rate": (0.05, 0.1, 0.2, 0.4),
+    "batch_size": (32, 64),
+}
 _EPOCHS = 60
-_BATCH = 32
+_RBM_RUNGS = ((TRIALS, 0.05), (6, 0.25), (2, 1.0))
 _BLOCK = 8
 
 
@@ -207,7 +222,7 @@ class RbmScore:
 
 
 def fit_annealed(
-    lists: Lists, *, hidden: int, learning_rate: float, epochs: int, seed: int
+    lists: Lists, *, hidden: int, learning_rate: float, batch_size: int, epochs: int, seed: int
 ) -> RbmScore:
     """Train scikit-learn's `BernoulliRBM` with a learning rate that falls linearly to 0.
 
@@ -215,7 +230,7 @@ def fit_annealed(
     validation scenes, the MRR (mean reciprocal rank) is .411 after 40 epochs with the falling rate.
     With a constant rate, the MRR is .377 after 10 epochs and .378 after 20 epochs.
     """
-    size = min(_BATCH, len(lists.v))
+    size, v = min(batch_size, len(lists.v)), lists.filled().numpy()
     rbm = BernoulliRBM(n_components=hidden, batch_size=size, random_state=seed)
     order = np.random.default_rng(seed)
     p = lists.weight.double().numpy()
@@ -223,14 +238,19 @@ def fit_annealed(
         rbm.set_params(learning_rate=learning_rate * (1 - epoch / epochs))
         drawn = order.choice(len(p), len(p) // size * size, p=p / p.sum())
         for index in drawn.reshape(-1, size):
-            rbm.partial_fit(lists.v[index].numpy())
+            rbm.partial_fit(v[index])
     weights = rbm.intercept_visible_, rbm.intercept_hidden_, rbm.components_
     return RbmScore(*(torch.as_tensor(w, dtype=torch.float32) for w in weights))
 
 
 def bernoulli_rbm(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Yield the score of a trained RBM for each initial learning rate."""
-    *_, (_, lists) = training_lists(train, structure)
-    for rate in _LEARNING_RATES:
-        score = fit_annealed(lists, hidden=_HIDDEN, learning_rate=rate, epochs=_EPOCHS, seed=seed)
-        yield {"learning_rate": rate, "epochs": _EPOCHS}, score
+    """Yield the score of a trained RBM for each setting and number of epochs."""
+    lists = dict(training_lists(train, structure))
+
+    def fit(setting: dict[str, Any], share: float) -> Iterator[tuple[Parameters, ObjectScore]]:
+        options = {key: value for key, value in setting.items() if key != "scenes"}
+        epochs = round(share * _EPOCHS)
+        score = fit_annealed(lists[setting["scenes"]], **options, epochs=epochs, seed=seed)
+        yield {"epochs": epochs}, score
+
+    return halving(drawn_settings(**_RBM_GRID | {"scenes": tuple(lists)}), fit, _RBM_RUNGS)

@@ -38,8 +38,8 @@ def relation_popularity(
 # successes in `together` trials. The penalty is the nuclear 3-norm of T. Lacroix et al., ICML 2018.
 
 _RANKS = (16, 64)
-_PENALTIES = (0.03, 0.1, 0.3)
-_COMPLEX_MULTIPLICITY = (0.0, 1.0)
+_PENALTIES = (0.03, 0.1, 0.2, 0.3)
+_COMPLEX_MULTIPLICITY = (0.0, 0.5, 1.0)
 _STEPS = 200
 _LEARNING_RATE = 0.05
 

@@ -1,0 +1,117 @@
+"""Rooms: of which room type is a scene?
+
+A request lists all classes of a scene, or 2 or 4 random classes. Structure and the room type are
+not listed. The short lists are drawn three times. Only scenes with a room type take part. A scene
+whose room type a model cannot name counts as wrong, with the lowest probability.
+
+Metrics:
+
+    top-1, top-3   share of lists whose room type ranks among the first k; expected over ties
+    log-loss       mean of -log p of the room type; p is at least `LEAST`
+    ECE            calibration error of the likeliest room type's probability, in ten bins of
+                   equally many lists
+
+In the metrics "profile named", the request names the data source of the scene. The metrics "real
+rooms" are those of the sources of real rooms alone.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from training.datasets.array_types import Rng
+from training.datasets.batches import SceneTensors, subset
+from training.evaluation.asking import ask_rows
+from training.evaluation.metrics import Items, Metric, Ratio
+from training.evaluation.missing_tasks import SEEDS
+from training.evaluation.model import Model, RoomScore
+from training.evaluation.parts import REAL_SOURCES, Parts, Ranking, Size, draw_parts, exactly
+from training.evaluation.setting import Outcome, Setting
+
+LEAST: Final = 1e-4
+"""Least probability of a room type in the log-loss."""
+
+
+def _all(classes: int, _: Rng) -> int:
+    return classes
+
+
+LISTS: Final[dict[str, tuple[Size, tuple[int, ...]]]] = {
+    "all classes": (_all, SEEDS[:1]),
+    "4 classes": (exactly(4), SEEDS),
+    "2 classes": (exactly(2), SEEDS),
+}
+"""Lists of a scene by name: their number of classes, and the seeds of the draws."""
+
+FIGURES: Final = ("top-1", "top-3", "log-loss", "ECE")
+
+
+def with_room_type(scenes: SceneTensors) -> SceneTensors:
+    """Return the scenes with a room type."""
+    return subset(scenes, (scenes.room >= 0).nonzero().squeeze(1))
+
+
+def room_figures(
+    scenes: SceneTensors, parts: Parts, score: RoomScore, profile: str = ""
+) -> dict[str, Metric]:
+    """Return `FIGURES` for lists of scenes with a room type."""
+    scene, target, count = parts.scene.numpy(), scenes.room[parts.scene], len(scenes)
+    log_p = ask_rows(partial(score, profile=profile), parts.v)
+    unnamed = max(0, int(target.max()) + 1 - log_p.shape[1])
+    log_p = torch.nn.functional.pad(log_p, (0, unnamed), value=-torch.inf)
+    ranking = Ranking.of(parts.scene, target, log_p, count, parts.skipped)
+    p, first = log_p.exp().double().max(1)
+    hit = (first == target).numpy()
+    loss = -log_p.gather(1, target.unsqueeze(1)).squeeze(1).clamp(min=float(np.log(LEAST)))
+    return {
+        "top-1": ranking.top(1),
+        "top-3": ranking.top(3),
+        "log-loss": Ratio.of_items(scene, loss.double().numpy(), count),
+        "ECE": Items(scene, p.numpy(), hit, count).metric("ECE"),
+    }
+
+
+def rooms_task(model: Model, setting: Setting) -> Outcome | None:
+    """Measure the likeliest room types, without and with the named profile."""
+    scenes = with_room_type(setting.some())
+    sources = {scene.source for scene in scenes.scenes}
+    if model.rooms is None or not len(scenes):
+        return None
+    metrics: dict[str, Metric] = {}
+    for name, (size, seeds) in LISTS.items():
+        parts = draw_parts(scenes, setting.structure, size, seeds)
+        if not len(parts.v):
+            continue
+        kinds = {name: ""} | ({f"{name}, profile named": min(sources)} if len(sources) == 1 else {})
+        for kind, profile in kinds.items():
+            figures = room_figures(scenes, parts, model.rooms, profile)
+            metrics |= {f"{figure}, {kind}": metric for figure, metric in figures.items()}
+    if sources <= set(REAL_SOURCES):
+        metrics |= {f"{name}, real rooms": metric for name, metric in metrics.items()}
+    return Outcome.over(scenes, metrics, 0) if metrics else None
+
+
+def mean_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> float:
+    """Return the mean over real sources and lists of log p of the room type; NaN without scenes.
+
+    Each list counts without and with the named profile. If the scenes contain no source of
+    `REAL_SOURCES`, all sources count.
+    """
+    scenes = with_room_type(scenes)
+    names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
+    values = []
+    for source in [name for name in REAL_SOURCES if (names == name).any()] or np.unique(names):
+        sample = subset(scenes, torch.from_numpy(np.flatnonzero(names == source)))
+        for size, seeds in LISTS.values():
+            parts = draw_parts(sample, structure, size, seeds)
+            values += [
+                -room_figures(sample, parts, score, profile)["log-loss"].value
+                for profile in ("", str(source))
+                if len(parts.v)
+            ]
+    return float(np.mean(values)) if values else float("nan")

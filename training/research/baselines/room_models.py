@@ -1,0 +1,104 @@
+"""Baselines for room types: naive Bayes and the most common type."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from training.datasets.batches import SceneTensors, subset
+from training.evaluation.baselines.classes import Lists, training_lists
+from training.evaluation.baselines.fitting import Proposals
+from training.evaluation.model import Parameters, RoomScore
+from training.evaluation.report import by_source
+from training.evaluation.room_task import with_room_type
+
+# Naive Bayes over room types:
+#
+#     log p(t | v) = log p(t) + s · sum_j log p(v_j | t) + constant
+#     p(v_j = 1 | t) = (scenes of t with j + α · p(j)) / (scenes of t + α)
+#
+# The sum runs over the listed classes, or over all classes. Classes that often occur together are
+# no independent evidence. A factor s < 1 corrects for this. If the request names its data source,
+# all counts are those of this source alone, with another α.
+
+_ALPHA = (10.0, 30.0, 100.0, 300.0)
+_SOURCE_ALPHA = (1.0, 3.0, 10.0)
+_EXPONENTS = (0.5, 0.75, 1.0)
+
+
+class _Counts(NamedTuple):
+    """Weighted counts of the scenes of each room type: all (C,), with and labelled (C, V)."""
+
+    scenes: Tensor
+    present: Tensor
+    labelled: Tensor
+
+    @classmethod
+    def of(cls, lists: Lists, room: Tensor, types: int) -> _Counts:
+        member = one_hot(room, types).float().T * lists.weight
+        return cls(member.sum(1), member @ lists.v, member @ lists.labelled.float())
+
+    def table(self, alpha: float, exponent: float, absent: bool) -> tuple[Tensor, Tensor]:
+        """Return the bias of each room type (C,) and the weights of the classes (C, V)."""
+        average = (self.present.sum(0) + 0.5) / (self.labelled.sum(0) + 1.0)
+        p = (self.present + alpha * average) / (self.labelled + alpha)
+        prior = ((self.scenes + 0.5) / (self.scenes + 0.5).sum()).log()
+        without = torch.log1p(-p) * absent
+        return prior + exponent * without.sum(1), exponent * (p.log() - without)
+
+
+@dataclass(frozen=True, eq=False)
+class RoomTable:
+    """A linear score of room types for each data source; "" stands for all data sources."""
+
+    tables: Mapping[str, tuple[Tensor, Tensor]]
+
+    def __call__(self, v: Tensor, profile: str) -> Tensor:
+        """Return log p of each room type, (B, C)."""
+        bias, weights = self.tables.get(profile, self.tables[""])
+        return (bias + v @ weights.T).log_softmax(1)
+
+
+def _counts(train: SceneTensors, structure: Tensor) -> Iterator[tuple[str, dict[str, _Counts]]]:
+    """Yield each set of scenes with its counts for all data sources, and for each data source."""
+    scenes = with_room_type(train)
+    if not len(scenes):
+        raise ValueError("no training scene has a room type")
+    types = int(scenes.room.max()) + 1
+    complete = subset(scenes, scenes.complete.nonzero().squeeze(1))
+    for name, chosen in (("all", scenes), ("complete", complete)):
+        if not len(chosen) or (name == "complete" and len(chosen) == len(scenes)):
+            continue
+        parts = {"": chosen, **dict(by_source(chosen))}
+        yield (
+            name,
+            {
+                source: _Counts.of(next(training_lists(part, structure))[1], part.room, types)
+                for source, part in parts.items()
+            },
+        )
+
+
+def naive_bayes(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RoomScore]:
+    """Yield a score for each set of scenes, smoothing, kind of evidence and exponent."""
+    grid = tuple(product(_ALPHA, _SOURCE_ALPHA, (False, True), _EXPONENTS))
+    for name, counts in _counts(train, structure):
+        for alpha, source_alpha, absent, s in grid:
+            tables = {
+                source: count.table(source_alpha if source else alpha, s, absent)
+                for source, count in counts.items()
+            }
+            kind: Parameters = {"scenes": name, "absent": absent, "exponent": s}
+            yield {**kind, "alpha": alpha, "source_alpha": source_alpha}, RoomTable(tables)
+
+
+def most_common(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RoomScore]:
+    """Yield the frequencies of the room types for each set of scenes."""
+    for name, counts in _counts(train, structure):
+        yield {"scenes": name}, RoomTable({q: c.table(1.0, 0.0, False) for q, c in counts.items()})
