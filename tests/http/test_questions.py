@@ -1,4 +1,4 @@
-"""The four questions, answered by real artifacts of every variant."""
+"""The five questions, answered by real artifacts of every variant."""
 
 from __future__ import annotations
 
