@@ -6,7 +6,7 @@ A machine whose chains drift away from the scenes learnt a wrong distribution: t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -14,9 +14,8 @@ import numpy as np
 
 from app.inference.chains import Bits, Conditions, SceneChains, random_stream
 from app.inference.weights import Weights
-from app.registry import Artifact, Metric
+from app.registry import Metric
 from training.datasets.array_types import Flags, Floats, Ints
-from training.datasets.batches import TrainingData
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_weights
 
@@ -171,16 +170,21 @@ class Drift:
 
 
 def measure_drift(
-    artifact: Artifact, data: TrainingData, config: ObjectsConfig, seed: int = 1
+    weights: Weights,
+    labels: Sequence[str],
+    scenes: ObjectScenes,
+    config: ObjectsConfig,
+    seed: int = 1,
 ) -> list[Drift]:
     """Run 3,000 sweeps from the training scenes of each served source, and compare them.
 
     Served sources have at least half of the largest weight in the served mix. The states of the
     last 1,000 sweeps count.
+
+    Args:
+        labels: label of each class, (classes,).
     """
-    scenes = ObjectScenes.of(data.train, data.structure, config)
-    served = served_weights(scenes, config)
-    chains, labels = scene_chains(artifact.weights), artifact.vocabulary.labels
+    served, chains = served_weights(scenes, config), scene_chains(weights)
     drifts = []
     for population in populations(scenes, config):
         q = population.profile

@@ -99,7 +99,9 @@ def publish_run(
         calibrated = with_statistics(calibrated, scenes)
     alarms = untouched_alarms(calibrated, scenes.parts["validation"])
     progress("running long chains")
-    drifts = measure_drift(calibrated, data, run.config.objects)
+    learnt = ObjectScenes.of(data.train, data.structure, run.config.objects)
+    labels = scenes.vocabulary.labels
+    drifts = measure_drift(calibrated.weights, labels, learnt, run.config.objects)
     objections = [entry.objection() for entry in alarms] + [drift.objection() for drift in drifts]
     reasons = [*filter(None, objections), *judge(calibrated)]
     for reason in reasons:
@@ -117,7 +119,7 @@ def publish_run(
         vocabulary=VocabularyEntry.of(
             with_room_aliases(scenes.vocabulary),
             machine.spec.A,
-            ObjectScenes.of(data.train, data.structure, run.config.objects).sources,
+            learnt.sources,
         ),
         calibration=calibrated.calibration,
         training={
