@@ -53,37 +53,33 @@ class Epoch:
 
 def phases(
     machine: Machine, scenes: Scenes, generator: torch.Generator, steps: int = 1
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[State, State, Tensor, Tensor]:
     """Run the positive phase and `steps` sweeps of the negative phase.
 
     Returns:
-        <E>_positive - <E>_negative of each scene, (B,), whose gradient estimates that of the
-        negative log-likelihood; the error E of the objects, (B,), and of the relations, (B,). In
-        both phases, the mean of h1 given all other units replaces h1.
+        The states at the end of the positive and of the negative phase, where the mean of h1 given
+        all other units replaces h1; the error E of the objects, (B,), and of the relations, (B,).
     """
     v, r, annotated = scenes.v, scenes.r, scenes.annotated.unsqueeze(1)
-    with torch.no_grad():
-        h1, h2 = machine.hidden(v, r, generator)
-        free = Free(torch.ones_like(v, dtype=torch.bool), annotated.expand(r.shape))
-        state = State(v, r, h1, h2)
-        object_p, relation_p = v, r
-        for _ in range(steps):
-            state, object_p, relation_p = machine.sweep(state, free, 1.0, generator)
-        positive = State(v, r, machine.h1_logits(v, r, h2).sigmoid(), h2)
-        h2 = bernoulli(machine.h2_logits(state.h1).sigmoid(), generator)
-        logits = machine.h1_logits(state.v, state.r, h2)
-        negative = State(state.v, state.r, logits.sigmoid(), h2)
-        object_error = (v - object_p).square().sum(1)
-        relation_error = ((r - relation_p) * annotated).square().sum(1)
-    loss = machine.energy(positive) - machine.energy(negative)
-    return loss, object_error, relation_error
+    h1, h2 = machine.hidden(v, r, generator)
+    free = Free(torch.ones_like(v, dtype=torch.bool), annotated.expand(r.shape))
+    state = State(v, r, h1, h2)
+    object_p, relation_p = v, r
+    for _ in range(steps):
+        state, object_p, relation_p = machine.sweep(state, free, 1.0, generator)
+    positive = State(v, r, machine.h1_logits(v, r, h2).sigmoid(), h2)
+    h2 = bernoulli(machine.h2_logits(state.h1).sigmoid(), generator)
+    logits = machine.h1_logits(state.v, state.r, h2)
+    negative = State(state.v, state.r, logits.sigmoid(), h2)
+    object_error = (v - object_p).square().sum(1)
+    relation_error = ((r - relation_p) * annotated).square().sum(1)
+    return positive, negative, object_error, relation_error
 
 
-@torch.no_grad()
 def errors(machine: Machine, scenes: Scenes, generator: torch.Generator) -> tuple[float, float]:
     """Return the error E of objects and of relations, averaged over scenes."""
     parts = [
-        phases(machine, scenes.rows(index), generator)[1:]
+        phases(machine, scenes.rows(index), generator)[2:]
         for index in torch.arange(len(scenes)).split(BATCH)
     ]
     objects, relations = (torch.cat(error) for error in zip(*parts, strict=True))
@@ -108,11 +104,10 @@ def train(
     Raises:
         FloatingPointError: the weights have diverged.
     """
-    optimiser = torch.optim.SGD(machine.parameters(), LEARNING_RATE)
     history: list[Epoch] = []
     best, best_epoch, weights = math.inf, 0, machine.state_dict()
     for epoch in range(epochs):
-        history.append(_epoch(machine, material, generator, optimiser))
+        history.append(_epoch(machine, material, generator))
         progress(epoch, history[-1])
         score = history[-1].validation_objects + history[-1].validation_relations
         if not math.isfinite(score):
@@ -130,15 +125,13 @@ def _epoch(
     machine: Machine,
     material: Material,
     generator: torch.Generator,
-    optimiser: torch.optim.Optimizer,
 ) -> Epoch:
     start, scenes = time.perf_counter(), material.train
     objects = relations = 0.0
     for index in torch.randperm(len(scenes), generator=generator).split(BATCH):
-        loss, object_error, relation_error = phases(machine, scenes.rows(index), generator)
-        optimiser.zero_grad()
-        loss.mean().backward()
-        optimiser.step()
+        positive, negative, *own = phases(machine, scenes.rows(index), generator)
+        machine.update(positive, negative, LEARNING_RATE)
+        object_error, relation_error = own
         objects += float(object_error.sum())
         relations += float(relation_error.sum())
     seconds = time.perf_counter() - start

@@ -73,11 +73,27 @@ class Machine(nn.Module):
         self.subject, self.object = triples[:, 1], triples[:, 2]
 
         def weights(*shape: int) -> nn.Parameter:
-            return nn.Parameter(_SCALE * torch.randn(shape, generator=generator))
+            return _fixed(_SCALE * torch.randn(shape, generator=generator))
 
-        self.b, self.c1, self.c2 = (nn.Parameter(torch.zeros(n)) for n in (V, H1, H2))
+        self.b, self.c1, self.c2 = (_fixed(torch.zeros(n)) for n in (V, H1, H2))
         self.W, self.J = weights(V, H1), weights(H1, H2)
-        self.d, self.U = nn.Parameter(torch.zeros(T)), weights(T, H1)
+        self.d, self.U = _fixed(torch.zeros(T)), weights(T, H1)
+
+    def update(self, positive: State, negative: State, rate: float) -> None:
+        """Add rate * (<-dE/dw>_positive - <-dE/dw>_negative), means over scenes, to each weight w.
+
+        E is linear in each weight, so -dE/dw is a product of units.
+        """
+        for state, step in ((positive, rate), (negative, -rate)):
+            self.add_products(state, step / len(state.v))
+
+    def add_products(self, state: State, step: float) -> None:
+        """Add step * -dE/dw, summed over scenes, to each weight w."""
+        v, r, h1, h2 = state.v, state.r, state.h1, state.h2
+        for bias, units in ((self.b, v), (self.c1, h1), (self.c2, h2), (self.d, r)):
+            bias.add_(units.sum(0), alpha=step)
+        for weights, rows, columns in ((self.W, v, h1), (self.J, h1, h2), (self.U, r, h1)):
+            weights.addmm_(rows.T, columns, alpha=step)
 
     def gate(self, v: Tensor) -> Tensor:
         """Return 1 for each relation that can be on given the objects, (B, T)."""
@@ -139,6 +155,11 @@ class Machine(nn.Module):
         return State(v, r, h1, h2), object_p, relation_p
 
 
+def _fixed(value: Tensor) -> nn.Parameter:
+    """Return a weight without automatic differentiation: `Machine.update` has the gradient."""
+    return nn.Parameter(value, requires_grad=False)
+
+
 class RBM(Machine):
     """Objects and relations are joined to the context only."""
 
@@ -150,11 +171,16 @@ class GBM(Machine):
         self, triples: Tensor, V: int, H1: int, H2: int, generator: torch.Generator
     ) -> None:
         super().__init__(triples, V, H1, H2, generator)
-        self.g = nn.Parameter(_SCALE * torch.randn((2, len(triples)), generator=generator))
+        self.g = _fixed(_SCALE * torch.randn((2, len(triples)), generator=generator))
+
+    def add_products(self, state: State, step: float) -> None:
+        super().add_products(state, step)
+        for g, end in zip(self.g, (self.subject, self.object), strict=True):
+            g.add_((state.r * state.v.index_select(1, end)).sum(0), alpha=step)
 
     def relation_logits(self, v: Tensor, h1: Tensor) -> Tensor:
-        ends = self.g[0] * v[:, self.subject] + self.g[1] * v[:, self.object]
-        return super().relation_logits(v, h1) + ends
+        subject, object_ = v.index_select(1, self.subject), v.index_select(1, self.object)
+        return super().relation_logits(v, h1) + self.g[0] * subject + self.g[1] * object_
 
     def pull(self, r: Tensor) -> Tensor:
         pull = super().pull(r)
@@ -166,7 +192,7 @@ class Triway(Machine):
     """Tri-way edges r_e v_i v_j: only objects that are present have relations."""
 
     def gate(self, v: Tensor) -> Tensor:
-        return v[:, self.subject] * v[:, self.object]
+        return v.index_select(1, self.subject) * v.index_select(1, self.object)
 
     def pull(self, r: Tensor) -> Tensor:
         """Return infinity for the objects of relations that are on, and 0 for the others."""
