@@ -2,14 +2,16 @@
 
 One step takes 32 scenes. The positive phase samples the context given the scene. The negative
 phase samples objects given context and relations, and then relations given context and objects, at
-temperature 1. The update is gradient descent with learning rate .5 on <E>_positive - <E>_negative.
-An unlisted relation of an annotated scene is false. The relations of a scene without annotation
-occur in neither phase.
+temperature 1. A step adds .5 (<-dE/dw>_positive - <-dE/dw>_negative) to each weight w. Both phases
+sample their last context with the same random numbers, so most of the noise cancels. An unlisted
+relation of an annotated scene is false. The relations of a scene without annotation occur in
+neither phase.
 
-The error E of the paper is the squared difference between the scene and the probabilities at the
-end of the negative phase, summed over units and averaged over scenes. Objects and relations are
-separate. Training stops if the error of the validation scenes, objects plus relations, has not
-fallen for `PATIENCE` epochs, and the weights of the best epoch are kept.
+The error E of the paper is the squared difference between the probabilities at the start of the
+positive phase and at the end of the negative phase, summed over units and averaged over scenes. The
+scene is observed, so the first probabilities are 0 or 1. Objects and relations are separate.
+Training stops if the error of the validation scenes, objects plus relations, has not fallen for
+`PATIENCE` epochs, and the weights of the best epoch are kept.
 
 Sources: Hinton, "Training products of experts by minimizing contrastive divergence" (2002);
 Bozcan et al. (2018).
@@ -19,22 +21,25 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import torch
 from torch import Tensor
 
-from training.seed.machines import Free, Machine, State, Variant, bernoulli
+from training.seed.machines import Free, Machine, State, Variant
 from training.seed.scenes import Material, Scenes
 
 LEARNING_RATE: Final = 0.5
 BATCH: Final = 32
 PATIENCE: Final = 30
 EPOCHS: Final = 200
-
-Progress = Callable[[int, "Epoch"], None]
+LARGEST_WEIGHT: Final = 50.0
+"""Limit of |w|. A larger weight is a sign of divergence: a logit of 20 is a certainty of 1e-9."""
+RUNAWAY: Final = 4.0, 10
+"""Training has diverged if E stays above this multiple of the error of units that are always off,
+for this number of epochs, and does not fall."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +72,20 @@ def phases(
     object_p, relation_p = v, r
     for _ in range(steps):
         state, object_p, relation_p = machine.sweep(state, free, 1.0, generator)
-    positive = State(v, r, machine.h1_logits(v, r, h2).sigmoid(), h2)
-    h2 = bernoulli(machine.h2_logits(state.h1).sigmoid(), generator)
-    logits = machine.h1_logits(state.v, state.r, h2)
-    negative = State(state.v, state.r, logits.sigmoid(), h2)
+    draws = [torch.rand(h.shape, generator=generator, dtype=h.dtype) for h in (h1, h2)]
+    positive = _with_context(machine, State(v, r, h1, h2), draws)
+    negative = _with_context(machine, state, draws)
     object_error = (v - object_p).square().sum(1)
     relation_error = ((r - relation_p) * annotated).square().sum(1)
     return positive, negative, object_error, relation_error
+
+
+def _with_context(machine: Machine, state: State, draws: Sequence[Tensor]) -> State:
+    """Sample h1 and h2 with these random numbers. Return the state with the mean of h1 given h2."""
+    visible = machine.h1_logits(state.v, state.r, torch.zeros_like(state.h2))
+    h1 = (draws[0] < (visible + state.h2 @ machine.J.T).sigmoid()).to(visible.dtype)
+    h2 = (draws[1] < machine.h2_logits(h1).sigmoid()).to(visible.dtype)
+    return State(state.v, state.r, (visible + h2 @ machine.J.T).sigmoid(), h2)
 
 
 def errors(machine: Machine, scenes: Scenes, generator: torch.Generator) -> tuple[float, float]:
@@ -96,22 +108,21 @@ def train(
     machine: Machine,
     material: Material,
     generator: torch.Generator,
-    progress: Progress,
     epochs: int = EPOCHS,
+    rate: float = LEARNING_RATE,
 ) -> list[Epoch]:
     """Train a machine in place, and return the errors of each epoch.
 
     Raises:
-        FloatingPointError: the weights have diverged.
+        FloatingPointError: training has diverged. The message names the weight, the errors and the
+            learning rate.
     """
     history: list[Epoch] = []
     best, best_epoch, weights = math.inf, 0, machine.state_dict()
     for epoch in range(epochs):
-        history.append(_epoch(machine, material, generator))
-        progress(epoch, history[-1])
+        history.append(_epoch(machine, material, generator, rate))
+        _check(machine, material.train, history, rate)
         score = history[-1].validation_objects + history[-1].validation_relations
-        if not math.isfinite(score):
-            raise FloatingPointError(f"the weights diverged in epoch {epoch + 1}")
         if score < best:
             best, best_epoch = score, epoch
             weights = {name: value.clone() for name, value in machine.state_dict().items()}
@@ -121,19 +132,14 @@ def train(
     return history
 
 
-def _epoch(
-    machine: Machine,
-    material: Material,
-    generator: torch.Generator,
-) -> Epoch:
+def _epoch(machine: Machine, material: Material, generator: torch.Generator, rate: float) -> Epoch:
     start, scenes = time.perf_counter(), material.train
     objects = relations = 0.0
     for index in torch.randperm(len(scenes), generator=generator).split(BATCH):
         positive, negative, *own = phases(machine, scenes.rows(index), generator)
-        machine.update(positive, negative, LEARNING_RATE)
-        object_error, relation_error = own
-        objects += float(object_error.sum())
-        relations += float(relation_error.sum())
+        machine.update(positive, negative, rate)
+        objects += float(own[0].sum())
+        relations += float(own[1].sum())
     seconds = time.perf_counter() - start
     return Epoch(
         objects / len(scenes),
@@ -141,3 +147,31 @@ def _epoch(
         *errors(machine, material.validation, generator),
         seconds,
     )
+
+
+def _check(machine: Machine, scenes: Scenes, history: Sequence[Epoch], rate: float) -> None:
+    """Raise FloatingPointError if a weight or an error shows divergence."""
+    largest = {name: float(w.abs().max()) for name, w in machine.named_parameters() if w.numel()}
+    name = max(largest, key=lambda k: largest[k] if math.isfinite(largest[k]) else math.inf)
+    off = {"objects": float(scenes.v.sum()) / len(scenes)}
+    off["relations"] = float(scenes.r.sum()) / max(int(scenes.annotated.sum()), 1)
+    multiple, epochs = RUNAWAY
+    causes = []
+    if not largest[name] <= LARGEST_WEIGHT:
+        causes.append(
+            f"a weight of {name} has the size {largest[name]:.4g}, above {LARGEST_WEIGHT:g}"
+        )
+    for kind, limit in off.items():
+        recent = [getattr(epoch, kind) for epoch in history[-epochs:]]
+        if len(recent) == epochs and min(recent) > multiple * limit and recent[-1] >= recent[0]:
+            causes.append(
+                f"the error E of {kind} was above {multiple * limit:.4g} for {epochs} epochs"
+            )
+    if causes:
+        last = history[-1]
+        raise FloatingPointError(
+            f"training diverged in epoch {len(history)}: {' and '.join(causes)}. E is "
+            f"{last.objects:.4g} for objects and {last.relations:.4g} for relations (all units "
+            f"off: {off['objects']:.4g} and {off['relations']:.4g}). The largest weight is "
+            f"{name}, {largest[name]:.4g}. Use a smaller learning rate than {rate:g}"
+        )
