@@ -157,10 +157,10 @@ def _check(machine: Machine, scenes: Scenes, history: Sequence[Epoch], rate: flo
     off["relations"] = float(scenes.r.sum()) / max(int(scenes.annotated.sum()), 1)
     multiple, epochs = RUNAWAY
     causes = []
-    if not largest[name] <= LARGEST_WEIGHT:
-        causes.append(
-            f"a weight of {name} has the size {largest[name]:.4g}, above {LARGEST_WEIGHT:g}"
-        )
+    if not math.isfinite(largest[name]):
+        causes.append(f"a weight of {name} is not finite")
+    elif largest[name] > LARGEST_WEIGHT:
+        causes.append(f"a weight of {name} has the size {largest[name]:.4g}")
     for kind, limit in off.items():
         recent = [getattr(epoch, kind) for epoch in history[-epochs:]]
         if len(recent) == epochs and min(recent) > multiple * limit and recent[-1] >= recent[0]:
@@ -171,7 +171,8 @@ def _check(machine: Machine, scenes: Scenes, history: Sequence[Epoch], rate: flo
         last = history[-1]
         raise FloatingPointError(
             f"training diverged in epoch {len(history)}: {' and '.join(causes)}. E is "
-            f"{last.objects:.4g} for objects and {last.relations:.4g} for relations (all units "
-            f"off: {off['objects']:.4g} and {off['relations']:.4g}). The largest weight is "
-            f"{name}, {largest[name]:.4g}. Use a smaller learning rate than {rate:g}"
+            f"{last.objects:.4g} for objects and {last.relations:.4g} for relations; with all "
+            f"units off, it is {off['objects']:.4g} and {off['relations']:.4g}. The largest weight "
+            f"is {largest[name]:.4g} in {name}, the limit {LARGEST_WEIGHT:g}. Use a smaller "
+            f"learning rate than {rate:g}"
         )
