@@ -14,8 +14,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from itertools import product
@@ -28,7 +27,7 @@ from rich.console import Console
 
 from training.datasets import DatasetError
 from training.datasets.files import DATA
-from training.seed.learning import EPOCHS, LEARNING_RATE, new_machine, train
+from training.seed.learning import EPOCHS, LEARNING_RATE, train
 from training.seed.machines import VARIANTS
 from training.seed.page import Row, Run, markdown, plot
 from training.seed.protocol import (
@@ -99,13 +98,18 @@ def _train_all(
     settings: Mapping[str, float],
     workers: int,
 ) -> dict[str, dict[str, list[Run]]]:
-    """Train and measure each machine without a file. Return the runs by split and variant."""
+    """Train and measure each machine without a file, in worker processes of one thread.
+
+    Returns:
+        The runs by split and variant.
+    """
     runs: dict[str, dict[str, list[Run]]] = {split: {} for split in materials}
     jobs = list(product(materials, VARIANTS, range(seeds)))
     one = partial(_run, folder=folder, materials=dict(materials), settings=dict(settings))
-    with console.status(f"training {len(jobs)} machines"), _processes(workers) as each:
-        for done, (job, run) in enumerate(zip(jobs, each(one, jobs), strict=True), 1):
-            split, name, number = job
+    pool = multiprocessing.get_context("spawn").Pool(workers, _start_worker)
+    with console.status(f"training {len(jobs)} machines"), pool:
+        for done, run in enumerate(pool.imap(one, jobs), 1):
+            split, name, number = jobs[done - 1]
             runs[split].setdefault(name, []).append(run)
             last = run["history"][-1]
             console.print(
@@ -114,17 +118,6 @@ def _train_all(
                 highlight=False,
             )
     return runs
-
-
-@contextmanager
-def _processes(workers: int) -> Iterator[Any]:
-    """Provide `map` over worker processes of one thread, or the built-in `map` for one worker."""
-    if workers == 1:
-        torch.set_num_threads(1)
-        yield map
-        return
-    with multiprocessing.get_context("spawn").Pool(workers, _start_worker) as pool:
-        yield pool.imap
 
 
 def _start_worker() -> None:
@@ -158,7 +151,8 @@ def _run(
             raise FolderError(f"{path} has other scenes or settings: use another --out")
         return run
     start, generator = time.process_time(), torch.Generator().manual_seed(number)
-    machine = new_machine(VARIANTS[name], material, generator)
+    variant, V = VARIANTS[name], len(material.vocabulary)
+    machine = variant.kind(material.triples, V, variant.H1, variant.H2, generator)
     try:
         history = train(machine, material, generator, settings["epochs"], settings["learning_rate"])
     except FloatingPointError as error:

@@ -28,7 +28,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from training.seed.machines import Free, Machine, State, Variant
+from training.seed.machines import Free, Machine, State
 from training.seed.scenes import Material, Scenes
 
 LEARNING_RATE: Final = 0.5
@@ -40,6 +40,9 @@ LARGEST_WEIGHT: Final = 50.0
 RUNAWAY: Final = 4.0, 10
 """Training has diverged if E stays above this multiple of the error of units that are always off,
 for this number of epochs, and does not fall."""
+
+
+KINDS: Final = ("objects", "relations")
 
 
 @dataclass(frozen=True)
@@ -88,22 +91,6 @@ def _with_context(machine: Machine, state: State, draws: Sequence[Tensor]) -> St
     return State(state.v, state.r, (visible + h2 @ machine.J.T).sigmoid(), h2)
 
 
-def errors(machine: Machine, scenes: Scenes, generator: torch.Generator) -> tuple[float, float]:
-    """Return the error E of objects and of relations, averaged over scenes."""
-    parts = [
-        phases(machine, scenes.rows(index), generator)[2:]
-        for index in torch.arange(len(scenes)).split(BATCH)
-    ]
-    objects, relations = (torch.cat(error) for error in zip(*parts, strict=True))
-    return float(objects.mean()), float(relations.sum()) / max(int(scenes.annotated.sum()), 1)
-
-
-def new_machine(variant: Variant, material: Material, generator: torch.Generator) -> Machine:
-    """Return an untrained machine for these scenes."""
-    V = len(material.vocabulary)
-    return variant.kind(material.triples, V, variant.H1, variant.H2, generator)
-
-
 def train(
     machine: Machine,
     material: Material,
@@ -133,28 +120,33 @@ def train(
 
 
 def _epoch(machine: Machine, material: Material, generator: torch.Generator, rate: float) -> Epoch:
-    start, scenes = time.perf_counter(), material.train
-    objects = relations = 0.0
-    for index in torch.randperm(len(scenes), generator=generator).split(BATCH):
-        positive, negative, *own = phases(machine, scenes.rows(index), generator)
+    start, own = time.perf_counter(), []
+    for index in torch.randperm(len(material.train), generator=generator).split(BATCH):
+        positive, negative, *error = phases(machine, material.train.rows(index), generator)
         machine.update(positive, negative, rate)
-        objects += float(own[0].sum())
-        relations += float(own[1].sum())
+        own.append(error)
     seconds = time.perf_counter() - start
-    return Epoch(
-        objects / len(scenes),
-        relations / max(int(scenes.annotated.sum()), 1),
-        *errors(machine, material.validation, generator),
-        seconds,
-    )
+    validation = errors(machine, material.validation, generator)
+    return Epoch(*_averages(own, material.train), *validation, seconds)
+
+
+def errors(machine: Machine, scenes: Scenes, generator: torch.Generator) -> tuple[float, float]:
+    """Return the error E of objects and of relations, averaged over scenes."""
+    batches = torch.arange(len(scenes)).split(BATCH)
+    own = [phases(machine, scenes.rows(index), generator)[2:] for index in batches]
+    return _averages(own, scenes)
+
+
+def _averages(own: Sequence[Sequence[Tensor]], scenes: Scenes) -> tuple[float, float]:
+    objects, relations = (float(torch.cat(error).sum()) for error in zip(*own, strict=True))
+    return objects / len(scenes), relations / max(int(scenes.annotated.sum()), 1)
 
 
 def _check(machine: Machine, scenes: Scenes, history: Sequence[Epoch], rate: float) -> None:
     """Raise FloatingPointError if a weight or an error shows divergence."""
     largest = {name: float(w.abs().max()) for name, w in machine.named_parameters() if w.numel()}
     name = max(largest, key=lambda k: largest[k] if math.isfinite(largest[k]) else math.inf)
-    off = {"objects": float(scenes.v.sum()) / len(scenes)}
-    off["relations"] = float(scenes.r.sum()) / max(int(scenes.annotated.sum()), 1)
+    off = dict(zip(KINDS, _averages([(scenes.v, scenes.r)], scenes), strict=True))
     multiple, epochs = RUNAWAY
     causes = []
     if not math.isfinite(largest[name]):

@@ -7,6 +7,7 @@ from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import Any, Final
 
+from training.seed.learning import KINDS
 from training.seed.machines import VARIANTS
 from training.seed.protocol import PAPER
 from training.seed.scenes import Material
@@ -23,7 +24,6 @@ _ANNEALED_SHOWN: Final = (
     "T3 error / objects",
 )
 _TITLES: Final = {"scenes": "Split by scenes, as in the paper", "groups": "Split by groups"}
-_KINDS: Final = ("objects", "relations")
 
 
 def markdown(source: str, materials: Mapping[str, Material], results: Mapping[str, Any]) -> str:
@@ -61,7 +61,7 @@ def _row(run: Run) -> Row:
     """Return all figures of a run by metric, in the order of the table."""
     history, row = run["history"], dict(run["figures"])
     row |= {f"annealed: {name}": run["annealed"][name] for name in _ANNEALED_SHOWN if name in row}
-    for kind in _KINDS:
+    for kind in KINDS:
         shown = {f"epoch {k}": history[k - 1] for k in _EPOCHS_SHOWN if k <= len(history)}
         for when, epoch in (shown | {"last epoch": history[-1]}).items():
             row[f"E {kind}, {when}"] = epoch[kind]
@@ -87,9 +87,9 @@ def plot(path: Path, results: Mapping[str, Any]) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4 * len(results)), layout="constrained")
-    axes = figure.subplots(len(results), len(_KINDS), squeeze=False)
+    axes = figure.subplots(len(results), len(KINDS), squeeze=False)
     for row, (split, result) in zip(axes, results.items(), strict=True):
-        for axis, kind in zip(row, _KINDS, strict=True):
+        for axis, kind in zip(row, KINDS, strict=True):
             for number, (name, runs) in enumerate(result["machines"].items()):
                 for seed, run in enumerate(runs):
                     values = [epoch[kind] for epoch in run["history"]]
