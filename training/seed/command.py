@@ -40,7 +40,7 @@ from training.seed.protocol import (
     measure,
     nothing_answer,
 )
-from training.seed.scenes import SPLITS, Material, read_material
+from training.seed.scenes import Material, read_material
 
 console = Console()
 
@@ -69,7 +69,7 @@ def seed(
     """
     try:
         with console.status("reading scenes"):
-            materials = read_material(source, data, tuple(SPLITS))
+            materials = read_material(source, data)
         folder = out / Path(source).name.split(".")[0]
         settings = {"epochs": epochs, "learning_rate": learning_rate}
         runs = _train_all(materials, folder, seeds, settings, workers)

@@ -65,6 +65,8 @@ def _row(run: Run) -> Row:
         shown = {f"epoch {k}": history[k - 1] for k in _EPOCHS_SHOWN if k <= len(history)}
         for when, epoch in (shown | {"last epoch": history[-1]}).items():
             row[f"E {kind}, {when}"] = epoch[kind]
+        left = history[min(50, len(history)) - 1][kind]
+        row[f"share of E {kind} left at epoch 50"] = left / max(history[0][kind], 1e-9)
     row["epochs"], row["weights"] = len(history), run["weights"]
     row["seconds an epoch"] = median(epoch["seconds"] for epoch in history)
     return row
