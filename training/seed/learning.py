@@ -2,14 +2,16 @@
 
 One step takes 32 scenes. The positive phase samples the context given the scene. The negative
 phase samples objects given context and relations, and then relations given context and objects, at
-temperature 1. The update is gradient descent with learning rate .5 on <E>_positive - <E>_negative.
-An unlisted relation of an annotated scene is false. The relations of a scene without annotation
-occur in neither phase.
+temperature 1. A step adds .5 (<-dE/dw>_positive - <-dE/dw>_negative) to each weight w. Both phases
+sample their last context with the same random numbers, so most of the noise cancels. An unlisted
+relation of an annotated scene is false. The relations of a scene without annotation occur in
+neither phase.
 
-The error E of the paper is the squared difference between the scene and the probabilities at the
-end of the negative phase, summed over units and averaged over scenes. Objects and relations are
-separate. Training stops if the error of the validation scenes, objects plus relations, has not
-fallen for `PATIENCE` epochs, and the weights of the best epoch are kept.
+The error E of the paper is the squared difference between the probabilities at the start of the
+positive phase and at the end of the negative phase, summed over units and averaged over scenes. The
+scene is observed, so the first probabilities are 0 or 1. Objects and relations are separate.
+Training stops if the error of the validation scenes, objects plus relations, has not fallen for
+`PATIENCE` epochs, and the weights of the best epoch are kept.
 
 Sources: Hinton, "Training products of experts by minimizing contrastive divergence" (2002);
 Bozcan et al. (2018).
@@ -19,22 +21,28 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import torch
 from torch import Tensor
 
-from training.seed.machines import Free, Machine, State, Variant, bernoulli
+from training.seed.machines import Free, Machine, State
 from training.seed.scenes import Material, Scenes
 
 LEARNING_RATE: Final = 0.5
 BATCH: Final = 32
 PATIENCE: Final = 30
 EPOCHS: Final = 200
+LARGEST_WEIGHT: Final = 50.0
+"""Limit of |w|. A larger weight is a sign of divergence: a logit of 20 is a certainty of 1e-9."""
+RUNAWAY: Final = 4.0, 10
+"""Training has diverged if E stays above this multiple of the error of units that are always off,
+for this number of epochs, and does not fall."""
 
-Progress = Callable[[int, "Epoch"], None]
+
+KINDS: Final = ("objects", "relations")
 
 
 @dataclass(frozen=True)
@@ -53,70 +61,55 @@ class Epoch:
 
 def phases(
     machine: Machine, scenes: Scenes, generator: torch.Generator, steps: int = 1
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[State, State, Tensor, Tensor]:
     """Run the positive phase and `steps` sweeps of the negative phase.
 
     Returns:
-        <E>_positive - <E>_negative of each scene, (B,), whose gradient estimates that of the
-        negative log-likelihood; the error E of the objects, (B,), and of the relations, (B,). In
-        both phases, the mean of h1 given all other units replaces h1.
+        The states at the end of the positive and of the negative phase, where the mean of h1 given
+        all other units replaces h1; the error E of the objects, (B,), and of the relations, (B,).
     """
     v, r, annotated = scenes.v, scenes.r, scenes.annotated.unsqueeze(1)
-    with torch.no_grad():
-        h1, h2 = machine.hidden(v, r, generator)
-        free = Free(torch.ones_like(v, dtype=torch.bool), annotated.expand(r.shape))
-        state = State(v, r, h1, h2)
-        object_p, relation_p = v, r
-        for _ in range(steps):
-            state, object_p, relation_p = machine.sweep(state, free, 1.0, generator)
-        positive = State(v, r, machine.h1_logits(v, r, h2).sigmoid(), h2)
-        h2 = bernoulli(machine.h2_logits(state.h1).sigmoid(), generator)
-        logits = machine.h1_logits(state.v, state.r, h2)
-        negative = State(state.v, state.r, logits.sigmoid(), h2)
-        object_error = (v - object_p).square().sum(1)
-        relation_error = ((r - relation_p) * annotated).square().sum(1)
-    loss = machine.energy(positive) - machine.energy(negative)
-    return loss, object_error, relation_error
+    h1, h2 = machine.hidden(v, r, generator)
+    free = Free(torch.ones_like(v, dtype=torch.bool), annotated.expand(r.shape))
+    state = State(v, r, h1, h2)
+    object_p, relation_p = v, r
+    for _ in range(steps):
+        state, object_p, relation_p = machine.sweep(state, free, 1.0, generator)
+    draws = [torch.rand(h.shape, generator=generator, dtype=h.dtype) for h in (h1, h2)]
+    positive = _with_context(machine, State(v, r, h1, h2), draws)
+    negative = _with_context(machine, state, draws)
+    object_error = (v - object_p).square().sum(1)
+    relation_error = ((r - relation_p) * annotated).square().sum(1)
+    return positive, negative, object_error, relation_error
 
 
-@torch.no_grad()
-def errors(machine: Machine, scenes: Scenes, generator: torch.Generator) -> tuple[float, float]:
-    """Return the error E of objects and of relations, averaged over scenes."""
-    parts = [
-        phases(machine, scenes.rows(index), generator)[1:]
-        for index in torch.arange(len(scenes)).split(BATCH)
-    ]
-    objects, relations = (torch.cat(error) for error in zip(*parts, strict=True))
-    return float(objects.mean()), float(relations.sum()) / max(int(scenes.annotated.sum()), 1)
-
-
-def new_machine(variant: Variant, material: Material, generator: torch.Generator) -> Machine:
-    """Return an untrained machine for these scenes."""
-    V = len(material.vocabulary)
-    return variant.kind(material.triples, V, variant.H1, variant.H2, generator)
+def _with_context(machine: Machine, state: State, draws: Sequence[Tensor]) -> State:
+    """Sample h1 and h2 with these random numbers. Return the state with the mean of h1 given h2."""
+    visible = machine.h1_logits(state.v, state.r, torch.zeros_like(state.h2))
+    h1 = (draws[0] < (visible + state.h2 @ machine.J.T).sigmoid()).to(visible.dtype)
+    h2 = (draws[1] < machine.h2_logits(h1).sigmoid()).to(visible.dtype)
+    return State(state.v, state.r, (visible + h2 @ machine.J.T).sigmoid(), h2)
 
 
 def train(
     machine: Machine,
     material: Material,
     generator: torch.Generator,
-    progress: Progress,
     epochs: int = EPOCHS,
+    rate: float = LEARNING_RATE,
 ) -> list[Epoch]:
     """Train a machine in place, and return the errors of each epoch.
 
     Raises:
-        FloatingPointError: the weights have diverged.
+        FloatingPointError: training has diverged. The message names the weight, the errors and the
+            learning rate.
     """
-    optimiser = torch.optim.SGD(machine.parameters(), LEARNING_RATE)
     history: list[Epoch] = []
     best, best_epoch, weights = math.inf, 0, machine.state_dict()
     for epoch in range(epochs):
-        history.append(_epoch(machine, material, generator, optimiser))
-        progress(epoch, history[-1])
+        history.append(_epoch(machine, material, generator, rate))
+        _check(machine, material.train, history, rate)
         score = history[-1].validation_objects + history[-1].validation_relations
-        if not math.isfinite(score):
-            raise FloatingPointError(f"the weights diverged in epoch {epoch + 1}")
         if score < best:
             best, best_epoch = score, epoch
             weights = {name: value.clone() for name, value in machine.state_dict().items()}
@@ -126,25 +119,52 @@ def train(
     return history
 
 
-def _epoch(
-    machine: Machine,
-    material: Material,
-    generator: torch.Generator,
-    optimiser: torch.optim.Optimizer,
-) -> Epoch:
-    start, scenes = time.perf_counter(), material.train
-    objects = relations = 0.0
-    for index in torch.randperm(len(scenes), generator=generator).split(BATCH):
-        loss, object_error, relation_error = phases(machine, scenes.rows(index), generator)
-        optimiser.zero_grad()
-        loss.mean().backward()
-        optimiser.step()
-        objects += float(object_error.sum())
-        relations += float(relation_error.sum())
+def _epoch(machine: Machine, material: Material, generator: torch.Generator, rate: float) -> Epoch:
+    start, own = time.perf_counter(), []
+    for index in torch.randperm(len(material.train), generator=generator).split(BATCH):
+        positive, negative, *error = phases(machine, material.train.rows(index), generator)
+        machine.update(positive, negative, rate)
+        own.append(error)
     seconds = time.perf_counter() - start
-    return Epoch(
-        objects / len(scenes),
-        relations / max(int(scenes.annotated.sum()), 1),
-        *errors(machine, material.validation, generator),
-        seconds,
-    )
+    validation = errors(machine, material.validation, generator)
+    return Epoch(*_averages(own, material.train), *validation, seconds)
+
+
+def errors(machine: Machine, scenes: Scenes, generator: torch.Generator) -> tuple[float, float]:
+    """Return the error E of objects and of relations, averaged over scenes."""
+    batches = torch.arange(len(scenes)).split(BATCH)
+    own = [phases(machine, scenes.rows(index), generator)[2:] for index in batches]
+    return _averages(own, scenes)
+
+
+def _averages(own: Sequence[Sequence[Tensor]], scenes: Scenes) -> tuple[float, float]:
+    objects, relations = (float(torch.cat(error).sum()) for error in zip(*own, strict=True))
+    return objects / len(scenes), relations / max(int(scenes.annotated.sum()), 1)
+
+
+def _check(machine: Machine, scenes: Scenes, history: Sequence[Epoch], rate: float) -> None:
+    """Raise FloatingPointError if a weight or an error shows divergence."""
+    largest = {name: float(w.abs().max()) for name, w in machine.named_parameters() if w.numel()}
+    name = max(largest, key=lambda k: largest[k] if math.isfinite(largest[k]) else math.inf)
+    off = dict(zip(KINDS, _averages([(scenes.v, scenes.r)], scenes), strict=True))
+    multiple, epochs = RUNAWAY
+    causes = []
+    if not math.isfinite(largest[name]):
+        causes.append(f"a weight of {name} is not finite")
+    elif largest[name] > LARGEST_WEIGHT:
+        causes.append(f"a weight of {name} has the size {largest[name]:.4g}")
+    for kind, limit in off.items():
+        recent = [getattr(epoch, kind) for epoch in history[-epochs:]]
+        if len(recent) == epochs and min(recent) > multiple * limit and recent[-1] >= recent[0]:
+            causes.append(
+                f"the error E of {kind} was above {multiple * limit:.4g} for {epochs} epochs"
+            )
+    if causes:
+        last = history[-1]
+        raise FloatingPointError(
+            f"training diverged in epoch {len(history)}: {' and '.join(causes)}. E is "
+            f"{last.objects:.4g} for objects and {last.relations:.4g} for relations; with all "
+            f"units off, it is {off['objects']:.4g} and {off['relations']:.4g}. The largest weight "
+            f"is {largest[name]:.4g} in {name}, the limit {LARGEST_WEIGHT:g}. Use a smaller "
+            f"learning rate than {rate:g}"
+        )

@@ -4,21 +4,24 @@ The units are binary: objects v (V,), relations r (T,), context h1 (H1,) and h2 
 machine of one hidden layer. Unit e of r is a triple (relation, subject class i, object class j) of
 the training scenes. The other triples have no unit: they are off with probability one.
 
-    E(v, r, h1, h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_e r_e l_e(v, h1)
+    E(v, r, h1, h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_e r_e g_e l_e(v, h1)
 
-    RBM     l_e = d_e + U_e·h1
-    GBM     l_e = d_e + U_e·h1 + g_e1 v_i + g_e2 v_j
-    Triway  l_e = d_e + U_e·h1, on the states with r_e <= v_i v_j
+    RBM     l_e = d_e + U_e·h1                          g_e = 1
+    GBM     l_e = d_e + U_e·h1 + g_e1 v_i + g_e2 v_j    g_e = 1
+    Triway  l_e = d_e + U_e·h1                          g_e = v_i v_j, the gate
+
+A sweep samples the context, the objects given context and relations, and then the relations given
+context and objects, as the paper does. The log-odds of object i are -E(v_i = 1) + E(v_i = 0) at the
+current values of all other units. All objects are sampled in one block.
 
 Three choices:
 
-- The published code multiplies only the tri-way weight by v_i v_j, and not U. Here a relation of an
-  absent object is impossible, so the gate covers both. RBM and GBM have no gate.
+- The published code multiplies only the tri-way weight by v_i v_j, and not U. Here the gate covers
+  both, and a sampled relation of an absent object is off.
+- So the sweep of the Triway is no exact Gibbs sampler. An exact sampler of r_e <= v_i v_j holds all
+  objects of relations that are on. The objects of listed relations then have no gradient in CD-1.
 - Each triple has free weights d_e and U_e, as in the later code of the authors. The paper shares
   one weight among all triples of a relation and adds up their gradients, which diverges.
-- A sweep samples objects given h1 and the current relations, and then relations given objects and
-  h1, as the paper does. Under the gate, a relation that is on holds its objects on until the sweep
-  switches the relation off.
 """
 
 from __future__ import annotations
@@ -57,7 +60,7 @@ def bernoulli(p: Tensor, generator: torch.Generator) -> Tensor:
 
 
 class Machine(nn.Module):
-    """The parts that the three machines share. A subclass defines its relations and their effect.
+    """The parts that all machines share. A subclass defines its relations and their effect.
 
     Args:
         triples: (T, 3) int64, the relation, subject class and object class of each unit of r.
@@ -73,11 +76,27 @@ class Machine(nn.Module):
         self.subject, self.object = triples[:, 1], triples[:, 2]
 
         def weights(*shape: int) -> nn.Parameter:
-            return nn.Parameter(_SCALE * torch.randn(shape, generator=generator))
+            return _fixed(_SCALE * torch.randn(shape, generator=generator))
 
-        self.b, self.c1, self.c2 = (nn.Parameter(torch.zeros(n)) for n in (V, H1, H2))
+        self.b, self.c1, self.c2 = (_fixed(torch.zeros(n)) for n in (V, H1, H2))
         self.W, self.J = weights(V, H1), weights(H1, H2)
-        self.d, self.U = nn.Parameter(torch.zeros(T)), weights(T, H1)
+        self.d, self.U = _fixed(torch.zeros(T)), weights(T, H1)
+
+    def update(self, positive: State, negative: State, rate: float) -> None:
+        """Add rate * (<-dE/dw>_positive - <-dE/dw>_negative), means over scenes, to each weight w.
+
+        E is linear in each weight, so -dE/dw is a product of units.
+        """
+        for state, step in ((positive, rate), (negative, -rate)):
+            self.add_products(state, step / len(state.v))
+
+    def add_products(self, state: State, step: float) -> None:
+        """Add step * -dE/dw, summed over scenes, to each weight w."""
+        v, r, h1, h2 = state.v, state.r, state.h1, state.h2
+        for bias, units in ((self.b, v), (self.c1, h1), (self.c2, h2), (self.d, r)):
+            bias.add_(units.sum(0), alpha=step)
+        for weights, rows, columns in ((self.W, v, h1), (self.J, h1, h2), (self.U, r, h1)):
+            weights.addmm_(rows.T, columns, alpha=step)
 
     def gate(self, v: Tensor) -> Tensor:
         """Return 1 for each relation that can be on given the objects, (B, T)."""
@@ -86,13 +105,6 @@ class Machine(nn.Module):
     def relation_logits(self, v: Tensor, h1: Tensor) -> Tensor:
         """Return l_e, (B, T), the log-odds of each relation whose gate is 1."""
         return self.d + h1 @ self.U.T
-
-    def energy(self, state: State) -> Tensor:
-        """Return E, (B,). It is linear in each unit, so a unit may be replaced by its mean."""
-        v, h1, h2 = state.v, state.h1, state.h2
-        context = self.c1 + v @ self.W + h2 @ self.J.T
-        relations = (state.r * self.relation_logits(v, h1)).sum(-1)
-        return -(v @ self.b + h2 @ self.c2 + (context * h1).sum(-1) + relations)
 
     def h1_logits(self, v: Tensor, r: Tensor, h2: Tensor) -> Tensor:
         """Return the log-odds of h1 given all other units, (B, H1)."""
@@ -106,18 +118,28 @@ class Machine(nn.Module):
         self, state: State, free: Free, temperature: float, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
         """Sample the free objects given h1 and r. Return v and p(v_i = 1), both (B, V)."""
-        p = ((self.b + state.h1 @ self.W.T + self.pull(state.r)) / temperature).sigmoid()
+        p = ((self.b + state.h1 @ self.W.T + self.pull(state)) / temperature).sigmoid()
         return torch.where(free.v, bernoulli(p, generator), state.v), p
 
-    def pull(self, r: Tensor) -> Tensor:
-        """Return what the relations r (B, T) add to the log-odds of objects, (B, V)."""
-        return r.new_zeros(len(r), len(self.b))
+    def pull(self, state: State) -> Tensor:
+        """Return the effect of the relations on the log-odds of objects, (B, V)."""
+        return torch.zeros_like(state.v)
+
+    def ends(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the presence of the subject and of the object of each relation, both (B, T)."""
+        return v.index_select(1, self.subject), v.index_select(1, self.object)
+
+    def to_ends(self, subject: Tensor, object_: Tensor) -> Tensor:
+        """Add values of relations (B, T) up over their subjects and over their objects, (B, V)."""
+        total = subject.new_zeros(len(subject), len(self.b)).index_add(1, self.subject, subject)
+        return total.index_add(1, self.object, object_)
 
     def hidden(self, v: Tensor, r: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Sample h1 and h2 given the visible units. Exact with one layer, else `_ROUNDS` sweeps."""
         h1, h2 = v.new_zeros(len(v), len(self.c1)), v.new_zeros(len(v), len(self.c2))
+        visible = self.h1_logits(v, r, h2)
         for _ in range(_ROUNDS if len(self.c2) else 1):
-            h1 = bernoulli(self.h1_logits(v, r, h2).sigmoid(), generator)
+            h1 = bernoulli((visible + h2 @ self.J.T).sigmoid(), generator)
             h2 = bernoulli(self.h2_logits(h1).sigmoid(), generator)
         return h1, h2
 
@@ -139,6 +161,11 @@ class Machine(nn.Module):
         return State(v, r, h1, h2), object_p, relation_p
 
 
+def _fixed(value: Tensor) -> nn.Parameter:
+    """Return a weight without automatic differentiation: `Machine.update` has the gradient."""
+    return nn.Parameter(value, requires_grad=False)
+
+
 class RBM(Machine):
     """Objects and relations are joined to the context only."""
 
@@ -150,34 +177,44 @@ class GBM(Machine):
         self, triples: Tensor, V: int, H1: int, H2: int, generator: torch.Generator
     ) -> None:
         super().__init__(triples, V, H1, H2, generator)
-        self.g = nn.Parameter(_SCALE * torch.randn((2, len(triples)), generator=generator))
+        self.g = _fixed(_SCALE * torch.randn((2, len(triples)), generator=generator))
+
+    def add_products(self, state: State, step: float) -> None:
+        super().add_products(state, step)
+        for g, end in zip(self.g, self.ends(state.v), strict=True):
+            g.add_((state.r * end).sum(0), alpha=step)
 
     def relation_logits(self, v: Tensor, h1: Tensor) -> Tensor:
-        ends = self.g[0] * v[:, self.subject] + self.g[1] * v[:, self.object]
-        return super().relation_logits(v, h1) + ends
+        subject, object_ = self.ends(v)
+        return super().relation_logits(v, h1) + self.g[0] * subject + self.g[1] * object_
 
-    def pull(self, r: Tensor) -> Tensor:
-        pull = super().pull(r)
-        pull = pull.index_add(1, self.subject, r * self.g[0])
-        return pull.index_add(1, self.object, r * self.g[1])
+    def pull(self, state: State) -> Tensor:
+        return self.to_ends(state.r * self.g[0], state.r * self.g[1])
 
 
-class Triway(Machine):
-    """Tri-way edges r_e v_i v_j: only objects that are present have relations."""
+class GatedRBM(Machine):
+    """The RBM whose sampled relations of absent objects are off. Relations do not pull objects."""
 
     def gate(self, v: Tensor) -> Tensor:
-        return v[:, self.subject] * v[:, self.object]
+        subject, object_ = self.ends(v)
+        return subject * object_
 
-    def pull(self, r: Tensor) -> Tensor:
-        """Return infinity for the objects of relations that are on, and 0 for the others."""
-        pull = super().pull(r)
-        on = pull.index_add(1, self.subject, r).index_add(1, self.object, r)
-        return pull.masked_fill(on > 0, torch.inf)
+
+class Triway(GatedRBM):
+    """Tri-way edges r_e v_i v_j: a relation also pulls its objects."""
+
+    def pull(self, state: State) -> Tensor:
+        logits = state.r * self.relation_logits(state.v, state.h1)
+        subject, object_ = self.ends(state.v)
+        same = self.subject == self.object  # v_i v_i = v_i
+        return self.to_ends(
+            logits * object_.masked_fill(same, 1.0), logits * subject.masked_fill(same, 0.0)
+        )
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A machine of the paper: its name in tables, its class and its hidden units."""
+    """A machine: its name in tables, its class and its hidden units."""
 
     title: str
     kind: type[Machine]
@@ -190,4 +227,6 @@ VARIANTS: Final = {
     "gbm": Variant("GBM", GBM, 200, 100),
     "triway": Variant("Triway", Triway, 200, 100),
     "triway-1": Variant("Triway, one layer", Triway, 200, 0),
+    "gated-rbm": Variant("RBM, gated relations", GatedRBM, 200, 0),
 }
+"""The machines of the paper, and two that tell the gate, the tri-way edges and h2 apart."""

@@ -52,7 +52,6 @@ _SHOWN: Final = 8  # most frequent classes of a hidden unit
 def machine_answer(machine: Machine, schedule: Sequence[float] = ONE_PASS) -> Answer:
     """Return the reconstruction by Gibbs sweeps at these temperatures."""
 
-    @torch.no_grad()
     def answer(v: Tensor, r: Tensor, free: Free, generator: torch.Generator) -> Visible:
         state = State(v, r, *machine.hidden(v, r, generator))
         for temperature in schedule:
@@ -153,7 +152,6 @@ def extra_errors(answer: Answer, test: Scenes, generator: torch.Generator) -> di
     }
 
 
-@torch.no_grad()
 def generate(
     machine: Machine, train: Scenes, vocabulary: Vocabulary, seed: int
 ) -> tuple[dict[str, float], dict[str, list[str]]]:

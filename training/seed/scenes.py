@@ -68,8 +68,8 @@ class Material:
     digest: str
 
 
-def read_material(source: str, folder: Path, splits: Sequence[str]) -> dict[str, Material]:
-    """Read the scenes of a source, and split them 60 / 30 / 10 % by each of the `splits`.
+def read_material(source: str, folder: Path) -> dict[str, Material]:
+    """Read the scenes of a source, and split them 60 / 30 / 10 % by each of `SPLITS`.
 
     A source is a file, or the name of a file `<name>.jsonl.gz` in the folder. The vocabulary has
     the classes of the source. Structure such as the floor is an ordinary class, as in the paper.
@@ -83,7 +83,7 @@ def read_material(source: str, folder: Path, splits: Sequence[str]) -> dict[str,
     objects = [replace(entry, structure=False) for entry in classes.objects]
     vocabulary = Vocabulary(objects, classes.room_types, classes.room_aliases)
     encoded = {scene.scene_id: scene for scene in encode(scenes, vocabulary)}
-    return {name: _material(scenes, encoded, vocabulary, SPLITS[name]) for name in splits}
+    return {name: _material(scenes, encoded, vocabulary, how) for name, how in SPLITS.items()}
 
 
 def _material(

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 from collections import Counter
 
 import pytest
 
+from tests.conftest import REPOSITORY, run_program
 from tests.training.commands import invoke
 from training.datasets import AnnotatedObject, AnnotatedScene, generate_rooms
 from training.datasets.jsonl import write_jsonl
@@ -24,7 +28,7 @@ def test_scenes_are_split_and_encoded(tmp_path):
     listed = ((1, "on-top", 0), (0, "on-top", 2))
     scenes = [scene(k, listed if k % 2 else None) for k in range(80)]
     write_jsonl(scenes, tmp_path / "lab.jsonl")
-    materials = read_material(str(tmp_path / "lab.jsonl"), tmp_path, tuple(SPLITS))
+    materials = read_material(str(tmp_path / "lab.jsonl"), tmp_path)
     for material in materials.values():
         labels = [entry.label for entry in material.vocabulary.objects]
         triples = {(labels[i], labels[j]) for _, i, j in material.triples.tolist()}
@@ -42,12 +46,12 @@ def test_scenes_are_split_and_encoded(tmp_path):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A finished command: (its arguments, the folder of its results)."""
+    """A finished command: (its arguments, the folder of its results, its output)."""
     folder = tmp_path_factory.mktemp("seed")
     write_jsonl(generate_rooms(60, seed=0), folder / "rooms.jsonl")
-    arguments = ("seed", folder / "rooms.jsonl", "--out", folder / "out", "--seeds", 2, "--epochs")
-    invoke(*arguments, 2)
-    return arguments, folder / "out" / "rooms"
+    arguments = ("seed", folder / "rooms.jsonl", "--seeds", 2, "--epochs", 2, "--workers")
+    output = invoke(*arguments, 1, "--out", folder / "out")
+    return arguments, folder / "out" / "rooms", output
 
 
 @pytest.mark.slow
@@ -64,41 +68,59 @@ def test_the_page_has_every_row_and_the_figures_of_the_paper(finished):
     for row in (
         "T1 precision", "T2 false objects, relations left", "T3 error / V", "T3 error / objects",
         "T4 objects a scene, others zero", "annealed: T1 on", "E objects, epoch 1",
-        "E relations, last epoch",
+        "E relations, last epoch", "share of E objects left at epoch 50",
     ):  # fmt: skip
         assert row in rows
     assert "0.0560 / 0.1418 / 0.2335" in text
 
 
 @pytest.mark.slow
-def test_finished_machines_are_kept(finished, monkeypatch):
-    """Ctrl-C stops the command, and the next call trains only the machines without a file."""
-    arguments, folder = finished
-    before = (folder / "results.md").read_text()
-    lost = [folder / "scenes" / "gbm-seed-1.json", folder / "groups" / "rbm-seed-0.json"]
-    for path in lost:
-        path.unlink()
-    trained = []
+def test_the_results_are_printed_and_drawn(finished):
+    _, folder, output = finished
+    assert output.endswith("results.json, errors.png")
+    assert " ".join((folder / "results.md").read_text().split()) in output
+    assert (folder / "errors.png").read_bytes().startswith(b"\x89PNG")
 
-    def interrupted(*values):
-        if trained:
-            raise KeyboardInterrupt
-        trained.append(values)
-        return train(*values)
 
-    train = command.train
-    monkeypatch.setattr(command, "train", interrupted)
-    assert "run the same command again" in invoke(*arguments, 2, code=130)
-    assert [path.exists() for path in lost] == [True, False]
-    monkeypatch.setattr(command, "train", train)
-    invoke(*arguments, 2)
-    kept = [line for line in before.splitlines() if "seconds" not in line]
-    after = (folder / "results.md").read_text().splitlines()
-    assert [line for line in after if "seconds" not in line] == kept
+def without_times(folder):
+    """Each file of a machine, without the times."""
+    runs = {path: json.loads(path.read_text()) for path in folder.glob("*/*.json")}
+    for run in runs.values():
+        del run["cpu"]
+        for epoch in run["history"]:
+            del epoch["seconds"]
+    return {path.relative_to(folder): run for path, run in runs.items()}
 
 
 @pytest.mark.slow
-def test_errors_are_named(finished, tmp_path):
-    arguments, _ = finished
-    assert "other scenes or settings" in invoke(*arguments, 3, code=1)
+def test_a_killed_command_continues_with_equal_figures(finished, tmp_path):
+    """Two worker processes give the figures of one, also if the command was killed on the way."""
+    arguments, folder, _ = finished
+    command = [sys.executable, "-m", "training", *map(str, arguments), "2", "--out", str(tmp_path)]
+    process = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 100
+    while not list(tmp_path.glob("*/*/*.json")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*/*.json")}
+    assert 0 < len(kept) < len(without_times(folder))
+    run_program(*command, timeout=300)
+    assert without_times(tmp_path / "rooms") == without_times(folder)
+    assert kept == {path: path.stat().st_mtime_ns for path in kept}
+
+
+@pytest.mark.slow
+def test_errors_are_named(finished, tmp_path, monkeypatch):
+    arguments, folder, _ = finished
+    again = (*arguments, 1, "--out", folder.parent)
+    assert "other scenes or settings" in invoke(*again, "--epochs", 3, code=1)
     assert "cannot be read" in invoke("seed", "nowhere", "--data", tmp_path, code=1)
+    large = (*arguments, 1, "--out", tmp_path, "--learning-rate", 1000)
+    assert "scenes, rbm, seed 0: training diverged in epoch 1" in invoke(*large, code=1)
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "read_material", stopped)
+    assert "run the same command again" in invoke(*again, code=130)

@@ -99,10 +99,11 @@ def test_the_frequency_row_draws_what_training_scenes_list():
 @pytest.mark.parametrize("schedule", [(1.0,), ANNEALED])
 @pytest.mark.parametrize("name", list(VARIANTS))
 def test_the_leak_of_t2_and_repeated_figures(name, schedule):
-    """A relation that is left on forces its object on in a gated machine alone."""
+    """A relation that is left on pulls its removed object in a Triway alone."""
     variant = VARIANTS[name]
     machine = variant.kind(TRIPLES, V, 6, variant.H2 and 3, rng())
     machine.b.data.fill_(-60.0)
+    machine.d.data.fill_(200.0)
     answer = machine_answer(machine, schedule)
     figures = measure(answer, TRIPLES, TEST, 0)
     assert figures["T2 on, relations left"] == (1 if variant.kind is Triway else 0)
