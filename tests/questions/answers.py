@@ -53,6 +53,7 @@ missing = _question(questions.missing, "missing")
 more = _question(_more)
 relations = _question(questions.relations, "relations")
 disagreements = _question(questions.relations, "disagreements")
+rooms = _question(questions.rooms, "room_types")
 generate = _question(questions.generate, "scenes")
 
 

@@ -10,11 +10,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from app.inference.weights import pack_scenes
 from app.scene import CANONICAL, contradiction, derive_relations
 from app.scene.scene import Scene
 from tests.enumeration.small_machines import enumerate_joint, with_mean_rates
@@ -362,3 +364,20 @@ def test_scenes_with_intruders_are_drawn_again():
         judged = [outliers(plain, scene_of(list(map(LABELS.index, one.objects)))) for one in scenes]
         counts.append(sum(entry.probability > 0.5 for one in judged for entry in one.outliers))
     assert counts[1] < counts[0]
+
+
+# -- room types --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rare", [(), (0,)])
+def test_a_scene_has_the_room_type_of_its_start_but_rarely_a_rare_one(rare):
+    """Half of the stored scenes are of each type. A rare type starts e^-6 times as often."""
+    machine = random_machine(replace(LARGER["triway-states"], N=64), 0.7)
+    machine.fantasies.copy_(torch.from_numpy(pack_scenes(np.eye(9, dtype=np.uint8)[[0, 1] * 32])))
+    machine.fantasy_rooms.copy_(torch.arange(64) % 2)
+    artifact = artifact_of(machine, rare_rooms=rare)
+    drawn = generate(artifact, scene_of([]), count=40, seed=4, steps=1)
+    types = [scene.room_type for scene in drawn]
+    assert types.count("bedroom") == 0 if rare else 5 < types.count("bedroom") < 35
+    (asked,) = generate(artifact, scene_of([], room=0), seed=4, steps=1)
+    assert asked.room_type == "bedroom"
