@@ -74,7 +74,7 @@ soak: $(EVERYTHING)  ## check that memory does not grow in ten minutes of mixed 
 	$(BIN)/python -m app.compile
 	CHAOS_SOAK_MINUTES=$(MINUTES) $(BIN)/python -m pytest tests/chaos/test_soak.py $(ARGS)
 
-image: $(BIN)/python  ## build the image, ask its service the four questions, remove it (Docker or buildah)
+image: $(BIN)/python  ## build the image, ask its service the five questions, remove it (Docker or buildah)
 	$(BIN)/python deploy/image.py $(ARGS)
 
 setup: $(EVERYTHING)  ## install everything that training, tests and benchmarks need

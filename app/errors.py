@@ -354,6 +354,21 @@ class ContradictionError(RequestError, slug="contradictory-evidence", status=422
     )
 
 
+class RareRoomTypeError(RequestError, slug="rare-room-type", status=422, steps=("scene",)):
+    """The model has too few training scenes of this room type to sample such a room.
+
+    The field `rare_room_types` of GET /models/{name}/vocabulary lists these room types. The other
+    questions accept them. Leave the room type out, or choose another one.
+    """
+
+    example = (
+        FieldError(
+            pointer="#/room_type",
+            message="the model has too few training scenes of this room type to sample such a room",
+        ),
+    )
+
+
 class AnswerTooLargeError(RequestError, slug="answer-too-large", status=422, steps=("scene",)):
     """The answer would be too large.
 

@@ -16,8 +16,9 @@ from app.serving.runtime import Runtime
 from app.settings import Settings
 
 _DESCRIPTION = """
-Ask a Boltzmann machine four questions about a scene: which relations hold between its objects,
-which objects are missing, which objects do not belong, and what a similar scene looks like.
+Ask a Boltzmann machine five questions about a scene: which relations hold between its objects,
+which objects are missing, which objects do not belong, which room it is, and what a similar scene
+looks like.
 Positions are in metres, in the axes of `frame_id`. Objects are named by their ids, or by their
 labels if only one object has the label.
 Every failure is a problem document (RFC 9457). Its `type` identifies the problem type.

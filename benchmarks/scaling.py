@@ -106,6 +106,7 @@ def _questions(scene: Scene) -> Mapping[str, Question]:
         "relations": lambda artifact: questions.relations(artifact, scene),
         "missing": lambda artifact: questions.missing(artifact, scene),
         "outliers": lambda artifact: questions.outliers(artifact, scene),
+        "rooms": lambda artifact: questions.rooms(artifact, scene),
         f"generate of {SCENES}": lambda artifact: questions.generate(
             artifact, scene, count=SCENES, seed=1
         ),

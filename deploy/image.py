@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Build the image from the Dockerfile, start it, and ask it the four questions.
+"""Build the image from the Dockerfile, start it, and ask it the five questions.
 
     python3 deploy/image.py                      Docker if it runs here, else buildah
     python3 deploy/image.py --engine buildah     needs root, buildah and debootstrap, but no daemon
@@ -42,6 +42,7 @@ QUESTIONS: list[tuple[str, dict[str, Any]]] = [
     ("relations", {"objects": ["lamp", "nightstand"]}),
     ("missing", {"objects": ["bed"], "at": {"relation": "on-top", "object": "bed"}}),
     ("outliers", {"objects": ["bed", "pillow", "nightstand", "lamp", "toilet"]}),
+    ("rooms", {"objects": ["bed", "pillow", "nightstand"]}),
     ("generate", {"objects": ["bed"], "seed": 1}),
 ]
 
@@ -358,6 +359,7 @@ def is_plausible(answers: dict[str, Any]) -> dict[str, bool]:
         "relations": (first["subject"], first["relation"]) == ("lamp", "on-top"),
         "missing": answers["missing"]["missing"][0]["label"] == "pillow",
         "outliers": outliers == ["toilet"],
+        "rooms": answers["rooms"]["room_types"][0]["room_type"] == "bedroom",
         "generate": "bed" in answers["generate"]["scenes"][0]["objects"],
     }
 
@@ -402,7 +404,7 @@ def check(engine: Docker | Buildah) -> None:
     if (users := engine.users()) != {USER}:
         raise ImageError(f"the service runs as user {users}, not {USER}")
     engine.stop()
-    print(f"four questions answered by user {USER}; nothing written outside /tmp")
+    print(f"five questions answered by user {USER}; nothing written outside /tmp")
 
 
 def main() -> int:

@@ -35,7 +35,7 @@ from tests.chaos import corpus as hostile
 
 TOLERANCE: Final = 1e-5
 SEED: Final = 20261123
-QUESTIONS: Final = ("relations", "missing", "outliers")
+QUESTIONS: Final = ("relations", "missing", "outliers", "rooms")
 MODELS: Final = (
     "default", "indoor-triway", "indoor-gbm", "indoor-rbm", "indoor-triway-deep", "open-triway",
     "indoor-triway@3.1.0",
@@ -188,6 +188,9 @@ class Scenes:
                     fields["sensitivity"] = rng.choice(["low", "medium", "high"])
                 if rng.random() < 0.2:
                     fields["threshold"] = rng.choice([0.0, 0.3, 0.7, 1.0])
+            case "rooms":
+                if self.rooms and rng.random() < 0.4:
+                    fields["candidates"] = rng.sample(self.rooms, min(len(self.rooms), 4))
         return fields
 
 
@@ -210,7 +213,7 @@ def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Js
         scenes = Scenes(rng, labels, words["room_types"], likely)
         count = 60 if model == "indoor-triway@3.1.0" else 210
         for k in range(count):
-            question = QUESTIONS[k % 3]
+            question = QUESTIONS[k % len(QUESTIONS)]
             body = scenes.scene() | {"model": model}
             if model == "default":
                 del body["model"]

@@ -178,7 +178,7 @@ class LiveService:
     def control(self) -> dict[str, bytes]:
         """Ask one fixed question of each kind. The answers never change."""
         answers = {}
-        for question in ("relations", "missing", "outliers", "generate"):
+        for question in ("relations", "missing", "outliers", "rooms", "generate"):
             body = CONTROL | ({"steps": 8} if question == "generate" else {})
             headers = {"X-Request-Id": "control"}
             response = self.client.post(f"/{question}", json=body, headers=headers)

@@ -6,33 +6,26 @@ command then continues the run.
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NoReturn
 
-import torch
 import typer
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from app.registry import Artifact, Metric, RegistryError, Store, load_model_set
+from app.registry import Artifact, RegistryError, Store, load_model_set
 from app.registry.references import AliasTarget
 from training.datasets import DatasetError
-from training.datasets.batches import subset
 from training.datasets.files import DATA
 from training.domain.candidates import Candidate
 from training.domain.compare import compare, compare_command, show
+from training.domain.evaluate_command import evaluate_command
 from training.domain.gate import MARGIN, NEW, losses, measure_usefulness, served_model
 from training.domain.init_command import example, fail, init
 from training.domain.labels import outside_vocabulary
-from training.evaluation.everyday_task import EVERYDAY
-from training.evaluation.metrics import Figure
-from training.evaluation.report import evaluate
-from training.evaluation.tasks import in_words
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, is_file, source_name
 from training.fit.trainer import Trainer
@@ -43,7 +36,7 @@ from training.runs.config_files import data_folder, load_config, shipped_configs
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun, load_run, save_run
 from training.runs.live import Display, next_steps, summarise
-from training.runs.pipeline import SplitScenes, prepare, read_sources, split_and_encode
+from training.runs.pipeline import SplitScenes, prepare
 from training.runs.publish import RefusedError, publish_run, refit
 from training.seed.command import seed as seed_command
 
@@ -56,6 +49,7 @@ app.command()(tune)
 app.command(name="compare")(compare_command)
 app.command()(benchmark)
 app.command()(ablate)
+app.command(name="evaluate")(evaluate_command)
 app.command(name="seed")(seed_command)
 console = Console()
 
@@ -211,56 +205,6 @@ def publish(
         _exit_refused(error, "; --even-if-worse publishes the version all the same")
     except (RunError, ConfigError, DatasetError, RegistryError) as error:
         fail(error)
-
-
-@app.command(name="evaluate")
-def evaluate_command(
-    models: Annotated[list[str], typer.Argument(help="model: an alias, name or name@version")],
-    data: StoredData = None,
-    store: StorePath = _STORE,
-    source: Annotated[list[str] | None, typer.Option(help="use only these data sources")] = None,
-    part: Annotated[str, typer.Option(help="scenes: train, validation or test")] = "test",
-    output: Annotated[Path | None, typer.Option("--json", help="write figures to a file")] = None,
-) -> None:
-    """Evaluate stored models on scenes of the same split as in training.
-
-    The figures are those of the model card. The command `benchmark` evaluates the baselines.
-    """
-    try:
-        tables: dict[str, list[Metric]] = {}
-        for reference in models:
-            stored = Store(store)
-            artifact = stored.load(*stored.resolve(reference))
-            config = Config.model_validate(artifact.manifest.training["config"])
-            names = source or list(map(source_name, config.data.sources))
-            with console.status("reading scenes"):
-                # The split must include all data sources, as in training. Otherwise the test part
-                # could contain training scenes.
-                scenes = split_and_encode(
-                    config.data, read_sources(config.data, data or DATA), artifact.vocabulary
-                )
-            tensors = scenes.training_data()
-            parts = {"train": tensors.train, "validation": tensors.validation, "test": tensors.test}
-            if part not in parts:
-                raise ConfigError(f"--part is {part!r}; it must be one of {', '.join(parts)}")
-            index = [k for k, scene in enumerate(parts[part].scenes) if scene.source in names]
-            if not index:
-                raise ConfigError(
-                    f"{reference}: the {part} part has no scenes of the sources {', '.join(names)}"
-                )
-            test = subset(parts[part], torch.tensor(index, dtype=torch.int64))
-            with console.status(reference) as status:
-                tables[reference] = evaluate(
-                    *(artifact, test, tensors.structure, tensors.train),
-                    everyday=EVERYDAY,
-                    progress=status.update,
-                )
-    except (ConfigError, DatasetError, RegistryError) as error:
-        fail(error)
-    _show(tables)
-    if output is not None:
-        rows = {name: [row.model_dump() for row in table] for name, table in tables.items()}
-        output.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
 @app.command(name="list")
@@ -420,18 +364,3 @@ def _promote(
     store.set_alias(alias, target, expected=served.target)
     change = f", before {served.target}" if served.target is not None else ""
     console.print(f"promoted: {alias} → {target}{change}", soft_wrap=True)
-
-
-def _show(tables: dict[str, list[Metric]]) -> None:
-    figures: dict[str, dict[tuple[str, str], dict[str, str]]] = {}
-    for name, rows in tables.items():
-        for row in rows:
-            lines = figures.setdefault(row.task, {})
-            figure = Figure(row.value, row.low, row.high, row.n)
-            lines.setdefault((row.metric, row.source), {})[name] = str(figure)
-    table = Table("task, metric", "source", *tables, box=box.SIMPLE_HEAD)
-    for task, lines in sorted(figures.items()):
-        table.add_row(f"[bold]{in_words(task)}[/bold]")
-        for (metric, source), values in lines.items():
-            table.add_row(f"  {metric}", source, *(values.get(name, "") for name in tables))
-    console.print(table)

@@ -122,7 +122,8 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
             {"label": "floor", "aliases": [], "structure": True, "anywhere": False},
         ],
         "relations": ["left", "front", "on-top", "above", "right", "behind", "under", "below"],
-        "room_types": ["bedroom"],
+        "room_types": ["bedroom", "garage"],
+        "rare_room_types": ["garage"],
         "profiles": ["sunrgbd", "procthor"],
         "examples": [
             {

@@ -128,6 +128,9 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> schemas.Vocab
         objects=[_class(entry) for entry in served.vocabulary.objects],
         relations=[cast("schemas.RelationName", name) for name in names],
         room_types=list(served.vocabulary.room_types),
+        rare_room_types=[
+            served.vocabulary.room_types[t] for t in served.artifact.calibration.rare_rooms
+        ],
         profiles=list(served.artifact.manifest.vocabulary.profiles),
         examples=[
             schemas.ExampleScene(name=example.name, scene=example.request())

@@ -23,7 +23,7 @@ _KEY_SCHEMES: Final = {
     "api-key-as-bearer-token": {"type": "http", "scheme": "bearer"},
 }
 TAGS: Final = [
-    {"name": "questions", "description": "The four questions about one scene."},
+    {"name": "questions", "description": "The five questions about one scene."},
     {"name": "batches", "description": "The same questions about many scenes in one request."},
     {"name": "models", "description": "The models, their versions and their vocabularies."},
     {"name": "administration", "description": "Change the served models, with the admin key."},

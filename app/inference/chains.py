@@ -10,11 +10,10 @@ The start of a chain is a random stored scene. Its weight, given the evidence, i
 
 where h1 is the mean of the hidden units given the stored scene, and t is the requested room type.
 If the machine stores no scene of room type t, the last term is h1·Q[t] + v·Y[t]. The method is
-sampling importance resampling, followed by Gibbs sweeps. The sweeps rarely change the room type of
-a scene.
+sampling importance resampling, followed by Gibbs sweeps. A chain keeps its room type. Without a
+requested room type, it keeps that of its start.
 
-The base rates stay the same in all sweeps: those of the profile, the mean over the data sources
-given the required classes, or those of the served mix if no class is required.
+The base rates are those of whole scenes (`Weights.scene_bias`). They stay the same in all sweeps.
 
 A sweep takes microseconds and releases the interpreter's lock. The result of a chain depends only
 on its conditions and its random stream.
@@ -25,7 +24,9 @@ estimation" (1993), for resampling and moving.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -110,6 +111,7 @@ class ChainState:
 
     Attributes:
         classes: (n,) int64, indices of the present classes, ascending.
+        room: index of the room type, or None if unknown.
         h1: (units,) state of each unit of h1.
         h2: indices of the units of h2 that are on, ascending.
         logits: (A, n, n) logits of the relations between the classes at temperature 1.
@@ -118,6 +120,7 @@ class ChainState:
     """
 
     classes: Indices
+    room: int | None
     h1: Indices
     h2: Indices
     logits: Floats
@@ -129,10 +132,16 @@ class SceneChains:
 
     Args:
         units: relation units of the machine. With None, the class builds them.
+        excluded: room types of stored scenes that start a chain only on request.
     """
 
-    def __init__(self, weights: Weights, units: RelationUnits | None = None) -> None:
-        self.machine = weights
+    def __init__(
+        self,
+        weights: Weights,
+        units: RelationUnits | None = None,
+        excluded: Collection[int] = (),
+    ) -> None:
+        self.machine, self._excluded = weights, list(excluded)
         self.units = units or relation_units(weights)
         W, J, spec = weights["W"], weights["J"], weights.spec
         self.arrays = Arrays(
@@ -176,7 +185,10 @@ class SceneChains:
         """Return the probability of each stored scene as the start of a chain, (N,); see module."""
         machine, room, classes = self.machine, conditions.room, conditions.classes
         log_weights = np.zeros(len(self.mean), np.float32)
-        if room is not None and machine.spec.C:
+        if room is None:
+            barred = np.isin(machine["fantasy_rooms"], self._excluded)
+            log_weights += np.where(barred, -OTHER_ROOM, 0)
+        elif machine.spec.C:
             same_room = machine["fantasy_rooms"] == room
             if same_room.any():
                 log_weights += np.where(same_room, 0, -OTHER_ROOM)
@@ -203,13 +215,12 @@ class ConditionedChains:
     """
 
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
-        self._chains, self._machine, self._w = chains, chains.machine, chains.arrays
+        self._chains, self._machine = chains, chains.machine
+        self._conditions, self._temperature = conditions, temperature
         spec = chains.machine.spec
-        classes, profile = conditions.classes, conditions.profile
-        if len(classes) or profile is not None:
-            certain = np.ones(len(classes), np.float32)
-            self._w = self._w._replace(b=chains.machine.class_bias(classes, certain, profile))
-        self._w = self._w._replace(b=self._w.b + chains.machine.room_couplings(conditions.room))
+        of = conditions.classes, conditions.profile, conditions.room
+        bias, self._room_bias = chains.machine.scene_bias(*of)
+        self._w = chains.arrays._replace(b=bias)
         self._beta = np.float32(1.0 / temperature)
         self._room, self._bias = conditions.room, chains.machine.room_bias(conditions.room)
         self._required_classes = _indicator(spec.V, conditions.classes)
@@ -217,10 +228,21 @@ class ConditionedChains:
         self._held[conditions.held[:, 0]] = conditions.held[:, 1]
         self._required_h2 = _indicator(spec.H2, conditions.held2)
         self._classes, self._observed = conditions.classes, conditions.observed
-        # Cumulative probabilities of the stored scenes as the start of a chain.
-        self._start_cdf = np.zeros(0)
-        if spec.N:
-            self._start_cdf = np.cumsum(chains.sample_weights(conditions))
+        self._others: dict[int | None, ConditionedChains] = {}
+
+    @cached_property
+    def _start_cdf(self) -> NDArray[np.float64]:
+        """Cumulative probabilities of the stored scenes as the start of a chain, (N,)."""
+        return np.cumsum(self._chains.sample_weights(self._conditions))
+
+    def _in_room(self, room: int | None) -> ConditionedChains:
+        """Return the chains under the same conditions in a room type."""
+        if room == self._room:
+            return self
+        if room not in self._others:
+            conditions = replace(self._conditions, room=room)
+            self._others[room] = self._chains.under(conditions, self._temperature)
+        return self._others[room]
 
     def draw(self, steps: int, stream: np.random.Generator) -> ChainState:
         """Run ``steps`` sweeps of one chain with its random stream and return its final state.
@@ -228,16 +250,22 @@ class ConditionedChains:
         The chain starts at a random stored scene; see `SceneChains.sample_weights`. If the machine
         stores no scenes, the start has only the required classes.
         """
-        on = np.zeros(self._machine.spec.V, np.uint8)
-        if len(self._start_cdf):
+        on, room = np.zeros(self._machine.spec.V, np.uint8), self._room
+        if self._machine.spec.N:
             start = int(np.searchsorted(self._start_cdf[:-1], stream.random(), "right"))
             packed = self._machine["fantasies"][start : start + 1]
             on = unpack_scenes(packed, len(on))[0].astype(np.uint8)
+            own = int(self._machine["fantasy_rooms"][start])
+            room = own if room is None and own >= 0 else room
+        return self._in_room(room)._continued(on, steps, stream)
+
+    def _continued(self, on: Bits, steps: int, stream: np.random.Generator) -> ChainState:
+        """Return the state of a chain after ``steps`` sweeps from the classes ``on``, (V,)."""
         h1, h2 = self.sweep(on, steps, stream)
         classes = np.flatnonzero(on)
         logits = self._logits(classes, h1)
         r = self._relations(classes, logits, stream)
-        return ChainState(classes, h1, np.flatnonzero(h2), logits, r)
+        return ChainState(classes, self._room, h1, np.flatnonzero(h2), logits, r)
 
     def sweep(
         self, on: Bits, steps: int, stream: np.random.Generator, h2: Bits | None = None
@@ -323,6 +351,8 @@ class ConditionedChains:
             shown: (n,) bool, True for classes that count as present.
             kept: (A, n, n) bool, True for relations that count as on.
         """
+        if state.room != self._room:
+            return self._in_room(state.room).log_score(state, shown, kept)
         listed, machine = state.classes[shown], self._machine
         x, m = self._context(listed)
         by_unit = x.astype(np.float64).reshape(-1, machine.spec.states - 1)
@@ -336,9 +366,7 @@ class ConditionedChains:
         score = self._w.b[listed].sum() + log_sums.sum() + machine["c2"] @ m
         if machine.spec.coupled:
             score += 0.5 * machine["L"][np.ix_(listed, listed)].sum()
-        if self._room is not None and machine.spec.C:
-            score += machine["e"][self._room]
-        return float(score + entropy + (on * logits - softplus(logits)).sum())
+        return float(score + self._room_bias + entropy + (on * logits - softplus(logits)).sum())
 
 
 def _indicator(size: int, units: Indices) -> Bits:

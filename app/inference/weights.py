@@ -54,6 +54,8 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
         Y (C, V): couplings between room types and classes, if `coupled`
         a (profiles, V): change of b in scenes of a data source, 0 for classes that it cannot show
         y (profiles, C): change of e in scenes of a data source
+        u (profiles + 1, V): change of b + a in whole scenes, which Gibbs chains draw. The last row
+            is for the mix of data sources that the model serves
         kappa (4, V): change of the log-odds of unlisted classes by the listed share; see `SHARES`
         triples (T, 3): sorted triples (relation a, subject class i, object class j) with an own
             weight
@@ -65,7 +67,7 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     floats: dict[str, tuple[int, ...]] = {
         "b": (V,), "c1": (H1,), "c2": (H2,), "e": (spec.C,), "W": (V, H1), "J": (H1, H2),
         "Q": (spec.C, H1), "f": (spec.profiles,), "a": (spec.profiles, V),
-        "y": (spec.profiles, spec.C), "kappa": (len(SHARES) + 1, V),
+        "y": (spec.profiles, spec.C), "u": (spec.profiles + 1, V), "kappa": (len(SHARES) + 1, V),
     }  # fmt: skip
     if spec.coupled:
         floats |= {"L": (V, V), "Y": (spec.C, V)}
@@ -181,6 +183,29 @@ class Weights:
         weights = self.source_weights(classes, presence[None], profile)[0]
         bias: NDArray[Any] = self["b"] + weights.astype(self["b"].dtype) @ self["a"]
         return bias
+
+    def scene_bias(
+        self, classes: NDArray[Any], profile: int | None, room: int | None
+    ) -> tuple[NDArray[Any], float]:
+        """Return the biases of whole scenes for Gibbs chains: of each class, (V,), and of the room.
+
+        The bias of a class is b + sum_q p(q) (a[q] + u[q]) + Y[t], and that of the room type t is
+        e[t] + sum_q p(q) y[q, t]; see `source_weights`. Without a required class and without a
+        profile, the mix of data sources determines them.
+
+        Args:
+            classes: (n,) indices of the required classes.
+            profile, room: index of the data source and of the room type, or None.
+        """
+        bias: NDArray[Any] = self["b"] + self.room_couplings(room)
+        of_room = self["e"] if self.spec.C else np.zeros(1)
+        if self.spec.profiles and (len(classes) or profile is not None):
+            p = self.source_weights(classes, np.ones((1, len(classes))), profile)[0]
+            bias = bias + p.astype(bias.dtype) @ (self["a"] + self["u"][:-1])
+            of_room = of_room + p @ self["y"] if self.spec.C else of_room
+        else:
+            bias = bias + self["u"][-1]
+        return bias, 0.0 if room is None or not self.spec.C else float(of_room[room])
 
     def state_means(self, x: NDArray[Any]) -> NDArray[Any]:
         """Return the probabilities of the states of h1 with the logits x, both (..., H1)."""

@@ -1,8 +1,9 @@
 """The question `generate`: draw scenes that contain the objects and relations of the evidence.
 
-The evidence is the scene in the request. A Gibbs chain sometimes ends in a state between two kinds
-of rooms. The drawn scene is then almost empty, or contains an object that fits neither kind of
-room. A scene is drawn again if one of these conditions is met:
+The evidence is the scene in the request. A drawn scene has the room type of the evidence, or that
+of the stored scene where its chain starts. A Gibbs chain sometimes ends in a state between two
+kinds of rooms. The drawn scene is then almost empty, or contains an object that fits neither kind
+of room. A scene is drawn again if one of these conditions is met:
 
 - The scene has fewer classes than 90 % of the real rooms of its type (`Calibration.smallest`).
 - The scene fits its room type worse than 85 % of the real rooms do (`Calibration.room_fit`).
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.errors import InvalidRequestError
+from app.errors import InvalidRequestError, RareRoomTypeError
 from app.inference import MachineSpec
 from app.inference.chains import ChainState, ConditionedChains, Conditions, random_stream
 from app.inference.posterior import context_of
@@ -124,7 +125,8 @@ def generate(
         for attempt in range(ATTEMPTS):
             state = chains.draw(steps, stream)
             is_shown = shown[state.classes]
-            if plausible(state.classes[is_shown].tolist()) or stop() or attempt == ATTEMPTS - 1:
+            classes = state.classes[is_shown].tolist()
+            if plausible(classes, state.room) or stop() or attempt == ATTEMPTS - 1:
                 scenes.append(_scene(artifact, chains, state, is_shown, evidence))
                 break
     if size_limit is not None:
@@ -197,7 +199,7 @@ def _scene(
 
     ``shown`` (n,) is True for the classes of ``state`` that the answer lists.
     """
-    labels = artifact.vocabulary.labels
+    labels, room_types = artifact.vocabulary.labels, artifact.vocabulary.room_types
     units = np.nonzero(state.r & shown[:, None] & shown)
     a, i, j = units
     named = np.stack([a, state.classes[i], state.classes[j]], axis=1)
@@ -205,7 +207,8 @@ def _scene(
     kept = np.zeros_like(state.r)
     kept[units] = stay
     triples = sorted({*map(tuple, named[stay].tolist()), *evidence})
-    return {
+    room = {} if state.room is None else {"room_type": room_types[state.room]}
+    return room | {
         "objects": [labels[index] for index in state.classes[shown].tolist()],
         "relations": [
             {"subject": labels[i], "relation": CANONICAL[a], "object": labels[j]}
@@ -314,30 +317,28 @@ class Plausible:
     """
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
-        self._artifact, self._room = artifact, scene.room_type
+        self._artifact = artifact
         self._listed = {thing.class_index for thing in scene.objects}
-        smallest = artifact.calibration.smallest
         # The last entry is for scenes without a room type.
-        self._least = 0
-        if smallest:
-            self._least = smallest[-1 if scene.room_type is None else scene.room_type]
+        self._smallest = artifact.calibration.smallest or (0,)
 
-    def __call__(self, classes: list[int]) -> bool:
-        """Return whether a drawn scene with these classes is plausible."""
-        if len(classes) < self._least or not self._suits_room(classes):
+    def __call__(self, classes: list[int], room: int | None) -> bool:
+        """Return whether a drawn scene with these classes and this room type is plausible."""
+        least = self._smallest[-1 if room is None else min(room, len(self._smallest) - 1)]
+        if len(classes) < least or not self._suits_room(classes, room):
             return False
         if not classes:
             return True
         labels = self._artifact.vocabulary.labels
         objects = [SceneObject(labels[index], labels[index], index) for index in classes]
-        drawn_scene = Scene(tuple(objects), room_type=self._room)
+        drawn_scene = Scene(tuple(objects), room_type=room)
         return self._listed.issuperset(intruders(self._artifact, drawn_scene).tolist())
 
-    def _suits_room(self, classes: list[int]) -> bool:
+    def _suits_room(self, classes: list[int], room: int | None) -> bool:
         limits = self._artifact.calibration.room_fit
-        if self._room is None or not limits:
+        if room is None or not limits:
             return True
-        return room_fit(self._artifact, classes, self._room) >= limits[self._room]
+        return room_fit(self._artifact, classes, room) >= limits[room]
 
 
 def room_fit(artifact: Artifact, classes: list[int], room: int) -> float:
@@ -362,9 +363,12 @@ def _size(scenes: Sequence[Fields]) -> tuple[int, int]:
     return fixed, objects + 2 * relations
 
 
-def _read(request: GenerateRequest, artifact: Artifact, _: Reading) -> Options:
+def _read(request: GenerateRequest, artifact: Artifact, reading: Reading) -> Options:
     """Return the arguments of `generate` for a request."""
     errors, layers = ErrorList(), _layers(artifact.spec)
+    if reading.scene.room_type in artifact.calibration.rare_rooms:
+        message = "the model has too few training scenes of this room type to sample such a room"
+        errors.add(RareRoomTypeError, ("room_type",), message)
     for layer, pairs in (request.context or {}).items():
         if layer not in layers:
             message = "the model lacks this hidden layer"
@@ -407,6 +411,7 @@ _EXAMPLE_ANSWER: Final = {
     "seed": 7,
     "scenes": [
         {
+            "room_type": "bedroom",
             "objects": ["bed", "nightstand", "lamp"],
             "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
             "log_score": -6.1,
@@ -425,6 +430,9 @@ GENERATE: Final = Question(
     _EXAMPLE_ANSWER,
     description="""
 Sample scenes that contain the given objects and relations. Equal seeds give equal scenes.
+
+The request is refused if too few training scenes have its room type (`rare_room_types` of `GET
+/models/{name}/vocabulary`).
 """,
     samples=True,
 )

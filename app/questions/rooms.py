@@ -142,13 +142,10 @@ _NO_ROOM_TYPES: Final = SceneWarning(
 
 _EXAMPLES: Final[dict[str, Any]] = {
     "labels": Example("which room is this?", LABELS),
-    "object": Example("where is such an object usually?", {"objects": ["toothbrush"]}),
+    "object": Example("where is such an object usually?", {"objects": ["keyboard"]}),
     "candidates": Example(
         "only the rooms of this flat",
-        {
-            "objects": ["sofa", "plant"],
-            "candidates": ["bedroom", "kitchen", "living room", "bathroom"],
-        },
+        {"objects": ["desk", "lamp"], "candidates": ["bedroom", "bathroom", "office"]},
     ),
     "scores": Example(
         "probabilities only, for a fast and short answer", {**LABELS, "detail": "scores"}

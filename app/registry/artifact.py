@@ -128,7 +128,7 @@ class Artifact:
     @cached_property
     def scene_chains(self) -> SceneChains:
         """Compiled Gibbs chains that sample scenes."""
-        return SceneChains(self.weights, self.relation_units)
+        return SceneChains(self.weights, self.relation_units, self.calibration.rare_rooms)
 
 
 def write_artifact(

@@ -21,9 +21,9 @@ _RESEARCH_WARNING = """\
 
 _INTENDED_USE = """\
 A robot recognises the objects of a scene and asks the model about them. The scene should resemble
-the scenes of the data sources below. The model answers four questions: Which spatial relations hold
+the scenes of the data sources below. The model answers five questions: Which spatial relations hold
 between the objects? Which object is missing, and where would it be? Which object does not belong?
-What does a similar scene look like?"""
+Which room is it? What does a similar scene look like?"""
 
 _MEASURED = """\
 The figures come from test scenes of each source. Training and calibration did not use these scenes.
@@ -46,7 +46,8 @@ A Brier skill of 0 means that the base rate is equally good. The probabilities m
   is in the scene and at this place
 - outliers: the object is an intruder, if half of the lists contain an intruder; at the default
   threshold, about 10 % of the unchanged parts of real validation scenes raise an alarm
-- misplaced: the relation is false, if half of the scenes contain an altered relation"""
+- misplaced: the relation is false, if half of the scenes contain an altered relation
+- rooms: the scene is a room of this type"""
 
 _OFFSETS = """\
 The rows "Offsets" measure the offsets of placements by relation. Mean and standard deviations

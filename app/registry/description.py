@@ -128,6 +128,8 @@ class Calibration(Frozen):
         misplaced_thresholds: minimum probability of a misplaced (probably false) relation. None
             exactly if `misplaced` is None.
         rooms: calibration of the probabilities of the room types.
+        rare_rooms: indices of the room types that `/generate` refuses, because too few training
+            scenes have them.
         smallest: (C + 1,) minimum number of classes in a generated scene of each room type. 90 % of
             the real rooms reach this number. The last entry is for scenes without a room type. If
             the tuple is empty, there is no minimum.
@@ -155,6 +157,7 @@ class Calibration(Frozen):
     outlier_lines: AlarmLines | None = None
     misplaced_thresholds: Thresholds | None = None
     rooms: Sharpness = Sharpness()
+    rare_rooms: Many[Count] = ()
     smallest: Many[Count] = ()
     room_fit: Many[float] = ()
     outlier: CountSlope | None = None
@@ -359,6 +362,8 @@ class Description(Frozen):
                 f"the vocabulary has {len(words.room_types)} room types, but the spec has "
                 f"C = {rooms}"
             )
+        if any(t >= rooms for t in self.calibration.rare_rooms):
+            raise ValueError(f"calibration.rare_rooms must be below C = {rooms}")
         for example in self.examples:
             example.require_known(words.vocabulary())
         return self

@@ -11,7 +11,7 @@ import sys
 import uvicorn
 from fastapi import FastAPI, Request, Response
 
-from scene_client.schemas import MissingRequest, OutliersRequest, RelationsRequest
+from scene_client.schemas import MissingRequest, OutliersRequest, RelationsRequest, RoomsRequest
 
 app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 _answers: dict[str, bytes] = {}
@@ -36,6 +36,11 @@ async def missing(_: MissingRequest) -> Response:
 @app.post("/outliers")
 async def outliers(_: OutliersRequest) -> Response:
     return Response(_answers["outliers"], media_type="application/json")
+
+
+@app.post("/rooms")
+async def rooms(_: RoomsRequest) -> Response:
+    return Response(_answers["rooms"], media_type="application/json")
 
 
 @app.get("/health/ready")

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.load.connections import prepared
 
-ROUTES = ("/missing", "/relations", "/outliers")
+ROUTES = ("/missing", "/relations", "/outliers", "/rooms")
 KINDS = ("12 labels", "12 poses", "20 relations")
 SCENES = 64
 """Number of scenes per kind of request. It exceeds the number of connections, so that all pending

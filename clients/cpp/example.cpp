@@ -1,4 +1,4 @@
-// Asks a running service the four questions about a bedroom: ./example [URL [SECONDS]]
+// Asks a running service the five questions about a bedroom: ./example [URL [SECONDS]]
 #include <cstdio>
 #include <cstdlib>
 #include <iostream>
@@ -45,6 +45,12 @@ int main(int argc, char** argv) {
     for (const auto& entry : outliers["outliers"])
       std::cout << "  " << entry["object"].get<std::string>() << " " << entry["probability"]
                 << (entry["is_outlier"].get<bool>() ? " does not belong here" : "") << "\n";
+
+    std::cout << "Which room it is:\n";
+    const json rooms = service.rooms({{"objects", room["objects"]}, {"top_k", 3}});
+    for (const auto& entry : rooms["room_types"])
+      std::cout << "  " << entry["room_type"].get<std::string>() << " " << entry["probability"]
+                << "\n";
 
     std::cout << "A scene like it:\n";
     question = {{"objects", {"bed"}}, {"seed", 7}};

@@ -107,7 +107,7 @@ class Client {
     http_.set_decompress(false);  // a decompressed body could have any size
   }
 
-  // The four questions. `timeout` limits one call; the default is `Options::timeout`.
+  // The five questions. `timeout` limits one call; the default is `Options::timeout`.
   json relations(const json& request, std::optional<Seconds> timeout = {}) {
     return call("POST", "/relations", request, timeout);
   }
@@ -116,6 +116,9 @@ class Client {
   }
   json outliers(const json& request, std::optional<Seconds> timeout = {}) {
     return call("POST", "/outliers", request, timeout);
+  }
+  json rooms(const json& request, std::optional<Seconds> timeout = {}) {
+    return call("POST", "/rooms", request, timeout);
   }
   json generate(const json& request, std::optional<Seconds> timeout = {}) {
     return call("POST", "/generate", request, timeout);
@@ -131,6 +134,9 @@ class Client {
   }
   json outliers_batch(const json& scenes, std::optional<Seconds> timeout = {}) {
     return call("POST", "/outliers/batch", {{"scenes", scenes}}, timeout);
+  }
+  json rooms_batch(const json& scenes, std::optional<Seconds> timeout = {}) {
+    return call("POST", "/rooms/batch", {{"scenes", scenes}}, timeout);
   }
 
   // List models, versions and aliases.

@@ -80,6 +80,7 @@ def test_scaling():
         "relations",
         "missing",
         "outliers",
+        "rooms",
         "generate",
     ]
     sizes = [value for name, value in results[0].facts.items() if name.endswith("artifact in MB")]

@@ -16,7 +16,7 @@ from benchmarks.load.connections import prepared
 from benchmarks.load.measure import is_steady
 from benchmarks.load.questions import KINDS, SCENES, bodies
 from benchmarks.load.windows import Window, at_concurrency, at_rate, joined
-from scene_client.schemas import MissingRequest, OutliersRequest, RelationsRequest
+from scene_client.schemas import MissingRequest, OutliersRequest, RelationsRequest, RoomsRequest
 
 LABELS = [f"thing {number}" for number in range(40)]
 REQUESTS = [prepared("/missing", {"objects": [label]}) for label in LABELS]
@@ -119,7 +119,7 @@ def test_scenes_fit_every_question_and_are_all_different(kind: str) -> None:
     assert scenes == bodies(kind, LABELS)
     assert len({str(scene) for scene in scenes}) == SCENES
     for scene in scenes:
-        for question in (MissingRequest, OutliersRequest, RelationsRequest):
+        for question in (MissingRequest, OutliersRequest, RelationsRequest, RoomsRequest):
             assert len(question.model_validate(scene).objects) == 12
 
 
@@ -128,7 +128,7 @@ async def test_the_yardstick_validates_and_sends_the_prepared_answer(kind: str) 
     transport = httpx.ASGITransport(plain.app)
     async with httpx.AsyncClient(transport=transport, base_url="http://plain") as client:
         scene = bodies(kind, LABELS)[0]
-        for question in ("missing", "relations", "outliers"):
+        for question in ("missing", "relations", "outliers", "rooms"):
             answer = f'{{"{question}":[]}}'.encode()
             await client.put(f"/answers/{question}", content=answer)
             found = await client.post(f"/{question}", json=scene)

@@ -261,6 +261,35 @@ def test_disagreements_are_drawn_where_an_answer_has_them(bedroom: Board) -> Non
     assert "nightstand left of bed 10 % expected: right of, 70 %" in bedroom.rows("relations")
 
 
+def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.Client) -> None:
+    page, asked = bedroom.page, list[str]()
+    page.on("request", lambda request: asked.append(request.url.rsplit("/", 1)[-1]))
+    options, likeliest = page.locator("#room option"), page.locator("#room-likely")
+
+    def check() -> None:
+        answer = ask(api, "rooms", bedroom.scene, top_k=4096, detail="scores")["room_types"]
+        words = [f"{one['room_type']} {percent(one['probability'])}" for one in answer]
+        expect(options).to_have_text(["unknown", *words])
+        expect(likeliest).to_have_text(f"Likeliest: {words[0]}")
+
+    check()
+    page.locator("#room").select_option("kitchen")
+    bedroom.settle()
+    assert bedroom.body("missing")["room_type"] == "kitchen"
+    assert "missing" in asked
+    # The room type that a person chooses is no evidence about the room type.
+    assert "rooms" not in asked
+    check()
+    expect(page.locator("#room")).to_have_value("kitchen")
+    bedroom.add("toilet")
+    assert "rooms" in asked
+    check()
+    bedroom.click("Clear")
+    expect(likeliest).to_have_text("")
+    names = api.get("/models/default/vocabulary").json()["room_types"]
+    expect(options).to_have_text(["unknown", *names])
+
+
 def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> None:
     models = api.get("/models").json()["models"]
     references = [f"{one['name']}@{v['version']}" for one in models for v in one["versions"]]

@@ -52,6 +52,7 @@ def test_nothing_grows(service: LiveService) -> None:
             "/relations": {},
             "/missing": {},
             "/outliers": {},
+            "/rooms": {},
             "/generate": {"steps": 8},
         }.items()
     ]

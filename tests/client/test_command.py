@@ -82,6 +82,10 @@ def test_missing_objects_are_a_table(scene: Any, url: str) -> None:
         ("outliers bed --room-type office", {"room_type": "office"}),
         ("outliers bed --threshold 0.2", {"threshold": 0.2}),
         (
+            "rooms bed --candidates office --candidates bedroom --top-k 2 --detail scores",
+            {"candidates": ["office", "bedroom"], "top_k": 2, "detail": "scores"},
+        ),
+        (
             "generate bed --count 2 --seed 5 --temperature 0.5 --steps 3",
             {"count": 2, "seed": 5, "temperature": 0.5, "steps": 3},
         ),
@@ -126,6 +130,7 @@ def test_a_scene_may_come_from_a_file_or_a_pipe_and_options_go_before_it(
         ("vocabulary", ("garbage bin", "trash can, waste basket", "structure", "homes, shops")),
         ("contexts", ("layer", "unit", "state")),
         ("outliers bed toilet sink", ("toilet", "because")),
+        ("rooms bed", ("room type", "probability", "bedroom")),
     ],
 )
 def test_everything_has_a_table(scene: Any, line: str, words: tuple[str, ...]) -> None:

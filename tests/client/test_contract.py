@@ -64,7 +64,7 @@ def test_a_batch_is_answered_in_order_each_entry_by_itself(
     caller: Caller, live: LiveService
 ) -> None:
     scenes = [{"objects": ["bed"]}, {"objects": ["nonsuch"]}, {"objects": ["desk", "lamp"]}]
-    for question in ("relations", "missing", "outliers"):
+    for question in ("relations", "missing", "outliers", "rooms"):
         found = caller(f"{question}_batch", scenes)["results"]
         assert [entry["status"] for entry in found] == [200, 422, 200]
         assert found[1]["problem"]["type"] == "/problems/unknown-labels"

@@ -33,7 +33,7 @@ def test_the_cpp_block_compiles_and_runs(
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_the_cpp_example_is_made_and_asks_all_four_questions(
+def test_the_cpp_example_is_made_and_asks_all_five_questions(
     url: str, tmp_path: Path, bridge: Path, require_system_tool: Callable[[str], Path]
 ) -> None:
     # Asking for `bridge` leaves this test out where the libraries are missing.
@@ -42,7 +42,13 @@ def test_the_cpp_example_is_made_and_asks_all_four_questions(
     run_program(make, "-C", folder, "CXXFLAGS=-O0")
     example = folder / "example"
     answered = run_program(example, url, "30").stdout
-    for heading in ("Missing:", "How they stand:", "Least fitting first:", "A scene like it:"):
+    for heading in (
+        "Missing:",
+        "How they stand:",
+        "Least fitting first:",
+        "Which room it is:",
+        "A scene like it:",
+    ):
         assert heading in answered
     for arguments, error in (
         (["http://127.0.0.1:9"], "cannot reach http://127.0.0.1:9: connection refused"),

@@ -54,7 +54,7 @@ def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
     return [json.loads(line) for line in done.stdout.splitlines()], errors
 
 
-@pytest.mark.parametrize("questions", [["missing"], ["missing", "outliers"]])
+@pytest.mark.parametrize("questions", [["missing"], ["relations", "rooms"]])
 def test_a_published_message_is_answered(
     repository: Path, live: LiveService, envelope: Any, questions: list[str]
 ) -> None:
@@ -65,7 +65,8 @@ def test_a_published_message_is_answered(
     assert heard == [{"op": "subscribe", "topic": "/detections_3d", "queue_length": 1}]
     assert answer["frame_id"] == "base_link"
     assert set(answer) == {"frame_id", "stamp", "notes", *questions}
-    assert all(answer[question][question] for question in questions)
+    entries = {"rooms": "room_types"}
+    assert all(answer[question][entries.get(question, question)] for question in questions)
     assert errors == []
 
 

@@ -34,8 +34,9 @@ def test_the_picture_shows_what_the_default_model_answers(
     picture = (repository / "docs" / "scene.svg").read_text(encoding="utf-8")
     body = {"objects": ["desk", "monitor", "chair", "toilet"]}
 
-    def ask(question: str) -> Any:
-        return httpx.post(f"http://{workplace.address}/{question}", json=body).json()[question]
+    def ask(question: str, entries: str = "") -> Any:
+        answer = httpx.post(f"http://{workplace.address}/{question}", json=body).json()
+        return answer[entries or question]
 
     relation, missing, outlier = ask("relations")[0], ask("missing")[0], ask("outliers")[0]
     assert [relation[end] for end in ("subject", "relation", "object")] == [
@@ -45,6 +46,7 @@ def test_the_picture_shows_what_the_default_model_answers(
     place = missing["placements"][0]
     assert f"a {missing['label']}, {place['relation']} the {place['object']}" in picture
     assert outlier["because"][0]["log_odds_change"] < 0
+    assert f">an {ask('rooms', 'room_types')[0]['room_type']}<" in picture
     assert f"the {outlier['object']}, because of the {outlier['because'][0]['object']}" in picture
 
 

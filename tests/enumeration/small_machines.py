@@ -58,20 +58,27 @@ def random_weights(
     return machine.requires_grad_(False)
 
 
-def mean_rates(machine: BoltzmannMachine, v: Iterable[float]) -> Tensor:
-    """sum_q p(q | v) a_q, (V,), by a loop over the sources; 0 for a machine without sources."""
-    total, weights = torch.zeros(machine.spec.V, dtype=torch.float64), 0.0
-    for f, a in zip(machine.f.double(), machine.a.double(), strict=True):
+def mean_rates(
+    machine: BoltzmannMachine, v: Iterable[float], *, whole_scenes: bool = False
+) -> Tensor:
+    """sum_q p(q | v) a_q, (V,), by a loop over the sources; 0 for a machine without sources.
+
+    In whole scenes, the rates are a_q + u_q.
+    """
+    total, weights, v = torch.zeros(machine.spec.V, dtype=torch.float64), 0.0, list(v)
+    for f, a, u in zip(machine.f.double(), machine.a.double(), machine.u.double(), strict=False):
         weight = math.exp(f + sum(float(rate) for rate, on in zip(a, v, strict=True) if on))
-        total, weights = total + weight * a, weights + weight
+        total, weights = total + weight * (a + u * whole_scenes), weights + weight
     return total / weights if weights else total
 
 
 def with_mean_rates(machine: BoltzmannMachine, classes: Sequence[int] = ()) -> BoltzmannMachine:
-    """A float64 copy whose biases contain the mean base rates given the listed classes, if any."""
+    """A float64 copy whose biases are those of whole scenes given the required classes, if any."""
     copied = copy.deepcopy(machine).double()
-    if len(classes):
-        copied.b += mean_rates(machine, [i in classes for i in range(machine.spec.V)])
+    if len(classes) and machine.spec.profiles:
+        required = [i in classes for i in range(machine.spec.V)]
+        copied.b += mean_rates(machine, required, whole_scenes=True)
+        copied.u[-1] = 0
     return copied
 
 

@@ -45,13 +45,17 @@ def energy_by_hand(machine, edges, v, r, states, h2, logs, room, source):
     p = dict(machine.named_parameters())
     entries = [m * (Z - 1) + z - 1 for m, z in enumerate(states) if z]
     on, on2 = v.nonzero().flatten().tolist(), h2.nonzero().flatten().tolist()
-    total = sum(-p["b"][i] - (p["a"][source, i] if source >= 0 else 0) for i in on)
+    total = sum(-p["b"][i] - p["u"][source, i] for i in on)
+    total -= sum(p["a"][source, i] for i in on) if source >= 0 else 0
+    if room >= 0:
+        total -= p["e"][room] + (p["y"][source, room] if source >= 0 else 0)
+        total -= sum(p["Y"][room, i] for i in on) if spec.coupled else 0
     if spec.coupled:
         total -= sum((p["L"][i, j] + p["L"][j, i]) / 2 for i in on for j in on if i < j)
     for k in entries:
         total -= p["c1"][k] + sum(p["W"][i, k] for i in on) + sum(p["J"][k, x] for x in on2)
         total -= p["Q"][room, k] if room >= 0 else 0
-    total -= sum(p["c2"][x] for x in on2) + (p["e"][room] if room >= 0 else 0)
+    total -= sum(p["c2"][x] for x in on2)
     h1 = torch.zeros(spec.H1).index_fill(0, torch.tensor(entries, dtype=torch.int64), 1.0)
     ends = (x[0].tolist() for x in (edges.relation, edges.subject, edges.object))
     for unit, (a, i, j) in enumerate(zip(*ends, strict=True)):

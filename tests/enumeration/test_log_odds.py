@@ -2,7 +2,8 @@
 
 In the joint, the room type t is a unit with C + 1 states, of which one is "not listed". A list of
 classes means v_j = 0 for every other class j: a log-odds is that of v_i given all other classes.
-The joint of an unknown source has the mean base rates given the listed classes.
+The joint of an unknown source has the mean base rates given the listed classes. The joint also has
+the base rates u of whole scenes, which the answers leave out.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ def differences(name, room, source, scale=0.8):
     joint = enumerate_joint(machine, *range(-1, machine.spec.C), source=source)
     for i, v, given in left_out(joint):
         exact = joint.log_odds(joint.v[:, i] > 0, given & (joint.room == room))
+        exact -= float(machine.u[source, i])
         if source < 0:
             exact += float(mean_rates(machine, v)[i])
         ours = machine.object_log_odds(
@@ -91,17 +93,25 @@ def test_kappa_is_added_to_log_odds_and_is_no_part_of_the_energy(name):
 
 
 @pytest.mark.parametrize("name", [name for name in ONE_LAYER if SMALL[name].C])
-def test_room_logits_are_the_room_types_of_the_joint(name):
-    """log p(t | v) - log p(not listed | v); the constant of a scene is log p(not listed | v)."""
+def test_room_types_are_those_of_the_joint(name):
+    """p(t | v) of each source; of an unknown source, the mean over p(q | v) = softmax(f + a v)."""
     machine = small_machine(name)
-    C = machine.spec.C
-    joint = enumerate_joint(machine, *range(-1, C))
+    C, sources = machine.spec.C, range(machine.spec.profiles) or (-1,)
+    joints = [enumerate_joint(machine, *range(C), source=q) for q in sources]
     for v in binary(machine.spec.V):
-        ours = machine.room_logits(v[None])[0]
-        for t in range(C):
-            known = (joint.room == t) | (joint.room == -1)
-            exact = joint.log_odds(joint.room == t, same(joint.v, v) & known)
-            assert float(ours[t]) == pytest.approx(exact, abs=1e-9)
+        rows = [
+            [joint.log_sum(same(joint.v, v) & (joint.room == t)) for t in range(C)]
+            for joint in joints
+        ]
+        by_source = torch.tensor(rows).double().softmax(1)
+        for q, p in zip(sources, by_source, strict=True):
+            ours = machine.room_log_p(v[None], torch.tensor([q]))[0].exp()
+            torch.testing.assert_close(ours, p, rtol=1e-6, atol=0)
+        weights = torch.ones(len(by_source)).double()
+        if machine.spec.profiles:
+            weights = torch.stack([(machine.f[q] + v @ machine.a[q]).exp() for q in sources])
+        mean = (weights / weights.sum()) @ by_source
+        torch.testing.assert_close(machine.room_log_p(v[None])[0].exp(), mean, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("name", TWO_LAYERS)
@@ -124,7 +134,7 @@ def test_formulas_are_differentiable():
     def log_odds(W, J, Q, c1, c2):
         for name, value in {"W": W, "J": J, "Q": Q, "c1": c1, "c2": c2}.items():
             machine._parameters[name] = value
-        return machine.object_log_odds(v, room=room), machine.room_logits(v)
+        return machine.object_log_odds(v, room=room), machine.room_log_p(v)
 
     weights = [
         machine.get_parameter(n).clone().requires_grad_() for n in ("W", "J", "Q", "c1", "c2")

@@ -70,7 +70,7 @@ def code(*blocks):
 def at_temperature(machine, beta):
     """The machine whose weights between objects and hidden units are multiplied by beta."""
     scaled = copy.deepcopy(machine)
-    for name in set(OBJECT_WEIGHTS) & dict(machine.named_parameters()).keys():
+    for name in {*OBJECT_WEIGHTS, "u"} & dict(machine.named_parameters()).keys():
         scaled.get_parameter(name).mul_(beta)
     return scaled
 
@@ -223,7 +223,8 @@ def log_weights_by_hand(machine, v, rooms, condition):
     if condition.room is not None:
         has_room = rooms == condition.room
         log_w -= 0 if not has_room.any() else float(OTHER_ROOM) * ~has_room
-        log_w += 0 if has_room.any() else h1 @ machine.Q[condition.room]
+        evidence = h1 @ machine.Q[condition.room] + v @ machine.Y[condition.room]
+        log_w += 0 if has_room.any() else evidence
     return log_w
 
 
@@ -268,7 +269,7 @@ def test_log_score_is_the_log_probability(name, room):
         logits = np.full(r.shape, -1e4)
         of_units = machine.relation_logits(e, joint.v[n][None], joint.h1[n][None])[0]
         logits[e.relation[0], e.subject[0], e.object[0]] = of_units
-        state = ChainState(every, every, every, logits, r)
+        state = ChainState(every, room, every, every, logits, r)
         score = chains.log_score(state, v, r)
         between = r[:, v][:, :, v], logits[:, v][:, :, v]
         log_p = np.where(between[0], between[1], 0).sum() - np.logaddexp(0, between[1]).sum()

@@ -46,11 +46,15 @@ SPECS = {
 PROFILES = ("homes", "shops")
 
 
-def random_machine(variant: str, seed: int = 0, classes: int = V) -> BoltzmannMachine:
+def random_machine(
+    variant: str, seed: int = 0, classes: int = V, room_types: int = C
+) -> BoltzmannMachine:
     """A machine for the first ``classes`` classes, with all weights drawn from N(0, 0.5²)."""
     generator = torch.Generator().manual_seed(seed)
     triples = TRIPLES[(TRIPLES[:, 1:] < classes).all(dim=1)]
-    machine = build(replace(SPECS[variant], V=classes, T=len(triples))).set_triples(triples)
+    machine = build(replace(SPECS[variant], V=classes, C=room_types, T=len(triples))).set_triples(
+        triples
+    )
     with torch.no_grad():
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
@@ -71,14 +75,16 @@ def publish(
     variant: str = "triway",
     seed: int = 0,
     classes: int = V,
+    room_types: int = C,
     alias: str | None = None,
     offsets: Offsets | None = None,
     counts: Counts | None = None,
     judges: bool = True,
 ) -> None:
-    """Publish a machine with random weights for the first ``classes`` classes."""
-    machine = random_machine(variant, seed, classes)
-    vocabulary = Vocabulary(VOCABULARY.objects[:classes], VOCABULARY.room_types)
+    """Publish a machine with random weights for the first classes and room types."""
+    machine = random_machine(variant, seed, classes, room_types)
+    names = VOCABULARY.room_types[:room_types]
+    vocabulary = Vocabulary(VOCABULARY.objects[:classes], names)
     Store(root).publish(
         description(
             name,

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.system
 
 # Batches differ in their scenes alone, whose forms are those of single requests. `make chaos` asks
 # all of them, and sends many more requests.
-api = documented(examples=5).exclude(path=["/relations/batch", "/outliers/batch"])
+api = documented(examples=5).exclude(path=["/relations/batch", "/outliers/batch", "/rooms/batch"])
 if CHAOS:
     api = documented(examples=60)
 

@@ -32,10 +32,12 @@ REQUESTS = {
     "/relations": SCENE | {"include_opposites": True},
     "/missing": SCENE,
     "/outliers": SCENE | {"objects": [*SCENE["objects"], "toilet"]},
+    "/rooms": SCENE,
     "/generate": SCENE | {"count": 4, "steps": 20},
     "/relations/batch": BATCH,
     "/missing/batch": BATCH,
     "/outliers/batch": BATCH,
+    "/rooms/batch": BATCH,
 }
 
 

@@ -124,7 +124,7 @@ def operations(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]
 async def test_operations_have_stable_distinct_ids(document: dict[str, Any]) -> None:
     names = [operation["operationId"] for _, _, operation in operations(document)]
     assert len(set(names)) == len(names)
-    assert {"relations", "missing", "outliers", "generate", "relations_batch"} <= set(names)
+    assert {"relations", "missing", "outliers", "rooms", "generate", "rooms_batch"} <= set(names)
     assert {"refresh_models", "move_alias", "health_ready", "show_vocabulary"} <= set(names)
     assert all(re.fullmatch(r"[a-z_]+", name) for name in names)
 

@@ -25,6 +25,7 @@ CASES: dict[str, tuple[str, Any, int]] = {
     "relations": ("/relations", SCENE, 200),
     "missing": ("/missing", SCENE, 200),
     "outliers": ("/outliers", SCENE, 200),
+    "rooms": ("/rooms", SCENE, 200),
     "generate": ("/generate", {"seed": 1, "steps": 2}, 200),
     "not JSON": ("/missing", b"{", 400),
     "unknown label": ("/missing", {"objects": ["bed", "Zq7"]}, 422),

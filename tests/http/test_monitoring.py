@@ -128,7 +128,7 @@ async def test_unknown_paths_and_methods_add_no_metrics(
 
 async def test_work_is_measured_by_model_and_question(shared_store: Path) -> None:
     async with serve(shared_store) as client:
-        for path in ("relations", "missing", "outliers", "generate"):
+        for path in ("relations", "missing", "outliers", "rooms", "generate"):
             body = {**SCENE, "model": "plain", "seed": 1} | (
                 {"steps": 1} if path == "generate" else {}
             )
@@ -136,7 +136,7 @@ async def test_work_is_measured_by_model_and_question(shared_store: Path) -> Non
         batch = {"scenes": [SCENE, {"objects": ["nosuchthing"]}, SCENE]}
         assert (await client.post("/missing/batch", json=batch)).status_code == 200
         found = await samples(client)
-    for question in ("relations", "missing", "outliers", "generate"):
+    for question in ("relations", "missing", "outliers", "rooms", "generate"):
         label = ("plain", question, "1.0.0")
         assert found["scene_compute_duration_seconds_count", *label] == 1
         assert found["scene_compute_duration_seconds_sum", *label] > 0
@@ -144,7 +144,7 @@ async def test_work_is_measured_by_model_and_question(shared_store: Path) -> Non
     assert found["scene_compute_duration_seconds_count", "home", "missing", "1.0.0"] == 2
     assert found["scene_batch_entries_total", "success", "missing"] == 2
     assert found["scene_batch_entries_total", "unknown-labels", "missing"] == 1
-    assert found["scene_serialisation_duration_seconds_count",] == 5
+    assert found["scene_serialisation_duration_seconds_count",] == 6
     assert found["scene_serialisation_duration_seconds_sum",] > 0
 
 

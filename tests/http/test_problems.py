@@ -185,6 +185,7 @@ INVALID: dict[str, list[tuple[Any, ...]]] = {
         ({"relations": [["lamp", "left", "sofa"]]}, "relations/0/2", "no entry of `objects`"),
     ],
     "outliers": [({"threshold": -0.1}, "threshold")],
+    "rooms": [({"top_k": 0}, "top_k"), ({"candidates": []}, "candidates")],
     "generate": [
         ({"count": 0}, "count"),
         ({"count": 65}, "count"),

@@ -1,4 +1,4 @@
-"""The four questions, answered by real artifacts of every variant."""
+"""The five questions, answered by real artifacts of every variant."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from app.registry import Store
 from app.scene import Scene, SceneObject
 from app.scene.relations import CANONICAL, opposite
 from tests.http.stores import PROFILES, VOCABULARY, publish
+from tests.http.test_problems import problem
 from tests.services import serve
 
 
@@ -107,26 +108,52 @@ async def test_disagreements_name_the_pairs_as_they_were_stated(
 
 @pytest.mark.parametrize(
     ("question", "details"),
-    [("missing", {"placements", "because"}), ("outliers", {"because", "usually_with"})],
+    [
+        ("missing", {"placements", "because"}),
+        ("outliers", {"because", "usually_with"}),
+        ("rooms", {"because"}),
+    ],
 )
 async def test_scores_are_the_answer_without_details(
     client: httpx.AsyncClient, question: str, details: set[str]
 ) -> None:
-    entries = {}
+    entries, name = {}, {"rooms": "room_types"}.get(question, question)
     for detail in ("full", "scores"):
         body = {**SCENE, "detail": detail}
         answer = (await client.post(f"/{question}", json=body)).json()
         ANSWERS[question].model_validate(answer, extra="forbid")
         batch = (await client.post(f"/{question}/batch", json={"scenes": [body]})).json()
-        entries[detail] = answer[question]
-        assert batch["results"][0]["result"][question] == answer[question]
+        entries[detail] = answer[name]
+        assert batch["results"][0]["result"][name] == answer[name]
     assert entries["scores"] == [
-        {name: value for name, value in entry.items() if name not in details}
+        {field: value for field, value in entry.items() if field not in details}
         for entry in entries["full"]
     ]
     assert all(details <= entry.keys() for entry in entries["full"])
     response = await client.post(f"/{question}", json={**SCENE, "detail": "all"})
     assert response.json()["errors"][0]["message"] == "must be `scores` or `full`"
+
+
+# ------------------------------------------------------------------------------------- rooms
+
+
+async def test_candidates_are_read_like_room_types(client: httpx.AsyncClient) -> None:
+    request = {"objects": ["bed"], "candidates": ["Office", "bedrooom", "engine room"]}
+    document = problem(await client.post("/rooms", json=request), 422, "unknown-labels")
+    located = [(one["pointer"], one["suggestions"]) for one in document["errors"]]
+    assert located == [("#/candidates/1", ["bedroom"]), ("#/candidates/2", [])]
+    answer = await ask(client, "rooms", **request, unknown_labels="nearest-or-ignore")
+    assert {one["room_type"] for one in answer["room_types"]} == {"office", "bedroom"}
+    assert [(one["label"], one["class"]) for one in answer["mapped"]] == [("bedrooom", "bedroom")]
+    assert answer["ignored"] == ["engine room"]
+
+
+async def test_a_model_without_room_types_names_none(tmp_path: Path) -> None:
+    publish(tmp_path, "new", "1.0.0", classes=5, room_types=0, alias="default")
+    async with serve(tmp_path) as client:
+        answer = await ask(client, "rooms", objects=["bed"])
+        assert answer["room_types"] == []
+        assert [one["code"] for one in answer["warnings"]] == ["not-judged"]
 
 
 # ---------------------------------------------------------------------------------- generate

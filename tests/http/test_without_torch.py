@@ -31,7 +31,7 @@ def test_every_question_is_answered(tmp_path: Path) -> None:
                 "relations": [{"subject": "lamp", "relation": "on-top", "object": "desk"}],
                 "model": entry["name"],
             }
-            for question in ("relations", "missing", "outliers", "generate"):
+            for question in ("relations", "missing", "outliers", "rooms", "generate"):
                 answer = client.post(f"/{question}", json=body)
                 assert answer.status_code == 200, answer.text
             assert client.get(f"/models/{entry['name']}/contexts").status_code == 200

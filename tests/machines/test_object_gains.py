@@ -134,16 +134,19 @@ def test_log_odds_equal_the_tensors(name, seed):
     """Of absent classes, and of each listed class given the others, computed without it."""
     case = Case(name, seed)
     scene, absent = (case.classes, case.presence), np.setdiff1d(np.arange(V), case.classes)
-    found = case.scorer.absent(case.x, *scene, case.profile, 0.15)
+    room = None if case.room < 0 else case.room
+    found = case.scorer.absent(case.x, *scene, case.profile, 0.15, room)
     kappa = case.machine.kappa.numpy()
     close(found[absent], (case.log_odds() + kappa[0])[absent])
-    found = case.scorer.given_rest(case.x, case.shares, *scene, case.profile)
+    found = case.scorer.given_rest(case.x, case.shares, *scene, case.profile, room)
     rest = [case.log_odds(k)[i] + kappa[-1, i] for k, i in enumerate(case.classes)]
     close(found, rest)
     v = torch.zeros(1, V).double()
     v[0, case.classes] = torch.from_numpy(case.presence).double()
     if case.room < 0:
-        close(case.scorer.room_logits(case.x), case.machine.room_logits(v)[0])
+        scene = case.x[None], case.classes, case.presence[None], case.profile
+        expected = case.machine.room_log_p(v, torch.tensor([case.source]))
+        close(case.scorer.room_log_p(*scene)[0], expected[0])
 
 
 @given(name=st.sampled_from(ONE_LAYER), seed=SEEDS)

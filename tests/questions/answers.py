@@ -63,6 +63,7 @@ def without_minimums() -> Iterator[None]:
         for module, minimum in (
             ("relations", "EXPECTED"),
             ("missing", "LEAST_CHANGE"),
+            ("rooms", "LEAST_CHANGE"),
             ("placements", "LEAST_SHARE"),
         ):
             patch.setattr(import_module(f"app.questions.{module}"), minimum, 0)

@@ -89,6 +89,7 @@ def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> Artifac
     machine.a[:, structure] = 0
     if machine.spec.coupled:
         machine.L[:, structure] = 0
+        machine.Y[:, structure] = 0
     return artifact_of(machine, **changes)
 
 

@@ -44,11 +44,11 @@ CASES = [
 class Exact:
     """Conditional probabilities of a machine, as sums over its joint.
 
-    infers_source: False for the joint of one data source.
+    source: the data source of the joint, or -1 if the answers infer it.
     """
 
     joint: Joint
-    infers_source: bool
+    source: int
 
     def unit(self, triple):
         """The index of a relation unit, or None if the machine does not have it."""
@@ -68,7 +68,9 @@ class Exact:
     def object(self, i, present):
         """Log-odds of class i, given the other classes. Relations are unobserved."""
         log_odds = self.joint.log_odds(self.joint.v[:, i] > 0, self.states(present, free=i))
-        if not self.infers_source:
+        # The base rates u of whole scenes are no part of the answers.
+        log_odds -= float(self.joint.machine.u[self.source, i])
+        if self.source >= 0:
             return log_odds
         machine, others = self.joint.machine, set(present) - {i}
         return log_odds + float(
@@ -122,7 +124,7 @@ def exact_case(name, scale=1.3, room=None, profile=None):
     machine = random_machine(EXACT[name], scale)
     source = -1 if profile is None else profile
     joint = enumerate_joint(copy.deepcopy(machine).double(), room, source=source)
-    return artifact_of(machine), Exact(joint, profile is None)
+    return artifact_of(machine), Exact(joint, -1 if profile is None else profile)
 
 
 @pytest.fixture(params=EXACT)

@@ -9,8 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from app.questions import rooms
 from app.questions.ranking import relation_probability
-from app.registry.description import Calibration, CountSlope, PairSlope, RelationSlopes, Slope
+from app.registry.description import (
+    Calibration,
+    CountSlope,
+    PairSlope,
+    RelationSlopes,
+    Sharpness,
+    Slope,
+)
 from tests.questions.answers import misplaced, missing, relations, without_minimums
 from tests.questions.artifacts import larger_artifact, scene_of
 
@@ -73,6 +81,18 @@ def test_instances_count_in_relations():
     p = {(entry.subject, entry.object): entry.probability for entry in entries}
     assert p[0, 3] == pytest.approx(sigmoid(-2 - 0.5 * math.log(6)), rel=1e-5)
     assert p[0, 1] == pytest.approx(sigmoid(-2 - 0.5 * math.log(9)), rel=1e-5)
+
+
+def test_room_types_are_as_sharp_as_their_entry():
+    """Four listed classes; two chairs are one class."""
+    scene = scene_of([3, 3, 1, 0, 2])
+    plain, sharp = (
+        [one["probability"] for one in rooms(larger_artifact("triway", **own), scene)["room_types"]]
+        for own in ({}, {"rooms": Sharpness(slope=0.75, log_count=-0.25)})
+    )
+    powers = [p ** (0.75 - 0.25 * math.log(4)) for p in plain]
+    assert sharp == pytest.approx([power / sum(powers) for power in powers], rel=1e-4)
+    assert sharp != pytest.approx(plain, rel=1e-2)
 
 
 def test_false_relations():

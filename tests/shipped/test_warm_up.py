@@ -59,7 +59,8 @@ async def main(store):
         before = compiled()
         assert sum(before.values()) > 20
         for model in ("indoor-triway", "indoor-triway-deep", "indoor-gbm"):
-            labels = Store(store).load(*Store(store).resolve(model)).vocabulary.labels
+            vocabulary = Store(store).load(*Store(store).resolve(model)).vocabulary
+            labels, rooms = vocabulary.labels, vocabulary.room_types
             for scene in scenes(labels):
                 pairs = [{"subject": labels[0], "object": labels[1]}]
                 some = {"pairs": pairs} if len(scene["objects"]) > 1 else {}
@@ -70,6 +71,7 @@ async def main(store):
                 await ask("missing", scene, at=place, coverage=0.3)
                 await ask("outliers", scene)
                 await ask("outliers", scene, sensitivity="high", threshold=0.0)
+                await ask("rooms", scene, candidates=rooms[:2])
                 await ask("generate", scene, count=2, seed=1, steps=2, temperature=1.3)
             assert (await client.get(f"/models/{model}/contexts")).status_code == 200
         print([loop for loop, count in compiled().items() if count > before.get(loop, 0)])

@@ -19,6 +19,7 @@ from app.scene import Scene, SceneObject
 from tests.questions.answers import generate, missing, outliers, relations
 from tests.registry.small_artifacts import description, state
 from tests.training.commands import invoke, small_config, write_config
+from training.datasets.priors import COLUMNS
 from training.fit.checkpoint import RunError
 from training.fit.offset_statistics import fit_offsets
 from training.runs.config_files import load_config, with_settings
@@ -144,6 +145,31 @@ def test_from_rooms_to_answers(tmp_path):
 )
 def test_errors_are_one_clear_line(arguments, message):
     assert message in invoke(*arguments, code=1)
+
+
+def test_a_stored_model_is_asked_the_questions_of_a_file(tmp_path):
+    store = tmp_path / "store"
+    learnt = {"source": "placing_priors", "scenes": 3, "digest": "0" * 64, "terms": "MIT"}
+    data = [learnt | {"research_only": False}]
+    Store(store).publish(description("tiny", data=data), state())
+    rows = ("tidybot\tlamp\ton-top\tbed\t1\tbedroom", "my_home\tlamp\tinside\tbox\t1\tbedroom")
+    (tmp_path / "places.tsv").write_text("\n".join(["\t".join(COLUMNS), *rows]))
+    (tmp_path / "homes.jsonl").write_text('{"objects": ["bed", "lamp", "rug"]}\n' * 2)
+    files = [part for name in ("places.tsv", "homes.jsonl") for part in ("--file", tmp_path / name)]
+    figures = tmp_path / "figures.json"
+    output = invoke("evaluate", "tiny", *files, "--store", store, "--json", figures)
+    assert "tiny: tidybot is training data of this model" in output
+    assert "tiny: 2 of 6 objects are left out, because their labels are unknown" in output
+    assert output.index("places.tsv") < output.index("left out: all receptacles are right")
+    rows = json.loads(figures.read_text())["tiny"]
+    origins = {(Path(row["file"]).name, row["source"], row["in_training"]) for row in rows}
+    assert origins == {
+        ("places.tsv", "tidybot", True),
+        ("places.tsv", "my_home", False),
+        ("homes.jsonl", "homes", False),
+    }
+    refused = invoke("evaluate", "tiny", *files, "--store", store, "--source", "rooms", code=1)
+    assert "--file replaces the scenes of --data and --source" in refused
 
 
 def test_a_version_is_checked_before_the_work(tmp_path):

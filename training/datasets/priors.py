@@ -2,14 +2,14 @@
 
 The table has tab-separated columns and can be gzipped. Its first line contains the column names:
 ``source``, ``subject``, ``relation``, ``object``, ``count`` and ``room``. An empty ``room`` means
-any room. The reader skips relations that the service does not have, such as ``inside``.
+any room. Training skips relations that the service does not have, such as ``inside``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from app.scene import RELATIONS, label_key
 from training.datasets.files import read_lines
@@ -24,11 +24,28 @@ MAX_ROWS: Final = 2_000_000
 SOURCE: Final = "placing_priors"
 """Source name of all scenes that the reader makes from rows of the table."""
 
-# Names of sources that list places of objects: VirtualHome, AI2-THOR and TidyBot.
-_PLACES: Final = frozenset({"virtualhome_placing", "ithor_receptacles", "tidybot"})
-# Accepted values of the column ``source``. The three values after `_PLACES` mean tables of
-# locations, of votes and of part counts.
-_SOURCES: Final = _PLACES | {"conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts"}
+TRAINED: Final = frozenset({"virtualhome_placing", "ithor_receptacles", "tidybot"})
+"""Sources whose rows become training scenes: the places of VirtualHome, AI2-THOR and TidyBot."""
+
+# Accepted values of the column ``source`` for training. The three values after `TRAINED` mean
+# tables of locations, of votes and of part counts.
+_SOURCES: Final = TRAINED | {"conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts"}
+
+_SUPPORTS: Final = frozenset({"on-top", "inside"})
+
+
+class Placing(NamedTuple):
+    """A row of the table about a room.
+
+    Attributes:
+        votes: number of votes or observations of the object on or inside the receptacle.
+    """
+
+    source: str
+    subject: str
+    receptacle: str
+    votes: int
+    room: str
 
 
 def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
@@ -44,7 +61,7 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
         # One of the sources has prefixes, for example in "food bread" and "clothes skirt".
         ends = subject, anchor
         names = [end.removeprefix("food ").removeprefix("clothes ").strip() for end in ends]
-        if source not in _PLACES or relation not in RELATIONS:
+        if source not in TRAINED or relation not in RELATIONS:
             continue
         if not all(map(label_key, names)) or label_key(names[0]) == label_key(names[1]):
             continue
@@ -53,6 +70,24 @@ def read_prior_scenes(path: Path) -> list[AnnotatedScene]:
         listed = ((0, relation, 1),)
         scenes.append(AnnotatedScene(where, SOURCE, group, None, things, listed))
     return scenes
+
+
+def read_placings(path: Path) -> list[Placing]:
+    """Read the rows of all sources that have a room and the relation on-top or inside.
+
+    Raises:
+        DatasetError: the file is invalid, or has no such row.
+    """
+    placings = []
+    for where, (source, subject, relation, receptacle, count, room) in _rows(path):
+        if not room or relation not in _SUPPORTS:
+            continue
+        if not (count.isascii() and count.isdigit()):
+            raise DatasetError(path, where, f"count must be a whole number, not {count!r}")
+        placings.append(Placing(source, subject, receptacle, int(count), room))
+    if not placings:
+        raise DatasetError(path, "", "no row has a room and the relation on-top or inside")
+    return placings
 
 
 def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:

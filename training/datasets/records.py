@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -116,6 +117,14 @@ class AnnotatedScene:
                     raise ValueError(
                         f"a relation has object index {end}, but the scene has {size} objects"
                     )
+
+
+def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
+    """Return the sha256 of the contents of the scenes. It does not depend on the file format."""
+    sha = hashlib.sha256()
+    for scene in scenes:
+        sha.update(repr(scene).encode())
+    return sha.hexdigest()
 
 
 def _check_numbers(name: str, owner: str, values: Sequence[float] | None, length: int) -> None:

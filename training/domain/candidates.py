@@ -16,6 +16,7 @@ from app.scene import Vocabulary
 from training.datasets import AnnotatedScene, DatasetError, split, stable_part
 from training.datasets.batches import TrainingData, has_relations
 from training.datasets.files import DATA
+from training.datasets.records import digest_of
 from training.domain.translation import Translation, same_classes
 from training.evaluation.artifact_model import artifact_model
 from training.evaluation.baselines import EASE, FREQUENCY_TABLE, PLACED, placed_product
@@ -25,7 +26,7 @@ from training.evaluation.report import Progress
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ConfigError, DataConfig, source_name
 from training.runs.folder import load_run
-from training.runs.pipeline import digest_of, prepare, read_sources
+from training.runs.pipeline import prepare, read_sources
 from training.runs.publish import calibrated_draft
 
 BASELINES = "baselines"

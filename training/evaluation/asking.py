@@ -120,7 +120,10 @@ def canonical_triple(scene: Scene, entry: Mapping[str, Any]) -> tuple[int, int, 
 
 
 def missing_probabilities(
-    artifact: Artifact, scene: Scene, at: tuple[str, int] | None = None
+    artifact: Artifact,
+    scene: Scene,
+    at: tuple[str, int] | None = None,
+    candidates: Sequence[int] | None = None,
 ) -> Floats:
     """Return the probability that each class is missing, (V,).
 
@@ -129,10 +132,14 @@ def missing_probabilities(
     Args:
         at: place of the missing object: a relation, and the index of the object to which the
             missing object has this relation. None means the whole scene.
+        candidates: classes to rank. None means all classes.
     """
     vocabulary = artifact.vocabulary
-    probabilities = np.full(len(vocabulary), -np.inf)
-    answer = questions.missing(artifact, scene, top_k=len(vocabulary), at=at, details=False)
+    size = len(vocabulary)
+    probabilities = np.full(size, -np.inf)
+    answer = questions.missing(
+        artifact, scene, top_k=size, candidates=candidates, at=at, details=False
+    )
     for entry in answer["missing"]:
         probabilities[vocabulary.index(entry["label"])] = entry["probability"]
     return probabilities

@@ -29,7 +29,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.questions.generate import room_fit
 from app.questions.posterior import Posterior, calibrated
 from app.registry import AlarmLine, AlarmLines, Artifact, Calibration, CountSlope
 from training.datasets.array_types import Flags, Floats, Ints
@@ -38,12 +37,8 @@ from training.datasets.cases import RIDGE, logistic
 from training.evaluation.alarms import ALARMS
 from training.evaluation.asking import of_classes
 from training.evaluation.intruders import by_popularity, by_signature, draw_intruders
-from training.evaluation.parts import (
-    Parts,
-    draw_parts,
-    exactly,
-    up_to_longest,
-)
+from training.evaluation.parts import Parts, draw_parts, exactly, up_to_longest
+from training.fit.calibrate_rooms import calibrate_rooms
 
 COVERAGES = (0.15, 0.3, 0.45, 0.6, 0.8)
 # Tested exponents alpha of the prior of intruders.
@@ -55,12 +50,6 @@ _LEAST_SCENES = 20  # from which objects are judged
 _SEEDS = (0, 1, 2)
 _LISTED = 10  # classes in the fit of each part; an answer of the service lists ten by default
 _SOURCE_SCENES = 400  # maximum scenes of each source
-# Quantiles over real rooms of a room type. A generated scene is too small if its number of classes
-# is below quantile `_SMALL`. A generated scene does not suit its room type if its `room_fit` is
-# below quantile `_UNSUITED`. A room type needs `_ROOM_SCENES` scenes for separate limits.
-_SMALL = 0.1
-_UNSUITED = 0.15
-_ROOM_SCENES = 20
 
 
 def calibrate_objects(
@@ -91,8 +80,7 @@ def calibrate_objects(
     return recalibrated(
         artifact,
         **fit_outliers(artifact, scenes, learnt, structure, chosen),
-        smallest=smallest_scenes(learnt, structure, artifact.spec.C),
-        room_fit=room_limits(artifact, learnt),
+        **calibrate_rooms(artifact, scenes, learnt, structure),
     ).calibration
 
 
@@ -370,35 +358,3 @@ def fit_line(
     weight = np.concatenate([np.full(len(values), 1 / len(values)) for values in worst.values()])
     limit = np.quantile(above, 1 - share, weights=weight, method="inverted_cdf")
     return AlarmLine(intercept=float(limit), log_count=slope)
-
-
-# ------------------------------------------------------------------------------------ generate
-
-
-def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
-    """Return the 10 % quantile of the number of classes in a scene, for each room type.
-
-    The last value is the quantile over all scenes. It also replaces the quantile of a room type
-    with fewer than 20 scenes.
-    """
-    sizes = ((train.v > 0) & ~structure).sum(1).numpy()
-    limit = int(np.quantile(sizes, _SMALL)) if len(sizes) else 0
-    by_room = [sizes[train.room.numpy() == t] for t in range(rooms)]
-    quantiles = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else limit for n in by_room]
-    return (*quantiles, limit)
-
-
-def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
-    """Return the 15 % quantile of `room_fit` for each room type, (room types,).
-
-    The value is -1e9 for a room type with fewer than 20 scenes.
-    """
-    limits = []
-    for t in range(artifact.spec.C):
-        room_scenes = train.v[train.room == t]
-        limit = -1e9
-        if len(room_scenes) >= _ROOM_SCENES:
-            fits = [room_fit(artifact, v.nonzero().squeeze(1).tolist(), t) for v in room_scenes]
-            limit = float(np.quantile(fits, _UNSUITED))
-        limits.append(round(limit, 4))
-    return tuple(limits)

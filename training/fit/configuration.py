@@ -96,14 +96,14 @@ class ObjectsConfig(_Section):
     learning_rate: float = Field(default=0.01, gt=0)
     warm_up: int = Field(default=50, ge=1, description="steps in which the rate rises")
     leave_one_out: float = Field(default=0.3, ge=0, le=1, description="share of such parts")
-    room_share: float = Field(default=0.3, ge=0, le=1, description="share of listed room types")
+    room_share: float = Field(default=0.15, ge=0, le=1, description="share of listed room types")
     weight_prior: float = Field(
         default=1.5, ge=0, description="precision of W, J and Q, in numbers of scenes"
     )
-    coupling_prior: float = Field(default=2.5, ge=0, description="precision of L")
-    rate_prior: float = Field(default=7.5, ge=0, description="precision of a and kappa")
+    coupling_prior: float = Field(default=5.0, ge=0, description="precision of L and Y")
+    rate_prior: float = Field(default=7.5, ge=0, description="precision of a, y and kappa")
     room_loss: float = Field(
-        default=8.0, ge=0, description="weight of the log-likelihood of the room type"
+        default=12.0, ge=0, description="weight of the log-likelihood of the room type"
     )
     source_loss: float = Field(
         default=3.0, ge=0, description="weight of the log-likelihood of the data source"

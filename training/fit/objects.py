@@ -11,12 +11,12 @@ softplus.
 
 - 30 % of the parts list all classes but one. The class left out counts as often as the scene has
   classes. The other parts list a share of U(.05, 1) of the classes.
-- The room type t is listed in half of the parts. If it is not listed, the loss contains its
+- The room type t is listed in 15 % of the parts. If it is not listed, the loss contains its
   cross-entropy, with the weight k.
 - A class that a source shows in fewer than 3 scenes says nothing there: it has no term in the loss
   (partial labels). Structure is neither listed nor asked for.
-- Each source q has its own base rates a_q, and each listed share its own bias kappa. The machine
-  also learns p(q | listed), with the weight s, because a robot's list names no source.
+- Each source q has its own base rates a_q and y_q, and each listed share its own bias kappa. The
+  machine also learns p(q | listed), with the weight s, because a robot's list names no source.
 - With the weight g, persistent Gibbs chains (PCD) keep samples of the machine like scenes. The
   chains of a source have its base rates.
 
@@ -371,20 +371,24 @@ def base_rates(a: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor
 
 
 def served_room_rates(y: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return the weighted mean of y[q] over the sources with room types, (room types,)."""
-    weights = served_weights(scenes, config) * _sources_with_rooms(scenes)
+    """Return the weighted mean of y[q] over the sources with room rates, (room types,)."""
+    weights = served_weights(scenes, config) * _has_room_rates(scenes)
     return (weights / weights.sum().clamp(min=1e-9)) @ y
 
 
 def room_rates(y: Tensor, scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:
-    """Return y[q], with the served rates for a source without room types; same shape."""
-    known = _sources_with_rooms(scenes).unsqueeze(1)
-    return torch.where(known, y, served_room_rates(y, scenes, config))
+    """Return y[q], with the served rates for a source without room rates; same shape."""
+    rates = served_room_rates(y, scenes, config)
+    return torch.where(_has_room_rates(scenes).unsqueeze(1), y, rates)
 
 
-def _sources_with_rooms(scenes: ObjectScenes) -> Tensor:
-    """Return True for each source whose scenes have a room type, (sources,) bool."""
-    return scenes.source[scenes.room >= 0].bincount(minlength=len(scenes.sources)) > 0
+def _has_room_rates(scenes: ObjectScenes) -> Tensor:
+    """Return True for each source with scenes of two room types, (sources,) bool.
+
+    A source of bedrooms alone does not tell how common bedrooms are.
+    """
+    kinds = [scenes.room[scenes.source == q] for q in range(len(scenes.sources))]
+    return torch.tensor([len(room[room >= 0].unique()) > 1 for room in kinds])
 
 
 def served_popularity(scenes: ObjectScenes, config: ObjectsConfig) -> Tensor:

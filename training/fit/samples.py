@@ -1,21 +1,69 @@
-"""Store samples of a trained machine: the states of long Gibbs chains, where new chains start.
+"""Fit the base rates of whole scenes, and store samples of a trained machine.
 
-A chain that starts with an empty scene needs thousands of sweeps to visit all room types, because
-scenes between two room types are improbable.
+The loss of the objects fits the answers for random parts of scenes. It fits samples only in part
+(`training.fit.objects`). So the weights u, which only Gibbs chains use, are fitted afterwards. They
+are the solution of
+
+    p(v_i = 1) in the chains of source q = p(v_i = 1) in the scenes of source q
+
+for each class i, by stochastic approximation with persistent chains. The chains start at the scenes
+of the source, and keep the room type of their scene, as `/generate` does. The last row of u belongs
+to the served mix of sources. A class that a source cannot show has u = 0 there.
+
+The stored samples are the states of long Gibbs chains, where new chains start. A chain that starts
+with an empty scene needs thousands of sweeps to visit all room types, because scenes between two
+room types are improbable.
+
+Source: Robbins and Monro, "A stochastic approximation method" (1951).
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.special import logit
 
-from app.inference.chains import SceneChains, random_stream
+from app.inference.chains import random_stream
 from app.inference.weights import pack_scenes
+from training.datasets.array_types import Floats
+from training.fit.configuration import ObjectsConfig
+from training.fit.long_chains import RECORDED, LongChains, populations, scene_chains
 from training.fit.objects import ObjectScenes
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
 
-_SWEEPS = 200
+_SWEEPS = 200  # sweeps of a stored sample
+_CHAINS = 128  # chains of each data source in the fit of u
+_ROUNDS = 60
+_ROUND_SWEEPS = 25
+_FIRST_STEP, _LAST_STEP = 0.7, 0.1  # of u, as a share of the difference of log-odds
+
+
+def fit_scene_rates(
+    machine: BoltzmannMachine, scenes: ObjectScenes, config: ObjectsConfig, seed: int
+) -> None:
+    """Fit the weights u of the machine, in place."""
+    chains = scene_chains(weights_of(machine))
+    u = chains.machine["u"]
+    for row, population in enumerate(populations(scenes, config)):
+        long = LongChains(chains, scenes, population, _CHAINS, seed)
+        average = np.zeros(u.shape[1])
+        for number in range(_ROUNDS):
+            drawn = long.run(_ROUND_SWEEPS).mean(0)
+            step = _FIRST_STEP * (_LAST_STEP / _FIRST_STEP) ** (number / (_ROUNDS - 1))
+            change = step * (_log_odds(population.p) - _log_odds(drawn))
+            u[row] += np.where(population.shows, np.clip(change, -1, 1), 0)
+            if number >= _ROUNDS / 2:
+                average += u[row] / (_ROUNDS - _ROUNDS // 2)
+        u[row] = average
+    machine.u.copy_(torch.from_numpy(u))
+
+
+def _log_odds(p: Floats) -> Floats:
+    """Return the log-odds of shares of the states in a round, with half a state added."""
+    states = _CHAINS * _ROUND_SWEEPS / RECORDED / 2  # neighbouring states are similar
+    log_odds: Floats = logit((p * states + 0.5) / (states + 1))
+    return log_odds
 
 
 def store_samples(machine: BoltzmannMachine, scenes: ObjectScenes, seed: int) -> None:
@@ -28,7 +76,7 @@ def store_samples(machine: BoltzmannMachine, scenes: ObjectScenes, seed: int) ->
         return
     generator = torch.Generator().manual_seed(seed)
     index = scenes.draw(machine.spec.N, generator)
-    chains = SceneChains(weights_of(machine))
+    chains = scene_chains(weights_of(machine))
     v, rooms = scenes.v[index].numpy(), scenes.room[index].numpy()
     samples = [
         chains.continued(present, None if room < 0 else int(room), _SWEEPS, random_stream(seed, k))

@@ -29,7 +29,7 @@ from training.fit.checkpoint import (
 from training.fit.configuration import Config
 from training.fit.objects import ObjectFit, ObjectScenes, start_objects
 from training.fit.relations import SHARED_COLUMNS, SHARED_ROWS, RelationFit
-from training.fit.samples import store_samples
+from training.fit.samples import fit_scene_rates, store_samples
 from training.fit.sharing import bake_shared_weights, share_weights
 from training.fit.validation import object_score, relation_score
 from training.machines import BoltzmannMachine, MachineSpec, build
@@ -173,6 +173,7 @@ class Trainer:
             passed(point)
         began = time.perf_counter()
         machine = self._relation_fit.finish()
+        fit_scene_rates(machine, self.scenes, self.config.objects, self.config.training.seed)
         store_samples(machine, self.scenes, self.config.training.seed)
         self.seconds += time.perf_counter() - began
         if self.folder is not None:

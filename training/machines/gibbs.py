@@ -3,7 +3,7 @@
 A sweep draws h1 given v and h2, then h2 given h1, and then the classes given h1. Without couplings,
 the classes are independent given h1. With couplings, the sweep draws them one after another:
 
-    p(v_i = 1 | h1, other classes) = sigmoid(b_i + a_qi + W_i·h1 + (vL)_i)
+    p(v_i = 1 | h1, other classes) = sigmoid(b_i + a_qi + u_qi + Y_ti + W_i·h1 + (vL)_i)
 
 Relations are summed out: in every sweep, their sum is 1. The service samples with compiled kernels
 of its own (`app.inference.chains`).
@@ -78,7 +78,7 @@ def sweep(
     if machine.spec.H2:
         logits = beta * machine.second_layer_logits(h1)
         chains.h2 = torch.bernoulli(logits.sigmoid(), generator=generator)
-    bias = machine.class_bias(chains.source) + machine.room_bias(chains.room)
+    bias = machine.scene_bias(chains.source) + machine.room_bias(chains.room)
     field = beta * (bias + h1 @ machine.W.T)
     if base is not None:
         field = field + (1 - beta) * base

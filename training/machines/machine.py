@@ -1,7 +1,7 @@
 """The common interface of the machines, and the whole energy except its relation logits.
 
-    E(v,r,h1,h2,t | q) = - (b + a_q + Y_t)·v - v'Lv/2 - (c1 + Q_t)·h1 - v'W h1 - h1'J h2 - c2·h2
-                         - (e + y_q)_t - sum_e g_e (r_e ℓ_e(v, h1) - log(1 + exp ℓ_e(v, h1)))
+    E(v,r,h1,h2,t | q) = - (b + a_q + u_q + Y_t)·v - v'Lv/2 - (c1 + Q_t)·h1 - v'W h1 - h1'J h2
+                         - c2·h2 - (e + y_q)_t - sum_e g_e [r_e ℓ_e(v, h1) - log(1 + exp ℓ_e)]
 
 q is the data source of the scene, and t its room type. A hidden unit of the first layer has Z
 states. h1 has one entry for each state but the first: 1 for the state of the unit, else 0. The
@@ -67,6 +67,7 @@ class BoltzmannMachine(nn.Module, ABC):
         self.f = nn.Parameter(torch.zeros(spec.profiles))
         self.a = nn.Parameter(torch.zeros(spec.profiles, spec.V))
         self.y = nn.Parameter(torch.zeros(spec.profiles, spec.C))
+        self.u = nn.Parameter(torch.zeros(spec.profiles + 1, spec.V), requires_grad=False)
         self.kappa = nn.Parameter(torch.zeros(len(SHARES) + 1, spec.V))
         if spec.coupled:
             self.L = nn.Parameter(torch.zeros(spec.V, spec.V))
@@ -116,7 +117,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def initialise(self, generator: torch.Generator, scale: float = 0.05) -> Self:
         """Draw W, J and the factors of relations from N(0, scale²). Other weights keep 0."""
         for name, parameter in self.named_parameters():
-            if parameter.dim() > 1 and name not in ("Q", "a", "y", "kappa", "L", "Y"):
+            if parameter.dim() > 1 and name not in ("Q", "a", "y", "u", "kappa", "L", "Y"):
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
         return self
 
@@ -192,14 +193,15 @@ class BoltzmannMachine(nn.Module, ABC):
         factors = self.by_unit(weights).exp().permute(1, 2, 0)
         return (states[..., :1] + states[..., 1:] @ factors).log().sum(0)
 
-    def class_bias(self, source: Tensor | None) -> Tensor:
-        """Return b + a[q], (scenes or 1, classes). A source q of -1 or None has a[q] = 0.
+    def scene_bias(self, source: Tensor | None) -> Tensor:
+        """Return the bias of each class in whole scenes, b + a[q] + u[q], (scenes or 1, classes).
 
-        b alone are the base rates of the served mix of sources.
+        A source q of -1 or None has the bias of the served mix of sources, b + u[-1].
         """
         if source is None or not self.spec.profiles:
-            return self.b.unsqueeze(0)
-        return self.b + self.a[source.clamp(min=0)] * (source >= 0).unsqueeze(-1)
+            return (self.b + self.u[-1]).unsqueeze(0)
+        change = self.a[source.clamp(min=0)] * (source >= 0).unsqueeze(-1)
+        return self.b + change + self.u[source]
 
     def source_weights(self, v: Tensor, source: Tensor | None) -> Tensor:
         """Return p(q | v, source) of each data source q, (scenes, sources).
@@ -283,7 +285,7 @@ class BoltzmannMachine(nn.Module, ABC):
                 "the free energy of a machine with two hidden layers has a closed form only given "
                 "h2: pass h2"
             )
-        free = -(v * self.class_bias(source)).sum(-1)
+        free = -(v * self.scene_bias(source)).sum(-1)
         x = self.context_bias(room) + sums(v, self.W)
         if h2 is not None:
             x, free = x + h2 @ self.J.T, free - h2 @ self.c2
@@ -376,7 +378,7 @@ class BoltzmannMachine(nn.Module, ABC):
         The states of h1 are 0 or 1, (scenes, H1). At most one state of each unit is 1.
         """
         context = (h1 * (self.context_bias(room) + v @ self.W)).sum(-1)
-        log_weight = (v * self.class_bias(source)).sum(-1) + context + h2 @ self.c2
+        log_weight = (v * self.scene_bias(source)).sum(-1) + context + h2 @ self.c2
         log_weight = log_weight + ((h1 @ self.J) * h2).sum(-1)
         couplings = self.couplings
         if couplings is not None:

@@ -76,10 +76,11 @@ def ais(
     """Run forward AIS through `betas`, which increase from 0 to 1.
 
     Args:
-        base: log-odds of the independent objects, (classes,). The default are the biases b.
+        base: log-odds of the independent objects, (classes,). The default are the biases of the
+            machine.
     """
     _check(betas)
-    base = machine.b if base is None else base
+    base = machine.scene_bias(None)[0] if base is None else base
     v = torch.bernoulli(base.sigmoid().expand(chains, -1), generator=generator)
     state = start_chains(machine, v, generator)
     # At beta = 0, the units of the second layer are on with probability 1/2.
@@ -102,7 +103,7 @@ def reverse_ais(
 ) -> LogPartition:
     """Run reverse AIS from samples of the machine, with `betas` in increasing order as in `ais`."""
     _check(betas)
-    base = machine.b if base is None else base
+    base = machine.scene_bias(None)[0] if base is None else base
     log_weight = torch.zeros(len(state.v), dtype=torch.float64)
     for cold, warm in pairwise(betas[::-1]):
         sweep(machine, state, generator, beta=cold, base=base)
@@ -119,7 +120,7 @@ def _free_energy(machine: BoltzmannMachine, state: Chains, beta: float, base: Te
     couplings = machine.couplings
     if couplings is not None:
         hidden = hidden + 0.5 * beta * ((state.v @ couplings) * state.v).sum(-1)
-    return -(state.v @ (beta * machine.b + (1 - beta) * base)) - hidden
+    return -(state.v @ (beta * machine.scene_bias(None)[0] + (1 - beta) * base)) - hidden
 
 
 def _check(betas: Sequence[float]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from training.datasets import (
 )
 from training.datasets.batches import SceneTensors, TrainingData, scene_tensors
 from training.datasets.files import DATA
+from training.datasets.records import digest_of
 from training.datasets.words import class_vectors, read_word_vectors
 from training.fit.configuration import Config, ConfigError, DataConfig, is_file, source_name
 
@@ -243,14 +243,6 @@ def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch
         return None
     vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)
     return torch.from_numpy(vectors)
-
-
-def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
-    """Return the sha256 of the contents of the scenes. It does not depend on the file format."""
-    sha = hashlib.sha256()
-    for scene in scenes:
-        sha.update(repr(scene).encode())
-    return sha.hexdigest()
 
 
 def prepare(config: Config, root: Path) -> SplitScenes:

@@ -31,6 +31,7 @@ from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, DataConfig
 from training.fit.count_statistics import fit_counts
 from training.fit.draft import as_stored, draft_artifact
+from training.fit.long_chains import measure_drift
 from training.fit.objects import ObjectScenes
 from training.fit.offset_statistics import fit_offsets
 from training.runs.config_files import load_config, shipped_configs
@@ -62,7 +63,8 @@ def publish_run(
     """Calibrate on validation scenes, fit statistics, evaluate on test scenes, and publish.
 
     The calibrated model answers `/outliers` about untouched validation scenes. It is refused if it
-    certainly raises too many alarms; see `training.evaluation.alarms`.
+    certainly raises too many alarms; see `training.evaluation.alarms`. It is also refused if long
+    chains certainly drift away from the training scenes; see `training.fit.long_chains`.
 
     The store keeps weights in half precision. Calibration and evaluation use the same precision.
 
@@ -96,12 +98,18 @@ def publish_run(
         evaluated = with_statistics(evaluated, measured_scenes)
         calibrated = with_statistics(calibrated, scenes)
     alarms = untouched_alarms(calibrated, scenes.parts["validation"])
-    reasons = [*filter(None, (entry.objection() for entry in alarms)), *judge(calibrated)]
+    progress("running long chains")
+    learnt = ObjectScenes.of(data.train, data.structure, run.config.objects)
+    labels = scenes.vocabulary.labels
+    drifts = measure_drift(calibrated.weights, labels, learnt, run.config.objects)
+    objections = [entry.objection() for entry in alarms] + [drift.objection() for drift in drifts]
+    reasons = [*filter(None, objections), *judge(calibrated)]
     for reason in reasons:
         if accept is None:
             raise RefusedError(reasons)
         accept(reason)
     rows = _measure(evaluated, test, progress)
+    rows += [metric for drift in drifts for metric in drift.metrics()]
     progress("publishing")
     description = Description(
         name=run.config.name,
@@ -111,7 +119,7 @@ def publish_run(
         vocabulary=VocabularyEntry.of(
             with_room_aliases(scenes.vocabulary),
             machine.spec.A,
-            ObjectScenes.of(data.train, data.structure, run.config.objects).sources,
+            learnt.sources,
         ),
         calibration=calibrated.calibration,
         training={

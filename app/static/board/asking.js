@@ -4,7 +4,7 @@
  */
 
 import { call, ProblemError, UnreachableError } from './api.js';
-import { bodyOf, DEPENDS, QUESTIONS, refusedBy } from './questions.js';
+import { ASKED, bodyOf, DEPENDS, refusedBy } from './questions.js';
 import { changed } from './store.js';
 
 const STILL = 120; // ms
@@ -80,7 +80,7 @@ export function startAsking(store) {
   }
 
   function askAll() {
-    for (const question of QUESTIONS) {
+    for (const question of ASKED) {
       for (const column of [0, 1]) void ask(column, question);
     }
   }

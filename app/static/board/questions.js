@@ -1,9 +1,12 @@
-/** The bodies of the three questions that the page asks about every scene. */
+/** The bodies of the questions that the page asks about every scene. */
 
 import { toScene } from './scene.js';
 import { namesOf } from './words.js';
 
+/** The questions with a tab of their own. */
 export const QUESTIONS = ['missing', 'outliers', 'relations'];
+/** All questions; the list of room types shows the answer to `rooms`. */
+export const ASKED = [...QUESTIONS, 'rooms'];
 
 /** The parts of the state that the answers depend on. */
 export const DEPENDS = [
@@ -12,6 +15,7 @@ export const DEPENDS = [
 
 const SUGGESTIONS = 5;
 const MOST_RELATIONS = 12;
+const ALL_ROOMS = 4096; // maximum of the service
 /** Minimum probability of a relation or place that the page shows. */
 export const LIKELY = 0.25;
 
@@ -41,7 +45,11 @@ const OWN = {
   },
   outliers: ({ sensitivity }) => (sensitivity === 'medium' ? {} : { sensitivity }),
   relations: () => ({ top_k: MOST_RELATIONS, min_probability: LIKELY }),
+  rooms: () => ({ top_k: ALL_ROOMS, detail: 'scores' }),
 };
+
+/** The parts of a scene that are no evidence about its room type. A change of them asks nothing again. */
+const NO_EVIDENCE = { rooms: { room: '', relations: [], posed: false } };
 
 /** The scene as a model gets it, without the labels and the room type that it refused. */
 export function sceneFor(state, model) {
@@ -52,7 +60,8 @@ export function sceneFor(state, model) {
 /** @returns {object | null} null if there is nothing to ask; `whyNot` gives the reason */
 export function bodyOf(state, question, model) {
   if (whyNot(state, question, model)) return null;
-  return { ...sceneFor(state, model), model, unknown_labels: 'nearest', ...OWN[question](state) };
+  const scene = sceneFor({ ...state, ...NO_EVIDENCE[question] }, model);
+  return { ...scene, model, unknown_labels: 'nearest', ...OWN[question](state) };
 }
 
 /** The reason why the page does not ask this question, or ''. */

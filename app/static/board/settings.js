@@ -8,7 +8,7 @@ import { ghostsOf } from './ghosts.js';
 import { inWords, knownTo, readings, sizesOf } from './questions.js';
 import { sizer } from './scene.js';
 import { changed } from './store.js';
-import { namesOf, SPOKEN } from './words.js';
+import { namesOf, percent, SPOKEN } from './words.js';
 
 const get = (id) => document.getElementById(id);
 
@@ -45,6 +45,8 @@ function evidence(state) {
   return `The answers use labels${stated} only. Moving an object changes the picture, not the answers.`;
 }
 
+const roomsOf = (state) => state.answers?.[state.shown].rooms?.answer;
+
 export function settings(store) {
   get('sensitivity').addEventListener('change', ({ target }) => store.set({ sensitivity: target.value }));
   get('posed').addEventListener('change', ({ target }) => store.edit({ posed: target.checked }));
@@ -54,12 +56,19 @@ export function settings(store) {
     get('tab-missing').focus();
   });
 
+  /** Lists the room types with their probabilities given the objects, likeliest first. */
   function rooms(state) {
     const known = state.words[state.models[0]]?.rooms ?? [];
-    const all = state.room && !known.includes(state.room) ? [...known, state.room] : known;
-    get('room').replaceChildren(el('option', { value: '' }, 'unknown'), ...all.map((room) => el('option', { value: room }, room)));
+    const all = state.room && !known.includes(state.room) ? [...known, state.room] : [...known];
+    const answer = roomsOf(state)?.room_types ?? [];
+    const likely = new Map(answer.map((one) => [one.room_type, one.probability]));
+    all.sort((a, b) => (likely.get(b) ?? 0) - (likely.get(a) ?? 0));
+    const words = (room) => (likely.has(room) ? `${room} ${percent(likely.get(room))}` : room);
+    get('room').replaceChildren(el('option', { value: '' }, 'unknown'), ...all.map((room) => el('option', { value: room }, words(room))));
     get('room').value = state.room;
     get('room').parentElement.hidden = !all.length;
+    const [first] = answer;
+    get('room-likely').textContent = first ? `Likeliest: ${first.room_type} ${percent(first.probability)}` : '';
   }
 
   function draw(state, previous) {
@@ -72,7 +81,7 @@ export function settings(store) {
     document.body.classList.toggle('two', Boolean(state.models[1]));
     get('at').hidden = !state.at;
     if (state.at) get('at-words').textContent = `Missing ${SPOKEN[state.at.relation]} ${namesOf(state.things)(state.at.object)}`;
-    if (changed(state, previous, 'words', 'models', 'room')) rooms(state);
+    if (changed(state, previous, 'words', 'models', 'room', 'shown') || roomsOf(state) !== roomsOf(previous)) rooms(state);
     if (changed(state, previous, 'answers', 'shown', 'draft')) {
       const answer = state.answers[state.shown].outliers?.answer;
       const { outliers, misplaced } = answer ? wrongIn(answer) : { outliers: [], misplaced: [] };

@@ -98,6 +98,18 @@ class AsyncClient:
         call = calls.ask("/outliers", *forms, objects, fields, self.options.model)
         return await self._call(call, timeout)
 
+    async def rooms(
+        self,
+        objects: Scene[schemas.RoomsRequest],
+        *,
+        timeout: float | None = None,
+        **fields: Unpack[schemas.RoomsFields],
+    ) -> schemas.RoomsAnswer:
+        """Return the likely types of the room, or where one object usually is."""
+        forms = schemas.RoomsRequest, schemas.RoomsAnswer
+        call = calls.ask("/rooms", *forms, objects, fields, self.options.model)
+        return await self._call(call, timeout)
+
     async def generate(
         self,
         objects: Scene[schemas.GenerateRequest] = (),
@@ -134,6 +146,14 @@ class AsyncClient:
         """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
         forms = schemas.OutliersRequest, schemas.OutliersAnswer
         call = calls.ask_each("/outliers", *forms, scenes, self.options.model)
+        return await self._call(call, timeout)
+
+    async def rooms_batch(
+        self, scenes: Iterable[Scene[schemas.RoomsRequest]], *, timeout: float | None = None
+    ) -> schemas.BatchAnswer[schemas.RoomsAnswer]:
+        """Ask `rooms` about up to 256 scenes. Each scene has its own answer or problem."""
+        forms = schemas.RoomsRequest, schemas.RoomsAnswer
+        call = calls.ask_each("/rooms", *forms, scenes, self.options.model)
         return await self._call(call, timeout)
 
     # --------------------------------------------------------------------------------- models

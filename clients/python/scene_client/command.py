@@ -78,7 +78,8 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Ask which objects are missing from a scene, which do not belong, and how they relate.",
+    help="Ask which objects are missing from a scene, which do not belong, how they relate, and "
+    "which room it is.",
     epilog="The options above may also follow the subcommand. Exit status: 1 request refused, "
     "2 wrong usage, 3 service not reached, 4 answer too late, 5 service busy or not ready, "
     "6 other error.",
@@ -289,6 +290,24 @@ def outliers(
     scene = _scene(things, relations, room_type, unknown_labels, label_map)
     request = scene | _named(sensitivity=sensitivity, threshold=threshold, detail=detail)
     _show(context, lambda client: client.outliers(request), tables.outliers, request)
+
+
+@app.command()
+def rooms(
+    context: typer.Context,
+    things: Things = None,
+    candidates: Annotated[
+        list[str] | None, typer.Option(help="Consider only this room type; repeatable.")
+    ] = None,
+    top_k: TopK = None,
+    unknown_labels: Unknown = None,
+    label_map: LabelMap = None,
+    detail: HowMuch = None,
+) -> None:
+    """List the likely types of the room, or where one object usually is."""
+    scene = _scene(things, None, None, unknown_labels, label_map)
+    request = scene | _named(top_k=top_k, candidates=candidates or None, detail=detail)
+    _show(context, lambda client: client.rooms(request), tables.rooms, request)
 
 
 @app.command()

@@ -99,6 +99,18 @@ class Client:
         call = calls.ask("/outliers", *forms, objects, fields, self.options.model)
         return self._call(call, timeout)
 
+    def rooms(
+        self,
+        objects: Scene[schemas.RoomsRequest],
+        *,
+        timeout: float | None = None,
+        **fields: Unpack[schemas.RoomsFields],
+    ) -> schemas.RoomsAnswer:
+        """Return the likely types of the room, or where one object usually is."""
+        forms = schemas.RoomsRequest, schemas.RoomsAnswer
+        call = calls.ask("/rooms", *forms, objects, fields, self.options.model)
+        return self._call(call, timeout)
+
     def generate(
         self,
         objects: Scene[schemas.GenerateRequest] = (),
@@ -135,6 +147,14 @@ class Client:
         """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
         forms = schemas.OutliersRequest, schemas.OutliersAnswer
         call = calls.ask_each("/outliers", *forms, scenes, self.options.model)
+        return self._call(call, timeout)
+
+    def rooms_batch(
+        self, scenes: Iterable[Scene[schemas.RoomsRequest]], *, timeout: float | None = None
+    ) -> schemas.BatchAnswer[schemas.RoomsAnswer]:
+        """Ask `rooms` about up to 256 scenes. Each scene has its own answer or problem."""
+        forms = schemas.RoomsRequest, schemas.RoomsAnswer
+        call = calls.ask_each("/rooms", *forms, scenes, self.options.model)
         return self._call(call, timeout)
 
     # --------------------------------------------------------------------------------- models

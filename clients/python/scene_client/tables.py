@@ -110,6 +110,15 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
     return Group(table, _table(*columns, rows=misplaced_rows, title=title))
 
 
+def rooms(answer: schemas.RoomsAnswer) -> RenderableType:
+    """Return a table of room types, most probable first."""
+    rows = [
+        (entry.room_type, _probability_text(entry.probability), _reasons(entry.because))
+        for entry in answer.room_types
+    ]
+    return _table("room type", "probability", "because", rows=rows)
+
+
 def notes(answer: BaseModel) -> list[str]:
     """Return one line for each mapped label and each warning of the answer."""
     if not isinstance(answer, schemas.Answer):

@@ -5,7 +5,14 @@ from pathlib import Path
 import pytest
 
 from training.datasets import DatasetError
-from training.datasets.priors import COLUMNS, MAX_LINE, SOURCE, read_prior_scenes
+from training.datasets.priors import (
+    COLUMNS,
+    MAX_LINE,
+    SOURCE,
+    Placing,
+    read_placings,
+    read_prior_scenes,
+)
 
 HEAD = "\t".join(COLUMNS)
 
@@ -23,7 +30,6 @@ def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
         "virtualhome_placing\tcup\tinside\ttable\t1\t",
         "tidybot\tcups\ton-top\tcup\t1\t",
         "tidybot\tbread\tbelow\ttable\t2\t",
-        "housekeep_votes\tcup\ton-top\tdesk\t5\tkitchen",
     )
     first, second = read_prior_scenes(path)
     assert [thing.label for thing in first.objects] == ["bread", "table"]
@@ -31,6 +37,40 @@ def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
         SOURCE, "bread table", ((0, "on-top", 1),)
     )  # fmt: skip
     assert (second.group, second.relations) == (first.group, ((0, "below", 1),))
+
+
+@pytest.mark.parametrize("relation", ["on-top", "inside"])
+def test_votes_of_housekeep_never_enter_training(tmp_path: Path, relation: str) -> None:
+    votes = f"housekeep_votes\tcup\t{relation}\tdesk\t5\tkitchen"
+    path = table(tmp_path, votes, "tidybot\tcup\ton-top\ttable\t1\tkitchen")
+    (scene,) = read_prior_scenes(path)
+    assert scene.group == "cup table"
+    # An outside test reads them.
+    placings = read_placings(path)
+    assert placings[0] == Placing("housekeep_votes", "cup", "desk", 5, "kitchen")
+
+
+def test_placings_are_rows_of_rooms_on_or_inside_a_receptacle(tmp_path: Path) -> None:
+    path = table(
+        tmp_path,
+        "my_home\tcup\tinside\tcabinet\t3\tkitchen",
+        "my_home\tcup\ton-top\ttable\t1\t",
+        "my_home\tcup\tunder\ttable\t1\tkitchen",
+    )
+    assert read_placings(path) == [Placing("my_home", "cup", "cabinet", 3, "kitchen")]
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("my_home\tcup\tinside\tcabinet\tmany\tkitchen", "line 2: count must be a whole number"),
+        ("my_home\tcup\tinside\tcabinet\t-1\tkitchen", "not '-1'"),
+        ("my_home\tcup\tinside\tcabinet\t1\t", "no row has a room and the relation on-top or"),
+    ],
+)
+def test_tables_without_questions(tmp_path: Path, row: str, message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        read_placings(table(tmp_path, row))
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from training.datasets import generate_rooms, split, stable_part
+from training.datasets.records import digest_of
 from training.domain.candidates import BASELINES, Candidate, held_out
 from training.fit.configuration import Config, ConfigError
-from training.runs.pipeline import digest_of
 
 SCENES = {"rooms": generate_rooms(500, 0)}
 REFERENCE = Candidate(BASELINES, None, {}, None)

@@ -176,7 +176,7 @@ def test_no_training_or_tuning_asks_the_facts():
     }
     users.discard("training/evaluation/everyday_task.py")
     assert users == {
-        "training/cli.py",
+        "training/domain/evaluate_command.py",
         "training/evaluation/report.py",
         "training/evaluation/tasks.py",
         "training/research/benchmark.py",

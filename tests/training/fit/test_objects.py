@@ -46,9 +46,13 @@ def machine_of(name, scale=0.05, seed=0, **changes):
 def log_weight(machine, v, room=-1, source=-1):
     """-E(v, h1, h2, t) without relations, (rows of v, states of h1, states of h2)."""
     h1, h2 = unit_states(machine.spec).to(v.dtype), binary(machine.spec.H2).to(v.dtype)
-    b = machine.b + (machine.a[source] if source >= 0 else 0)
+    b = machine.b + machine.u[source] + (machine.a[source] if source >= 0 else 0)
+    if room >= 0 and machine.spec.coupled:
+        b = b + machine.Y[room]
     c1 = machine.c1 + (machine.Q[room] if room >= 0 else 0)
-    objects_ = v @ b + (machine.e[room] if room >= 0 else 0)
+    of_room = machine.e[room] if room >= 0 else 0
+    of_room = of_room + (machine.y[source, room] if room >= 0 and source >= 0 else 0)
+    objects_ = v @ b + of_room
     if machine.spec.coupled:
         L = (machine.L + machine.L.T) / 2
         pairs = v.unsqueeze(2) * v.unsqueeze(1) * (1 - torch.eye(V))

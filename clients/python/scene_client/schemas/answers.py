@@ -1,4 +1,4 @@
-"""Schemas of the answers to the four questions, and of problems."""
+"""Schemas of the answers to the five questions, and of problems."""
 
 from __future__ import annotations
 

@@ -60,6 +60,8 @@ class GenerateRequest(SceneRequest):
 class GeneratedScene(Reply):
     """A sampled scene: labels, relations between the labels, and the states of hidden units."""
 
+    room_type: str | None = None
+    """room type of the scene; absent if it has none"""
     objects: list[str]
     relations: list[Relation]
     log_score: Finite

@@ -114,6 +114,8 @@ class VocabularyAnswer(Reply):
     objects: list[VocabularyEntry]
     relations: list[RelationName]
     room_types: list[str]
+    rare_room_types: list[str] = []
+    """room types that `/generate` refuses, because too few training scenes have them"""
     profiles: list[str] = []
     """names of the data sources whose base rates a request can choose"""
     examples: list[ExampleScene] = []

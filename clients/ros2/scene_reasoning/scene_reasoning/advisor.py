@@ -10,7 +10,7 @@ from scene_client.ros_fields import LabelMap, read_label_map
 from scene_client.schemas import Answer
 from scene_client.vision_msgs import SceneFields, Viewpoint, from_message
 
-QUESTIONS = ("missing", "outliers", "relations")
+QUESTIONS = ("missing", "outliers", "relations", "rooms")
 
 
 class Asker(Protocol):
@@ -19,6 +19,7 @@ class Asker(Protocol):
     def missing(self, **fields: Any) -> Answer: ...
     def outliers(self, **fields: Any) -> Answer: ...
     def relations(self, **fields: Any) -> Answer: ...
+    def rooms(self, **fields: Any) -> Answer: ...
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,132 @@
+"""Files of a user as tests: room lists and placing tables, read, asked and marked as learnt."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model
+from training.datasets import DatasetError, annotated_classes, encode, generate_rooms, read_scenes
+from training.datasets.batches import scene_tensors
+from training.datasets.jsonl import write_jsonl
+from training.datasets.priors import COLUMNS, SOURCE
+from training.datasets.records import digest_of
+from training.evaluation.artifact_model import artifact_model
+from training.evaluation.outside import ROOM_TASKS, RoomList, read_test
+from training.evaluation.report import measure
+from training.evaluation.setting import Setting
+from training.evaluation.tasks import TASKS
+
+ROWS = (
+    "tidybot\tlamp\ton-top\tdesk\t1\tbedroom",
+    "tidybot\tbook\tinside\tcabinet\t1\tbedroom",
+    "housekeep_votes\tcup\ton-top\tcounter\t6\tkitchen",
+    "housekeep_votes\tplate\tinside\tdishwasher\t5\tkitchen",
+)
+
+
+def table(folder: Path, *rows: str) -> Path:
+    path = folder / "places.tsv.gz"
+    path.write_bytes(gzip.compress("\n".join(["\t".join(COLUMNS), *rows]).encode()))
+    return path
+
+
+def room_file(folder: Path, scenes) -> Path:
+    path = folder / "homes.jsonl"
+    write_jsonl(scenes, path)
+    return path
+
+
+def learnt(*sources):
+    """A model with these data sources in its manifest."""
+    entries = [SimpleNamespace(source=s, scenes=n, digest=d) for s, n, d in sources]
+    return replace(room_model(), manifest=SimpleNamespace(data=entries))
+
+
+def test_rooms_are_asked_every_task_that_needs_no_training_scenes(tmp_path):
+    """The figures are those of the tasks; intervals resample the groups of the file."""
+    pairs = [replace(s, group=f"home {k // 2}") for k, s in enumerate(generate_rooms(12, 3))]
+    test = read_test(room_file(tmp_path, pairs))
+    encoded = encode([replace(s, source="homes") for s in pairs], VOCABULARY)
+    annotated = annotated_classes(encoded, VOCABULARY)
+    scenes = scene_tensors(encoded, annotated, len(VOCABULARY))
+    setting = Setting(scenes, STRUCTURE, train=scenes, limit=None)
+    model = artifact_model(room_model(), scenes)
+    outcomes = measure(model, setting, "homes", tasks=ROOM_TASKS).outcomes
+    rows = test.measure(room_model())
+    assert {row.source for row in rows} == {"homes"}
+    assert len(rows) == len({(row.task, row.metric) for row in rows})
+    assert {row.task for row in rows} == {task for task, outcome in outcomes.items() if outcome}
+    assert {"T2 missing", "T3 outliers", "T3 alarms", "T1a relations"} <= {r.task for r in rows}
+    for row in rows:
+        metric = outcomes[row.task].metrics[row.metric]
+        figure = metric.figure()
+        assert len(metric.groups) <= 6
+        assert row.model_dump(include=set(asdict(figure))) == pytest.approx(asdict(figure))
+        assert row.metric in TASKS[row.task].card
+
+
+def test_labels_of_the_vocabulary_only(tmp_path):
+    scenes = [{"objects": ["bed", "lamp", "pillow", "zeppelin"]}, {"objects": ["zeppelin"]}]
+    path = tmp_path / "mine.jsonl"
+    path.write_text("\n".join(map(json.dumps, scenes * 2)))
+    test = read_test(path)
+    artifact = room_model()
+    assert test.remark(artifact) == "4 of 10 objects are left out, because their labels are unknown"
+    mrr = {row.metric: row for row in test.measure(artifact) if row.task == "T2 missing"}
+    assert mrr["MRR, one removed"].n == 6  # three draws for both rooms that have known objects
+    alone = tmp_path / "none.jsonl"
+    alone.write_text(json.dumps(scenes[1]))
+    assert read_test(alone).measure(artifact) == []
+
+
+def test_one_group_leaves_intervals_over_rooms(tmp_path):
+    rooms = [replace(scene, group="home") for scene in generate_rooms(4, 3)]
+    rows = read_test(room_file(tmp_path, rooms)).measure(room_model())
+    assert any(row.task == "T2 missing" for row in rows)
+
+
+def test_a_table_has_figures_for_each_source(tmp_path):
+    rows = read_test(table(tmp_path, *ROWS)).measure(room_model())
+    assert list(dict.fromkeys(row.source for row in rows)) == ["housekeep_votes", "tidybot"]
+    assert {row.task for row in rows} == {"Placing"}
+    assert {row.metric: row.n for row in rows if row.source == "tidybot"}["mAP"] == 2
+
+
+def test_training_data_is_no_outside_test(tmp_path):
+    places = read_test(table(tmp_path, *ROWS))
+    assert places.trained(learnt((SOURCE, 1000, "x"))) == ["tidybot"]
+    assert places.trained(learnt(("sunrgbd", 1000, "x"))) == []
+    scenes = generate_rooms(5, 3)
+    path = room_file(tmp_path, scenes)
+    # The file may have another name now than in training.
+    digest = digest_of([replace(scene, source="before") for scene in read_scenes(path)])
+    rooms = read_test(path)
+    assert rooms.trained(learnt(("sunrgbd", 5, "x"), ("before", 5, digest))) == ["homes"]
+    assert rooms.trained(learnt(("before", 5, "x"))) == []
+    fewer = RoomList("homes", rooms.scenes[:4])
+    assert fewer.trained(learnt(("before", 5, digest))) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("rooms.csv", "", r"rename the file to \*.jsonl.* A placing table is named \*.tsv or"),
+        ("rooms.jsonl", "", "rooms.jsonl: contains no scenes"),
+        ("rooms.jsonl", '{"label": 1}', "line 1: a scene lacks objects"),
+        ("places.tsv", "", "places.tsv: no row has a room and the relation on-top or inside"),
+        ("places.tsv", "thing\tplace\n", "line 1: must name the columns source, subject"),
+        ("places.tsv", None, "cannot be read"),
+    ],
+)
+def test_files_that_are_no_test(tmp_path, name, text, message):
+    path = tmp_path / name
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        read_test(path)

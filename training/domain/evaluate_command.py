@@ -1,0 +1,143 @@
+"""The command `evaluate`: figures of stored models, on test scenes or on a file of the user."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from app.registry import Artifact, Metric, RegistryError, Store
+from training.datasets import DatasetError
+from training.datasets.batches import subset
+from training.datasets.files import DATA
+from training.domain.init_command import fail
+from training.evaluation.everyday_task import EVERYDAY
+from training.evaluation.metrics import Figure
+from training.evaluation.outside import OutsideTest, read_test
+from training.evaluation.report import Progress, evaluate
+from training.evaluation.tasks import in_words
+from training.fit.configuration import Config, ConfigError, source_name
+from training.runs.pipeline import read_sources, split_and_encode
+
+Figures = dict[str, list[Metric]]
+
+console = Console()
+
+
+def evaluate_command(
+    models: Annotated[list[str], typer.Argument(help="model: an alias, name or name@version")],
+    files: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--file",
+            help="your own test: a file of scenes (*.jsonl), or a table of places (*.tsv). It "
+            "replaces the scenes of the training split (--data, --source, --part)",
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            "--data",
+            help="folder with the scene files. For a stored model of your own scenes, pass the "
+            f"folder of its configuration file; default: {DATA}",
+        ),
+    ] = None,
+    store: Annotated[
+        str, typer.Option("--store", help="folder of the model store")
+    ] = "model_store",
+    source: Annotated[list[str] | None, typer.Option(help="use only these data sources")] = None,
+    part: Annotated[str, typer.Option(help="scenes: train, validation or test")] = "test",
+    output: Annotated[Path | None, typer.Option("--json", help="write figures to a file")] = None,
+) -> None:
+    """Evaluate stored models on scenes of the same split as in training, or on your own file.
+
+    The figures are those of the model card. The command `benchmark` evaluates the baselines.
+    """
+    try:
+        stored = Store(store)
+        artifacts = {name: stored.load(*stored.resolve(name)) for name in models}
+        if files and (data is not None or source):
+            raise ConfigError("--file replaces the scenes of --data and --source; leave these out")
+        rows: dict[str, list[dict[str, Any]]] = {name: [] for name in models}
+        for path, test in [(path, read_test(path)) for path in files or ()]:
+            figures = _ask(test, artifacts)
+            _show(figures, title=path.name)
+            for name, table in figures.items():
+                learnt = test.trained(artifacts[name])
+                for row in table:
+                    origin = {"file": str(path), "in_training": row.source in learnt}
+                    rows[name].append(row.model_dump() | origin)
+        if not files:
+            figures = {
+                name: _measure(name, artifact, data or DATA, source, part)
+                for name, artifact in artifacts.items()
+            }
+            _show(figures)
+            rows = {name: [row.model_dump() for row in table] for name, table in figures.items()}
+    except (ConfigError, DatasetError, RegistryError) as error:
+        fail(error)
+    if output is not None:
+        output.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+
+
+def _ask(test: OutsideTest, artifacts: dict[str, Artifact]) -> Figures:
+    """Ask all models the questions of a file, and print the remarks on the figures."""
+    figures: Figures = {}
+    for name, artifact in artifacts.items():
+        with console.status(name) as status:
+            say: Progress = status.update
+            figures[name] = test.measure(artifact, say)
+        learnt = test.trained(artifact)
+        remarks = [f"{source} is training data of this model, not new data" for source in learnt]
+        for remark in filter(None, [test.remark(artifact), *remarks]):
+            console.print(f"{name}: {remark}", markup=False, highlight=False, soft_wrap=True)
+    return figures
+
+
+def _measure(
+    reference: str, artifact: Artifact, data: Path, sources: list[str] | None, part: str
+) -> list[Metric]:
+    """Return the figures of a model on a part of the scenes of its configuration."""
+    config = Config.model_validate(artifact.manifest.training["config"])
+    names = sources or list(map(source_name, config.data.sources))
+    with console.status("reading scenes"):
+        # The split must include all data sources, as in training. Otherwise the test part
+        # could contain training scenes.
+        scenes = split_and_encode(config.data, read_sources(config.data, data), artifact.vocabulary)
+    tensors = scenes.training_data()
+    parts = {"train": tensors.train, "validation": tensors.validation, "test": tensors.test}
+    if part not in parts:
+        raise ConfigError(f"--part is {part!r}; it must be one of {', '.join(parts)}")
+    index = [k for k, scene in enumerate(parts[part].scenes) if scene.source in names]
+    if not index:
+        raise ConfigError(
+            f"{reference}: the {part} part has no scenes of the sources {', '.join(names)}"
+        )
+    test = subset(parts[part], torch.tensor(index, dtype=torch.int64))
+    with console.status(reference) as status:
+        return evaluate(
+            *(artifact, test, tensors.structure, tensors.train),
+            everyday=EVERYDAY,
+            progress=status.update,
+        )
+
+
+def _show(tables: Figures, title: str | None = None) -> None:
+    figures: dict[str, dict[tuple[str, str], dict[str, str]]] = {}
+    for name, rows in tables.items():
+        for row in rows:
+            lines = figures.setdefault(row.task, {})
+            figure = Figure(row.value, row.low, row.high, row.n)
+            lines.setdefault((row.metric, row.source), {})[name] = str(figure)
+    table = Table("task, metric", "source", *tables, box=box.SIMPLE_HEAD, title=title)
+    for task, lines in sorted(figures.items()):
+        table.add_row(f"[bold]{in_words(task)}[/bold]")
+        for (metric, source), values in lines.items():
+            table.add_row(f"  {metric}", source, *(values.get(name, "") for name in tables))
+    console.print(table)

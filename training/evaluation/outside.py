@@ -1,0 +1,164 @@
+"""Outside tests: questions from a file of the user, which no training read.
+
+Two kinds of files are read. A room list contains scenes in any format of `read_scenes`, such as
+JSON lines. A placing table (``*.tsv`` or ``*.tsv.gz``) names the receptacles of objects, see
+`training.evaluation.placing_task`. The labels are read with the vocabulary of the evaluated model.
+
+Intervals come from resampled groups: groups of scenes, or objects of one class.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import torch
+
+from app.registry import Artifact
+from app.registry import Metric as CardMetric
+from training.datasets import (
+    AnnotatedScene,
+    DatasetError,
+    annotated_classes,
+    encode,
+    priors,
+    read_scenes,
+)
+from training.datasets.batches import scene_tensors
+from training.datasets.readers import guess_format
+from training.datasets.records import digest_of
+from training.evaluation.artifact_model import artifact_model
+from training.evaluation.metrics import Metric
+from training.evaluation.placing_task import TASK, Room, placing_metrics, rooms_of
+from training.evaluation.report import Progress, measure, silent
+from training.evaluation.setting import Setting
+from training.evaluation.tasks import TASKS, WHOLE_SET
+
+ROOM_TASKS: Final = tuple(name for name in TASKS if name not in (*WHOLE_SET, "Density"))
+"""Tasks that a room list is asked. The others compare the answers with training scenes."""
+
+_TABLES: Final = (".tsv", ".tsv.gz")
+
+
+class OutsideTest(ABC):
+    """The questions of one file."""
+
+    @abstractmethod
+    def measure(self, artifact: Artifact, progress: Progress = silent) -> list[CardMetric]:
+        """Ask a model. Return the figures of each source."""
+
+    @abstractmethod
+    def trained(self, artifact: Artifact) -> list[str]:
+        """Return the sources of the file that are training data of the model."""
+
+    @abstractmethod
+    def remark(self, artifact: Artifact) -> str:
+        """Return a remark on labels that the model does not know, or an empty string."""
+
+
+def read_test(path: Path) -> OutsideTest:
+    """Read a room list or a placing table.
+
+    Raises:
+        DatasetError: the file has no known format, is invalid or contains no questions.
+    """
+    if path.name.endswith(_TABLES):
+        by_source: dict[str, list[priors.Placing]] = {}
+        for row in priors.read_placings(path):
+            by_source.setdefault(row.source, []).append(row)
+        return PlacingTable({name: rooms_of(rows) for name, rows in sorted(by_source.items())})
+    try:
+        guess_format(path)
+    except DatasetError as error:
+        problem = f"{error.problem}. A placing table is named *.tsv or *.tsv.gz"
+        raise DatasetError(path, "", problem) from None
+    name = path.name.partition(".")[0]
+    scenes = [replace(scene, source=name) for scene in read_scenes(path)]
+    if not scenes:
+        raise DatasetError(path, "", "contains no scenes")
+    return RoomList(name, scenes)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacingTable(OutsideTest):
+    """The rooms of a placing table by source."""
+
+    rooms: Mapping[str, list[Room]]
+
+    def measure(self, artifact: Artifact, progress: Progress = silent) -> list[CardMetric]:
+        """Return the metrics of `placing_metrics` for each source."""
+        figures: list[CardMetric] = []
+        for source, rooms in self.rooms.items():
+            progress(f"{source}: {TASK}")
+            figures += _figures(TASK, source, placing_metrics(artifact, rooms))
+        return figures
+
+    def trained(self, artifact: Artifact) -> list[str]:
+        """Return the sources whose rows training reads, for a model of the placing priors."""
+        is_trained = any(entry.source == priors.SOURCE for entry in artifact.manifest.data)
+        return sorted(priors.TRAINED & set(self.rooms)) if is_trained else []
+
+    def remark(self, artifact: Artifact) -> str:
+        """Return an empty string, because the figures contain the share of unknown labels."""
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class RoomList(OutsideTest):
+    """The scenes of a file, with the name of the file as source."""
+
+    source: str
+    scenes: Sequence[AnnotatedScene]
+
+    def measure(self, artifact: Artifact, progress: Progress = silent) -> list[CardMetric]:
+        """Return the metrics of `ROOM_TASKS` that the scenes support.
+
+        Intervals are over groups, or over rooms if the file has one group. The intruders of T3
+        have the popularity and the typical rooms of the file itself.
+        """
+        vocabulary = artifact.vocabulary
+        encoded = encode(self.scenes, vocabulary)
+        if len({scene.group for scene in encoded}) == 1:
+            encoded = [replace(scene, group=scene.scene_id) for scene in encoded]
+        annotated = annotated_classes(encoded, vocabulary)
+        scenes = scene_tensors(encoded, annotated, len(vocabulary))
+        structure = torch.from_numpy(vocabulary.structure.copy())
+        setting = Setting(scenes, structure, train=scenes, limit=None)
+        model = artifact_model(artifact, scenes)
+        report = measure(model, setting, self.source, tasks=ROOM_TASKS, progress=progress)
+        figures: list[CardMetric] = []
+        for task, outcome in report.outcomes.items():
+            metrics = {} if outcome is None else outcome.metrics
+            shown = {name: metrics[name] for name in TASKS[task].card if name in metrics}
+            figures += _figures(task, self.source, shown)
+        return figures
+
+    def trained(self, artifact: Artifact) -> list[str]:
+        """Return the source if the model learnt from exactly these scenes."""
+        is_trained = any(
+            entry.scenes == len(self.scenes)
+            and digest_of([replace(scene, source=entry.source) for scene in self.scenes])
+            == entry.digest
+            for entry in artifact.manifest.data
+        )
+        return [self.source] if is_trained else []
+
+    def remark(self, artifact: Artifact) -> str:
+        """Return the number of objects with unknown labels."""
+        labels = [thing.label for scene in self.scenes for thing in scene.objects]
+        unknown = sum(artifact.vocabulary.index(label) is None for label in labels)
+        if not unknown:
+            return ""
+        return (
+            f"{unknown:,} of {len(labels):,} objects are left out, because their labels are unknown"
+        )
+
+
+def _figures(task: str, source: str, metrics: Mapping[str, Metric]) -> Iterator[CardMetric]:
+    """Generate the figures of a task with an interval, which needs two groups."""
+    for name, metric in metrics.items():
+        if len(metric.groups) > 1:
+            yield CardMetric(task=task, source=source, metric=name, **asdict(metric.figure()))

@@ -1,0 +1,198 @@
+"""Tables of places: on which receptacle of a room does an object belong?
+
+The table is a file of the user (`training.datasets.priors`), such as the votes of Housekeep. A
+question is an object and a room of a source. The candidates are all receptacles of the room in the
+source. The relevant ones are those with votes for the object.
+
+The service answers as for a robot at a receptacle: the scene lists the receptacle, and `/missing`
+returns the probability that the object is there and on top of it. This probability ranks the
+receptacles. The models do not know the relation inside, so inside is asked as on-top. A receptacle
+that the model does not know, or for which it does not propose the object, ranks last.
+
+Metric: mean average precision (mAP). For ties, the average precision is the expectation under
+random order. Two rivals rank the same receptacles: by their votes for all other objects of the room
+in the source (popularity), and in random order.
+
+Two kinds of questions are left out and counted. A model cannot propose an unknown object, or
+structure such as a wall. If all receptacles are relevant, every order has the precision 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from app.registry import Artifact
+from app.scene import Scene, SceneObject
+from training.datasets.array_types import Flags, Floats
+from training.datasets.priors import Placing
+from training.evaluation.asking import missing_probabilities
+from training.evaluation.metrics import Metric, Ratio
+
+TASK: Final = "Placing"
+
+_ANCHOR: Final = ("on-top", 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """A room of a source, with n objects and m receptacles.
+
+    Attributes:
+        name: name of the room type.
+        objects, receptacles: their labels.
+        votes: (n, m) number of votes or observations.
+    """
+
+    name: str
+    objects: tuple[str, ...]
+    receptacles: tuple[str, ...]
+    votes: Floats
+
+
+class _Answer(NamedTuple):
+    """The answers to one question.
+
+    Attributes:
+        group: class of the object; its label if the model does not know the object.
+        precision: average precision of each ranking by name, 0 if the question is left out.
+        unknown: number of receptacles that the model does not know.
+        receptacles: number of receptacles.
+        reason: reason for which the question is left out, or an empty string.
+    """
+
+    group: str
+    precision: dict[str, float]
+    unknown: int
+    receptacles: int
+    reason: str
+
+
+_UNKNOWN: Final = "left out: unknown object"
+_TRIVIAL: Final = "left out: all receptacles are right"
+_RIVALS: Final = ("popularity", "random order")
+
+
+def rooms_of(placings: Iterable[Placing]) -> list[Room]:
+    """Return the rooms of one source, sorted by name."""
+    votes: dict[str, dict[tuple[str, str], int]] = {}
+    for row in placings:
+        pairs = votes.setdefault(row.room, {})
+        pair = row.subject, row.receptacle
+        pairs[pair] = pairs.get(pair, 0) + row.votes
+    rooms = []
+    for name, pairs in sorted(votes.items()):
+        objects, receptacles = (tuple(sorted({pair[end] for pair in pairs})) for end in (0, 1))
+        table = np.zeros((len(objects), len(receptacles)))
+        for (subject, receptacle), count in pairs.items():
+            table[objects.index(subject), receptacles.index(receptacle)] = count
+        voted = table.any(1)
+        objects = tuple(np.array(objects)[voted].tolist())
+        rooms.append(Room(name, objects, receptacles, table[voted]))
+    return rooms
+
+
+def average_precision(score: Floats, relevant: Flags) -> float:
+    """Return the average precision of a ranking, in expectation over random order of ties.
+
+    Args:
+        score: (m,) score of each item.
+        relevant: (m,) True for relevant items; at least one.
+
+    Source: McSherry and Najork, "Computing information retrieval performance measures efficiently
+    in the presence of tied scores" (2008).
+    """
+    total = 0.0
+    above = relevant_above = 0
+    for value in np.unique(score)[::-1]:
+        tied = score == value
+        ties, hits = int(tied.sum()), int((tied & relevant).sum())
+        # Given a relevant item at position k of the ties, each of the k items above it among the
+        # ties is relevant with the same probability.
+        k = np.arange(ties)
+        others = k * (hits - 1) / max(ties - 1, 1)
+        precision = (relevant_above + 1 + others) / (above + 1 + k)
+        total += hits / ties * float(precision.sum())
+        above, relevant_above = above + ties, relevant_above + hits
+    return total / int(relevant.sum())
+
+
+def ask_places(artifact: Artifact, room: Room, *, with_room: bool) -> Floats:
+    """Return the probability of each object on each receptacle, (n, m).
+
+    The value is -inf if the model does not know the receptacle or does not propose the object.
+
+    Args:
+        with_room: the scenes also state the room type, if the model knows it.
+    """
+    vocabulary = artifact.vocabulary
+    room_type = vocabulary.room_index(room.name) if with_room else None
+    classes = [vocabulary.index(label) for label in room.objects]
+    rows = [row for row, index in enumerate(classes) if index is not None]
+    candidates = [index for index in classes if index is not None]
+    scores = np.full(room.votes.shape, -np.inf)
+    for column, label in enumerate(room.receptacles):
+        if (index := vocabulary.index(label)) is None:
+            continue
+        scene = Scene((SceneObject("receptacle", label, index),), room_type=room_type)
+        p = missing_probabilities(artifact, scene, at=_ANCHOR, candidates=candidates)
+        scores[rows, column] = p[candidates]
+    return scores
+
+
+def placing_metrics(artifact: Artifact, rooms: list[Room]) -> dict[str, Metric]:
+    """Return the metrics over all questions of a source.
+
+    Intervals are over the classes of the objects, because all objects of a class get the same
+    answers.
+    """
+    answers = [answer for room in rooms for answer in _answer(artifact, room)]
+    scored = [answer for answer in answers if not answer.reason]
+    is_scored = np.array([not answer.reason for answer in answers])
+    metrics: dict[str, Metric] = {}
+
+    def mean(name: str) -> Ratio:
+        values = [answer.precision[name] for answer in answers]
+        return Ratio.of_scenes(np.array(values), is_scored)
+
+    if scored:
+        ours = mean("model")
+        metrics = {"mAP": ours, "mAP, room type listed": mean("model, room type listed")}
+        metrics |= {f"mAP of {name}": mean(name) for name in _RIVALS}
+        metrics |= {f"mAP minus {name}": ours - mean(name) for name in _RIVALS}
+        unknown = np.array([answer.unknown for answer in answers]) * is_scored
+        receptacles = np.array([answer.receptacles for answer in answers]) * is_scored
+        metrics["unknown receptacles"] = Ratio(unknown.astype(float), receptacles.astype(float))
+    for reason in (_UNKNOWN, _TRIVIAL):
+        is_left_out = np.array([answer.reason == reason for answer in answers])
+        metrics[reason] = Ratio.of_scenes(is_left_out)
+    _, groups = np.unique([answer.group for answer in answers], return_inverse=True)
+    return {name: metric.by(groups) for name, metric in metrics.items()}
+
+
+def _answer(artifact: Artifact, room: Room) -> list[_Answer]:
+    """Return the answers to the questions about the objects of a room."""
+    vocabulary = artifact.vocabulary
+    rankings = {
+        "model": ask_places(artifact, room, with_room=False),
+        "model, room type listed": ask_places(artifact, room, with_room=True),
+        "popularity": room.votes.sum(0) - room.votes,
+        "random order": np.zeros_like(room.votes),
+    }
+    unknown = sum(vocabulary.index(label) is None for label in room.receptacles)
+    answers = []
+    for row, label in enumerate(room.objects):
+        relevant = room.votes[row] > 0
+        index = vocabulary.index(label)
+        is_unknown = index is None or bool(vocabulary.structure[index])
+        reason = _UNKNOWN if is_unknown else _TRIVIAL if relevant.all() else ""
+        precision = {
+            name: 0.0 if reason else average_precision(scores[row], relevant)
+            for name, scores in rankings.items()
+        }
+        group = label if index is None else vocabulary.labels[index]
+        answers.append(_Answer(group, precision, unknown, len(relevant), reason))
+    return answers

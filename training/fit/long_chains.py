@@ -1,0 +1,213 @@
+"""Long Gibbs chains that start at scenes, and the test that they stay like these scenes.
+
+A machine whose chains drift away from the scenes learnt a wrong distribution: the samples of
+`/generate` are then good only as long as the chains are short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from app.inference.chains import Bits, Conditions, SceneChains, random_stream
+from app.inference.weights import Weights
+from app.registry import Metric
+from training.datasets.array_types import Flags, Floats, Ints
+from training.fit.configuration import ObjectsConfig
+from training.fit.objects import ObjectScenes, served_weights
+
+RECORDED: Final = 5
+"""Number of sweeps between two recorded states."""
+
+TASK: Final = "Long chains"
+SIZE: Final = "change of the number of classes"
+SHARE: Final = "largest change of a class"
+
+_CHAINS, _SWEEPS = 256, 3000
+_SETTLED = 2000  # sweeps before the first recorded state of the test
+_COMMONEST = 50
+_SIZE_LIMIT, _SHARE_LIMIT = 0.10, 0.20
+_CERTAIN = 3.0  # standard errors beyond a limit
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """The scenes that the chains of one row of u should draw.
+
+    Attributes:
+        profile: index of the data source, or None for the served mix.
+        weight: weight of each scene, (scenes,). The sum is 1.
+        room: room type of each scene, (scenes,). -1 means unknown.
+        shows: True for classes that the scenes can show, (classes,).
+        p: share of the scenes with each class, (classes,).
+    """
+
+    profile: int | None
+    weight: Floats
+    room: Ints
+    shows: Flags
+    p: Floats
+
+    def draw(self, count: int, rng: np.random.Generator) -> Ints:
+        """Return indices of scenes, (count,), drawn in proportion to their weights.
+
+        The draw is systematic: each room type has its share of the scenes, rounded.
+        """
+        order = np.lexsort((rng.random(len(self.room)), self.room))
+        position = (np.arange(count) + rng.random()) / count
+        index: Ints = order[np.searchsorted(self.weight[order].cumsum()[:-1], position)]
+        return index
+
+
+def populations(scenes: ObjectScenes, config: ObjectsConfig) -> Iterator[Population]:
+    """Yield the population of each data source, and that of the served mix."""
+    served = served_weights(scenes, config)
+    by_source = served / scenes.source_sizes
+    mixed = scenes.weight * by_source[scenes.source]
+    v = scenes.v.double().numpy()
+    for profile in (*range(len(scenes.sources)), None):
+        weight, shows = mixed, (scenes.shows & (served > 0).unsqueeze(1)).any(0)
+        if profile is not None:
+            weight, shows = scenes.weight * (scenes.source == profile), scenes.shows[profile]
+        share = weight.double().numpy() / float(weight.double().sum())
+        yield Population(profile, share, scenes.room.numpy(), shows.numpy(), share @ v)
+
+
+class LongChains:
+    """Gibbs chains that start at the scenes of a population, and continue from call to call.
+
+    Each chain keeps the room type of its scene.
+
+    Args:
+        chains: chains of the machine; see `scene_chains`.
+        count: number of chains.
+    """
+
+    def __init__(
+        self,
+        chains: SceneChains,
+        scenes: ObjectScenes,
+        population: Population,
+        count: int,
+        seed: int,
+    ) -> None:
+        index = population.draw(count, np.random.default_rng(seed))
+        self.on = scenes.v[index].numpy().astype(np.uint8)
+        self._chains, self._profile = chains, population.profile
+        self._rooms = population.room[index]
+        self._h2: list[Bits | None] = [None] * count
+        self._streams = [random_stream(seed, k) for k in range(count)]
+
+    def run(self, sweeps: int) -> Floats:
+        """Make sweeps; return how often each class is present, (chains, classes), from 0 to 1."""
+        none = np.zeros(0, np.int64)
+        alone = none, np.zeros(0, np.float32), None, none.reshape(0, 2), none
+        total = np.zeros(self.on.shape)
+        for room in np.unique(self._rooms).tolist():
+            conditions = Conditions(*alone, None if room < 0 else room, self._profile)
+            conditioned = self._chains.under(conditions)
+            for k in np.flatnonzero(self._rooms == room).tolist():
+                for _ in range(0, sweeps, RECORDED):
+                    state = self.on[k], RECORDED, self._streams[k], self._h2[k]
+                    _, self._h2[k] = conditioned.sweep(*state)
+                    total[k] += self.on[k]
+        share: Floats = total / -(-sweeps // RECORDED)
+        return share
+
+
+def scene_chains(weights: Weights) -> SceneChains:
+    """Return the chains of a machine without its stored samples."""
+    samples = ("fantasies", "fantasy_rooms")
+    arrays = {name: array for name, array in weights.arrays.items() if name not in samples}
+    return SceneChains(Weights(replace(weights.spec, N=0), arrays))
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How far long chains are from the scenes of a data source.
+
+    Attributes:
+        size, size_error: relative change of the number of classes in a scene, and its standard
+            error.
+        label: the class among the 50 commonest whose share of the scenes changes most.
+        share, share_error: relative change of this share, and its standard error.
+    """
+
+    source: str
+    size: float
+    size_error: float
+    label: str
+    share: float
+    share_error: float
+
+    def metrics(self) -> list[Metric]:
+        """Return the metrics for the model card, with intervals of two standard errors."""
+        values = ((SIZE, self.size, self.size_error), (SHARE, self.share, self.share_error))
+        return [
+            Metric(
+                task=TASK, source=self.source, metric=name, value=round(value, 4),
+                low=round(value - 2 * error, 4), high=round(value + 2 * error, 4), n=_CHAINS,
+            )
+            for name, value, error in values
+        ]  # fmt: skip
+
+    def objection(self) -> str | None:
+        """Return why samples of the model are unlike the scenes, or None."""
+        if abs(self.size) - _CERTAIN * self.size_error > _SIZE_LIMIT:
+            return (
+                f"after {_SWEEPS} sweeps, generated scenes of {self.source} have {self.size:+.0%} "
+                f"classes; at most {_SIZE_LIMIT:.0%} are allowed"
+            )
+        if abs(self.share) - _CERTAIN * self.share_error > _SHARE_LIMIT:
+            return (
+                f"after {_SWEEPS} sweeps, {self.share:+.0%} generated scenes of {self.source} have "
+                f"the class {self.label}; at most {_SHARE_LIMIT:.0%} are allowed"
+            )
+        return None
+
+
+def measure_drift(
+    weights: Weights,
+    labels: Sequence[str],
+    scenes: ObjectScenes,
+    config: ObjectsConfig,
+    seed: int = 1,
+) -> list[Drift]:
+    """Run 3,000 sweeps from the training scenes of each served source, and compare them.
+
+    Served sources have at least half of the largest weight in the served mix. The states of the
+    last 1,000 sweeps count.
+
+    Args:
+        labels: label of each class, (classes,).
+    """
+    served, chains = served_weights(scenes, config), scene_chains(weights)
+    drifts = []
+    for population in populations(scenes, config):
+        q = population.profile
+        if q is None or served[q] < served.max() / 2:
+            continue
+        long = LongChains(chains, scenes, population, _CHAINS, seed)
+        long.run(_SETTLED)
+        drawn = long.run(_SWEEPS - _SETTLED)
+        sizes = drawn[:, population.shows].sum(1) / population.p[population.shows].sum()
+        top = np.argsort(-np.where(population.shows, population.p, 0))[:_COMMONEST]
+        top = top[population.p[top] > 0]
+        change = drawn[:, top] / population.p[top] - 1
+        error = change.std(0) / np.sqrt(_CHAINS)
+        # The class that is most certainly beyond the limit.
+        k = int(np.argmax(np.abs(change.mean(0)) - _CERTAIN * error))
+        drifts.append(
+            Drift(
+                source=scenes.sources[q],
+                size=float(sizes.mean() - 1),
+                size_error=float(sizes.std() / np.sqrt(_CHAINS)),
+                label=labels[top[k]],
+                share=float(change[:, k].mean()),
+                share_error=float(error[k]),
+            )
+        )
+    return drifts
