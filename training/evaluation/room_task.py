@@ -100,10 +100,13 @@ def rooms_task(model: Model, setting: Setting) -> Outcome | None:
 
 
 def mean_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> float:
-    """Return the mean over real sources and lists of log p of the room type; NaN without scenes.
+    """Return the mean over real sources and lists of log p of the room type.
 
     Each list counts without and with the named profile. If the scenes contain no source of
     `REAL_SOURCES`, all sources count.
+
+    Raises:
+        ValueError: no scene has a room type.
     """
     scenes = with_room_type(scenes)
     names = np.array([scene.source for scene in scenes.scenes], dtype=np.str_)
@@ -117,4 +120,6 @@ def mean_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> flo
                 for profile in ("", str(source))
                 if len(parts.v)
             ]
-    return float(np.mean(values)) if values else float("nan")
+    if not values:
+        raise ValueError("no scene has a room type")
+    return float(np.mean(values))

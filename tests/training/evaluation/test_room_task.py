@@ -61,7 +61,8 @@ def test_short_lists_are_shorter_and_need_more_classes():
 def test_only_scenes_with_a_room_type_take_part():
     silent = replace(DATA, room=torch.full((30,), -1))
     assert rooms_task(Model(rooms=by_first), Setting(silent, NO_STRUCTURE)) is None
-    assert np.isnan(mean_log_p(silent, NO_STRUCTURE, by_first))
+    with pytest.raises(ValueError, match="no scene has a room type"):
+        mean_log_p(silent, NO_STRUCTURE, by_first)
     assert rooms_task(Model(), SETTING) is None
 
 

@@ -29,12 +29,10 @@ from training.evaluation.model import (
     Parameters,
     PlacedScore,
     RelationScore,
-    RoomScore,
     Trial,
 )
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import complete_scenes, rank, rank_relations
-from training.evaluation.room_task import mean_log_p
 
 _SCENES = 1000  # maximum scenes in `placed_mrr`
 
@@ -86,18 +84,6 @@ def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> 
     value = validation_score(lambda v, _: score(v), scenes, structure)
     if math.isnan(value):
         raise ValueError("no scene has two classes, so no class can be hidden")
-    return value
-
-
-def room_log_p(scenes: SceneTensors, structure: Tensor, score: RoomScore) -> float:
-    """Return the mean of log p of the room type, see `mean_log_p`.
-
-    Raises:
-        ValueError: no scene has a room type.
-    """
-    value = mean_log_p(scenes, structure, score)
-    if math.isnan(value):
-        raise ValueError("no validation scene has a room type")
     return value
 
 

@@ -14,6 +14,7 @@ from training.evaluation.baselines import (
     triples,
 )
 from training.evaluation.baselines.fitting import Baseline
+from training.evaluation.room_task import mean_log_p
 from training.research.baselines import networks, object_models, relation_models, room_models
 
 _EVERY: tuple[Baseline, ...] = (
@@ -25,8 +26,8 @@ _EVERY: tuple[Baseline, ...] = (
     Baseline("scikit-learn BernoulliRBM", object_models.bernoulli_rbm, stochastic=True),
     Baseline("masked transformer", networks.transformer, stochastic=True),
     Baseline("denoising autoencoder", networks.autoencoder, stochastic=True),
-    Baseline("most common room type", room_models.most_common, fitting.room_log_p, ("rooms",)),
-    Baseline("naive Bayes of rooms", room_models.naive_bayes, fitting.room_log_p, ("rooms",)),
+    Baseline("most common room type", room_models.most_common, mean_log_p, ("rooms",)),
+    Baseline("naive Bayes of rooms", room_models.naive_bayes, mean_log_p, ("rooms",)),
     Baseline(
         "relation popularity", relation_models.relation_popularity, fitting.r_precision, RELATIONS
     ),
