@@ -145,7 +145,7 @@ _EXAMPLES: Final[dict[str, Any]] = {
     "object": Example("where is such an object usually?", {"objects": ["keyboard"]}),
     "candidates": Example(
         "only the rooms of this flat",
-        {"objects": ["desk", "lamp"], "candidates": ["bedroom", "bathroom", "office"]},
+        {"objects": ["desk", "lamp"], "candidates": ["bedroom", "bathroom", "office"], "top_k": 2},
     ),
     "scores": Example(
         "probabilities only, for a fast and short answer", {**LABELS, "detail": "scores"}

@@ -80,6 +80,7 @@ def publish(
     offsets: Offsets | None = None,
     counts: Counts | None = None,
     judges: bool = True,
+    rare_rooms: tuple[int, ...] = (),
 ) -> None:
     """Publish a machine with random weights for the first classes and room types."""
     machine = random_machine(variant, seed, classes, room_types)
@@ -91,7 +92,9 @@ def publish(
             version,
             spec=machine.spec.to_dict(),
             vocabulary=VocabularyEntry.of(vocabulary, profiles=PROFILES[: machine.spec.profiles]),
-            calibration=Calibration.neutral(A).model_copy(update=JUDGING if judges else {}),
+            calibration=Calibration.neutral(A).model_copy(
+                update={"rare_rooms": rare_rooms} | (JUDGING if judges else {})
+            ),
             examples=EXAMPLES if classes == V else (),
         ),
         machine.state_dict()

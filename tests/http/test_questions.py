@@ -159,6 +159,21 @@ async def test_a_model_without_room_types_names_none(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------------------- generate
 
 
+async def test_rare_room_types_are_named_and_not_sampled(tmp_path: Path) -> None:
+    """The other questions accept them. Without a room type, no scene has a rare one."""
+    publish(tmp_path, "home", "1.0.0", rare_rooms=(1,), alias="default")
+    async with serve(tmp_path) as client:
+        words = (await client.get("/models/default/vocabulary")).json()
+        (rare,) = words["rare_room_types"]
+        assert rare == words["room_types"][1]
+        request = {"objects": ["bed"], "room_type": rare}
+        document = problem(await client.post("/generate", json=request), 422, "rare-room-type")
+        assert [one["pointer"] for one in document["errors"]] == ["#/room_type"]
+        assert (await client.post("/missing", json=request)).status_code == 200
+        other = await ask(client, "generate", room_type=words["room_types"][0], count=2)
+        assert {one["room_type"] for one in other["scenes"]} == {words["room_types"][0]}
+
+
 async def test_a_drawn_seed_is_reported_and_draws_the_same_again(client: httpx.AsyncClient) -> None:
     first = await ask(client, "generate", count=3)
     assert 0 <= first["seed"] < 2**53

@@ -103,10 +103,10 @@ def test_reads_back_as_written(change: dict[str, Any]) -> None:
     read = Manifest.from_bytes(data)
     assert read == written
     assert read.to_bytes() == data
-    assert json.loads(data)["format"] == 5
+    assert json.loads(data)["format"] == 6
 
 
-@pytest.mark.parametrize("value", [4, 6, 5.0, "5", None, True])
+@pytest.mark.parametrize("value", [5, 7, 6.0, "6", None, True])
 def test_refuses_another_format(value: object) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"]

@@ -101,7 +101,8 @@ def test_from_rooms_to_answers(tmp_path):
     tables = json.loads(figures.read_text())
     artifact = Store(tmp_path / "store").load("rooms-triway", "1.0.0")
     # The card of the stored model has the figures that are measured on it again.
-    card = {(m.task, m.source, m.metric): m.value for m in artifact.manifest.metrics}
+    metrics = [m for m in artifact.manifest.metrics if m.task != "Long chains"]
+    card = {(m.task, m.source, m.metric): m.value for m in metrics}
     again = {(r["task"], r["source"], r["metric"]): r["value"] for r in tables["default"]}
     assert again == pytest.approx(card, abs=1e-6)
     # Everyday facts are measured where their folder is.

@@ -147,7 +147,7 @@ def placing_metrics(artifact: Artifact, rooms: list[Room]) -> dict[str, Metric]:
     """Return the metrics over all questions of a source.
 
     Intervals are over the classes of the objects, because all objects of a class get the same
-    answers.
+    answers. If all objects have one class, intervals are over the questions.
     """
     answers = [answer for room in rooms for answer in _answer(artifact, room)]
     scored = [answer for answer in answers if not answer.reason]
@@ -169,7 +169,9 @@ def placing_metrics(artifact: Artifact, rooms: list[Room]) -> dict[str, Metric]:
     for reason in (_UNKNOWN, _TRIVIAL):
         is_left_out = np.array([answer.reason == reason for answer in answers])
         metrics[reason] = Ratio.of_scenes(is_left_out)
-    _, groups = np.unique([answer.group for answer in answers], return_inverse=True)
+    names, groups = np.unique([answer.group for answer in answers], return_inverse=True)
+    if len(names) < 2:
+        return metrics
     return {name: metric.by(groups) for name, metric in metrics.items()}
 
 

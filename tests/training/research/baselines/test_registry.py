@@ -251,7 +251,7 @@ def test_densities_beat_independent_classes(train, validation):
 
 @named([one for one in EVERY if one is not DENSITY])
 def test_nothing_to_choose_by_is_an_error(baseline, train):
-    with pytest.raises(ValueError, match=r"no scene|all scenes|two classes"):
+    with pytest.raises(ValueError, match=r"no scene|no validation scene|all scenes|two classes"):
         baseline.fit(train, tensors([scene([0])]), STRUCTURE)
 
 

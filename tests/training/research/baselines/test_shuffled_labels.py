@@ -95,8 +95,10 @@ def test_popularity_is_what_it_was():
 @pytest.mark.parametrize("baseline", OBJECTS, ids=lambda baseline: baseline.name)
 def test_objects_fall_to_popularity(baseline):
     real, shuffled = (baseline.fit(*parts(labels), STRUCTURE).missing for labels in (False, True))
-    for figure, level in ((mrr, popular()), (partial, partly_popular())):
-        assert figure(real) > level + 2 * TOLERANCE
+    # A quarter of a room of seven classes says less than all classes but one.
+    figures = (mrr, popular(), 2 * TOLERANCE), (partial, partly_popular(), 1.5 * TOLERANCE)
+    for figure, level, least in figures:
+        assert figure(real) > level + least
         assert figure(shuffled) <= level + TOLERANCE
 
 
@@ -148,7 +150,7 @@ def trained(variant: Variant, train: SceneTensors, validation: SceneTensors):
     data = TrainingData(
         *(train, validation, held_out(), STRUCTURE),
         relations=A,
-        room_types=0,
+        room_types=2,
         vocabulary=VOCABULARY,
     )
     return Trainer(config, data).run().machine.requires_grad_(False)
