@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from training.evaluation.artifact_model import artifact_model, floor_model, inde
 from training.evaluation.asking import ask_rows
 from training.evaluation.baselines import PLACED, placed_product
 from training.evaluation.baselines.classes import frequency
-from training.evaluation.baselines.fitting import Baseline
+from training.evaluation.baselines.fitting import TRIALS, Baseline
 from training.evaluation.model import Model, ObjectScore, suspicion_of
 from training.evaluation.outlier_tasks import first_shares, intruder_weights, with_intruders
 from training.evaluation.report import Progress, write_whole
@@ -36,8 +37,9 @@ CALIBRATION = "calibration.json"
 """File name of a machine's calibration, in the folder of its run."""
 
 
-# Weights of log popularity in the ranking of intruders, and the scenes that choose one.
-_WEIGHTS = (0.0, 0.125, 0.25, 0.375, 0.5)
+# Weights of log popularity in the ranking of intruders, and the scenes that choose one. The scores
+# of baselines have different scales.
+_WEIGHTS = (0.0, *np.geomspace(0.005, 2.0, TRIALS - 1).tolist())
 _SCENES = 300
 
 
