@@ -108,6 +108,7 @@ def test_from_rooms_to_answers(tmp_path):
     # Everyday facts are measured where their folder is.
     assert {task.split()[0] for task, _, _ in card} - {"Everyday"} == {
         "T1", "T1a", "T1b", "T2", "T2-at", "T3", "T3b", "T4", "Calibration", "Offsets", "Counts",
+        "Rooms",
     }  # fmt: skip
     same_offsets_as_training_alone_teaches(artifact, load_config(str(config)))
     same_weights_with_refitted_statistics(artifact, tmp_path / "store")
@@ -153,7 +154,8 @@ def test_a_stored_model_is_asked_the_questions_of_a_file(tmp_path):
     learnt = {"source": "placing_priors", "scenes": 3, "digest": "0" * 64, "terms": "MIT"}
     data = [learnt | {"research_only": False}]
     Store(store).publish(description("tiny", data=data), state())
-    rows = ("tidybot\tlamp\ton-top\tbed\t1\tbedroom", "my_home\tlamp\tinside\tbox\t1\tbedroom")
+    places = ("tidybot\t{}\ton-top\tbed\t1\tbedroom", "my_home\t{}\tinside\tbox\t1\tbedroom")
+    rows = [place.format(thing) for place in places for thing in ("lamp", "rug")]
     (tmp_path / "places.tsv").write_text("\n".join(["\t".join(COLUMNS), *rows]))
     (tmp_path / "homes.jsonl").write_text('{"objects": ["bed", "lamp", "rug"]}\n' * 2)
     files = [part for name in ("places.tsv", "homes.jsonl") for part in ("--file", tmp_path / name)]

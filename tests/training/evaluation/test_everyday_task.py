@@ -153,8 +153,9 @@ def test_a_card_has_the_lines_once(folder):
     rows = evaluate(room_model(), rooms(8, 1), STRUCTURE, rooms(9, 2), limit=2, everyday=folder)
     found = [(row.source, row.metric) for row in rows if row.task == "Everyday"]
     # A single fact has no interval.
-    asked = ask_everyday(room_model(), folder)
-    assert found == [("facts", line) for line in LINES if len(asked[line]) > 1]
+    setting = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
+    metrics = everyday_task(Model(artifact=room_model()), setting).metrics
+    assert found == [("facts", line) for line in LINES if len(metrics[line].groups) > 1]
     assert len(found) > 5
 
 
