@@ -196,10 +196,10 @@ def test_improbable_objects_and_places_are_left_out(open_board: OpenBoard) -> No
     board = open_board()
     board.alter("missing", improbable)
     board.add("laptop")
-    assert board.ghosts == []
     (row,) = board.rows("missing")
     assert row.count("%") == 1, "the probability of the object, and no place"
     assert "no likely place" in row
+    assert board.ghosts == []
 
 
 def test_no_suggestion_stands_at_an_outlier(open_board: OpenBoard, api: httpx.Client) -> None:
