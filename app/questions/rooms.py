@@ -1,7 +1,7 @@
 """The question `rooms`: of which room type is a room with these objects?
 
-For a single object, the answer is where such an object usually is. The room type of the request is
-no evidence. The machine's probability of a room type t (`app.inference.objects`) is calibrated:
+For a single object, the answer is where such an object usually is. The answer ignores the room type
+of the request. The machine's probability of a room type t (`app.inference.objects`) is calibrated:
 
     p(t) ∝ p_machine(t | objects)^s,   s = slope + log_count · log(number of listed classes)
 """

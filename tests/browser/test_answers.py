@@ -277,7 +277,7 @@ def test_room_types_are_listed_by_their_probability(bedroom: Board, api: httpx.C
     bedroom.settle()
     assert bedroom.body("missing")["room_type"] == "kitchen"
     assert "missing" in asked
-    # The room type that a person chooses is no evidence about the room type.
+    # The probabilities ignore the room type that a person chooses.
     assert "rooms" not in asked
     check()
     expect(page.locator("#room")).to_have_value("kitchen")

@@ -68,7 +68,7 @@ class Exact:
     def object(self, i, present):
         """Log-odds of class i, given the other classes. Relations are unobserved."""
         log_odds = self.joint.log_odds(self.joint.v[:, i] > 0, self.states(present, free=i))
-        # The base rates u of whole scenes are no part of the answers.
+        # The answers leave out the base rates u of whole scenes.
         log_odds -= float(self.joint.machine.u[self.source, i])
         if self.source >= 0:
             return log_odds

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import torch
 
 from app.inference.chains import Bits, Conditions, SceneChains, random_stream
 from app.inference.weights import Weights
@@ -63,8 +64,12 @@ class Population:
 
 
 def populations(scenes: ObjectScenes, config: ObjectsConfig) -> Iterator[Population]:
-    """Yield the population of each data source, and that of the served mix."""
+    """Yield the population of each data source, and that of the served mix.
+
+    Without a scene of a served source, the served mix has all scenes.
+    """
     served = served_weights(scenes, config)
+    served = served if served.any() else torch.ones_like(served)
     by_source = served / scenes.source_sizes
     mixed = scenes.weight * by_source[scenes.source]
     v = scenes.v.double().numpy()

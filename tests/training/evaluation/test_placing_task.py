@@ -148,7 +148,7 @@ def test_rooms_are_apart_and_votes_add_up():
     bedroom, kitchen = rooms_of(rows)
     assert (bedroom.name, kitchen.name) == ("bedroom", "kitchen")
     assert kitchen.receptacles == ("sink",)
-    # Without votes, cup is no object of the bedroom.
+    # A cup without votes does not count as an object of the bedroom.
     assert bedroom.objects == ("book", "lamp", "pillow")
     assert bedroom.receptacles == ("bed", "desk", "dresser", "nightstand")
     assert bedroom.votes.tolist() == [[0, 7, 5, 0], [0, 5, 0, 8], [9, 0, 0, 0]]

@@ -59,6 +59,13 @@ def test_a_population_weighs_scenes_by_source():
         np.testing.assert_allclose(population.p, own)
 
 
+def test_served_sources_without_scenes_leave_a_mix_of_all():
+    elsewhere = ObjectsConfig(served_sources={"3dssg": 1.0})
+    *_, mixed = populations(scenes_of(SHOWS), elsewhere)
+    *_, equal = populations(scenes_of(SHOWS), ObjectsConfig())
+    np.testing.assert_array_equal(mixed.p, equal.p)
+
+
 def test_chains_start_at_each_room_type_in_proportion():
     scenes = scenes_of(SHOWS)
     mixed = list(populations(scenes, CONFIG))[-1]
