@@ -1,7 +1,7 @@
-"""The eight spatial relations and their four canonical forms.
+"""The ten spatial relations and their five canonical forms.
 
 A relation and its opposite are the same statement with exchanged objects: ``right(i, j)`` is
-``left(j, i)``. So scenes store only the four relations in `CANONICAL`. A relation index is an index
+``left(j, i)``. So scenes store only the five relations in `CANONICAL`. A relation index is an index
 into `CANONICAL`. The first argument of a relation is its subject, and the second is its anchor.
 """
 
@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final, TypeVar
 
-CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above")
+CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above", "inside")
 OPPOSITES: Final[dict[str, str]] = {
     "left": "right",
     "front": "behind",
     "on-top": "under",
     "above": "below",
+    "inside": "contains",
 }
 RELATIONS: Final[tuple[str, ...]] = CANONICAL + tuple(OPPOSITES[name] for name in CANONICAL)
 
@@ -23,6 +24,14 @@ LEFT: Final = 0
 FRONT: Final = 1
 ON_TOP: Final = 2
 ABOVE: Final = 3
+INSIDE: Final = 4
+
+VERTICAL: Final = (ON_TOP, ABOVE)
+"""Indices of the relations of an object to an object under it."""
+SUPPORTS: Final = (ON_TOP, INSIDE)
+"""Indices of the relations of an object to the object that it stands on or in."""
+STACKED: Final = (ON_TOP, ABOVE, INSIDE)
+"""Indices of the relations of two objects with overlapping footprints."""
 
 _INDEX: Final = {name: index for index, name in enumerate(CANONICAL)}
 _FLIPPED: Final = {OPPOSITES[name]: index for index, name in enumerate(CANONICAL)}
@@ -39,7 +48,7 @@ def opposite(relation: str) -> str:
     """Return the opposite relation: ``opposite("left") == "right"``.
 
     Raises:
-        ValueError: the relation is not one of the eight `RELATIONS`.
+        ValueError: the relation is not one of the ten `RELATIONS`.
     """
     try:
         return _OPPOSITE[relation]
@@ -50,11 +59,11 @@ def opposite(relation: str) -> str:
 def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, End]:
     """Return a statement in canonical form: (relation index, subject, anchor).
 
-    For ``right``, ``behind``, ``under`` and ``below``, the function exchanges subject and anchor.
-    Subject and anchor may have any type.
+    For ``right``, ``behind``, ``under``, ``below`` and ``contains``, the function exchanges subject
+    and anchor. Subject and anchor may have any type.
 
     Raises:
-        ValueError: the relation is not one of the eight `RELATIONS`.
+        ValueError: the relation is not one of the ten `RELATIONS`.
     """
     if (index := _INDEX.get(relation)) is not None:
         return index, subject, anchor

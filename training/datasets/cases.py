@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
 from app.scene import CANONICAL, Scene, SceneObject, Vocabulary
+from app.scene.relations import STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.batches import SceneTensors, subset
@@ -34,7 +35,6 @@ RIDGE: Final = 1.0
 """`C` of `logistic` for a few unweighted examples, such as those of 20 validation scenes."""
 
 _LISTED: Final = (0.25, 0.5, 0.75, 1.0)
-_VERTICAL = [CANONICAL.index("on-top"), CANONICAL.index("above")]
 
 
 def scene_rng(scene: EncodedScene, seed: int) -> Rng:
@@ -73,7 +73,7 @@ def annotated_relations(encoded: EncodedScene) -> Flags:
     """
     unlisted = meaning_of(encoded.source).unlisted
     annotated, holds = encoded.instance_observed.copy(), encoded.instance_holds
-    stacked = holds[_VERTICAL].any(0)
+    stacked = holds[[*STACKED]].any(0)
     stacked |= stacked.T
     for a in range(min(len(annotated), len(unlisted))):
         is_false = annotated[a] & ~holds[a]

@@ -26,6 +26,7 @@ from app.scene import (
     pool_instances,
     to_viewer_frame,
 )
+from app.scene.relations import ON_TOP, STACKED
 from scene_client.image_plane import are_neighbours, relation_between
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.names import Names, curated_names
@@ -33,8 +34,6 @@ from training.datasets.records import AnnotatedObject, AnnotatedScene
 from training.datasets.sources import SOURCES, Meaning, meaning_of
 
 A = len(CANONICAL)
-_ON_TOP: Final = CANONICAL.index("on-top")
-_VERTICAL: Final = [_ON_TOP, CANONICAL.index("above")]
 _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
 
 
@@ -213,8 +212,8 @@ def _from_lists(
     }
     holds &= ~is_contradicted
     observed = np.stack([masks[kind] for kind in meaning.unlisted]) | holds | denied
-    is_vertical = holds[_VERTICAL].any(0)
-    observed |= is_vertical | is_vertical.T
+    is_stacked = holds[[*STACKED]].any(0)
+    observed |= is_stacked | is_stacked.T
     return PoseRelations(holds, observed & ~is_contradicted & ~np.eye(n, dtype=np.bool_))
 
 
@@ -226,7 +225,7 @@ def _apply_rules(
     sized = located & np.array([thing.size is not None for thing in objects])
     for relation, unlisted in enumerate(meaning.unlisted):
         if unlisted == "off":
-            annotated = sized if relation in _VERTICAL else located
+            annotated = sized if relation in STACKED else located
             pairs = annotated[:, None] & annotated & ~np.eye(len(objects), dtype=np.bool_)
             relations.observed[relation] |= pairs
         elif unlisted == "unobserved":
@@ -252,7 +251,7 @@ def _add_supports(relations: PoseRelations, objects: Sequence[AnnotatedObject]) 
             continue
         pair = [index, support], [support, index]
         relations.holds[:, *pair], relations.observed[:, *pair] = False, True
-        relations.holds[_ON_TOP, index, support] = True
+        relations.holds[ON_TOP, index, support] = True
 
 
 def room_viewpoint(scene_id: str, positions: Floats) -> Viewpoint:

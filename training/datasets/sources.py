@@ -3,17 +3,17 @@
 A listed relation holds. An unlisted relation is false ("off"), false only between neighbours ("off
 for neighbours"), or unobserved. The meaning depends on the data source and on the relation:
 
-| source | on-top | above | left, front |
-|---|---|---|---|
-| boxes with sizes (procthor) | off | off | off for neighbours |
-| centres only (bedrooms) | unobserved | unobserved | off |
-| 3dssg | off | unobserved | off for neighbours |
-| support links (virtualhome) | off | unobserved | unobserved |
-| pictures and sentences | unobserved | unobserved | unobserved |
-| scenes of the user with listed relations | off | off | off |
+| source | on-top | inside | above | left, front |
+|---|---|---|---|---|
+| boxes with sizes (procthor) | off | off | off | off for neighbours |
+| centres only (bedrooms) | unobserved | unobserved | unobserved | off |
+| 3dssg | off | unobserved | unobserved | off for neighbours |
+| support links (virtualhome) | off | off | unobserved | unobserved |
+| pictures and sentences | unobserved | unobserved | unobserved | unobserved |
+| scenes of the user with listed relations | off | off | off | off |
 
-Two rules apply to every data source. First, if on-top or above is listed for a pair of objects, all
-unlisted relations of the pair are false in both directions. (1 to 10 % of such pairs also have a
+Two rules apply to every data source. First, if on-top, inside or above is listed for a pair of
+objects, all unlisted relations of the pair are false in both directions. (1 to 10 % of such pairs also have a
 listed left or front.) Second, a relation that an annotator marked as false is false.
 
 With poses, two objects are neighbours if they are close by the rule of `app.scene.geometry`.
@@ -38,8 +38,8 @@ class Meaning:
     """The meaning of relations and objects that the scenes of a data source do not list.
 
     Attributes:
-        on_top, above, lateral: meaning of an unlisted relation of this kind. lateral means left and
-            front.
+        on_top, inside, above, lateral: meaning of an unlisted relation of this kind. lateral means
+            left and front.
         complete_objects: True if object lists are nearly complete. The training of objects then
             uses unlisted objects as absent objects.
         scenes_per_group: maximum total weight of a group of near-duplicates in the training of
@@ -47,6 +47,7 @@ class Meaning:
     """
 
     on_top: Unlisted = "off"
+    inside: Unlisted = "off"
     above: Unlisted = "off"
     lateral: Unlisted = "off"
     complete_objects: bool = True
@@ -55,8 +56,8 @@ class Meaning:
     @property
     def unlisted(self) -> tuple[Unlisted, ...]:
         """Meaning of an unlisted relation, for each canonical relation in order."""
-        vertical = {"on-top": self.on_top, "above": self.above}
-        return tuple(vertical.get(name, self.lateral) for name in CANONICAL)
+        stacked = {"on-top": self.on_top, "above": self.above, "inside": self.inside}
+        return tuple(stacked.get(name, self.lateral) for name in CANONICAL)
 
 
 LISTS: Final = Meaning()
@@ -65,13 +66,13 @@ LISTS: Final = Meaning()
 BOXES: Final = Meaning(lateral="off for neighbours")
 """Meaning for relations derived from boxes. Without sizes, on-top and above are unobserved."""
 
-_CENTRES: Final = Meaning(on_top="unobserved", above="unobserved")
-_SELECTED: Final = Meaning(on_top="unobserved", above="unobserved", lateral="unobserved")
-_SUPPORTS: Final = replace(_SELECTED, on_top="off")
+_CENTRES: Final = Meaning(on_top="unobserved", inside="unobserved", above="unobserved")
+_SELECTED: Final = replace(_CENTRES, lateral="unobserved")
+_SUPPORTS: Final = replace(_SELECTED, on_top="off", inside="off")
 _MENTIONS: Final = replace(_SELECTED, complete_objects=False)
 
-_THE_EIGHT: Final = {name: name for name in RELATIONS}
-# Relation of each predicate of 3DSSG. All kinds of support become on-top.
+_THE_TEN: Final = {name: name for name in RELATIONS}
+# Relation of each predicate of 3DSSG. All kinds of support become on-top or inside.
 _3DSSG: Final = {
     "left": "left",
     "right": "right",
@@ -80,6 +81,9 @@ _3DSSG: Final = {
     "standing on": "on-top",
     "lying on": "on-top",
     "supported by": "on-top",
+    "standing in": "inside",
+    "lying in": "inside",
+    "hanging in": "inside",
     "higher than": "above",
     "lower than": "below",
 }
@@ -90,6 +94,8 @@ _VRD: Final = {
     "over": "above",
     "under": "under",
     "beneath": "under",
+    "in": "inside",
+    "inside": "inside",
     "below": "below",
     "behind": "behind",
     "in the front of": "front",
@@ -108,7 +114,7 @@ class Source:
         meaning: meaning of unlisted relations. None means `LISTS` for scenes with listed relations
             and `BOXES` for other scenes.
         predicates: maps predicates of the data source to relations of the service. The reader skips
-            other predicates, such as "inside" and "wear". None means that another predicate is an
+            other predicates, such as "next to" and "wear". None means that another predicate is an
             error. Names of relations are predicates of every source.
         left_out: labels that are ignored because their annotation is too incomplete or biased.
         coarse: classes whose objects annotators mostly call by the name of the broader class, such
@@ -160,7 +166,9 @@ SOURCES: Final[dict[str, Source]] = {
         "3DSSG (Wald, Dhamo, Navab, Tombari, CVPR 2020) on 3RScan: annotated relations of real "
         "rooms; research use",
         research_only=True,
-        meaning=Meaning(above="unobserved", lateral="off for neighbours"),
+        meaning=Meaning(
+            inside="unobserved", above="unobserved", lateral="off for neighbours"
+        ),
         predicates=_3DSSG,
     ),
     "procthor": Source(
@@ -180,7 +188,7 @@ SOURCES: Final[dict[str, Source]] = {
         "research use",
         research_only=True,
         meaning=_MENTIONS,
-        predicates=_THE_EIGHT,
+        predicates=_THE_TEN,
     ),
     "coco_captions": Source(
         "COCO captions (Lin et al., ECCV 2014; COCO Consortium): triples from captions of indoor "
@@ -189,33 +197,33 @@ SOURCES: Final[dict[str, Source]] = {
         # Photographers aim at people and pets. So captions mention them far more often than rooms
         # contain them.
         left_out=("person", "cat", "dog", "bird", "animal"),
-        predicates=_THE_EIGHT,
+        predicates=_THE_TEN,
     ),
     "reverie_text": Source(
         "REVERIE (Qi et al., CVPR 2020): triples from instructions for Matterport houses; "
         "non-commercial use",
         research_only=True,
         meaning=_MENTIONS,
-        predicates=_THE_EIGHT,
+        predicates=_THE_TEN,
     ),
     "alfred": Source(
         "ALFRED (Shridhar et al., CVPR 2020): AI2-THOR rooms and triples from instructions; MIT",
         # Thousands of episodes show only about a hundred rooms, so all episodes of a room together
         # have the weight of three scenes.
         meaning=replace(_SELECTED, scenes_per_group=3.0),
-        predicates=_THE_EIGHT,
+        predicates=_THE_TEN,
         left_out=("steps",),  # of a person: "walk two steps"
         counts_movables=True,
     ),
     "bddl_goal": Source(
         "BEHAVIOR-1K (Li et al., CoRL 2022): end states of household activities; MIT",
         meaning=_MENTIONS,
-        predicates=_THE_EIGHT,
+        predicates=_THE_TEN,
     ),
     "behavior1k_rooms": Source(
         "BEHAVIOR-1K (Li et al., CoRL 2022): object lists of rooms; MIT",
         meaning=LISTS,  # its scenes list no relations
-        predicates=_THE_EIGHT,
+        predicates=_THE_TEN,
     ),
     "matterport_rooms": Source(
         "Matterport3D (Chang et al., 3DV 2017): object lists of rooms, from REVERIE (Qi et al., "
@@ -227,13 +235,13 @@ SOURCES: Final[dict[str, Source]] = {
     "virtualhome": Source(
         "VirtualHome (Puig et al., CVPR 2018): rooms of designed apartments; MIT",
         meaning=_SUPPORTS,
-        predicates=_THE_EIGHT,
+        predicates=_THE_TEN,
     ),
     "vsr": Source(
         "Visual Spatial Reasoning (Liu, Emerson, Collier, TACL 2023): voted relations in "
         "photographs; Apache-2.0",
         meaning=_MENTIONS,
-        predicates=_THE_EIGHT,
+        predicates=_THE_TEN,
     ),
     "placing_priors": Source(
         "VirtualHome (Puig et al., CVPR 2018), AI2-THOR (Kolve et al., 2017) and TidyBot (Wu et "

@@ -66,6 +66,8 @@ class MisplacedRelation(ScoredRelation):
 
     is_misplaced: bool = False
     """true if `probability` reaches the threshold for `sensitivity`"""
+    moved: str | None = None
+    """for a misplaced relation: the id of its object that probably stands in the wrong place"""
 
 
 class OutliersAnswer(Answer):

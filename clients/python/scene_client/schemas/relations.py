@@ -43,7 +43,7 @@ class RelationsRequest(SceneRequest):
     ] = None
     """limit the answer to these pairs of subject and object"""
     include_opposites: bool = False
-    """also list right, behind, under and below"""
+    """also list right, behind, under, below and contains"""
 
 
 @dataclass(slots=True)
@@ -66,10 +66,16 @@ class Disagreement:
 
 
 class ExpectedRelation(ScoredRelation):
-    """A relation and the probability that it holds, given that both objects are in the scene."""
+    """A relation and the probability that it holds, given that both objects are in the scene.
+
+    For an observed relation, `probability` is that of the evidence: the product of the confidences
+    of both objects. A relation that the boxes of both objects exclude has at most .01.
+    """
 
     observed: bool = False
     """true if the request states the relation or the positions show it"""
+    expected: Probability | None = None
+    """for an observed relation: its probability if it were not observed"""
 
 
 class RelationsAnswer(Answer):

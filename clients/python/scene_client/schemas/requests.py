@@ -39,7 +39,9 @@ The validation of a million invalid relations would take seconds.
 
 UnknownLabels = Literal["error", "ignore", "nearest", "nearest-or-ignore"]
 Detail = Literal["scores", "full"]
-RelationName = Literal["left", "right", "front", "behind", "on-top", "under", "above", "below"]
+RelationName = Literal[
+    *("left", "right", "front", "behind", "on-top", "under", "above", "below", "inside", "contains")
+]
 
 
 def _plain_text(value: str) -> str:
