@@ -1,0 +1,68 @@
+"""Roles of two boxes that reach into each other: the smaller is on, under or in the larger.
+
+Boxes are solid, but furniture has legs, backs and doors. So the boxes of a bin under a desk, of a
+pillow on a bed with a headboard, and of milk in a fridge look alike. The roles that such pairs of
+classes have in words and support links decide.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.compiling import compiled
+
+ON, UNDER, IN = 0, 1, 2
+"""Roles of the smaller object: on-top of, under, or inside the larger object."""
+
+LEAST_SHARE: Final = 0.8  # minimum share of a role among the possible roles of a pair
+# Weight of the roles at the larger class, in counts. They decide for pairs that were never seen.
+_OF_ANCHOR: Final = 2.0
+
+
+class RoleCounts(NamedTuple):
+    """How often classes have each role, as sources state it in words or by support links.
+
+    Attributes:
+        pair: (P,) int64 keys i V + j of pairs of smaller class i and larger class j, ascending.
+        counts: (P, 3) float32 number of scenes in which i has each role at j.
+        anchor: (V, 3) float32 number of scenes in which any class has each role at class j.
+    """
+
+    pair: NDArray[np.int64]
+    counts: NDArray[np.float32]
+    anchor: NDArray[np.float32]
+
+
+@compiled
+def likely_role(
+    roles: tuple[NDArray[Any], NDArray[Any], NDArray[Any]], i: int, j: int, possible: NDArray[Any]
+) -> int:
+    """Return the role of a smaller object of class i at a larger object of class j, or -1.
+
+    The result is -1 if no role has `LEAST_SHARE` of the smoothed counts.
+
+    Args:
+        roles: see `RoleCounts`.
+        i, j: class indices. -1 means an unknown class.
+        possible: (3,) bool, True for the roles that the boxes allow.
+    """
+    pair, counts, anchor = roles
+    if i < 0 or j < 0:
+        return -1
+    weight = np.zeros(3)
+    total = anchor[j].sum()
+    key = i * len(anchor) + j
+    row = np.searchsorted(pair, key)
+    is_seen = row < len(pair) and pair[row] == key
+    for role in range(3):
+        if total > 0:
+            weight[role] += _OF_ANCHOR * anchor[j, role] / total
+        if is_seen:
+            weight[role] += counts[row, role]
+        if not possible[role]:
+            weight[role] = 0.0
+    best = np.argmax(weight)
+    return best if weight[best] > 0 and weight[best] >= LEAST_SHARE * weight.sum() else -1
