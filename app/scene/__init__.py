@@ -10,6 +10,7 @@ from app.scene.relations import (
     contradiction,
     opposite,
 )
+from app.scene.roles import RoleCounts
 from app.scene.scene import (
     ClassEvidence,
     Scene,
@@ -27,6 +28,7 @@ __all__ = [
     "ClassEvidence",
     "ObjectClass",
     "PoseRelations",
+    "RoleCounts",
     "Scene",
     "SceneObject",
     "Viewpoint",

@@ -4,6 +4,7 @@ from training.datasets.encoding import EncodedScene, annotated_classes, encode
 from training.datasets.names import Names, curated_names
 from training.datasets.readers import READERS, read_scenes
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
+from training.datasets.roles import count_roles
 from training.datasets.rooms import generate_rooms, rooms_vocabulary
 from training.datasets.shuffling import shuffle_objects
 from training.datasets.splits import FRACTIONS, split, stable_part
@@ -29,6 +30,7 @@ __all__ = [
     "annotated_classes",
     "build_indoor_vocabulary",
     "build_vocabulary",
+    "count_roles",
     "coverage",
     "curated_names",
     "encode",

@@ -18,6 +18,7 @@ from app.scene import (
     CANONICAL,
     ClassEvidence,
     PoseRelations,
+    RoleCounts,
     Viewpoint,
     Vocabulary,
     canonicalise,
@@ -26,14 +27,19 @@ from app.scene import (
     pool_instances,
     to_viewer_frame,
 )
-from app.scene.relations import ON_TOP, STACKED
+from app.scene.geometry import CONTACT
+from app.scene.relations import INSIDE, ON_TOP, STACKED, SUPPORTS
+from app.scene.roles import IN, ON, likely_role
 from scene_client.image_plane import are_neighbours, relation_between
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.names import Names, curated_names
 from training.datasets.records import AnnotatedObject, AnnotatedScene
+from training.datasets.roles import lift_of
 from training.datasets.sources import SOURCES, Meaning, meaning_of
 
 A = len(CANONICAL)
+# Roles of an object at its support.
+_SUPPORTED: Final = np.isin(range(3), (ON, IN))
 _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
 
 
@@ -70,25 +76,27 @@ class EncodedScene:
     complete: bool = True
 
 
-def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[EncodedScene]:
-    """Encode scenes with a vocabulary.
+def encode(
+    scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary, roles: RoleCounts | None = None
+) -> list[EncodedScene]:
+    """Encode scenes with a vocabulary, and the roles of classes whose boxes reach into each other.
 
     A relation is observed if its truth is known. Relations come from the first kind of annotation
     in this list that a scene contains:
 
     - Listed relations. A relation that is listed in both directions is unobserved.
     - Positions, by the rules of `app.scene.geometry`. If positions are not in viewer axes,
-      `room_viewpoint` chooses a viewpoint. A support link means that the relation on-top holds and
-      all other relations of the pair are false.
+      `room_viewpoint` chooses a viewpoint.
     - Boxes in an image, by the rule of `scene_client.image_plane`, for left and above only.
-    - Support links.
+    - Support links. The object is on top of its support or inside it. All other relations of the
+      pair are false. If the object reaches into its support, the roles of the two classes decide.
 
     The module `training.datasets.sources` defines for each data source which unlisted relations are
     false, and which labels are ignored.
 
     Relations of structure classes are unobserved.
     """
-    encoder = _Encoder(vocabulary, curated_names())
+    encoder = _Encoder(vocabulary, curated_names(), roles)
     scene_list = list(scenes)
     groups = Counter((scene.source, scene.group) for scene in scene_list)
     return [encoder(scene, groups[scene.source, scene.group]) for scene in scene_list]
@@ -128,8 +136,9 @@ def _indices_of(
 
 
 class _Encoder:
-    def __init__(self, vocabulary: Vocabulary, names: Names) -> None:
+    def __init__(self, vocabulary: Vocabulary, names: Names, roles: RoleCounts | None) -> None:
         self.vocabulary = vocabulary
+        self.roles = roles
         self.names = names
         self.index = cache(vocabulary.index)
 
@@ -138,7 +147,8 @@ class _Encoder:
         left_out = _indices_of("left_out", scene.source, self.vocabulary)
         classes = [self.index(thing.label) for thing in scene.objects]
         kept = [i for i, c in enumerate(classes) if c is not None and c not in left_out]
-        relations, positions = _relations(scene, meaning)
+        indices = np.array([-1 if c is None else c for c in classes], dtype=np.int64)
+        relations, positions = _relations(scene, meaning, indices, self.roles)
         holds = relations.holds[:, kept][:, :, kept]
         observed = relations.observed[:, kept][:, :, kept]
         instance_classes = np.array([classes[i] for i in kept], dtype=np.int64)
@@ -174,19 +184,21 @@ class _Encoder:
         )
 
 
-def _relations(scene: AnnotatedScene, meaning: Meaning) -> tuple[PoseRelations, Floats | None]:
+def _relations(
+    scene: AnnotatedScene, meaning: Meaning, classes: Ints, roles: RoleCounts | None
+) -> tuple[PoseRelations, Floats | None]:
     """Derive all relations, as `encode` describes. Return them and their positions, or None."""
     n, positions = len(scene.objects), None
     if scene.relations is not None:
         return _from_lists(scene, scene.relations, meaning), None
     if any(thing.position is not None for thing in scene.objects):
-        relations, positions = _from_poses(scene)
+        relations, positions = _from_poses(scene, classes, roles)
         _apply_rules(relations, scene.objects, meaning)
     elif any(thing.box2d is not None for thing in scene.objects):
         relations = derive_from_boxes([thing.box2d or (math.nan,) * 4 for thing in scene.objects])
     else:
         relations = PoseRelations(*np.zeros((2, A, n, n), dtype=np.bool_))
-    _add_supports(relations, scene.objects)
+    _add_supports(relations, scene.objects, classes, roles)
     for subject, relation, anchor in scene.false_relations:
         denied = canonicalise(subject, relation, anchor)
         relations.holds[denied], relations.observed[denied] = False, True
@@ -232,7 +244,9 @@ def _apply_rules(
             relations.observed[relation] &= relations.holds[relation]
 
 
-def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, Floats]:
+def _from_poses(
+    scene: AnnotatedScene, classes: Ints, roles: RoleCounts | None
+) -> tuple[PoseRelations, Floats]:
     unknown = (math.nan,) * 3
     positions = np.array([thing.position or unknown for thing in scene.objects])
     sizes = np.array([thing.size or unknown for thing in scene.objects])
@@ -243,15 +257,27 @@ def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, Floats]:
     return derive_relations(positions, sizes, yaws), positions
 
 
-def _add_supports(relations: PoseRelations, objects: Sequence[AnnotatedObject]) -> None:
-    """Set the relation on-top for each support link, also for an object inside its support."""
+def _add_supports(
+    relations: PoseRelations,
+    objects: Sequence[AnnotatedObject],
+    classes: Ints,
+    roles: RoleCounts | None,
+) -> None:
+    """Set on-top or inside for each support link; see `encode`."""
     index_of = {thing.id: index for index, thing in enumerate(objects)}
     for index, thing in enumerate(objects):
         if thing.supported_by is None or (support := index_of[thing.supported_by]) == index:
             continue
         pair = [index, support], [support, index]
         relations.holds[:, *pair], relations.observed[:, *pair] = False, True
-        relations.holds[ON_TOP, index, support] = True
+        lift = lift_of(thing, objects[support])
+        role = ON
+        if roles is not None and lift is not None and lift < -CONTACT:
+            role = likely_role(roles, classes[index], classes[support], _SUPPORTED)
+        if role >= 0:
+            relations.holds[ON_TOP if role == ON else INSIDE, index, support] = True
+        else:
+            relations.observed[[*SUPPORTS], index, support] = False
 
 
 def room_viewpoint(scene_id: str, positions: Floats) -> Viewpoint:

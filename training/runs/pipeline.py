@@ -10,11 +10,12 @@ from pathlib import Path
 import torch
 
 from app.registry import Example
-from app.scene import CANONICAL, Vocabulary
+from app.scene import CANONICAL, RoleCounts, Vocabulary
 from training.datasets import (
     AnnotatedScene,
     EncodedScene,
     annotated_classes,
+    count_roles,
     encode,
     generate_rooms,
     indoor_vocabulary,
@@ -41,6 +42,7 @@ class SplitScenes:
     Attributes:
         data: the configuration section that names the sources.
         vocabulary: classes; the scenes use their indices.
+        roles: roles of the classes in the training scenes.
         counts, digests: number of scenes and sha256 of their contents, by source.
         shuffle: seed of the permutation of objects; None if the objects are not permuted.
         words: (V, D) unit word vectors of the classes; None without word vectors.
@@ -49,6 +51,7 @@ class SplitScenes:
 
     data: DataConfig
     vocabulary: Vocabulary
+    roles: RoleCounts
     parts: dict[str, list[EncodedScene]]
     counts: dict[str, int]
     digests: dict[str, str]
@@ -227,10 +230,12 @@ def split_and_encode(
     parts = split(all_scenes, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
         vocabulary = build_vocabulary(data, list(parts["train"]), root)
+    roles = count_roles(parts["train"], vocabulary)
     return SplitScenes(
         data=data,
         vocabulary=vocabulary,
-        parts={name: encode(part, vocabulary) for name, part in parts.items()},
+        roles=roles,
+        parts={name: encode(part, vocabulary, roles) for name, part in parts.items()},
         counts={name: len(source) for name, source in scenes.items()},
         digests={name: digest_of(source) for name, source in scenes.items()},
         words=_word_vectors(data, vocabulary, root),
