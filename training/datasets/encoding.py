@@ -217,8 +217,10 @@ def _from_lists(
     # Contradictory annotations are unobserved: both directions listed, or listed and denied.
     is_contradicted = (holds & holds.swapaxes(1, 2)) | (holds & denied)
     is_related = holds.any(0)
+    supported = np.isin(np.arange(n), scene.supported)
     masks = {
         "off": np.ones((n, n), dtype=np.bool_),
+        "off for supported": np.repeat(supported[:, None], n, axis=1),
         "off for neighbours": is_related | is_related.T,
         "unobserved": np.zeros((n, n), dtype=np.bool_),
     }

@@ -30,7 +30,7 @@ from typing import Any, Final
 from app.scene.geometry import SMALLEST
 from training.datasets.files import bounded_int, read_lines
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
-from training.datasets.sources import relation_of
+from training.datasets.sources import relations_of, supported_subjects
 
 MAX_LINE: Final = 8 * 2**20
 
@@ -114,9 +114,8 @@ def _parse_scene(values: Any, default_id: str) -> AnnotatedScene:
     if not isinstance(viewer_frame, bool):
         raise ValueError(f"viewer_frame must be true or false, not {viewer_frame!r}")
     room_type = values.get("room_type")
-    relations, false_relations = (
-        _parse_relations(name, values.get(name), source, objects)
-        for name in ("relations", "false_relations")
+    stated, denied = (
+        _parse_triples(name, values.get(name), objects) for name in ("relations", "false_relations")
     )
     return AnnotatedScene(
         scene_id=scene_id,
@@ -124,9 +123,10 @@ def _parse_scene(values: Any, default_id: str) -> AnnotatedScene:
         group=_require_text("group", values.get("group", scene_id)),
         room_type=None if room_type is None else _require_text("room_type", room_type),
         objects=objects,
-        relations=relations,
+        relations=None if stated is None else relations_of(source, stated),
         viewer_frame=viewer_frame,
-        false_relations=false_relations or (),
+        false_relations=relations_of(source, denied or ()),
+        supported=supported_subjects(source, stated or ()),
     )
 
 
@@ -184,9 +184,10 @@ def _parse_object(values: Mapping[str, Any], name: str) -> AnnotatedObject:
     )
 
 
-def _parse_relations(
-    name: str, values: Any, source: str, objects: tuple[AnnotatedObject, ...]
-) -> tuple[tuple[int, str, int], ...] | None:
+def _parse_triples(
+    name: str, values: Any, objects: tuple[AnnotatedObject, ...]
+) -> list[tuple[int, str, int]] | None:
+    """Return the triples (subject index, predicate, object index) of a list, or None for null."""
     if values is None:
         return None
     if not isinstance(values, list):
@@ -194,7 +195,7 @@ def _parse_relations(
     labels = Counter(thing.label for thing in objects)
     index_of = {t.label: index for index, t in enumerate(objects) if labels[t.label] == 1}
     index_of |= {thing.id: index for index, thing in enumerate(objects)}
-    relations: dict[tuple[int, str, int], None] = {}
+    triples = []
     for entry in values:
         if isinstance(entry, dict) and set(entry) == {"subject", "relation", "object"}:
             entry = [entry["subject"], entry["relation"], entry["object"]]
@@ -206,11 +207,8 @@ def _parse_relations(
         subject, anchor = index_of.get(_require_id(entry[0])), index_of.get(_require_id(entry[2]))
         if subject is None or anchor is None:
             raise ValueError(f"relation {entry!r} names an object that is not in the scene")
-        relation = relation_of(source, _require_text("predicate", entry[1]))
-        # Some image annotators relate an object to itself. Such relations are skipped.
-        if relation is not None and subject != anchor:
-            relations[subject, relation, anchor] = None
-    return tuple(relations)
+        triples.append((subject, _require_text("predicate", entry[1]), anchor))
+    return triples
 
 
 def _check_fields(what: str, values: Any, needed: set[str], allowed: set[str]) -> None:

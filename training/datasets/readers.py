@@ -21,7 +21,7 @@ from typing import Any, Final
 from training.datasets.files import load_json, located, take
 from training.datasets.jsonl import read_jsonl
 from training.datasets.records import AnnotatedObject, AnnotatedScene, Box2d, DatasetError
-from training.datasets.sources import relation_of
+from training.datasets.sources import relations_of, supported_subjects
 from training.datasets.sunrgbd_mat import read_sunrgbd_mat
 
 
@@ -49,11 +49,18 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
         scene_id = f"3dssg-{name}-{scan['split']}" if "split" in scan else f"3dssg-{name}"
         if scene_id in scenes:
             raise DatasetError(path, where, f"scene {scene_id} is listed twice")
-        relations = _relations(path, where, scan, list(objects))
+        triples = _triples(path, where, scan, list(objects))
         with located(path, where):
             things = tuple(AnnotatedObject(key, label) for key, label in objects.items())
-            group = f"3rscan-{rooms[name]}"
-            scenes[scene_id] = AnnotatedScene(scene_id, "3dssg", group, None, things, relations)
+            scenes[scene_id] = AnnotatedScene(
+                scene_id=scene_id,
+                source="3dssg",
+                group=f"3rscan-{rooms[name]}",
+                room_type=None,
+                objects=things,
+                relations=relations_of("3dssg", triples),
+                supported=supported_subjects("3dssg", triples),
+            )
     return list(scenes.values())
 
 
@@ -64,11 +71,12 @@ def _entries(path: Path, where: str, values: Any, name: str) -> list[tuple[str, 
     return [(f"{start}[{number}]", entry) for number, entry in enumerate(entries)]
 
 
-def _relations(
+def _triples(
     path: Path, where: str, scan: dict[str, Any], ids: list[str]
-) -> tuple[tuple[int, str, int], ...]:
+) -> list[tuple[int, str, int]]:
+    """Return the triples (subject index, predicate, object index) of a scan."""
     index_of = {key: index for index, key in enumerate(ids)}
-    relations: dict[tuple[int, str, int], None] = {}
+    triples = []
     for place, entry in _entries(path, where, scan, "relationships"):
         if not isinstance(entry, list) or len(entry) != 4 or not isinstance(entry[3], str):
             raise DatasetError(
@@ -77,10 +85,8 @@ def _relations(
         subject, anchor = index_of.get(str(entry[0])), index_of.get(str(entry[1]))
         if subject is None or anchor is None:
             raise DatasetError(path, place, f"{entry!r} names an object that is not in the scan")
-        relation = relation_of("3dssg", entry[3])
-        if relation is not None and subject != anchor:
-            relations[subject, relation, anchor] = None
-    return tuple(relations)
+        triples.append((subject, entry[3], anchor))
+    return triples
 
 
 def _labels(path: Path) -> dict[str, dict[str, str]]:

@@ -82,6 +82,8 @@ class AnnotatedScene:
         room_type: room type in the data set. None means unknown.
         relations, false_relations: triples (subject index, relation, object index) that hold, and
             that an annotator marked as false. Without annotated relations, `relations` is None.
+        supported: indices of the objects whose support is listed, also if it is no relation of the
+            service, such as "attached to".
         viewer_frame: True if positions are in viewer axes. Otherwise left and front are undefined
             until a viewpoint is chosen.
 
@@ -97,6 +99,7 @@ class AnnotatedScene:
     relations: tuple[tuple[int, str, int], ...] | None = None
     viewer_frame: bool = False
     false_relations: tuple[tuple[int, str, int], ...] = ()
+    supported: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         ids = {thing.id for thing in self.objects}

@@ -1,13 +1,14 @@
 """Known data sources: terms of use, predicates, and the meaning of relations that are not listed.
 
 A listed relation holds. An unlisted relation is false ("off"), false only between neighbours ("off
-for neighbours"), or unobserved. The meaning depends on the data source and on the relation:
+for neighbours"), false only if the support of its subject is listed ("off for supported"), or
+unobserved. The meaning depends on the data source and on the relation:
 
 | source | on-top | inside | above | left, front |
 |---|---|---|---|---|
 | boxes with sizes (procthor) | off | off | off | off for neighbours |
 | centres only (bedrooms) | unobserved | unobserved | unobserved | off |
-| 3dssg | off | unobserved | unobserved | off for neighbours |
+| 3dssg | off for supported | off for supported | unobserved | off for neighbours |
 | support links (virtualhome) | off | off | unobserved | unobserved |
 | pictures and sentences | unobserved | unobserved | unobserved | unobserved |
 | scenes of the user with listed relations | off | off | off | off |
@@ -18,19 +19,21 @@ listed left or front.) Second, a relation that an annotator marked as false is f
 
 With poses, two objects are neighbours if they are close by the rule of `app.scene.geometry`.
 Without poses, two objects with at least one listed relation are neighbours. 3DSSG compares heights
-only within a class, so an unlisted above is unobserved. 3DSSG lists left and front only between
+only within a class, so an unlisted above is unobserved. 3DSSG lists the support of half of the small
+objects, such as 51 % of the pillows. If the support of an object is listed, other supports are
+false. Supports are also walls, and objects that the object leans against or is a part of. 3DSSG lists left and front only between
 objects on the same support, so left and front of distant pairs are unobserved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from app.scene import CANONICAL, RELATIONS
 
-Unlisted = Literal["off", "off for neighbours", "unobserved"]
+Unlisted = Literal["off", "off for neighbours", "off for supported", "unobserved"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +119,8 @@ class Source:
         predicates: maps predicates of the data source to relations of the service. The reader skips
             other predicates, such as "next to" and "wear". None means that another predicate is an
             error. Names of relations are predicates of every source.
+        supports: predicates that state the support of their subject. They mark the objects whose
+            support is listed.
         left_out: labels that are ignored because their annotation is too incomplete or biased.
         coarse: classes whose objects annotators mostly call by the name of the broader class, such
             as "table" for a coffee table. An unlisted class of this kind is unobserved.
@@ -130,6 +135,7 @@ class Source:
     research_only: bool = False
     meaning: Meaning | None = None
     predicates: Mapping[str, str] | None = None
+    supports: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     coarse: tuple[str, ...] = ()
     open_vocabulary: bool = False
@@ -167,9 +173,17 @@ SOURCES: Final[dict[str, Source]] = {
         "rooms; research use",
         research_only=True,
         meaning=Meaning(
-            inside="unobserved", above="unobserved", lateral="off for neighbours"
+            on_top="off for supported",
+            inside="off for supported",
+            above="unobserved",
+            lateral="off for neighbours",
         ),
         predicates=_3DSSG,
+        supports=(
+            *("standing on", "lying on", "supported by", "standing in", "lying in", "hanging in"),
+            *("hanging on", "attached to", "leaning against", "build in", "connected to"),
+            *("part of", "belonging to"),
+        ),
     ),
     "procthor": Source(
         "ProcTHOR (Deitke et al., NeurIPS 2022): procedural rooms; Apache-2.0",
@@ -277,3 +291,29 @@ def relation_of(source: str, predicate: str) -> str | None:
     if predicate not in RELATIONS:
         raise ValueError(f"unknown relation {predicate!r}: must be one of {', '.join(RELATIONS)}")
     return predicate
+
+
+def relations_of(
+    source: str, triples: Iterable[tuple[int, str, int]]
+) -> tuple[tuple[int, str, int], ...]:
+    """Translate triples (subject, predicate, object) of a data source into distinct relations.
+
+    Predicates that are no relation of the service are skipped. Some image annotators relate an
+    object to itself. Such triples are also skipped.
+    """
+    relations: dict[tuple[int, str, int], None] = {}
+    for subject, predicate, anchor in triples:
+        relation = relation_of(source, predicate)
+        if relation is not None and subject != anchor:
+            relations[subject, relation, anchor] = None
+    return tuple(relations)
+
+
+def supported_subjects(source: str, triples: Iterable[tuple[int, str, int]]) -> tuple[int, ...]:
+    """Return the sorted subjects of triples (subject, predicate, object) that state a support.
+
+    The predicates are those of the data source. Sources without `Source.supports` return ().
+    """
+    entry = SOURCES.get(source)
+    supports = () if entry is None else entry.supports
+    return tuple(sorted({subject for subject, predicate, _ in triples if predicate in supports}))
