@@ -28,7 +28,7 @@ from app.questions.answer import (
 from app.questions.counts import more
 from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
-from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated, placed_logits
+from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.ranking import likeliest_classes
 from app.questions.reading import Reading
@@ -150,11 +150,11 @@ def _ranked(
     if not chosen.any():
         return absent[:0], np.zeros(0), np.zeros(0)
     log_odds = posterior.absent_log_odds(absent, coverage)
-    listed = max(1, posterior.listed)
     if place is None:
-        logits = calibrated(artifact.calibration.missing, log_odds, listed)
+        entry = artifact.calibration.missing
+        logits = calibrated(entry, log_odds, max(1, posterior.listed))
     else:
-        logits = _logits_at(artifact, posterior, place, absent, chosen, log_odds, listed, top_k)
+        logits = _logits_at(artifact, posterior, place, absent, chosen, log_odds, top_k)
     first, probabilities = likeliest_classes(logits, chosen, top_k)
     return absent[first], probabilities, log_odds[first]
 
@@ -166,26 +166,32 @@ def _logits_at(
     absent: NDArray[np.int64],
     chosen: NDArray[np.bool_],
     log_odds: NDArray[np.floating[Any]],
-    listed: int,
     top_k: int,
 ) -> NDArray[np.floating[Any]]:
-    """Return the logits of p(present) · p(relation to the anchor holds | present), (N,).
+    """Return the logits of p(present and at the place), (N,); see `PlaceFit`.
 
-    The function scores candidates in blocks, in descending order of p(present). The product is at
-    most p(present). So the function stops when p(present) of the next candidate is below the
-    `top_k` largest products. The remaining candidates get the logit -inf.
+    The log probability of the relation is at most 0. So the other terms give an upper bound of the
+    logit. The function scores candidates in blocks, in descending order of this bound. It stops
+    when the bound of the next candidate is below the `top_k` largest logits. The remaining
+    candidates get the logit -inf.
     """
-    presence = calibrated(artifact.calibration.missing, log_odds, listed)
-    logits = np.full_like(presence, -np.inf)
+    entry = artifact.calibration.at[place.relation]
+    bound = log_odds.astype(np.float64)
+    if artifact.places is not None and entry.counts:
+        anchor = int(posterior.present.classes[posterior.present.row[place.anchor]])
+        ratio = artifact.places.log_ratio(place.relation, anchor, outgoing=place.outgoing)
+        bound = bound + entry.counts * ratio[absent]
+    scores = np.full_like(bound, -np.inf)
     order = np.flatnonzero(chosen)
-    order = order[np.argsort(-presence[order], kind="stable")]
+    order = order[np.argsort(-bound[order], kind="stable")]
     for start in range(0, len(order), _BLOCK):
         block = order[start : start + _BLOCK]
-        largest = np.sort(logits[order[:start]])[-top_k:]
-        if len(largest) == top_k and presence[block[0]] < largest[0]:
+        largest = np.sort(scores[order[:start]])[-top_k:]
+        if len(largest) == top_k and bound[block[0]] < largest[0]:
             break
-        log_p = place_log_p(artifact, posterior, absent[block], place)
-        logits[block] = placed_logits(artifact.calibration, log_odds[block], log_p, listed)
+        log_p = place_log_p(posterior, absent[block], place)
+        scores[block] = bound[block] + entry.relation * log_p
+    logits: NDArray[np.floating[Any]] = entry.intercept + entry.slope * scores
     return logits
 
 

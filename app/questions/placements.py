@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.inference.relations import NO_UNIT
 from app.questions.answer import Fields, significant
-from app.questions.posterior import Posterior, placement_log_p
+from app.questions.posterior import Posterior
 from app.questions.ranking import likeliest_places
 from app.registry.artifact import Artifact
 from app.registry.offsets import UNOBSERVED, Offsets, look_up
@@ -73,18 +73,11 @@ class Place(NamedTuple):
 
 
 def place_log_p(
-    artifact: Artifact, posterior: Posterior, candidates: NDArray[np.int64], place: Place
+    posterior: Posterior, candidates: NDArray[np.int64], place: Place
 ) -> NDArray[np.floating[Any]]:
-    """Return the calibrated log p(relation to the anchor | candidate is present), (N,)."""
-    relation, anchor, outgoing = place
-    present = posterior.present
-    row = int(present.row[anchor])
-    return placement_log_p(
-        artifact.relation_slopes.asked_place[relation],
-        posterior.placed_log_p(candidates, relation, row, outgoing=outgoing),
-        log_count=float(present.log_counts[row]),
-        classes=posterior.listed + 1,
-    )
+    """Return log p(relation to the anchor | candidate is present), not calibrated, (N,)."""
+    row = int(posterior.present.row[place.anchor])
+    return posterior.placed_log_p(candidates, place.relation, row, outgoing=place.outgoing)
 
 
 def placements(
@@ -132,8 +125,6 @@ def placements(
         slopes, forward, backward, log_counts, posterior.listed + 1, PLACES, first
     )
     places = len(rows) // len(candidates)  # the same number for each candidate
-    if first >= 0 and at is not None:
-        p[::places] = np.exp(place_log_p(artifact, posterior, candidates, at))
     likely = np.flatnonzero(p >= LEAST_SHARE * np.repeat(p[::places], places))
     rows, relations, outgoing = rows[likely], relations[likely], outgoing[likely]
     columns = columns[likely]

@@ -130,39 +130,6 @@ def calibrated(entry: CountSlope, z: Floats, n: int | NDArray[np.integer[Any]]) 
     return log_odds
 
 
-def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int) -> Floats:
-    """Calibrate log p(relation to the anchor | candidate is present) of N candidate classes, (N,).
-
-    Args:
-        entry: (4 + 2K,) row of the relation in a table of `RelationSlopes`.
-        log_p: (N,) log probability of the relation between the classes, not yet calibrated.
-        log_count: log of the number of instances of the anchor's class.
-        classes: number of distinct classes in the scene without structure, the candidate included.
-    """
-    intercept, slope, count_weight, classes_weight = entry[:4]
-    # log(p / (1 - p)). The limit avoids log(0) for p = 1.
-    log_odds = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-7)))
-    logits = intercept + slope * log_odds + count_weight * log_count
-    logits = logits + classes_weight * math.log(classes)
-    bend(entry, logits)
-    log_probability: Floats = -np.logaddexp(0.0, -logits)
-    return log_probability
-
-
-def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, listed: int) -> Floats:
-    """Return the logits of p(present but unlisted) · p(relation holds | present), (N,).
-
-    Args:
-        log_odds: (N,) log-odds that each candidate class is present, not yet calibrated.
-        log_p: (N,) calibrated log p(relation holds | present) of each candidate class.
-        listed: number of classes that the scene lists.
-    """
-    presence = calibrated(calibration.missing, log_odds, listed)
-    log_product = log_p - np.logaddexp(0.0, -presence)
-    logits: Floats = log_product - np.log(-np.expm1(np.minimum(log_product, -1e-7)))
-    return logits
-
-
 def false_log_odds(entry: Slope, log_odds: Floats) -> Floats:
     """Convert the log-odds that stated relations hold to the log-odds that they are false.
 

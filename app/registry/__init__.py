@@ -12,6 +12,7 @@ from app.registry.description import (
     Description,
     Metric,
     PairSlope,
+    PlaceFit,
     Sharpness,
     Slope,
     Thresholds,
@@ -22,6 +23,7 @@ from app.registry.examples import Example
 from app.registry.manifest import Manifest
 from app.registry.model_set import ArtifactFailure, ModelSet, load_model_set
 from app.registry.offsets import Offsets
+from app.registry.places import Places
 from app.registry.references import AliasTarget
 from app.registry.store import Store, StoreState
 
@@ -44,6 +46,8 @@ __all__ = [
     "ModelSet",
     "Offsets",
     "PairSlope",
+    "PlaceFit",
+    "Places",
     "RegistryError",
     "Sharpness",
     "Slope",

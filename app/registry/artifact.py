@@ -32,6 +32,8 @@ from app.registry.errors import ArtifactError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
 from app.registry.offsets import PREFIX as OFFSETS
 from app.registry.offsets import Offsets
+from app.registry.places import PREFIX as PLACES
+from app.registry.places import Places
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
 from app.scene.vocabulary import Vocabulary
 
@@ -66,6 +68,7 @@ class Artifact:
             training scenes had no poses.
         counts: statistics of the numbers of instances. None means that the training scenes do not
             count instances.
+        places: counts of where objects stand. None means that the training scenes had no relations.
     """
 
     manifest: Manifest
@@ -77,6 +80,7 @@ class Artifact:
     path: Path
     offsets: Offsets | None = None
     counts: Counts | None = None
+    places: Places | None = None
 
     @cached_property
     def spec(self) -> MachineSpec:
@@ -144,7 +148,7 @@ def write_artifact(
         directory: the new directory. Its parent must exist.
         description: contents of the manifest without the entries about files.
         state: maps names to arrays. It contains the arrays of `layout`, and optionally those of
-            `Offsets.tensors()` and of `Counts.tensors()`.
+            `Offsets.tensors()`, `Counts.tensors()` and `Places.tensors()`.
         storage_dtype: dtype of floating-point tensors with two or more axes; see `pack`.
 
     Raises:
@@ -187,7 +191,7 @@ def load_artifact(
     if previous is not None and previous.digest == digest:
         return previous
     tensors = unpack(stored, manifest.tensors)
-    offsets, counts = _pop_group(tensors, OFFSETS), _pop_group(tensors, COUNTS)
+    offsets, counts, places = (_pop_group(tensors, name) for name in (OFFSETS, COUNTS, PLACES))
     weights = _weights(manifest, tensors)
     return Artifact(
         manifest=manifest,
@@ -201,6 +205,7 @@ def load_artifact(
         counts=Counts.from_tensors(counts, weights.spec.V, len(manifest.vocabulary.room_types))
         if counts
         else None,
+        places=Places.from_tensors(places, weights.spec.A, weights.spec.V) if places else None,
     )
 
 

@@ -46,8 +46,26 @@ class PairSlope(CountSlope):
 
 PairSlopes = Annotated[Many[PairSlope], Field(max_length=len(CANONICAL))]
 
-PAIR_CALIBRATIONS: Final = ("relation", "relation_given", "placement", "asked_place")
+PAIR_CALIBRATIONS: Final = ("relation", "relation_given", "placement")
 """Fields of `Calibration` with one `PairSlope` for each canonical relation."""
+
+
+class PlaceFit(Frozen):
+    """The log-odds that an unlisted class stands at the place that a request names.
+
+    With the log-odds z that the class is present, the log probability p of its relation to the
+    anchor if it is present, and the log ratio c of the counts (`Places.log_ratio`), they are
+
+        intercept + slope · (z + relation·p + counts·c)
+    """
+
+    relation: Annotated[float, Field(ge=0)] = 1.0
+    counts: Annotated[float, Field(ge=0)] = 0.0
+    intercept: float = 0.0
+    slope: Annotated[float, Field(gt=0)] = 1.0
+
+
+PlaceFits = Annotated[Many[PlaceFit], Field(max_length=len(CANONICAL))]
 
 
 class Slope(Frozen):
@@ -143,8 +161,8 @@ class Calibration(Frozen):
         relation_given: calibration of each canonical relation in scenes with observed relations.
         placement: calibration of each canonical relation for a missing object at its most probable
             places.
-        asked_place: calibration of each canonical relation for a missing object at the place that a
-            request names.
+        at: calibration of each canonical relation for a missing object at the place that a request
+            names.
         misplaced: calibration that converts the log-odds of a stated relation to the log-odds that
             the relation is false. None means that training had too few scenes with relations for
             the fit: the model then judges no relation.
@@ -164,7 +182,7 @@ class Calibration(Frozen):
     relation: PairSlopes
     relation_given: PairSlopes
     placement: PairSlopes
-    asked_place: PairSlopes
+    at: PlaceFits
     misplaced: Slope | None = None
 
     @model_validator(mode="after")
@@ -178,7 +196,8 @@ class Calibration(Frozen):
     def neutral(cls, relations: int) -> Self:
         """Return the calibration with default values for A = ``relations`` canonical relations."""
         neutral = (PairSlope(),) * relations
-        return cls(relation=neutral, relation_given=neutral, placement=neutral, asked_place=neutral)
+        at = (PlaceFit(),) * relations
+        return cls(relation=neutral, relation_given=neutral, placement=neutral, at=at)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,7 +212,6 @@ class RelationSlopes:
     relation: Floats
     relation_given: Floats
     placement: Floats
-    asked_place: Floats
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
@@ -349,7 +367,7 @@ class Description(Frozen):
             ("profiles", "vocabulary profiles", len(words.profiles)),
             *(
                 ("A", f"entries of calibration.{name}", len(getattr(self.calibration, name)))
-                for name in PAIR_CALIBRATIONS
+                for name in (*PAIR_CALIBRATIONS, "at")
             ),
         ):
             if self.spec.get(name, 0) != length:

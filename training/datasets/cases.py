@@ -66,21 +66,20 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
 def annotated_relations(encoded: EncodedScene) -> Flags:
     """Return a mask of the relations whose truth is annotated without selection bias.
 
-    The mask has the shape (relations, instances, instances). Some data sources list `left` and
-    `front` only occasionally and never as false. Such sources do not show how often these two
-    relations hold. The mask then contains only pairs with one object on or above the other. For
-    these pairs, an unlisted `left` or `front` is false.
+    The mask has the shape (relations, instances, instances). It contains a relation only if the
+    data source also shows that the relation does not hold. So people's sentences show nothing
+    here. If the objects have positions, left and front are annotated for all pairs, because they do
+    not hold beyond the neighbours. Without positions, the neighbours are the pairs that an annotator
+    selected.
     """
-    unlisted = meaning_of(encoded.source).unlisted
-    annotated, holds = encoded.instance_observed.copy(), encoded.instance_holds
-    stacked = holds[[*STACKED]].any(0)
-    stacked |= stacked.T
-    for a in range(min(len(annotated), len(unlisted))):
-        is_false = annotated[a] & ~holds[a]
-        # Without poses, the "neighbours" are the pairs of objects that an annotator selected.
-        is_selected = unlisted[a] == "off for neighbours" and encoded.instance_positions is None
-        if is_selected or (unlisted[a] == "unobserved" and not (is_false & ~stacked).any()):
-            annotated[a] &= stacked & is_false.any()
+    positions = encoded.instance_positions
+    annotated = encoded.instance_observed.copy()
+    for a, unlisted in enumerate(meaning_of(encoded.source, listed=positions is None).unlisted):
+        if unlisted == "off for neighbours" and positions is not None:
+            located = np.isfinite(positions).all(1)
+            annotated[a] = located[:, None] & located & ~np.eye(len(located), dtype=np.bool_)
+        elif unlisted not in ("off", "off for supported"):
+            annotated[a] = False
     return annotated
 
 

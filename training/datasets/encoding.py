@@ -30,6 +30,7 @@ from app.scene import (
 from app.scene.geometry import CONTACT
 from app.scene.relations import INSIDE, ON_TOP, STACKED, SUPPORTS
 from app.scene.roles import IN, ON, likely_role
+from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, stands_of
 from scene_client.image_plane import are_neighbours, relation_between
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.names import Names, curated_names
@@ -58,6 +59,7 @@ class EncodedScene:
         instance_positions: centres of the instances in metres, (instances, 3), in the viewer axes
             from which relations were derived. NaN means an unknown centre. None means that the
             relations do not come from positions.
+        instance_stands: what holds each instance, (instances,); see `app.scene.stands`.
         weight: weight of the scene in the training of objects.
         complete: True if the object list of the scene is nearly complete; see `Meaning`.
     """
@@ -71,9 +73,27 @@ class EncodedScene:
     instance_holds: Flags
     instance_observed: Flags
     unknown: tuple[str, ...]
+    instance_stands: Ints
     instance_positions: Floats | None = None
     weight: float = 1.0
     complete: bool = True
+
+    def only(self, kept: Flags) -> EncodedScene:
+        """Return the scene with only some of its instances, (instances,) bool."""
+        index = np.flatnonzero(kept)
+        holds = self.instance_holds[:, index][:, :, index]
+        observed = self.instance_observed[:, index][:, :, index]
+        classes, positions = self.instance_classes[index], self.instance_positions
+        room = self.evidence.room_type
+        return replace(
+            self,
+            evidence=pool_instances(classes, np.ones(len(index)), holds, observed, room),
+            instance_classes=classes,
+            instance_holds=holds,
+            instance_observed=observed,
+            instance_stands=self.instance_stands[index],
+            instance_positions=None if positions is None else positions[index],
+        )
 
 
 def encode(
@@ -149,6 +169,7 @@ class _Encoder:
         kept = [i for i, c in enumerate(classes) if c is not None and c not in left_out]
         indices = np.array([-1 if c is None else c for c in classes], dtype=np.int64)
         relations, positions = _relations(scene, meaning, indices, self.roles)
+        stands = _stands(scene, relations, positions, self._is_structure(indices))[kept]
         holds = relations.holds[:, kept][:, :, kept]
         observed = relations.observed[:, kept][:, :, kept]
         instance_classes = np.array([classes[i] for i in kept], dtype=np.int64)
@@ -177,11 +198,38 @@ class _Encoder:
             instance_holds=holds,
             instance_observed=observed,
             # One spelling of each label without a class.
+            instance_stands=stands,
             unknown=tuple(sorted({label_key(label): label for label in labels}.values())),
             instance_positions=None if positions is None else positions[kept],
             weight=min(1.0, share),
             complete=meaning.complete_objects,
         )
+
+    def _is_structure(self, classes: Ints) -> Flags:
+        return (classes >= 0) & self.vocabulary.structure[np.maximum(classes, 0)]
+
+
+def _stands(
+    scene: AnnotatedScene, relations: PoseRelations, positions: Floats | None, structure: Flags
+) -> Ints:
+    """Return what holds each object of a scene, (objects,); see `app.scene.stands`.
+
+    Without positions, a listed support that is neither the floor nor an object is a wall.
+    """
+    if positions is not None:
+        heights = np.array([math.nan if t.size is None else t.size[2] for t in scene.objects])
+        bottoms = positions[:, 2] - heights / 2
+        if np.isfinite(bottoms).any():
+            holds, observed = relations.holds, relations.observed
+            stands = stands_of(holds, observed, bottoms, float(np.nanmin(bottoms)))
+            stands[[thing.supported_by is not None for thing in scene.objects]] = SUPPORTED
+            return stands
+    stands = np.full(len(scene.objects), UNKNOWN)
+    stands[[*scene.supported]] = HANGS
+    supports = relations.holds[[*SUPPORTS]].any(0)
+    stands[supports[:, structure].any(1)] = FLOOR
+    stands[supports[:, ~structure].any(1)] = SUPPORTED
+    return stands
 
 
 def _relations(

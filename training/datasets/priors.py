@@ -2,7 +2,7 @@
 
 The table has tab-separated columns and can be gzipped. Its first line contains the column names:
 ``source``, ``subject``, ``relation``, ``object``, ``count`` and ``room``. An empty ``room`` means
-any room. Training skips relations that the service does not have, such as ``inside``.
+any room. Training skips relations that the service does not have, such as ``nearby``.
 """
 
 from __future__ import annotations
@@ -24,12 +24,14 @@ MAX_ROWS: Final = 2_000_000
 SOURCE: Final = "placing_priors"
 """Source name of all scenes that the reader makes from rows of the table."""
 
-TRAINED: Final = frozenset({"virtualhome_placing", "ithor_receptacles", "tidybot"})
-"""Sources whose rows become training scenes: the places of VirtualHome, AI2-THOR and TidyBot."""
+TRAINED: Final = frozenset({"virtualhome_placing", "ithor_receptacles"})
+"""Sources whose rows become training scenes: the places of VirtualHome and AI2-THOR."""
 
-# Accepted values of the column ``source`` for training. The three values after `TRAINED` mean
-# tables of locations, of votes and of part counts.
-_SOURCES: Final = TRAINED | {"conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts"}
+# Other accepted values of the column ``source``: places that people prefer, tables of locations, of
+# votes and of part counts.
+_SOURCES: Final = TRAINED | {
+    *("tidybot", "conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts")
+}
 
 _SUPPORTS: Final = frozenset({"on-top", "inside"})
 

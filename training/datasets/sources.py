@@ -258,8 +258,8 @@ SOURCES: Final[dict[str, Source]] = {
         predicates=_THE_TEN,
     ),
     "placing_priors": Source(
-        "VirtualHome (Puig et al., CVPR 2018), AI2-THOR (Kolve et al., 2017) and TidyBot (Wu et "
-        "al., 2023): where things are placed; MIT and Apache-2.0",
+        "VirtualHome (Puig et al., CVPR 2018) and AI2-THOR (Kolve et al., 2017): where things are "
+        "placed; MIT and Apache-2.0",
         meaning=_MENTIONS,
     ),
     "rooms": Source("Rooms made by this project's own generator; no restriction"),

@@ -4,10 +4,11 @@ All fits use validation scenes. Without enough scenes for `outlier` or `misplace
 None and the model gives no judgement. An unfitted entry of another question keeps the model's own
 probability. `training.fit.calibrate_objects` fits the entries about objects.
 
-All fits are logistic regressions (Platt scaling) on relations that a data source annotates as true
-or false. Other relations are left out. One source of generated rooms has more examples than all
-other sources together. The fit that ranks relations therefore gives large sources a lower weight.
-The fit of the overall probability gives all examples equal weights.
+The probability of a relation means that it holds in a home with both objects. So the fits use only
+data sources that annotate true and false relations alike (`annotated_relations`), such as real rooms
+with listed supports. All fits are logistic regressions (Platt scaling). One source of generated
+rooms has more examples than all other sources together. The fits therefore give large sources a
+lower weight. A robot lists few objects or many, so each scene takes part as a whole and in parts.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
@@ -45,14 +46,15 @@ from training.datasets.cases import (
     removed_class,
     scene_of,
 )
-from training.datasets.sources import meaning_of
 from training.evaluation.alarms import ALARMS
+from training.fit.calibrate_at import fit_at
 from training.fit.calibrate_objects import calibrate_objects, recalibrated
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_popularity
 
 _SCENES = 2500
 _LISTED = 20  # relations that an answer of the service lists by default
+_MOST_OF_A_PART = 8  # classes of a part of a scene
 _OF_THE_REST = 0.02
 _ROUNDS = 3
 # Column indices of the table of examples. Column 0 is the scene.
@@ -94,26 +96,42 @@ def calibrate(
     generator = torch.Generator().manual_seed(seed)
     pick = torch.randperm(len(scenes), generator=generator)
     annotated = [k for k in pick.tolist() if scenes.scenes[k].evidence.holds.any()]
-    related = subset(scenes, torch.tensor(annotated[:_SCENES], dtype=torch.int64)).scenes
+    related = subset(scenes, torch.tensor(annotated[:_SCENES], dtype=torch.int64))
     if not len(related):
         return objects
-    alone = fit_relations(artifact, related)
+    complete = [encoded for encoded in related.scenes if annotated_relations(encoded).any()]
+    alone = fit_relations(artifact, complete, seed)
     return recalibrated(
         artifact,
         relation=alone,
-        **fit_placements(artifact, related, seed),
-        relation_given=fit_with_observed(artifact, related, alone, seed),
+        placement=fit_placements(artifact, complete, seed),
+        relation_given=fit_with_observed(artifact, complete, alone, seed),
+        at=fit_at(artifact, related, seed),
         **fit_misplaced(artifact, related, seed),
     ).calibration
 
 
-def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[PairSlope, ...]:
+def fit_relations(
+    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+) -> tuple[PairSlope, ...]:
     """Fit the probability that a relation holds between two instances.
 
     The input is the log-odds of the relation between the two classes. The fit uses scenes without
     observed relations.
     """
-    return _fit_listed(_examples(_examples_of_pairs(artifact, scenes)), artifact.spec.A, _LISTED)
+    rng = np.random.default_rng(seed)
+    structure = artifact.vocabulary.structure
+    parts = [_part_of(encoded, structure, rng) for encoded in scenes]
+    blocks = _examples_of_pairs(artifact, [*scenes, *parts])
+    return _fit_listed(_examples(blocks), artifact.spec.A, _LISTED)
+
+
+def _part_of(encoded: EncodedScene, structure: Flags, rng: Rng) -> EncodedScene:
+    """Return a random part of a scene: 2 to `_MOST_OF_A_PART` classes, with all their instances."""
+    classes = encoded.evidence.classes
+    things = rng.permutation(classes[~structure[classes]])
+    count = int(rng.integers(2, _MOST_OF_A_PART + 1))
+    return encoded.only(np.isin(encoded.instance_classes, things[:count]))
 
 
 def fit_with_observed(
@@ -145,6 +163,8 @@ def _examples_of_pairs(
             if not observed:
                 continue
         scene = replace(scene_of(encoded, range(len(pairs)), observed), room_type=None)
+        if not scene.objects:
+            continue
         values = Posterior(artifact, scene).relation_log_odds()
         source = sources.index(encoded.source)
         blocks.append(_instance_pairs(number, source, encoded, values, structure, pairs))
@@ -153,18 +173,20 @@ def _examples_of_pairs(
 
 def fit_placements(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
-) -> dict[str, tuple[PairSlope, ...]]:
+) -> tuple[PairSlope, ...]:
     """Fit the probability of relations between a removed object and the objects of its scene.
 
-    The entry `placement` is fitted to the likeliest places, because an answer lists these places.
-    `asked_place` is fitted to all places with equal weight, because a request can name any place.
-    It leaves out data sources that never annotate false relations, such as people's sentences.
+    The fit is mainly to the likeliest relations, because an answer lists them. The scenes are whole
+    scenes and parts.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
     blocks: list[Floats] = []
-    for number, encoded in enumerate([*scenes] * _PLACEMENT_CASES):
+    for number in range(_PLACEMENT_CASES * len(scenes)):
+        encoded = scenes[number % len(scenes)]
+        if number % 2:
+            encoded = _part_of(encoded, structure, rng)
         removal = removed_class(encoded, structure, rng)
         if removal is None:
             continue
@@ -185,29 +207,13 @@ def fit_placements(
             columns = number, a, values[0].ravel(), count, size, truth.ravel()
             rows = np.broadcast_arrays(*columns, sources.index(encoded.source))
             blocks.append(np.stack(rows, 1).astype(np.float64))
-    examples, relations = _examples(blocks), artifact.spec.A
-    return {
-        "placement": _fit_listed(examples, relations, PLACES),
-        "asked_place": _fit_listed(_from_complete(examples, sources), relations, len(examples)),
-    }
+    return _fit_listed(_examples(blocks), artifact.spec.A, PLACES)
 
 
 def _examples(blocks: list[Floats]) -> Floats:
     """Return the examples for which the machine has a relation unit, and so log-odds."""
     examples = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
     return examples[examples[:, _LOGIT] > NO_UNIT]
-
-
-def _from_complete(examples: Floats, sources: Sequence[str]) -> Floats:
-    """Return the examples from data sources that also annotate false relations.
-
-    If no source annotates a relation as false, return all examples of that relation.
-    """
-    rules = np.array([meaning_of(source).unlisted for source in sources])
-    complete = rules != "unobserved"
-    relation, source = examples[:, [_RELATION, _SOURCE]].astype(int).T
-    is_complete = complete[source, relation]
-    return examples[is_complete | ~np.isin(relation, relation[is_complete])]
 
 
 def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[PairSlope, ...]:

@@ -17,7 +17,7 @@ from training.machines import BoltzmannMachine, build
 # information 1/4, so the prior has the weight of four such scenes.
 _PRECISION = 1.0
 # Minimum number of scenes with an annotation of a triple, and minimum size of a stored residual.
-_SPEAKING_SCENES = 5
+_SPEAKING_SCENES = 2
 _LEAST_RESIDUAL = 0.1
 _NEWTON_STEPS = 12
 _BATCH = 64

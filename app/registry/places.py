@@ -1,0 +1,135 @@
+"""Counts of where objects of each class stand in the training scenes.
+
+The counts serve two purposes. The roles decide between on, under and in for boxes that reach into
+each other (`app.scene.roles`). The triples tell which classes stand at a place, such as on a desk:
+
+    p(i at a, j) = (held(a, i, j) + s · p(i at a)) / (held(a, any class, j) + s)
+    p(i at a)    = (held(a, i, any class) + m · p(i)) / (held(a, any class, any class) + m)
+
+held is the number of scenes with a relation a from class i to class j, or in the other direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.registry.errors import ArtifactError
+from app.registry.fields import TensorGroup
+from app.scene.roles import RoleCounts
+
+PREFIX: Final = "places."
+"""Prefix of the names of these tensors. They are in the same file as the machine's tensors."""
+
+_PLACE: Final = 10.0  # smoothing s, in scenes
+_RELATION: Final = 3.0  # smoothing m, in scenes
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Places(TensorGroup):
+    """Counts of relations between classes, of the roles of boxes, and of objects on the floor.
+
+    Attributes:
+        triple: (N,) keys (a V + i) V + j of relations a from class i to class j, ascending.
+        held: (N,) number of training scenes with each triple.
+        frequency: (V,) share of each class among the listed classes of the training scenes.
+        role_pair, role_counts, role_anchor: see `RoleCounts`.
+        stands: (V, 3) shares of the objects of each class that stand on the floor, hang, and stand
+            on or in an object.
+    """
+
+    prefix: ClassVar[str] = PREFIX
+
+    triple: NDArray[np.int32]
+    held: NDArray[np.float32]
+    frequency: NDArray[np.float32]
+    role_pair: NDArray[np.int32]
+    role_counts: NDArray[np.float32]
+    role_anchor: NDArray[np.float32]
+    stands: NDArray[np.float32]
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
+        """Build the counts of a machine with A relations and V classes from stored tensors.
+
+        Raises:
+            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
+                `invalid_tensor` if a value is invalid.
+        """
+        N, P = (len(np.atleast_1d(tensors.get(PREFIX + n, ()))) for n in ("triple", "role_pair"))
+        shapes = {
+            "triple": (N,),
+            "held": (N,),
+            "frequency": (V,),
+            "role_pair": (P,),
+            "role_counts": (P, 3),
+            "role_anchor": (V, 3),
+            "stands": (V, 3),
+        }
+        places = cls.read(tensors, shapes)
+        if complaint := places._complaint(A * V * V, V * V):
+            raise ArtifactError("invalid_tensor", f"the place tensors are invalid: {complaint}")
+        return places
+
+    def _complaint(self, triples: int, pairs: int) -> str | None:
+        for name, most in (("triple", triples), ("role_pair", pairs)):
+            keys = getattr(self, name)
+            if not np.issubdtype(keys.dtype, np.integer):
+                return f"{name} must be integers"
+            if (keys[1:] <= keys[:-1]).any() or (keys[:1] < 0).any() or (keys[-1:] >= most).any():
+                return f"the keys in {name} must be ascending and in the range of the classes"
+        numbers = self.held, self.role_counts, self.role_anchor, self.stands
+        if any((array < 0).any() for array in numbers) or (self.frequency <= 0).any():
+            return "counts must be at least 0, and frequencies must be above 0"
+        return None
+
+    @cached_property
+    def roles(self) -> RoleCounts:
+        """The roles of pairs of classes."""
+        return RoleCounts(self.role_pair.astype(np.int64), self.role_counts, self.role_anchor)
+
+    def log_ratio(self, relation: int, anchor: int, *, outgoing: bool) -> Floats:
+        """Return log p(i at a, j) - log p(i) of each class i at a place, (V,).
+
+        Args:
+            relation: index a of the canonical relation of the place.
+            anchor: index j of the class of the place's object.
+            outgoing: True if the class i is the subject of the relation, False if the anchor is.
+        """
+        start, classes, counts, back_off = self._by_anchor[int(outgoing)]
+        V = len(self.frequency)
+        begin, end = start[relation * V + anchor], start[relation * V + anchor + 1]
+        held = _PLACE * back_off[relation]
+        held[classes[begin:end]] += counts[begin:end]
+        ratio: Floats = np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
+        return ratio
+
+    @cached_property
+    def _by_anchor(self) -> tuple[tuple[Indices, Indices, Floats, Floats], ...]:
+        """For anchors as subjects, then as objects: the triples in the order of their anchor.
+
+        The arrays are the first row of each (relation, anchor) and the end, (A V + 1,); class i and
+        number of scenes of each row, both (N,); and p(i at a), (A, V).
+        """
+        V = len(self.frequency)
+        a, i, j = self.triple // V // V, self.triple // V % V, self.triple % V
+        A = int(a.max(initial=-1)) + 1
+        share = self.frequency.astype(np.float64) / self.frequency.sum()
+        tables = []
+        for anchor, other in ((i, j), (j, i)):
+            key = a.astype(np.int64) * V + anchor
+            order = np.argsort(key, kind="stable")
+            back_off = np.zeros((A, V)) + _RELATION * share
+            np.add.at(back_off, (a, other), self.held)
+            back_off /= back_off.sum(1, keepdims=True)
+            start = np.searchsorted(key[order], np.arange(A * V + 1))
+            tables.append((start, other[order], self.held[order].astype(np.float64), back_off))
+        return tuple(tables)

@@ -1,0 +1,65 @@
+"""Count where objects of each class stand in the training scenes; see `app.registry.places`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from app.registry import Places
+from app.scene import RoleCounts, Vocabulary
+from training.datasets import EncodedScene
+from training.datasets.array_types import Floats
+
+# Weight of the parent of a class, and of all classes, in objects.
+_OF_PARENT, _OF_ALL = 5.0, 5.0
+
+
+def fit_places(
+    scenes: Sequence[EncodedScene], roles: RoleCounts, vocabulary: Vocabulary
+) -> Places | None:
+    """Count the relations of the scenes. Return None if no scene has a relation.
+
+    Relations of structure, and relations between objects of one class, do not count.
+    """
+    V, is_thing = len(vocabulary), ~vocabulary.structure
+    held: Counter[int] = Counter()
+    listed = np.ones(V)
+    for scene in scenes:
+        evidence = scene.evidence
+        listed[evidence.classes] += 1
+        relation, subject, anchor = np.nonzero(evidence.holds)
+        i, j = evidence.classes[subject], evidence.classes[anchor]
+        counted = is_thing[i] & is_thing[j] & (i != j)
+        held.update(((relation * V + i) * V + j)[counted].tolist())
+    if not held:
+        return None
+    keys = np.array(sorted(held), np.int32)
+    return Places(
+        triple=keys,
+        held=np.array([held[key] for key in keys.tolist()], np.float32),
+        frequency=(listed / listed.sum()).astype(np.float32),
+        role_pair=roles.pair.astype(np.int32),
+        role_counts=roles.counts,
+        role_anchor=roles.anchor,
+        stands=_stands(scenes, vocabulary).astype(np.float32),
+    )
+
+
+def _stands(scenes: Sequence[EncodedScene], vocabulary: Vocabulary) -> Floats:
+    """Return the shares of floor, wall and supporting objects for each class, (V, 3).
+
+    The counts of a class are smoothed towards those of its parent, and of all classes.
+    """
+    counts = np.zeros((len(vocabulary), 3))
+    for scene in scenes:
+        known = scene.instance_stands >= 0
+        np.add.at(counts, (scene.instance_classes[known], scene.instance_stands[known]), 1)
+    usual = counts.sum(0) + 1
+    shares = (counts + _OF_ALL * usual / usual.sum()) / (counts.sum(1, keepdims=True) + _OF_ALL)
+    parents = vocabulary.parents
+    prior = np.where((parents >= 0)[:, None], shares[parents], usual / usual.sum())
+    weight = np.where(parents >= 0, _OF_PARENT, _OF_ALL)[:, None]
+    smoothed: Floats = (counts + weight * prior) / (counts.sum(1, keepdims=True) + weight)
+    return smoothed
