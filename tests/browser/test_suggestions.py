@@ -150,14 +150,15 @@ def seen(ghost: Box, anchor: Box, viewer: dict[str, float]) -> set[str]:
 
     If the boxes reach into each other, the service chooses by their classes.
     """
-    reaching = set()
-    if share(ghost, anchor) >= 0.3:
-        if anchor["z"] <= ghost["z"] + 1e-3 and ghost["z"] < top(anchor) - 0.05:
-            reaching |= {"inside", "under"}
-        if ghost["z"] <= anchor["z"] + 1e-3 and anchor["z"] < top(ghost) - 0.05:
-            reaching.add("contains")
-    if reaching:
-        return reaching
+    depth = min(top(ghost) - anchor["z"], top(anchor) - ghost["z"])
+    if share(ghost, anchor) >= 0.3 and depth > 0.05:
+        inner, outer = sorted((ghost, anchor), key=lambda one: one["size"]["x"] * one["size"]["y"])
+        found = set()
+        if inner["size"]["z"] <= 1.2 * outer["size"]["z"]:
+            found.add("inside" if inner is ghost else "contains")
+        if inner is ghost and ghost["z"] <= anchor["z"] + 0.1:
+            found.add("under")
+        return found
     pair = [ghost, anchor]
     centres = [[one["x"], one["y"], one["z"] + one["size"]["z"] / 2] for one in pair]
     yaws = [math.radians(one["yaw"]) for one in pair]

@@ -13,7 +13,8 @@ const HOLDING = ['inside', 'contains'];
 const CLEAR = 0.1;
 const NEIGHBOURS = 0.9;
 const THIN = 0.03;
-const OVERHANG = 1.25;
+const OVERHANG = 1.25; // share of the support's extent that a footprint on it may have
+const HIGHEST = 1.2; // share of the container's height that contents may have, by the service's rule
 /** The part of half a suggestion that stays over the anchor at its learnt offset. */
 const HELD = 0.6;
 const GAP = 0.15; // metres between neighbours without a learnt offset
@@ -135,21 +136,22 @@ function freeAt(anchor, { relation, offset }, size, viewer, boxes, ghosts) {
 /** Whether the sizes of the anchor and of a suggestion allow the relation. */
 function hasRoom(anchor, relation, own) {
   const beneath = anchor.z + THIN >= own.size.z; // free height below the anchor
+  const holds = (box, other) => fits(box, other, 1) && box.size.z <= HIGHEST * other.size.z;
   const rooms = {
-    'on-top': () => fits(own, anchor),
-    inside: () => fits(own, anchor),
-    contains: () => fits(anchor, own),
+    'on-top': () => fits(own, anchor, OVERHANG),
+    inside: () => holds(own, anchor),
+    contains: () => holds(anchor, own),
     // A lower object stands between the legs of the anchor.
-    under: () => beneath || (fits(own, anchor) && own.size.z < anchor.size.z),
+    under: () => beneath || (fits(own, anchor, 1) && own.size.z < anchor.size.z),
     below: () => beneath,
   };
   return rooms[relation]?.() ?? true;
 }
 
-/** Whether a footprint has room on another one, with an overhang of at most a quarter. */
-function fits(box, other) {
+/** Whether the extents of a footprint are at most this share of those of another one. */
+function fits(box, other, share) {
   const half = halves({ size: box.size, yaw: box.yaw - other.yaw });
-  return half.x <= OVERHANG * (other.size.x / 2) && half.y <= OVERHANG * (other.size.y / 2);
+  return half.x <= share * (other.size.x / 2) && half.y <= share * (other.size.y / 2);
 }
 
 const wider = (box, by) => ({ ...box, size: { ...box.size, x: box.size.x + 2 * by, y: box.size.y + 2 * by } });
@@ -164,16 +166,13 @@ const within = ({ yaw }, x, y) => turned({ yaw: -yaw }, x, y);
 /** The height of the bottom of a suggestion. `ground` is the height of the anchor's support, or 0, the floor. */
 function height(anchor, relation, size, learnt, ground) {
   const top = anchor.z + anchor.size.z;
-  // Between the bottom and the top of the anchor, or around both.
-  const between = () => Math.min(Math.max(learnt ?? anchor.z, anchor.z), Math.max(anchor.z, top - Math.max(size.z, CLEAR)));
-  const around = () => Math.min(Math.max(learnt ?? ground, ground, top - size.z), anchor.z);
   const heights = {
     'on-top': () => top,
     above: () => Math.max(top + CLEAR, learnt ?? top + 0.3),
-    under: () => (anchor.z + THIN >= size.z ? Math.max(0, anchor.z - size.z) : between()),
+    under: () => (anchor.z + THIN >= size.z ? Math.max(0, anchor.z - size.z) : anchor.z),
     below: () => Math.max(0, Math.min(learnt ?? 0, anchor.z - CLEAR - size.z)),
-    inside: between,
-    contains: around,
+    inside: () => Math.min(Math.max(learnt ?? anchor.z, anchor.z), Math.max(anchor.z, top - Math.max(size.z, CLEAR))),
+    contains: () => Math.min(Math.max(learnt ?? ground, ground, top - size.z), anchor.z),
   };
   return heights[relation]?.() ?? learnt ?? 0;
 }
