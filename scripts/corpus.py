@@ -40,7 +40,10 @@ MODELS: Final = (
     "default", "indoor-triway", "indoor-gbm", "indoor-rbm", "indoor-triway-deep", "open-triway",
     "indoor-triway@3.2.0",
 )  # fmt: skip
-RELATIONS: Final = ("left", "right", "front", "behind", "on-top", "under", "above", "below")
+RELATIONS: Final = (
+    *("left", "right", "front", "behind", "on-top"),
+    *("under", "above", "below", "inside", "contains"),
+)
 HEADERS: Final = ("content-type", "retry-after", "www-authenticate", "allow", "location")
 NONSENSE: Final[tuple[dict[str, Json], ...]] = (
     {"objects": [f"nonsuch {k}" for k in range(256)]},

@@ -121,7 +121,10 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
             {"label": "container", "aliases": [], "structure": False, "anywhere": False},
             {"label": "floor", "aliases": [], "structure": True, "anywhere": False},
         ],
-        "relations": ["left", "front", "on-top", "above", "right", "behind", "under", "below"],
+        "relations": [
+            *("left", "front", "on-top", "above", "inside"),
+            *("right", "behind", "under", "below", "contains"),
+        ],
         "room_types": ["bedroom", "garage"],
         "rare_room_types": ["garage"],
         "profiles": ["sunrgbd", "procthor"],

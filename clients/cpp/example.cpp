@@ -7,6 +7,13 @@
 
 using scene::json;
 
+// Prints a relation of an answer, without a line end.
+static void print(const json& entry) {
+  std::cout << "  " << entry["subject"].get<std::string>() << " "
+            << entry["relation"].get<std::string>() << " " << entry["object"].get<std::string>()
+            << " " << entry["probability"];
+}
+
 int main(int argc, char** argv) {
   scene::Options options;
   if (argc > 1) options.url = argv[1];
@@ -35,16 +42,26 @@ int main(int argc, char** argv) {
 
     std::cout << "How they stand:\n";
     const json relations = service.relations(question);
-    for (const auto& entry : relations["relations"])
-      std::cout << "  " << entry["subject"].get<std::string>() << " "
-                << entry["relation"].get<std::string>() << " "
-                << entry["object"].get<std::string>() << " " << entry["probability"] << "\n";
+    for (const auto& entry : relations["relations"]) {
+      print(entry);
+      // Only an observed relation has an expected probability.
+      if (entry.contains("expected") && entry["expected"].is_number())
+        std::cout << " expected " << entry["expected"];
+      std::cout << "\n";
+    }
 
     std::cout << "Least fitting first:\n";
     const json outliers = service.outliers(room);
     for (const auto& entry : outliers["outliers"])
       std::cout << "  " << entry["object"].get<std::string>() << " " << entry["probability"]
                 << (entry["is_outlier"].get<bool>() ? " does not belong here" : "") << "\n";
+    for (const auto& entry : outliers["misplaced"]) {
+      if (!entry.value("is_misplaced", false)) continue;
+      print(entry);
+      if (entry.contains("moved") && entry["moved"].is_string())
+        std::cout << " moved " << entry["moved"].get<std::string>();
+      std::cout << "\n";
+    }
 
     std::cout << "Which room it is:\n";
     const json rooms = service.rooms({{"objects", room["objects"]}, {"top_k", 3}});

@@ -28,6 +28,8 @@ SPOKEN = {
     "under": "under",
     "above": "above",
     "below": "below",
+    "inside": "in",
+    "contains": "containing",
 }
 
 
@@ -132,6 +134,21 @@ def test_the_menu_of_an_object_asks_what_is_missing_there(
     assert "at" not in bedroom.body("missing")
 
 
+def test_the_menu_asks_what_is_missing_in_an_object(bedroom: Board, api: httpx.Client) -> None:
+    answer = ask(api, "missing", bedroom.scene, top_k=3)
+    answer["missing"] = [one | {"placements": []} for one in answer["missing"]]
+    answer["more"] = []
+    bedroom.page.route("**/missing", lambda route: route.fulfill(json=answer))
+    bedroom.click("Actions for nightstand")
+    bedroom.page.get_by_role("menuitem", name="What is missing in it?").click()
+    bedroom.settle()
+    assert bedroom.body("missing")["at"] == {"relation": "inside", "object": "nightstand"}
+    expect(bedroom.page.locator("#at-words")).to_have_text("Missing in nightstand")
+    rows = bedroom.rows("missing")
+    assert len(rows) == 3
+    assert all("no likely place" in row for row in rows)
+
+
 def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Client) -> None:
     bedroom.tab("Wrong")
     answer = ask(api, "outliers", bedroom.scene)
@@ -158,17 +175,17 @@ def test_outliers_are_marked_with_reasons_in_words(bedroom: Board, api: httpx.Cl
 
 def test_only_misplaced_relations_are_in_the_wrong_place(bedroom: Board) -> None:
     said = {"subject": "lamp", "relation": "on-top", "object": "bed"}
-    amiss = {**said, "probability": 0.75, "is_misplaced": True}
-    fine = amiss | {"object": "nightstand", "probability": 0.1, "is_misplaced": False}
+    amiss = {**said, "probability": 0.75, "is_misplaced": True, "moved": "lamp"}
+    fine = {**said, "object": "nightstand", "probability": 0.1, "is_misplaced": False}
     answer = {"outliers": [], "misplaced": [amiss, fine]}
     bedroom.alter("outliers", lambda other: other | answer)
     bedroom.use_positions()
     bedroom.tab("Wrong")
-    assert bedroom.rows("outliers") == ["lamp on top of bed in the wrong place 75 %"]
+    assert bedroom.rows("outliers") == ["lamp on top of bed in the wrong place 75 % moved: lamp"]
     assert bedroom.edges == [("misplaced", "on top of?")]
     expect(bedroom.page.locator("#legend .misplaced")).to_have_text("probably in the wrong place")
     expect(bedroom.page.locator("#alarms")).to_have_text("1")
-    assert "In the wrong place: lamp on top of bed." in bedroom.announced
+    assert "In the wrong place: lamp on top of bed (moved: lamp)." in bedroom.announced
     assert "Nothing looks wrong" not in bedroom.announced
 
 
@@ -195,7 +212,8 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
     kinds = {"disagrees"} if odd else set()
     for row, one in zip(rows, answer["relations"], strict=True):
         assert row.startswith(f"{one['subject']} {SPOKEN[one['relation']]} {one['object']}")
-        assert row.endswith(percent(one["probability"]))
+        expected = f" expected: {percent(one['expected'])}" if one.get("expected") else ""
+        assert row.endswith(percent(one["probability"]) + expected)
         assert ("observed" in row) == one["observed"]
         kinds.add("holds" if one["observed"] else "expected")
     assert {kind for kind, _ in bedroom.edges} == kinds >= {"holds", "expected"}
@@ -206,6 +224,29 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
     words = {text for kind, text in bedroom.edges if text and kind != "disagrees"}
     assert words
     assert words <= said
+
+
+def test_an_observed_relation_shows_its_expected_probability(bedroom: Board) -> None:
+    milk = {"subject": "milk", "relation": "inside", "object": "bed", "probability": 1.0}
+    seen = milk | {"observed": True, "expected": 0.004}
+    unseen = milk | {"relation": "contains", "observed": False, "expected": None}
+    bedroom.alter("relations", lambda other: other | {"relations": [seen, unseen]})
+    bedroom.tab("Relations")
+    bedroom.use_positions()
+    assert bedroom.rows("relations") == [
+        "milk in bed observed 100 % expected: < 1 %",
+        "milk containing bed 100 %",
+    ]
+
+
+def test_the_floor_can_be_the_wrong_place(bedroom: Board) -> None:
+    place = {"subject": "lamp", "relation": "on-top", "object": "floor", "probability": 0.75}
+    amiss = place | {"is_misplaced": True, "moved": "lamp"}
+    bedroom.alter("outliers", lambda other: other | {"outliers": [], "misplaced": [amiss]})
+    bedroom.use_positions()
+    bedroom.tab("Wrong")
+    assert bedroom.rows("outliers") == ["lamp on top of floor in the wrong place 75 % moved: lamp"]
+    assert bedroom.edges == [], "the floor is not on the board"
 
 
 def test_every_symbol_is_in_the_legend(bedroom: Board) -> None:

@@ -14,13 +14,16 @@ import pytest
 from app.scene.footprints import overlap_and_gap
 from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
 from app.scene.relations import CANONICAL, OPPOSITES
-from tests.browser.driving import OpenBoard
+from tests.browser.driving import Board, OpenBoard
 
 pytestmark = pytest.mark.system
 
 Box = dict[str, Any]
 
-RELATIONS = ("on-top", "on-top", "above", "under", "below", "left", "right", "front", "behind")
+RELATIONS = (
+    *("on-top", "on-top", "above", "under", "below", "left", "right", "front", "behind"),
+    *("inside", "contains"),
+)
 ROBOT = 0.5
 """Side of the square that stays free around the robot, in metres."""
 FLOOR, CEILING = 0.1, 2.2
@@ -113,8 +116,11 @@ def passed(ghost: Box, anchor: Box, boxes: list[Box]) -> list[str]:
     supports = [one["id"] for one in near if top(one) <= anchor["z"] + 0.03]
     if relation in ("on-top", "above"):
         return [anchor["id"], *supports]
+    carried = [one["id"] for one in near if one["z"] >= top(anchor) - 0.03]
     if relation in ("under", "below"):
-        return [anchor["id"], *(one["id"] for one in near if one["z"] >= top(anchor) - 0.03)]
+        return [anchor["id"], *carried]
+    if relation in ("inside", "contains"):
+        return [anchor["id"], *supports, *carried]
     return supports
 
 
@@ -140,7 +146,19 @@ def wrong_with(ghost: Box, ghosts: list[Box], case: dict[str, Any]) -> list[str]
 
 
 def seen(ghost: Box, anchor: Box, viewer: dict[str, float]) -> set[str]:
-    """The relations of a ghost to its anchor by the rules of the service."""
+    """The relations of a ghost to its anchor by the rules of the service.
+
+    If the boxes reach into each other, the service chooses by their classes.
+    """
+    depth = min(top(ghost) - anchor["z"], top(anchor) - ghost["z"])
+    if share(ghost, anchor) >= 0.3 and depth > 0.05:
+        inner, outer = sorted((ghost, anchor), key=lambda one: one["size"]["x"] * one["size"]["y"])
+        found = set()
+        if inner["size"]["z"] <= 1.2 * outer["size"]["z"]:
+            found.add("inside" if inner is ghost else "contains")
+        if inner is ghost and ghost["z"] <= anchor["z"] + 0.1:
+            found.add("under")
+        return found
     pair = [ghost, anchor]
     centres = [[one["x"], one["y"], one["z"] + one["size"]["z"] / 2] for one in pair]
     yaws = [math.radians(one["yaw"]) for one in pair]
@@ -172,8 +190,140 @@ def test_suggestions_of_random_rooms_have_free_places(open_board: OpenBoard) -> 
     assert 0.6 * 8 * len(cases) < count < 8 * len(cases)
 
 
+def ghost_at(
+    board: Board, relation: str, anchor: Box, size: tuple[float, float, float], **more: Any
+) -> Box:
+    """The ghost of one placement, with the fields ``offset``, ``boxes`` and ``at`` of the case."""
+    placement = {"relation": relation, "object": anchor["id"], "probability": 0.5}
+    if "offset" in more:
+        mean = dict(zip("xyz", more["offset"], strict=True))
+        placement["offset"] = {"mean": mean, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
+    case = {
+        "boxes": [anchor, *more.get("boxes", [])],
+        "missing": [{"label": "it", "probability": 0.5, "placements": [placement]}],
+        "viewer": {"x": 0.0, "y": 0.0, "yaw": 0.0},
+        "sizes": {"it": dict(zip("xyz", size, strict=True))},
+        "at": None,
+    }
+    ((ghost,),) = board.page.evaluate(STANDING, [case])
+    return dict(ghost)
+
+
+def test_contents_stand_in_the_footprint_of_their_container(open_board: OpenBoard) -> None:
+    fridge = box("fridge", 3, 1, 0, (0.7, 0.8, 1.8))
+    milk = box("milk", 3, 1, 0.5, (0.1, 0.1, 0.25))
+    board = open_board()
+    ghost = ghost_at(board, "inside", fridge, (0.1, 0.1, 0.25), offset=(0.2, -0.1, 0.3))
+    assert (ghost["x"], ghost["y"], ghost["z"]) == pytest.approx((3.2, 0.9, 1.075))
+    ghost = ghost_at(board, "inside", fridge, (0.1, 0.1, 0.25), offset=(0.6, 0, 0))
+    assert ghost["x"] == pytest.approx(3.3), "the wall of the fridge"
+    ghost = ghost_at(board, "contains", milk, (0.7, 0.8, 1.8), offset=(0.2, -0.1, -0.1))
+    assert (ghost["x"], ghost["y"]) == pytest.approx((3.2, 0.9))
+    assert ghost["z"] == 0
+    assert top(ghost) > top(milk)
+
+
+def test_a_low_object_stands_between_the_legs_of_a_table(open_board: OpenBoard) -> None:
+    desk = box("desk", 3, 0, 0, (0.8, 1.6, 0.74))
+    ghost = ghost_at(open_board(), "under", desk, (0.3, 0.3, 0.4), offset=(0.2, -0.5, -0.17))
+    assert (ghost["x"], ghost["y"], ghost["z"]) == pytest.approx((3.2, -0.5, 0))
+
+
+@pytest.mark.parametrize(
+    ("relation", "offset"),
+    [
+        # The first overhangs the bed a little, the second is close to the anchor.
+        ("on-top", (0.85, 0.65, 0.4)),
+        ("left", (0.1, 1.01, 0)),
+        ("behind", (1.4, -1.3, 0)),
+    ],
+)
+def test_a_ghost_stands_where_the_answer_says(
+    open_board: OpenBoard, relation: str, offset: tuple[float, float, float]
+) -> None:
+    bed = box("bed", 3, 0, 0, (2, 1.6, 0.5))
+    board = open_board()
+    ghost = ghost_at(board, relation, bed, (0.4, 0.4, 0.2), offset=offset)
+    assert (ghost["x"], ghost["y"]) == pytest.approx((3 + offset[0], offset[1]))
+    assert not ghost["shifted"]
+    taken = box("box", 3 + offset[0], offset[1], 0, (0.3, 0.3, 1))
+    moved = ghost_at(board, relation, bed, (0.4, 0.4, 0.2), offset=offset, boxes=[taken])
+    assert share(moved, taken) == 0
+    assert moved["shifted"]
+    assert not ghost_at(board, relation, bed, (0.4, 0.4, 0.2))["shifted"], "no offset to keep"
+
+
+def test_a_suggestion_at_another_place_says_so(open_board: OpenBoard) -> None:
+    far = {"mean": {"x": 9.0, "y": 0.0, "z": 0.5}, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
+    place = {"relation": "on-top", "object": "desk", "probability": 0.9, "offset": far}
+    board = open_board()
+    board.alter(
+        "missing",
+        lambda answer: (
+            answer | {"missing": [answer["missing"][0] | {"label": "cup", "placements": [place]}]}
+        ),
+    )
+    board.add("laptop")
+    assert "drawn at the nearest free place" in board.rows("missing")[0]
+    ghost = board.page.locator("#board .ghost").first
+    assert "drawn at the nearest free place" in str(ghost.get_attribute("aria-label"))
+    far["mean"]["x"] = 0.0
+    board.add("lamp")
+    assert board.ghosts == ["cup"]
+    assert "nearest free place" not in board.rows("missing")[0]
+
+
+LAY_OUT = """async ([boxes, relations]) => {
+  const { layOut } = await import('./static/board/layout.js');
+  return layOut([], boxes, relations, { x: 0, y: 0, yaw: 0 });
+}"""
+
+
+def test_a_layout_puts_contents_into_their_container(open_board: OpenBoard) -> None:
+    boxes = [
+        box("milk", 0, 0, 0, (0.1, 0.1, 0.25)),
+        box("juice", 0, 0, 0, (0.3, 0.3, 0.25)),
+        box("fridge", 0, 0, 0, (0.7, 0.8, 1.8)),
+        box("magnet", 0, 0, 0, (0.1, 0.1, 0.1)),
+    ]
+    relations = [
+        {"subject": "milk", "relation": "inside", "object": "fridge"},
+        {"subject": "fridge", "relation": "contains", "object": "juice"},
+        {"subject": "magnet", "relation": "on-top", "object": "fridge"},
+    ]
+    placed = open_board().page.evaluate(LAY_OUT, [boxes, relations])
+    milk, juice, fridge, magnet = placed
+    for one in (milk, juice):
+        for axis in "xy":
+            room = (fridge["size"][axis] - one["size"][axis]) / 2
+            assert abs(one[axis] - fridge[axis]) <= room + 1e-6
+        assert one["z"] == fridge["z"]
+    assert (milk["x"], milk["y"]) != (juice["x"], juice["y"])
+    assert magnet["z"] == top(fridge)
+
+
+def test_contents_move_with_their_container(open_board: OpenBoard) -> None:
+    board = open_board({"objects": ["fridge"]})
+    after = board.page.evaluate(
+        """async (things) => {
+          const { moved } = await import('./static/board/geometry.js');
+          return moved(things, 'fridge', 5, 5, (thing) => thing);
+        }""",
+        [
+            box("fridge", 1, 1, 0, (0.7, 0.8, 1.8)),
+            box("milk", 1.1, 1, 0.5, (0.1, 0.1, 0.25)),
+            box("chair", 1.4, 1, 0, (0.5, 0.5, 0.9)),
+        ],
+    )
+    assert [(one["x"], one["y"], one["z"]) for one in after] == [
+        (5, 5, 0),
+        (5.1, 5, 0.5),
+        (1.4, 1, 0),
+    ]
+
+
 def test_a_suggestion_without_a_place_says_so(open_board: OpenBoard) -> None:
-    placements = [{"relation": "under", "object": "desk", "probability": 0.9}]
+    placements = [{"relation": "below", "object": "desk", "probability": 0.9}]
     board = open_board()
     board.alter(
         "missing",

@@ -17,6 +17,7 @@ from scene_client import Client, __version__, tables
 from scene_client.command import app
 from scene_client.schemas import (
     Disagreement,
+    ExpectedRelation,
     GenerateAnswer,
     MisplacedRelation,
     MissingAnswer,
@@ -423,6 +424,28 @@ def test_offsets_reasons_and_disagreements_are_shown_where_an_answer_has_them() 
     assert "disagreements" in text
     assert "left, above" in text
     assert "on-top 0.900" in text
+
+
+def test_an_observed_relation_has_a_given_and_an_expected_probability() -> None:
+    given = {"subject": "milk", "relation": "inside", "object": "fridge", "probability": 0.81}
+    seen = ExpectedRelation(**given, observed=True, expected=0.123)
+    unseen = ExpectedRelation(**given | {"relation": "on-top"})
+    answer = RelationsAnswer(**ANSWERED, relations=[seen, unseen], disagreements=[])
+    lines = shown(tables.relations(answer))
+    rows = [line.split() for line in lines.splitlines()]
+    assert ["subject", "relation", "object", "probability", "expected"] in rows
+    assert ["milk", "inside", "fridge", "0.810", "observed", "0.123"] in rows
+    assert ["milk", "on-top", "fridge", "0.810"] in rows
+
+
+def test_the_moved_object_of_a_misplaced_relation_is_named() -> None:
+    place = {"subject": "pillow", "relation": "on-top", "object": "floor", "probability": 0.9}
+    moved = MisplacedRelation(**place, is_misplaced=True, moved="pillow")
+    fine = MisplacedRelation(**place | {"relation": "left", "object": "bed", "probability": 0.1})
+    lines = shown(tables.outliers(OutliersAnswer(**ANSWERED, outliers=[], misplaced=[moved, fine])))
+    rows = [line.split() for line in lines.splitlines()]
+    assert ["pillow", "on-top", "floor", "0.900", "misplaced", "pillow"] in rows
+    assert ["pillow", "left", "bed", "0.100"] in rows
 
 
 def test_markup_of_a_service_is_not_rendered() -> None:

@@ -1,17 +1,23 @@
-"""Pictures of scenes: nothing overlaps, and what can be drawn as stated is."""
+"""Pictures of scenes: boxes are separate or nested, and what can be drawn as stated is."""
 
 from __future__ import annotations
 
 import struct
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scene_client.schemas import GenerateAnswer, GeneratedScene, ModelReference, Relation
+from scene_client.schemas import (
+    GenerateAnswer,
+    GeneratedScene,
+    ModelReference,
+    Relation,
+    RelationName,
+)
 
 plot = pytest.importorskip("scene_client.plot", exc_type=ImportError)
 
@@ -19,7 +25,7 @@ if TYPE_CHECKING:
     from scene_client.plot import Box
 
 NAMES = ["bed", "desk", "lamp", "book", "a rather long name", "x", "chair", "mug"]
-RELATIONS = ["left", "right", "front", "behind", "on-top", "under", "above", "below"]
+RELATIONS = get_args(RelationName)
 
 
 def stated(*relations: tuple[str, str, str]) -> list[Relation]:
@@ -32,15 +38,26 @@ def boxes(objects: list[str], *relations: tuple[str, str, str]) -> dict[str, Box
     return {box.label: box for box in plot.arrange(objects, stated(*relations))}
 
 
+def is_inside(inner: Box, outer: Box) -> bool:
+    return (
+        outer.x < inner.x
+        and outer.y < inner.y
+        and inner.x + inner.width < outer.x + outer.width
+        and inner.y + inner.height <= outer.y + outer.height - plot.HEIGHT + 1e-9
+    )
+
+
 objects = st.lists(st.sampled_from(NAMES), unique=True, max_size=8)
 triples = st.tuples(st.sampled_from(NAMES), st.sampled_from(RELATIONS), st.sampled_from(NAMES))
 
 
 @given(objects=objects, relations=st.lists(triples, max_size=30))
-def test_every_object_is_drawn_once_and_none_overlaps_another(
+def test_every_object_is_drawn_once_and_only_contents_overlap_their_container(
     objects: list[str], relations: list[tuple[str, str, str]]
 ) -> None:
     found = plot.arrange(objects, stated(*relations))
+    holders = {a for a, relation, _ in relations if relation == "contains"}
+    holders |= {b for _, relation, b in relations if relation == "inside"}
     assert sorted(box.label for box in found) == sorted(objects)
     for place, one in enumerate(found):
         assert one.x >= 0
@@ -52,7 +69,9 @@ def test_every_object_is_drawn_once_and_none_overlaps_another(
                 or one.y >= other.y + other.height - 1e-9
                 or other.y >= one.y + one.height - 1e-9
             )
-            assert apart, (one, other)
+            outer, inner = sorted((one, other), key=lambda box: -box.height)
+            nested = outer.label in holders and is_inside(inner, outer)
+            assert apart or nested, (one, other)
 
 
 @given(order=st.permutations(NAMES))
@@ -81,6 +100,18 @@ def test_an_object_on_a_support_is_drawn_on_it() -> None:
         assert desk.x <= found[name].x
         assert found[name].x + found[name].width <= desk.x + desk.width
     assert boxes(["desk", "lamp"], ("lamp", "above", "desk"))["lamp"].y > desk.y + plot.HEIGHT
+
+
+def test_contents_are_drawn_inside_their_container() -> None:
+    found = boxes(
+        ["desk", "mug", "book", "lamp"],
+        *(("mug", "inside", "desk"), ("desk", "contains", "book"), ("lamp", "on-top", "desk")),
+    )
+    desk = found["desk"]
+    for name in ("mug", "book"):
+        assert is_inside(found[name], desk)
+        assert found[name].height == plot.HEIGHT
+    assert found["lamp"].y == desk.y + desk.height
 
 
 def test_of_contradictory_relations_the_first_is_drawn() -> None:

@@ -14,6 +14,7 @@ import pytest
 from py_trees.common import Status
 
 from scene_client import Client
+from scene_client.schemas import OutliersAnswer
 from scene_client.vision_msgs import SceneFields
 from tests.deploy.ros import load_package
 from tests.services import LiveService
@@ -90,6 +91,35 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
         )
         assert settle(plant(condition)) is expected
         assert condition.feedback_message.startswith("toilet_1: an outlier with probability 0.")
+
+
+@pytest.mark.parametrize(
+    ("thing", "moved", "is_misplaced", "message"),
+    [
+        ("pillow_1", "pillow_1", True, "pillow_1: in the wrong place, pillow_1 on-top floor"),
+        ("pillow", "pillow_1", True, "pillow_1: in the wrong place, pillow_1 on-top floor"),
+        ("pillow_1", "bed", True, None),
+        ("pillow_1", None, False, None),
+    ],
+)
+def test_a_thing_in_the_wrong_place_does_not_belong(
+    behaviours: Any, plant: Plant, thing: str, moved: str | None, is_misplaced: bool, message: Any
+) -> None:
+    outlier = {"probability": 0.01, "log_odds": 2.0, "is_outlier": False}
+    place = {"subject": "pillow_1", "relation": "on-top", "object": "floor", "probability": 0.9}
+    answer = OutliersAnswer.model_validate(
+        {
+            "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
+            "request_id": "r",
+            "outliers": [outlier | {"object": "pillow_1", "label": "pillow"}],
+            "misplaced": [place | {"is_misplaced": is_misplaced, "moved": moved}],
+        }
+    )
+    client = SimpleNamespace(outliers=lambda **fields: answer)
+    condition = behaviours.ObjectBelongs("belongs", client, lambda: {"objects": ["bed"]}, thing)
+    assert settle(plant(condition)) is (Status.FAILURE if message else Status.SUCCESS)
+    likely = "pillow_1: an outlier with probability 0.01"
+    assert condition.feedback_message == (message or likely)
 
 
 LAMP = {"candidates": ["lamp"], "at": {"relation": "on-top", "object": "desk"}, "log_odds": -1e3}

@@ -279,17 +279,21 @@ def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyP
     offset = {"mean": {"x": 0.1, "y": -0.2, "z": 0.5}, "std": {"x": 0.2, "y": 0.0, "z": 9.0}}
     nowhere = {"relation": "front", "object": "c"}
     there = {"relation": "on-top", "object": "d"}
+    inside = {"relation": "inside", "object": "d", "offset": None}
     missing = [
+        {"label": "milk", "placements": []},
         {"label": "lamp", "placements": [nowhere, there | {"offset": offset}]},
         {"label": "bed", "placements": [nowhere]},
         {"label": "cup", "placements": [there]},
-        {"label": "pen", "placements": [there]},
+        {"label": "pen", "placements": [inside]},
+        {"label": "book", "placements": [there]},
     ]
-    lamp, cup = ghosts(advisor.Advice(fields, {"missing": {"missing": missing}}), 2)
+    lamp, cup, pen = ghosts(advisor.Advice(fields, {"missing": {"missing": missing}}), 3)
     assert lamp.text == "lamp? on-top desk"
     assert lamp.position == pytest.approx((1.1, 1.8, 0.9))
     assert lamp.extent == (0.4, 0.05, 1.5)
     assert (cup.text, cup.position, cup.extent) == ("cup? on-top desk", (1.0, 2.0, 0.4), None)
+    assert (pen.text, pen.position, pen.extent) == ("pen? inside desk", (1.0, 2.0, 0.4), None)
 
 
 @pytest.mark.parametrize("questions", [[], ["weather"], ["missing", "generate"]])

@@ -153,7 +153,7 @@ export function createActions(store, say, menu) {
     if (store.get().draft) return;
     const box = opener.getBoundingClientRect();
     const at = pointer ?? { left: box.left + Math.min(box.width, 40), top: box.bottom };
-    const asks = ['on-top', 'under', 'left', 'right', 'front', 'behind'];
+    const asks = ['on-top', 'inside', 'under', 'left', 'right', 'front', 'behind'];
     select(id);
     openMenu(menu, opener, at, [
       ...asks.map((relation) => [`What is missing ${SPOKEN[relation]} it?`, () => ask(relation, id)]),

@@ -3,7 +3,7 @@
 import { curl, python } from './calls.js';
 import { bar, copy, el, redraw } from './dom.js';
 import { wrongIn } from './edges.js';
-import { accept, ghostsOf, likely } from './ghosts.js';
+import { accept, ghostsOf, likely, SHIFTED } from './ghosts.js';
 import { common, inWords, QUESTIONS, reading, whyNot } from './questions.js';
 import { changed } from './store.js';
 import { namesOf, percent, SPOKEN } from './words.js';
@@ -52,6 +52,7 @@ const ROWS = {
       if (ghost && placements.indexOf(ghost.placement) >= PLACES) first.splice(-1, 1, ghost.placement);
       const places = first.map((one) => `${SPOKEN[one.relation]} ${name(one.object)} ${percent(one.probability)}`);
       if (places.length && !ghost && column === state.shown) places.push('no free place on the board');
+      if (ghost?.shifted) places.push(SHIFTED);
       const button = ghost && el('button', {
         type: 'button', class: 'icon', 'data-key': `add-${label}`,
         'aria-label': `Put ${label} ${SPOKEN[ghost.placement.relation]} ${name(ghost.placement.object)}`,
@@ -76,7 +77,8 @@ const ROWS = {
       }, name(one.object)), one.probability, one.is_outlier ? { kind: 'alarm', words: 'does not belong' } : {},
       reasons(one.because, name, one.usually_with)));
     const misplaced = wrongIn(answer).misplaced.map((one) =>
-      row('outliers', el('b', {}, spoken(one, name)), one.probability, { kind: 'alarm', words: 'in the wrong place' }));
+      row('outliers', el('b', {}, spoken(one, name)), one.probability, { kind: 'alarm', words: 'in the wrong place' },
+        one.moved == null ? null : el('p', { class: 'quiet' }, `moved: ${name(one.moved)}`)));
     const stated = state.posed || state.relations.length;
     const alarms = wrongIn(answer).outliers.length; // the first ones, because the least fitting objects come first
     return [
@@ -94,7 +96,8 @@ const ROWS = {
         el('p', {}, `expected: ${SPOKEN[one.expected]}, ${percent(one.probability)}`))),
     ...relations.map((one) =>
       row('relations', el('b', {}, spoken(one, name)), one.probability,
-        one.observed ? { kind: 'holds', words: 'observed' } : { kind: 'expected' })),
+        one.observed ? { kind: 'holds', words: 'observed' } : { kind: 'expected' },
+        one.expected == null ? null : el('p', { class: 'quiet' }, `expected: ${percent(one.expected)}`))),
   ],
 };
 

@@ -76,22 +76,26 @@ export function floorUnder(boxes, box) {
   return height;
 }
 
-/** The ids of all objects that rest on a box, directly or on each other. */
+/** Whether a box lies inside another box. */
+function contained(box, other) {
+  return inside(box, other) && box.z >= other.z - NEAR && box.z + box.size.z <= other.z + other.size.z + NEAR;
+}
+
+/** The ids of all objects that rest on a box or lie inside it, directly or on each other. */
 function riders(boxes, box, found = new Set()) {
   for (const other of boxes) {
-    const rests = Math.abs(other.z - (box.z + box.size.z)) < NEAR;
-    if (other.id !== box.id && !found.has(other.id) && rests && area(other) < area(box)) {
-      if (covers(box, other.x, other.y)) {
-        found.add(other.id);
-        riders(boxes, other, found);
-      }
+    if (other.id === box.id || found.has(other.id) || area(other) >= area(box)) continue;
+    const rests = Math.abs(other.z - (box.z + box.size.z)) < NEAR && covers(box, other.x, other.y);
+    if (rests || contained(other, box)) {
+      found.add(other.id);
+      riders(boxes, other, found);
     }
   }
   return found;
 }
 
 /**
- * The objects after one of them was moved. Objects on top of it move along, and it gets a new support.
+ * The objects after one of them was moved. Objects on it and in it move along, and it gets a new support.
  * @param {Thing[]} things
  * @param {(thing: Thing) => Thing & {size: import('./store.js').Extents}} sized
  */

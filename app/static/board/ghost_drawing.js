@@ -2,13 +2,14 @@
 
 import { UNKNOWN_SIZE } from './geometry.js';
 import { labelPlaces, widthOf } from './labels.js';
+import { SHIFTED } from './ghosts.js';
 import { onScreen, ROUND } from './view.js';
 import { namesOf, percent, SPOKEN } from './words.js';
 
 const FONT = '500 12px system-ui, sans-serif';
 
-const spokenGhost = ({ label, probability, placement }, name) =>
-  `${label}, ${percent(probability)}, ${SPOKEN[placement.relation]} ${name(placement.object)}`;
+const spokenGhost = ({ label, probability, placement, shifted }, name) =>
+  `${label}, ${percent(probability)}, ${SPOKEN[placement.relation]} ${name(placement.object)}${shifted ? `, ${SHIFTED}` : ''}`;
 
 export function drawGhosts(layer, ghosts, boxes, view, places, take) {
   const name = namesOf(boxes);

@@ -8,12 +8,17 @@ import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
 const DIRECTION = { left: [0, 1], right: [0, -1], front: [-1, 0], behind: [1, 0] };
 const ABOVE = ['on-top', 'above'];
 const BENEATH = ['under', 'below'];
+const HOLDING = ['inside', 'contains'];
 /** Distances in metres by the service's rules: minimum gap of "above", maximum gap of neighbours (nearly). */
 const CLEAR = 0.1;
 const NEIGHBOURS = 0.9;
 const THIN = 0.03;
-const OVERHANG = 1.25;
+const OVERHANG = 1.25; // share of the support's extent that a footprint on it may have
+const HIGHEST = 1.2; // share of the container's height that contents may have, by the service's rule
+/** The part of half a suggestion that stays over the anchor at its learnt offset. */
+const HELD = 0.6;
 const GAP = 0.15; // metres between neighbours without a learnt offset
+const EXACT = 0.01; // metres; a ghost this near to its learnt offset stands there
 const MARGINS = [0.3, 0.05]; // metres that stay free between two ghosts, preferred first
 /** Suggestions may overlap lower and higher boxes, such as floors, rugs and ceilings. */
 const FLOOR = 0.1;
@@ -30,8 +35,12 @@ const PARTS = Array.from({ length: 17 }, (_, index) => index / 8 - 1); // candid
  * @property {number} x
  * @property {number} y
  * @property {number} z of its bottom
+ * @property {boolean} shifted whether it stands elsewhere than the offset of the answer says
  * @property {import('./store.js').Extents} size
  */
+
+/** Says that a ghost stands elsewhere than the answer says. */
+export const SHIFTED = 'drawn at the nearest free place';
 
 let last = { keys: [], ghosts: [] };
 
@@ -64,7 +73,8 @@ export function likely({ missing: { answer: { missing } }, outliers }, at) {
 
 /**
  * Missing objects at the first of their placements with free space, or at the place `at` of the question.
- * A ghost overlaps neither the robot nor another ghost nor a box, except those it stands on or under.
+ * A ghost stands at the offset of the answer, else at the free place nearest to it. It overlaps neither the
+ * robot nor another ghost nor a box, except those it stands on, under or in, or contains.
  * Missing objects without a free place have no ghost.
  * @returns {Ghost[]}
  */
@@ -86,43 +96,62 @@ export function standing(missing, boxes, viewer, sizes, at = null) {
   return ghosts;
 }
 
-/** The free place nearest to the learnt offset where the relation to the anchor holds, or undefined. */
+/** The place nearest to the learnt offset that is free and where the relation to the anchor holds, or undefined. */
 function freeAt(anchor, { relation, offset }, size, viewer, boxes, ghosts) {
-  // An object stands only on a larger one, and "under" and "below" need free height below the anchor.
-  if (relation === 'on-top' && !fits(size, anchor)) return undefined;
-  if (BENEATH.includes(relation) && anchor.z + THIN < size.z) return undefined;
+  const own = { size, yaw: 0 };
+  if (!hasRoom(anchor, relation, own)) return undefined;
   const learnt = offset && { x: anchor.x + offset.mean.x, y: anchor.y + offset.mean.y };
   const centre = offset && anchor.z + anchor.size.z / 2 + offset.mean.z;
-  const z = height(anchor, relation, size, offset ? Math.max(0, centre - size.z / 2) : null);
   const vertical = !DIRECTION[relation];
   const others = boxes.filter((box) => box !== anchor);
   const near = others.filter((box) => overlap(box, anchor));
   const supports = near.filter((box) => box.z + box.size.z <= anchor.z + THIN);
   const carried = near.filter((box) => box.z >= anchor.z + anchor.size.z - THIN);
+  const ground = Math.max(0, ...supports.map((box) => box.z + box.size.z));
+  const z = height(anchor, relation, size, offset ? Math.max(0, centre - size.z / 2) : null, ground);
   // An object on the anchor is also above its supports, and one below the anchor is also below its load.
-  const passed = ABOVE.includes(relation) ? supports : BENEATH.includes(relation) ? carried : [];
+  const passed = [
+    ...(ABOVE.includes(relation) || HOLDING.includes(relation) ? supports : []),
+    ...(BENEATH.includes(relation) || HOLDING.includes(relation) ? carried : []),
+  ];
   const obstacles = [...others.filter((box) => !passed.includes(box)), ...(vertical ? [] : [anchor])]
     .filter((box) => box.z + box.size.z > FLOOR && box.z < CEILING);
   const places = (vertical ? over(anchor, relation, size, learnt) : beside(anchor, relation, size, viewer, learnt))
-    .map(([x, y]) => ({ x: round(x), y: round(y), size, yaw: 0 }));
+    .map(([x, y]) => ({ x: round(x), y: round(y), ...own }));
   // An object beside the anchor may stand on the anchor's support.
   const supportOf = (place) => (vertical ? undefined : supports.find((box) => inside(place, box)));
   const free = places.filter((place) => {
     const support = supportOf(place);
     return obstacles.every((box) => box === support || !overlap(place, box));
   });
-  for (const margin of MARGINS) {
-    const place = free.find((one) => !ghosts.some((ghost) => overlap(wider(one, margin), ghost)));
-    const support = place && supportOf(place);
-    if (place) return { x: place.x, y: place.y, z: round(support ? support.z + support.size.z : z) };
-  }
-  return undefined;
+  const isLearnt = ({ x, y }) => learnt && Math.hypot(x - learnt.x, y - learnt.y) < EXACT;
+  const clear = (margin) => (one) => !ghosts.some((ghost) => overlap(wider(one, margin), ghost));
+  const place = free.filter(isLearnt).find(clear(0)) ?? MARGINS.map((margin) => free.find(clear(margin))).find(Boolean);
+  if (!place) return undefined;
+  const support = supportOf(place);
+  const bottom = round(support ? support.z + support.size.z : z);
+  return { x: place.x, y: place.y, z: bottom, shifted: Boolean(learnt) && !isLearnt(place) };
 }
 
-/** Whether an object can stand on the anchor, with an overhang of at most a quarter. */
-function fits(size, anchor) {
-  const half = halves({ size, yaw: -anchor.yaw });
-  return half.x <= OVERHANG * (anchor.size.x / 2) && half.y <= OVERHANG * (anchor.size.y / 2);
+/** Whether the sizes of the anchor and of a suggestion allow the relation. */
+function hasRoom(anchor, relation, own) {
+  const beneath = anchor.z + THIN >= own.size.z; // free height below the anchor
+  const holds = (box, other) => fits(box, other, 1) && box.size.z <= HIGHEST * other.size.z;
+  const rooms = {
+    'on-top': () => fits(own, anchor, OVERHANG),
+    inside: () => holds(own, anchor),
+    contains: () => holds(anchor, own),
+    // A lower object stands between the legs of the anchor.
+    under: () => beneath || (fits(own, anchor, 1) && own.size.z < anchor.size.z),
+    below: () => beneath,
+  };
+  return rooms[relation]?.() ?? true;
+}
+
+/** Whether the extents of a footprint are at most this share of those of another one. */
+function fits(box, other, share) {
+  const half = halves({ size: box.size, yaw: box.yaw - other.yaw });
+  return half.x <= share * (other.size.x / 2) && half.y <= share * (other.size.y / 2);
 }
 
 const wider = (box, by) => ({ ...box, size: { ...box.size, x: box.size.x + 2 * by, y: box.size.y + 2 * by } });
@@ -134,27 +163,31 @@ function turned(viewer, ahead, left) {
 }
 const within = ({ yaw }, x, y) => turned({ yaw: -yaw }, x, y);
 
-/** The height of the bottom of a suggestion; at least 0, the floor. */
-function height(anchor, relation, size, learnt) {
+/** The height of the bottom of a suggestion. `ground` is the height of the anchor's support, or 0, the floor. */
+function height(anchor, relation, size, learnt, ground) {
   const top = anchor.z + anchor.size.z;
   const heights = {
     'on-top': () => top,
     above: () => Math.max(top + CLEAR, learnt ?? top + 0.3),
-    under: () => Math.max(0, anchor.z - size.z),
+    under: () => (anchor.z + THIN >= size.z ? Math.max(0, anchor.z - size.z) : anchor.z),
     below: () => Math.max(0, Math.min(learnt ?? 0, anchor.z - CLEAR - size.z)),
+    inside: () => Math.min(Math.max(learnt ?? anchor.z, anchor.z), Math.max(anchor.z, top - Math.max(size.z, CLEAR))),
+    contains: () => Math.min(Math.max(learnt ?? ground, ground, top - size.z), anchor.z),
   };
   return heights[relation]?.() ?? learnt ?? 0;
 }
 
-/** Places on, above or below the anchor, with overlapping footprints; nearest to the learnt offset first. */
+/** Places with footprints that overlap the anchor's; nearest to the learnt offset first. */
 function over(anchor, relation, size, learnt) {
   const half = halves({ size, yaw: -anchor.yaw });
   const room = (axis) => anchor.size[axis] / 2 - half[axis];
-  // An object below may be larger: its footprint then contains that of the anchor.
-  const limit = (axis) => (ABOVE.includes(relation) ? Math.max(0, room(axis)) : Math.abs(room(axis)));
+  // An object below may be larger: its footprint then contains that of the anchor, as that of a container does.
+  const around = [...BENEATH, 'contains'].includes(relation);
+  const limit = (axis) => (around ? Math.abs(room(axis)) : Math.max(0, room(axis)));
+  const held = (axis) => (ABOVE.includes(relation) ? Math.max(limit(axis), anchor.size[axis] / 2 - HELD * half[axis]) : limit(axis));
   const along = { yaw: (anchor.yaw * Math.PI) / 180 };
   const [x, y] = learnt ? within(along, learnt.x - anchor.x, learnt.y - anchor.y) : [0, 0];
-  const begin = [clamp(x, limit('x')), clamp(y, limit('y'))];
+  const begin = [clamp(x, held('x')), clamp(y, held('y'))];
   const all = [begin];
   for (const p of PARTS) for (const q of PARTS) all.push([p * limit('x'), q * limit('y')]);
   return nearest(all, begin).map(([p, q]) => {
@@ -172,17 +205,19 @@ function beside(anchor, relation, size, viewer, learnt) {
   const touching = half[axis] + own[axis];
   const flush = half[other] + own[other];
   const [p, q] = learnt ? within(viewer, learnt.x - anchor.x, learnt.y - anchor.y) : [0, 0];
-  const out = p * ahead + q * left;
-  const aside = clamp(ahead ? q : p, flush);
+  const [out, by] = [p * ahead + q * left, ahead ? q : p];
+  const aside = clamp(by, flush);
   const least = Math.max(touching + (learnt ? THIN : GAP), CLEAR + THIN);
   const furthest = Math.max(least, touching + NEIGHBOURS);
   const begin = [Math.min(Math.max(out, least), furthest), aside];
   const all = [begin];
+  if (learnt && out >= CLEAR) all.push([out, by]);
   for (let more = 0; more <= furthest - least; more += 0.15) {
-    for (let by = -1.5; by <= 1.5; by += 0.15) all.push([least + more, aside + by]);
+    for (let step = -1.5; step <= 1.5; step += 0.15) all.push([least + more, aside + step]);
   }
-  return nearest(all.map(([far, by]) => [far, clamp(by, far - THIN)]), begin).map(([far, by]) => {
-    const [dx, dy] = ahead ? turned(viewer, ahead * far, by) : turned(viewer, by, left * far);
+  const wanted = learnt ? [out, by] : begin;
+  return nearest(all.map(([far, along]) => [far, clamp(along, far - THIN)]), wanted).map(([far, along]) => {
+    const [dx, dy] = ahead ? turned(viewer, ahead * far, along) : turned(viewer, along, left * far);
     return [anchor.x + dx, anchor.y + dy];
   }).filter(([x, y]) => gap({ x, y, size, yaw: 0 }, anchor) <= NEIGHBOURS);
 }

@@ -9,6 +9,7 @@ const GAP = 0.12; // metres
 const CANONICAL = {
   left: ['left', false], right: ['left', true], front: ['front', false], behind: ['front', true],
   'on-top': ['on-top', false], under: ['on-top', true], above: ['above', false], below: ['above', true],
+  inside: ['inside', false], contains: ['inside', true],
 };
 
 function canonical(relations) {
@@ -18,14 +19,14 @@ function canonical(relations) {
   });
 }
 
-/** The support of each object: the first one stated, unless this would make a cycle. */
+/** The support or container of each object, and its relation: the first one stated, unless this would make a cycle. */
 function supports(triples, movable) {
   const on = new Map();
   for (const [subject, name, object] of triples) {
-    if (!['on-top', 'above'].includes(name) || on.has(subject) || !movable.has(subject)) continue;
+    if (!['on-top', 'above', 'inside'].includes(name) || on.has(subject) || !movable.has(subject)) continue;
     let below = object;
-    while (below !== undefined && below !== subject) below = on.get(below);
-    if (below === undefined && subject !== object) on.set(subject, object);
+    while (below !== undefined && below !== subject) below = on.get(below)?.object;
+    if (below === undefined && subject !== object) on.set(subject, { object, name });
   }
   return on;
 }
@@ -100,22 +101,24 @@ export function layOut(fixed, free, relations, viewer) {
   return free.map((box) => placed.get(box.id));
 }
 
-/** Puts boxes on their supports, side by side. */
+/** Puts boxes on their supports and into their containers, side by side. */
 function stack(boxes, on, placed, middle) {
   const count = new Map();
   let waiting = boxes;
   while (waiting.length) {
-    const ready = waiting.filter((box) => placed.has(on.get(box.id)));
+    const ready = waiting.filter((box) => placed.has(on.get(box.id).object));
     // If the support is not on the board, the floor replaces it.
     for (const box of ready.length ? ready : waiting) {
-      const below = placed.get(on.get(box.id)) ?? { ...middle, z: 0, yaw: 0, size: { x: 1, y: 1, z: 0 } };
-      const number = count.get(on.get(box.id)) ?? 0;
-      count.set(on.get(box.id), number + 1);
-      const half = halves(below);
-      const reach = number ? 0.65 : 0;
-      const x = round(below.x + half.x * reach * Math.sin(2.4 * number));
-      const y = round(below.y + half.y * reach * Math.cos(2.4 * number));
-      placed.set(box.id, { ...box, x, y, z: round(below.z + below.size.z) });
+      const { object, name } = on.get(box.id);
+      const below = placed.get(object) ?? { ...middle, z: 0, yaw: 0, size: { x: 1, y: 1, z: 0 } };
+      const number = count.get(object) ?? 0;
+      count.set(object, number + 1);
+      const [half, own] = [halves(below), halves(box)];
+      // Contents stay within the footprint of their container.
+      const room = (axis) => Math.min(0.65 * half[axis], name === 'inside' ? Math.max(0, half[axis] - own[axis]) : Infinity);
+      const [x, y] = number ? [room('x') * Math.sin(2.4 * number), room('y') * Math.cos(2.4 * number)] : [0, 0];
+      const z = name === 'inside' ? below.z : below.z + below.size.z;
+      placed.set(box.id, { ...box, x: round(below.x + x), y: round(below.y + y), z: round(z) });
     }
     waiting = ready.length ? waiting.filter((box) => !placed.has(box.id)) : [];
   }

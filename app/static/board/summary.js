@@ -22,7 +22,8 @@ export function summary(state) {
   const { outliers, misplaced } = wrongIn(own.outliers.answer);
   if (outliers.length) parts.push(`Does not belong here: ${outliers.map((one) => name(one.object)).join(', ')}.`);
   if (misplaced.length) {
-    const places = misplaced.map((one) => `${name(one.subject)} ${SPOKEN[one.relation]} ${name(one.object)}`);
+    const places = misplaced.map(({ subject, relation, object, moved }) =>
+      `${name(subject)} ${SPOKEN[relation]} ${name(object)}${moved == null ? '' : ` (moved: ${name(moved)})`}`);
     const rest = places.length > MOST_SAID ? ` and ${places.length - MOST_SAID} more` : '';
     parts.push(`In the wrong place: ${places.slice(0, MOST_SAID).join(', ')}${rest}.`);
   }

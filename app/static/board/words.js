@@ -53,6 +53,8 @@ export const SPOKEN = {
   under: 'under',
   above: 'above',
   below: 'below',
+  inside: 'in',
+  contains: 'containing',
 };
 
 export const percent = (probability) =>

@@ -222,7 +222,10 @@ def relations(
         float | None, typer.Option(help="Leave out relations with a lower probability.")
     ] = None,
     include_opposites: Annotated[
-        bool, typer.Option("--include-opposites", help="Also list right, behind, under and below.")
+        bool,
+        typer.Option(
+            "--include-opposites", help="Also list right, behind, under, below and contains."
+        ),
     ] = False,
     unknown_labels: Unknown = None,
     label_map: LabelMap = None,

@@ -1,8 +1,8 @@
 """Relations of two boxes in an image: left, right, above and below, as the camera sees the boxes.
 
 Training on images uses the same rule as the conversion of detections without depth. Without depth,
-the relations front and on-top are unknown. An object that is *above* another object in the image
-may be farther away on the floor.
+the relations front, on-top and inside are unknown. An object that is *above* another object in the
+image may be farther away on the floor.
 
 Lengths in an image are not in metres, so the unit of length is the mean diagonal of the two boxes.
 Two boxes are neighbours if the gap between the boxes is at most one unit. The larger of the

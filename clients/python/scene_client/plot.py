@@ -1,7 +1,8 @@
-"""Pictures of generated scenes. A picture shows objects as boxes that never overlap.
+"""Pictures of generated scenes. A picture shows objects as boxes.
 
 A picture shows the scene from the view of the robot. Objects on the left of the scene are on the
-left, near objects are at the bottom, and a supported object is above its support. If relations
+left, near objects are at the bottom, and a supported object is above its support. The box of an
+object inside another object is inside its box. All other boxes are separate. If relations
 contradict each other, the earlier relation of the answer decides. The module needs matplotlib,
 which is in the dependency group `training`.
 """
@@ -23,8 +24,10 @@ from scene_client.schemas import GenerateAnswer, GeneratedScene, Relation
 HEIGHT: Final = 1.0
 GAP: Final = 0.6
 """Gap between neighbouring boxes, in the unit of `HEIGHT`, the height of a box."""
+_WALL: Final = 0.2  # gap between a container and its contents
 
-# Colour and line style of each relation. The relation on-top has no line, because its boxes touch.
+# Colour and line style of each relation. The relations on-top and inside have no lines, because
+# their boxes touch.
 _STYLES: Final = {
     "left": ("#1f5fa8", "-"),
     "front": ("#b34700", "--"),
@@ -80,7 +83,8 @@ def _draw(axes: Axes, scene: GeneratedScene, boxes: list[Box]) -> None:
                 zorder=2,
             )
         )
-        middle = (box.x + box.width / 2, box.y + box.height / 2)
+        # The label of a container is above its contents.
+        middle = (box.x + box.width / 2, box.y + box.height - HEIGHT / 2)
         # In matplotlib, an unescaped dollar sign starts a formula.
         text = box.label.replace("$", r"\$")
         axes.text(*middle, text, ha="center", va="center", fontsize=_POINTS, zorder=3)
@@ -120,7 +124,13 @@ def _draw_line(axes: Axes, subject: Box, object: Box, relation: str) -> None:
 
 # Maps a relation to its opposite. The picture shows only the opposite, with subject and object
 # exchanged.
-_OPPOSITES: Final = {"right": "left", "behind": "front", "under": "on-top", "below": "above"}
+_OPPOSITES: Final = {
+    "right": "left",
+    "behind": "front",
+    "under": "on-top",
+    "below": "above",
+    "contains": "inside",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,13 +221,13 @@ def _canonical(relation: Relation) -> tuple[str, str, str]:
 
 
 def _supporters(triples: Sequence[tuple[str, str, str]]) -> dict[str, tuple[str, str]]:
-    """Return the lower object and the relation of each object with a relation on-top or above.
+    """Return the lower or containing object of each object inside, on or above another, and how.
 
-    The keys of the dictionary are the upper objects. The function ignores a relation that would
-    close a cycle.
+    The keys of the dictionary are the upper or inner objects. The function ignores a relation that
+    would close a cycle.
     """
     below: dict[str, tuple[str, str]] = {}
-    for vertical in ("on-top", "above"):
+    for vertical in ("inside", "on-top", "above"):
         for subject, relation, object in triples:
             if relation == vertical and subject not in below and _root(object, below) != subject:
                 below[subject] = (object, relation)
@@ -232,16 +242,22 @@ def _root(name: str, below: dict[str, tuple[str, str]]) -> str:
 
 
 def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
-    """Return the boxes of an object at (0, 0) and of all objects that are above this object."""
-    boxes: list[Box] = []
+    """Return the boxes of an object at (0, 0), and of all objects in, on and above this object."""
+    parts = [(how, _pile(other, below)) for other, (at, how) in below.items() if at == name]
+    contents: list[Box] = []
+    inner = 0.0
+    for pile in (pile for how, pile in parts if how == "inside"):
+        contents += _shifted(pile, _WALL + inner, _WALL)
+        inner += extent(pile)[0] + GAP
+    height = HEIGHT + (extent(contents)[1] if contents else 0.0)
+    upper: list[Box] = []
     x = 0.0
-    for other, (supporter, relation) in below.items():
-        if supporter == name:
-            pile = _pile(other, below)
-            boxes += _shifted(pile, x, HEIGHT + (GAP if relation == "above" else 0.0))
+    for how, pile in parts:
+        if how != "inside":
+            upper += _shifted(pile, x, height + (GAP if how == "above" else 0.0))
             x += extent(pile)[0] + GAP
-    width = max(0.2 * len(name) + 0.6, x - GAP)
-    return [Box(name, 0.0, 0.0, width, HEIGHT), *boxes]
+    width = max(0.2 * len(name) + 0.6, x - GAP, inner - GAP + 2 * _WALL)
+    return [Box(name, 0.0, 0.0, width, height), *contents, *upper]
 
 
 def _in_shelves(piles: Sequence[list[Box]]) -> list[Box]:

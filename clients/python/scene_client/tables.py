@@ -30,8 +30,15 @@ A table of answers about one place contains all places.
 
 def relations(answer: schemas.RelationsAnswer) -> RenderableType:
     """Return a table of relations, most probable first, and a table of disagreements."""
-    rows = [(*_relation(entry), "observed" if entry.observed else "") for entry in answer.relations]
-    table = _table("subject", "relation", "object", "probability", "", rows=rows)
+    rows = [
+        (
+            *_relation(entry),
+            "observed" if entry.observed else "",
+            "" if entry.expected is None else _probability_text(entry.expected),
+        )
+        for entry in answer.relations
+    ]
+    table = _table("subject", "relation", "object", "probability", "", "expected", rows=rows)
     disagreements = [
         (
             entry.subject,
@@ -100,10 +107,10 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
     if not answer.misplaced:
         return table
     misplaced_rows = [
-        (*_relation(entry), "misplaced" if entry.is_misplaced else "")
+        (*_relation(entry), "misplaced" if entry.is_misplaced else "", entry.moved or "")
         for entry in answer.misplaced[:MOST_MISPLACED]
     ]
-    columns = ("subject", "relation", "object", "probability of being wrong", "")
+    columns = ("subject", "relation", "object", "probability of being wrong", "", "moved")
     title = "relations as given"
     if len(misplaced_rows) < len(answer.misplaced):
         title += f": the {len(misplaced_rows)} likeliest to be wrong of {len(answer.misplaced)}"

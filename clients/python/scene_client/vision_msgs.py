@@ -135,7 +135,7 @@ def from_detection2d_array(
 ) -> SceneFields:
     """Convert objects without poses. The relation left comes from neighbouring boxes in the image.
 
-    An image does not show depth or support, so the relations front, on-top and above stay
+    An image does not show depth or support, so the relations front, on-top, above and inside stay
     unobserved.
 
     Args:

@@ -18,6 +18,7 @@
 #include <condition_variable>
 #include <mutex>
 #include <optional>
+#include <set>
 #include <string>
 #include <thread>
 #include <utility>
@@ -160,8 +161,10 @@ class SceneComplete : public SceneCondition {
   }
 };
 
-// SUCCESS if an object fits the scene; FAILURE if it is an outlier or is not in the scene. The port
-// `object` is an id or a label. With a label, every object of this label must fit.
+// SUCCESS if an object fits the scene and its place; FAILURE if it is an outlier, was moved to a
+// wrong place, or is not in the scene. The port `object` is an id or a label. With a label, every
+// object of this label must fit. The service judges places only of objects with positions or stated
+// relations.
 class ObjectBelongs : public SceneCondition {
  public:
   ObjectBelongs(const std::string& name, const BT::NodeConfig& config,
@@ -177,15 +180,28 @@ class ObjectBelongs : public SceneCondition {
     std::string named;
     if (!getInput("object", named)) return {false, "no object was named"};
     for (const char* by : {"object", "label"}) {
-      std::string seen, outlier;
+      std::set<std::string> seen;
       for (const auto& thing : answer.at("outliers")) {
         if (thing.at(by) != named) continue;
-        seen = thing.at("object").get<std::string>();
-        if (outlier.empty() && thing.at("is_outlier").get<bool>()) outlier = seen;
+        const auto id = thing.at("object").get<std::string>();
+        if (thing.at("is_outlier").get<bool>()) return {false, id + " is an outlier"};
+        seen.insert(id);
       }
-      if (!outlier.empty()) return {false, outlier + " is an outlier"};
-      if (!seen.empty()) return {true, seen + " belongs"};
+      for (const auto& place : answer.at("misplaced")) {
+        const auto moved = place.find("moved");
+        if (moved == place.end() || !place.value("is_misplaced", false)) continue;
+        if (moved->is_string() && seen.count(moved->get<std::string>()))
+          return {false, moved->get<std::string>() + " is in the wrong place: " + words(place)};
+      }
+      if (!seen.empty()) return {true, *seen.rbegin() + " belongs"};
     }
     return {false, "no " + named + " was seen"};
+  }
+
+ private:
+  static std::string words(const scene::json& relation) {
+    return relation.at("subject").get<std::string>() + " " +
+           relation.at("relation").get<std::string>() + " " +
+           relation.at("object").get<std::string>();
   }
 };

@@ -40,7 +40,16 @@ The validation of a million invalid relations would take seconds.
 UnknownLabels = Literal["error", "ignore", "nearest", "nearest-or-ignore"]
 Detail = Literal["scores", "full"]
 RelationName = Literal[
-    *("left", "right", "front", "behind", "on-top", "under", "above", "below", "inside", "contains")
+    "left",
+    "right",
+    "front",
+    "behind",
+    "on-top",
+    "under",
+    "above",
+    "below",
+    "inside",
+    "contains",
 ]
 
 

@@ -22,7 +22,7 @@ from py_trees.common import Status
 
 from scene_client import ClientError
 from scene_client.ros_fields import MessageError
-from scene_client.schemas import MissingAnswer, OutliersAnswer
+from scene_client.schemas import MisplacedRelation, MissingAnswer, OutliersAnswer
 from scene_reasoning.advisor import Asker
 
 SceneSource = Callable[[], Mapping[str, Any] | None]
@@ -125,7 +125,10 @@ class SceneComplete(SceneCondition):
 
 
 class ObjectBelongs(SceneCondition):
-    """SUCCESS if an object fits the scene; FAILURE if it is an outlier or is not in the scene.
+    """SUCCESS if an object fits the scene and its place.
+
+    FAILURE if the object is an outlier, was moved to a wrong place, or is not in the scene. The
+    service judges places only of objects with positions or stated relations.
 
     Args:
         thing: id or label of the object. With a label, every object of this label must fit.
@@ -148,5 +151,14 @@ class ObjectBelongs(SceneCondition):
         if not named:
             return False, f"no {self.thing} was seen"
         worst = max(named, key=lambda entry: entry.probability)
+        if not worst.is_outlier:
+            ids = {entry.object for entry in named}
+            for place in answer.misplaced:
+                if place.is_misplaced and place.moved in ids:
+                    return False, f"{place.moved}: in the wrong place, {_words(place)}"
         text = f"{worst.object}: an outlier with probability {worst.probability:.2f}"
-        return not any(entry.is_outlier for entry in named), text
+        return not worst.is_outlier, text
+
+
+def _words(relation: MisplacedRelation) -> str:
+    return f"{relation.subject} {relation.relation} {relation.object}"
