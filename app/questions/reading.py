@@ -1,7 +1,7 @@
 """Conversion of a request to a scene with ids, class indices and relations from poses.
 
 The functions collect all errors of a request before they raise an exception. So a client can
-correct all errors at once. A scene with probable mistakes gets warnings.
+correct all errors at once.
 """
 
 from __future__ import annotations
@@ -12,24 +12,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
-from statistics import median
-from typing import Final, Literal
 
 from pydantic_core import to_json
 
 from app.errors import ContradictionError, InvalidRequestError, Location
 from app.questions.names import ErrorList, LookUps, Names, Unknown
-from app.scene.geometry import (
-    LARGEST,
-    MOST_DISTANT,
-    SMALLEST,
-    Viewpoint,
-    body_pose,
-    is_optical,
-    is_world_fixed,
-)
+from app.questions.scene_warnings import scene_warnings
+from app.scene.geometry import Viewpoint, body_pose, is_optical
 from app.scene.relations import CANONICAL, canonicalise
-from app.scene.scene import Point, Scene, SceneObject, observe
+from app.scene.roles import RoleCounts
+from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import (
     Detection,
@@ -102,6 +94,7 @@ def read_scene(
     limits: Limits,
     look_ups: LookUps | None = None,
     *,
+    roles: RoleCounts | None = None,
     profiles: Sequence[str] = (),
     may_be_empty: bool = False,
 ) -> Reading:
@@ -112,6 +105,7 @@ def read_scene(
         limits: limits on the scene.
         look_ups: searches for similar classes, shared by all scenes of a batch. None means that the
             request has only this scene.
+        roles: counts that decide between on-top, under and inside; see `derive_relations`.
         profiles: names of the model's profiles.
         may_be_empty: whether a scene without objects of known classes is valid.
 
@@ -125,7 +119,7 @@ def read_scene(
     reading = Reading(Scene(()), ids, unknown)
     objects: list[SceneObject] = []
     optical = request.frame_id is not None and is_optical(request.frame_id)
-    has_poses = has_detections = False
+    detections: dict[int, Detection] = {}
     for number, entry in enumerate(request.objects):
         label = entry if isinstance(entry, str) else entry.label
         index = vocabulary.index(label)
@@ -141,8 +135,7 @@ def read_scene(
         elif isinstance(entry, str):
             objects.append(SceneObject(ids[number], label, index))
         else:
-            has_detections = True
-            has_poses = has_poses or entry.position is not None
+            detections[len(objects)] = entry
             objects.append(_scene_object(ids[number], entry, index, optical=optical))
     room, room_name = None, request.room_type
     if room_name is not None:
@@ -168,8 +161,13 @@ def read_scene(
             errors.raise_any()
         complete = request.relations_complete
         reading.scene = Scene(reading.scene.objects, triples, complete, room, profile)
-    if has_detections:
-        _derive(request, reading, vocabulary, has_poses=has_poses)
+    if detections:
+        in_frame = reading.scene
+        _derive(request, reading, vocabulary, roles)
+        derived = reading.observed is not None
+        reading.warnings = scene_warnings(
+            in_frame, detections, vocabulary, request, derived=derived
+        )
     return reading
 
 
@@ -195,24 +193,23 @@ def _check_fields(request: SceneRequest, limits: Limits, errors: ErrorList) -> N
 
 
 def _derive(
-    request: SceneRequest, reading: Reading, vocabulary: Vocabulary, *, has_poses: bool
+    request: SceneRequest, reading: Reading, vocabulary: Vocabulary, roles: RoleCounts | None
 ) -> None:
-    """Add to ``reading`` the relations and warnings that follow from the poses of the objects."""
-    stated = reading.scene
-    if has_poses and stated.relations is None:
-        view = request.viewpoint
-        reading.scene = observe(
-            stated,
-            frame_id=request.frame_id,
-            viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
-            typical_sizes=vocabulary.sizes,
-        )
+    """Add to ``reading`` the relations that follow from the poses of the objects."""
+    view = request.viewpoint
+    reading.scene = observe(
+        reading.scene,
+        frame_id=request.frame_id,
+        viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
+        typical_sizes=vocabulary.sizes,
+        roles=roles,
+    )
+    if reading.scene.poses is not None:
         ids = reading.ids
         reading.observed = [
             ObservedRelation(ids[i], CANONICAL[a], ids[j])  # type: ignore[arg-type]
             for a, i, j in reading.scene.relations or ()
         ]
-    reading.warnings = scene_warnings(stated, reading.scene, vocabulary, request)
 
 
 def _ids(entries: Sequence[str | Detection], errors: ErrorList) -> list[str]:
@@ -334,92 +331,3 @@ def _triples(
             errors.add(ContradictionError, location, message)
         triples.setdefault((index, i, j), i != subject)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])
-
-
-# ------------------------------------------------------------------------------------ warnings
-
-_SAME_DEPTH: Final = 1e-3  # maximum difference in m of depths that count as equal
-_LEAST_FLAT: Final = 3  # minimum number of objects for the warning flat-scene
-
-_TOO_FAR: Final = (
-    f"the object is more than {MOST_DISTANT:g} m from the viewer; positions must be in metres"
-)
-_ODD_SIZE: Final = (
-    f"all sides of the object are below {SMALLEST * 1e3:g} mm, so its size is unknown, or a side "
-    f"is above {LARGEST:g} m; sizes must be in metres"
-)
-_FLAT: Final = "all objects have the same depth along the optical axis; the depth may be missing"
-_UNSIZED: Final = (
-    "the service cannot derive vertical relations of this object: the object has no size, and its "
-    "class has no typical size"
-)
-
-Code = Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"]
-
-
-def scene_warnings(
-    stated: Scene, scene: Scene, vocabulary: Vocabulary, request: SceneRequest
-) -> list[SceneWarning]:
-    """Return the warnings about a scene.
-
-    Args:
-        stated: the scene in the request's frame, in axes of REP-103 (x forward, y left, z up).
-        scene: the same scene after `observe`, in the axes of the viewer if the request has a
-            viewpoint.
-        vocabulary: classes of the model, with their typical sizes.
-        request: the request that contains the scene.
-    """
-    # Python loops are fast enough, because most scenes have no poses or pass all checks.
-    placed = [thing for thing in scene.objects if thing.position is not None]
-    odd = [thing for thing in scene.objects if not _is_plausible(thing.size)]
-    is_seen_flat = (
-        request.frame_id is not None and is_optical(request.frame_id) and _is_flat(stated)
-    )
-    has_poses = scene.poses is not None and len(placed) > 1
-    kinds: list[tuple[Code, str, Sequence[SceneObject]]] = [
-        ("implausible-position", _TOO_FAR, _distant(stated, request) if placed else ()),
-        ("implausible-size", _ODD_SIZE, odd),
-        ("flat-scene", _FLAT, placed if is_seen_flat else ()),
-        ("unknown-sizes", _UNSIZED, _unsized(placed, vocabulary) if has_poses else ()),
-    ]
-    return [
-        SceneWarning(code=code, message=message, objects=[thing.id for thing in objects])
-        for code, message, objects in kinds
-        if objects
-    ]
-
-
-def _distant(stated: Scene, request: SceneRequest) -> list[SceneObject]:
-    """Return the objects that are too far from the viewer.
-
-    In a world-fixed frame without a viewpoint, the position of the viewer is unknown. The median
-    position of the objects then replaces the position of the viewer.
-    """
-    placed = [(thing, thing.position) for thing in stated.objects if thing.position is not None]
-    centre: Point = (0.0, 0.0, 0.0)
-    if request.viewpoint is not None:
-        centre = (request.viewpoint.x, request.viewpoint.y, 0.0)
-    elif request.frame_id is not None and is_world_fixed(request.frame_id):
-        xs, ys, zs = zip(*[position for _, position in placed], strict=True)
-        centre = (median(xs), median(ys), median(zs))
-    return [thing for thing, position in placed if math.dist(position, centre) > MOST_DISTANT]
-
-
-def _is_plausible(size: Point | None) -> bool:
-    return size is None or SMALLEST <= max(size) <= LARGEST
-
-
-def _is_flat(stated: Scene) -> bool:
-    """Return whether all objects have the same depth, the distance along the optical axis."""
-    depths = [thing.position[0] for thing in stated.objects if thing.position is not None]
-    return len(depths) >= _LEAST_FLAT and max(depths) - min(depths) <= _SAME_DEPTH
-
-
-def _unsized(placed: Sequence[SceneObject], vocabulary: Vocabulary) -> list[SceneObject]:
-    sizes = vocabulary.sizes
-    return [
-        thing
-        for thing in placed
-        if thing.size is None
-        and (thing.class_index is None or math.isnan(sizes[thing.class_index, 0]))
-    ]

@@ -5,22 +5,41 @@ radians. Boxes are upright. The footprint of a box is the rectangle of its horiz
 rotated by the yaw.
 
 1. *on-top*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
-   bottom of i is within 5 cm of the top of j.
+   bottom of i is within 5 cm of the top of j. If two thin boxes meet this rule in both directions,
+   only the box with the higher centre is on top. If both centres have the same height, neither box
+   is on top.
 2. *above*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
    bottom of i is more than 5 cm above the top of j.
-3. If neither *on-top* nor *above* holds between two neighbours, their centres decide. dx and dy are
-   the differences of the centres. If |dy| is at least |dx|, the box with the larger y is *left* of
-   the other box. If |dx| is larger, the box with the smaller x, nearer to the viewer, is in *front*
-   of the other box. If both |dx| and |dy| are under 10 cm, neither relation holds.
+3. Two boxes reach into each other if two conditions hold. The footprints overlap by at least 30 %
+   of the smaller footprint. The bottom of each box is more than 5 cm below the top of the other.
+   The smaller box is the box with the smaller footprint. If the footprints differ by at most 1 %,
+   it is the box with the smaller volume. The smaller box has one of three roles:
 
-Two boxes are neighbours if their footprints are at most 1 m apart. If the size of a box is unknown,
-the centres must be at most 1.5 m apart in the horizontal plane. If two thin boxes meet rule 1 in
-both directions, only the box with the higher centre is on top. If both centres have the same
-height, neither box is on top.
+   - on the larger box: *on-top*(smaller, larger). The bottom of the smaller box must be at least
+     20 % of the larger height above the bottom of the larger box.
+   - under the larger box: *on-top*(larger, smaller). The bottom of the smaller box must be at
+     most 10 cm, or at most 20 % of the larger height, above the bottom of the larger box.
+   - in the larger box: *inside*(smaller, larger). The smaller box must have at most 1.2 times the
+     larger height.
 
-All relations between two neighbours are observed, whether they hold or not. So if a vertical
-relation (on-top, above) holds, the horizontal relations (left, front) are observed not to hold. If
-the size of a box is unknown, its vertical relations stay unobserved.
+   The counts of `app.scene.roles` choose one of the possible roles, or leave the role undecided.
+   Without counts, without classes, or if the volumes also differ by at most 1 %, the role is
+   undecided.
+4. If rules 1 to 3 do not apply to two neighbours, their centres decide. dx and dy are the
+   differences of the centres. If |dy| is at least |dx|, the box with the larger y is *left* of the
+   other box. If |dx| is larger, the box with the smaller x, nearer to the viewer, is in *front* of
+   the other box. If both |dx| and |dy| are under 10 cm, neither relation holds.
+5. Two boxes are neighbours if their footprints are at most 1 m apart. If the size of a box is
+   unknown, the centres must be at most 1.5 m apart in the horizontal plane.
+6. All relations between two neighbours are observed, whether they hold or not. So if a stacked
+   relation (on-top, above, inside) holds, left and front are observed not to hold.
+7. If a role is undecided, the relations of the possible roles are unobserved. All other relations
+   of the two boxes are observed not to hold. For two boxes of the same size, *on-top* and *inside*
+   are unobserved in both directions.
+8. Boxes that are further apart than neighbours exclude stacked relations: on-top, above and inside
+   are observed not to hold. Left and front are unobserved.
+9. If the size of a box is unknown, its stacked relations are unobserved. A box without height or
+   depth is thin, and its size is known.
 """
 
 from __future__ import annotations
@@ -35,7 +54,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from app.compiling import compiled
 from app.scene.footprints import measure
-from app.scene.relations import ABOVE, CANONICAL, FRONT, LEFT, ON_TOP
+from app.scene.relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP
+from app.scene.roles import IN, ON, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
 
 MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
 CONTACT: Final = 0.05  # maximum distance in metres between bottom and top for *on-top*
@@ -67,7 +87,8 @@ class PoseRelations:
     Attributes:
         holds: (A, n, n) bool. ``holds[a, i, j]`` means that object i has relation a to object j.
         observed: (A, n, n) bool. ``observed[a, i, j]`` means that relation a between objects i and
-            j was observed, whether it holds or not. The array is symmetric in i and j.
+            j was observed, whether it holds or not. The array is symmetric in i and j, except for
+            undecided roles.
     """
 
     holds: NDArray[np.bool_]
@@ -99,7 +120,13 @@ def to_viewer_frame(
 
 
 def derive_relations(
-    positions: Rows, sizes: Rows, yaws: ArrayLike | None = None, *, horizontal: bool = True
+    positions: Rows,
+    sizes: Rows,
+    yaws: ArrayLike | None = None,
+    *,
+    horizontal: bool = True,
+    classes: NDArray[np.int64] | None = None,
+    roles: RoleCounts | None = None,
 ) -> PoseRelations:
     """Derive the relations between n boxes by the rules of this module.
 
@@ -111,9 +138,13 @@ def derive_relations(
         yaws: (n,) rotation of each box about z in radians. None means that all rotations are 0.
         horizontal: whether to derive left and front. False means that the viewer is unknown, so
             that left and front stay unobserved.
+        classes: (n,) index of the class of each box, -1 for an unknown class. None means that all
+            classes are unknown.
+        roles: counts that decide between the roles of rule 3. None leaves all roles undecided.
 
     Raises:
-        ValueError: a shape is wrong, a value is infinite, or a size is negative.
+        ValueError: a shape is wrong, a value is infinite, a size is negative, or the counts lack a
+            class.
     """
     points = _array("positions", positions, (len(positions), 3))
     n = len(points)
@@ -123,10 +154,19 @@ def derive_relations(
         raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
     if np.any(extents < 0):
         raise ValueError("sizes must not be negative")
+    if classes is None or roles is None:
+        classes, roles = np.full(n, -1), _NO_ROLES
+    elif classes.shape != (n,) or classes.max(initial=-1) >= len(roles.anchor):
+        raise ValueError(f"classes must be {n} indices below {len(roles.anchor)}")
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     observed = np.zeros_like(holds)
-    _relate_all(points, extents, turns, horizontal, holds, observed)
+    _relate_all(points, extents, turns, horizontal, classes, roles, holds, observed)
     return PoseRelations(holds, observed)
+
+
+_NO_ROLES: Final = RoleCounts(
+    np.empty(0, np.int64), np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
+)
 
 
 @compiled
@@ -142,8 +182,8 @@ def _are_valid(points, extents, turns):
 
 
 @compiled
-def _relate_all(points, extents, turns, horizontal, holds, observed):
-    """Write the relations of all pairs of neighbours to ``holds`` and ``observed``."""
+def _relate_all(points, extents, turns, horizontal, classes, roles, holds, observed):
+    """Write the relations of all pairs of boxes to ``holds`` and ``observed``."""
     n = len(points)
     has_position, has_size = np.empty(n, np.bool_), np.empty(n, np.bool_)
     radius = np.empty(n)
@@ -167,8 +207,18 @@ def _relate_all(points, extents, turns, horizontal, holds, observed):
                 neighbours, overlap = gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
             else:
                 neighbours = False
-            if neighbours:
-                _relate(points, extents, i, j, have_sizes, overlap, horizontal, holds, observed)
+            # The order of relation indices is left, front, on-top, above, inside.
+            first = LEFT if neighbours and horizontal else ON_TOP
+            last = INSIDE if have_sizes else FRONT
+            for relation in range(first, last + 1):
+                observed[relation, i, j] = observed[relation, j, i] = True
+            if overlap and _stack(points, extents, i, j, classes, roles, holds, observed):
+                continue
+            if neighbours and horizontal:
+                for subject, anchor in ((i, j), (j, i)):
+                    relation = _horizontal(points, subject, anchor)
+                    if relation != _NONE:
+                        holds[relation, subject, anchor] = True
 
 
 @compiled
@@ -177,34 +227,61 @@ def _is_known(row):
 
 
 @compiled
-def _relate(points, extents, i, j, have_sizes, overlap, horizontal, holds, observed):
-    """Set the relations of two neighbours. A vertical relation excludes horizontal relations."""
-    # The order of relation indices is left, front, on-top, above.
-    first, last = LEFT if horizontal else ON_TOP, ABOVE if have_sizes else FRONT
-    for relation in range(first, last + 1):
-        observed[relation, i, j] = observed[relation, j, i] = True
+def _stack(points, extents, i, j, classes, roles, holds, observed):
+    """Set the stacked relations of two boxes by rules 1 to 3. Return whether a rule applies.
+
+    The footprints must overlap.
+    """
     for subject, anchor in ((i, j), (j, i)):
-        relation = _vertical(points, extents, subject, anchor) if overlap else _NONE
+        relation = _vertical(points, extents, subject, anchor)
         if relation != _NONE:
             holds[relation, subject, anchor] = True
-            return
-    if not horizontal:
-        return
-    for subject, anchor in ((i, j), (j, i)):
-        relation = _horizontal(points, subject, anchor)
-        if relation != _NONE:
-            holds[relation, subject, anchor] = True
+            return True
+    if _lift(points, extents, i, j) >= -CONTACT or _lift(points, extents, j, i) >= -CONTACT:
+        return False  # two thin boxes at the same height
+    for smaller, larger in ((i, j), (j, i)):
+        if is_smaller(extents[smaller], extents[larger]):
+            _choose_role(points, extents, smaller, larger, classes, roles, holds, observed)
+            return True
+    for relation in (ON_TOP, INSIDE):
+        observed[relation, i, j] = observed[relation, j, i] = False
+    return True
+
+
+@compiled
+def _choose_role(points, extents, smaller, larger, classes, roles, holds, observed):
+    """Set the relation of a role by rule 3, or leave the relations of possible roles unobserved."""
+    height, larger_height = extents[smaller, 2], extents[larger, 2]
+    rise = points[smaller, 2] - height / 2 - (points[larger, 2] - larger_height / 2)
+    possible = possible_roles(rise, height, larger_height)
+    role = likely_role(roles, classes[smaller], classes[larger], possible)
+    if role == ON:
+        holds[ON_TOP, smaller, larger] = True
+    elif role == UNDER:
+        holds[ON_TOP, larger, smaller] = True
+    elif role == IN:
+        holds[INSIDE, smaller, larger] = True
+    else:
+        observed[ON_TOP, smaller, larger] = not possible[ON]
+        observed[ON_TOP, larger, smaller] = not possible[UNDER]
+        observed[INSIDE, smaller, larger] = not possible[IN]
 
 
 @compiled
 def _vertical(points, extents, i, j):
     """Return the vertical relation of box i to box j. Their footprints must overlap."""
-    lift = (points[i, 2] - extents[i, 2] / 2) - (points[j, 2] + extents[j, 2] / 2)
+    lift = _lift(points, extents, i, j)
     if lift > CONTACT:
         return ABOVE
     if abs(lift) <= CONTACT and points[i, 2] > points[j, 2]:
         return ON_TOP
     return _NONE
+
+
+@compiled
+def _lift(points, extents, i, j):
+    """Return the height in metres of the bottom of box i above the top of box j."""
+    return (points[i, 2] - extents[i, 2] / 2) - (points[j, 2] + extents[j, 2] / 2)
 
 
 @compiled

@@ -1,8 +1,8 @@
 """Roles of two boxes that reach into each other: the smaller is on, under or in the larger.
 
 Boxes are solid, but furniture has legs, backs and doors. So the boxes of a bin under a desk, of a
-pillow on a bed with a headboard, and of milk in a fridge look alike. The roles that such pairs of
-classes have in words and support links decide.
+pillow on a bed with a headboard, and of milk in a fridge look alike. Their heights exclude some
+roles. The roles that such pairs of classes have in words and support links decide.
 """
 
 from __future__ import annotations
@@ -17,6 +17,10 @@ from app.compiling import compiled
 ON, UNDER, IN = 0, 1, 2
 """Roles of the smaller object: on-top of, under, or inside the larger object."""
 
+SAME: Final = 0.01  # footprints or volumes count as equal up to this share of the larger one
+LEAST_RISE: Final = 0.2  # minimum height of an object on the larger, as a share of its height
+MAX_RISE: Final = 0.10  # height in metres above the bottom of the larger that counts as the floor
+MAX_HEIGHT: Final = 1.2  # maximum height of an object in the larger, as a share of its height
 LEAST_SHARE: Final = 0.8  # minimum share of a role among the possible roles of a pair
 # Weight of the roles at the larger class, in counts. They decide for pairs that were never seen.
 _OF_ANCHOR: Final = 2.0
@@ -34,6 +38,35 @@ class RoleCounts(NamedTuple):
     pair: NDArray[np.int64]
     counts: NDArray[np.float32]
     anchor: NDArray[np.float32]
+
+
+@compiled
+def is_smaller(size_i: NDArray[Any], size_j: NDArray[Any]) -> bool:
+    """Return whether box i is smaller than box j, by footprint or else by volume.
+
+    For two boxes of the same size, the result is False in both orders. The sizes (3,) are extents
+    in metres.
+    """
+    a, b = size_i[0] * size_i[1], size_j[0] * size_j[1]
+    if abs(a - b) <= SAME * max(a, b):
+        a, b = a * size_i[2], b * size_j[2]
+    return a < b - SAME * max(a, b)
+
+
+@compiled
+def possible_roles(rise: float, height: float, larger_height: float) -> NDArray[np.bool_]:
+    """Return which roles the heights of two boxes allow, (3,) bool.
+
+    Args:
+        rise: bottom of the smaller box above the bottom of the larger box, in metres.
+        height: height of the smaller box in metres.
+        larger_height: height of the larger box in metres.
+    """
+    possible = np.empty(3, np.bool_)
+    possible[ON] = rise >= LEAST_RISE * larger_height
+    possible[UNDER] = rise <= max(MAX_RISE, LEAST_RISE * larger_height)
+    possible[IN] = height <= MAX_HEIGHT * larger_height
+    return possible
 
 
 @compiled
@@ -64,5 +97,5 @@ def likely_role(
             weight[role] += counts[row, role]
         if not possible[role]:
             weight[role] = 0.0
-    best = np.argmax(weight)
+    best = int(np.argmax(weight))
     return best if weight[best] > 0 and weight[best] >= LEAST_SHARE * weight.sum() else -1

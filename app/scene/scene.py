@@ -28,6 +28,7 @@ from app.scene.geometry import (
     to_viewer_frame,
 )
 from app.scene.relations import CANONICAL, contradiction
+from app.scene.roles import RoleCounts
 
 A = len(CANONICAL)
 Indices = NDArray[np.int64]
@@ -95,6 +96,8 @@ class Scene:
             not to hold, and replace ``relations`` as evidence. ``relations`` must list the derived
             relations that hold, but the class does not check this condition. None means that no
             relations were derived from poses.
+        excluded: (A, n, n) bool, True for relations that the poses of the objects exclude, without
+            the stated relations. None means that no object has a position.
 
     Raises:
         ValueError: two objects have the same id, a triple is invalid, or `relations_complete` is
@@ -108,6 +111,7 @@ class Scene:
     room_type: int | None = None
     profile: int | None = None
     poses: PoseRelations | None = field(default=None, compare=False, repr=False)
+    excluded: NDArray[np.bool_] | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         n = len(self.objects)
@@ -131,10 +135,10 @@ class Scene:
                     f"{CANONICAL[relation]!r} is stated from {first!r} to {second!r} and also from "
                     f"{second!r} to {first!r}, but both cannot hold"
                 )
-        if self.poses is not None and self.poses.holds.shape != (len(CANONICAL), n, n):
-            raise ValueError(
-                f"poses must have the shape {(len(CANONICAL), n, n)}, not {self.poses.holds.shape}"
-            )
+        holds = None if self.poses is None else self.poses.holds
+        for name, array in (("poses", holds), ("excluded", self.excluded)):
+            if array is not None and array.shape != (A, n, n):
+                raise ValueError(f"{name} must have the shape {(A, n, n)}, not {array.shape}")
 
     def _refuse(self, triple: tuple[int, int, int], n: int) -> NoReturn:
         relation, subject, anchor = triple
@@ -168,6 +172,7 @@ def observe(
     frame_id: str | None = None,
     viewpoint: Viewpoint | None = None,
     typical_sizes: NDArray[np.float64] | None = None,
+    roles: RoleCounts | None = None,
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
 
@@ -176,9 +181,10 @@ def observe(
     result lists the relations that hold. The field ``poses`` also contains relations observed not
     to hold.
 
-    The function returns a scene unchanged if the scene states relations or has no positions. In a
+    Stated relations take the place of derived relations. If the scene states relations, the
+    function only sets the field ``excluded``. It returns a scene without positions unchanged. In a
     world-fixed frame (map, odom, world) without a viewpoint, left and front are undefined. The
-    function then derives only on-top and above.
+    function then derives only on-top, above and inside.
 
     Args:
         frame_id: name of the frame of the positions.
@@ -186,18 +192,28 @@ def observe(
             the origin and looks along x.
         typical_sizes: (V, 3) typical extents of each class in metres (`Vocabulary.sizes`). They
             replace missing sizes of objects, and sizes below `SMALLEST`. NaN means an unknown size.
+        roles: counts that decide between on-top, under and inside; see `derive_relations`.
     """
-    if scene.relations is not None or all(thing.position is None for thing in scene.objects):
+    if all(thing.position is None for thing in scene.objects):
         return scene
-    if viewpoint is not None:
-        scene = replace(scene, objects=_in_viewer_frame(scene.objects, viewpoint))
-    positions = np.array([thing.position or _UNKNOWN for thing in scene.objects])
-    sizes = np.array([_extent(thing, typical_sizes) for thing in scene.objects])
-    yaws = np.array([thing.yaw for thing in scene.objects])
+    objects = scene.objects if viewpoint is None else _in_viewer_frame(scene.objects, viewpoint)
     has_no_viewer = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
-    poses = derive_relations(positions, sizes, yaws, horizontal=not has_no_viewer)
+    indices = [-1 if thing.class_index is None else thing.class_index for thing in objects]
+    poses = derive_relations(
+        np.array([thing.position or _UNKNOWN for thing in objects]),
+        np.array([_extent(thing, typical_sizes) for thing in objects]),
+        np.array([thing.yaw for thing in objects]),
+        horizontal=not has_no_viewer,
+        classes=np.array(indices),
+        roles=roles,
+    )
+    excluded = poses.observed & ~poses.holds
+    if scene.relations is not None:
+        for triple in scene.relations:
+            excluded[triple] = False
+        return replace(scene, excluded=excluded)
     triples = tuple(zip(*(ends.tolist() for ends in np.nonzero(poses.holds)), strict=True))
-    return replace(scene, relations=triples, poses=poses)
+    return replace(scene, objects=objects, relations=triples, poses=poses, excluded=excluded)
 
 
 def _in_viewer_frame(

@@ -7,10 +7,13 @@ but the names of the relations. What rounding may decide either way is left unde
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 Point = tuple[float, float]
+
+# The role of a smaller thing at a larger one, of those that are possible: on, under, in, or none.
+Decide = Callable[[int, int, frozenset[str]], str | None]
 
 # Metres, and shares of an area.
 _ROUNDING = 1e-7
@@ -23,6 +26,24 @@ class Box:
     position: Sequence[float] | None
     size: Sequence[float] | None
     yaw: float = 0.0
+    kind: int = -1
+
+    @property
+    def footprint(self) -> float:
+        """Area."""
+        assert self.size is not None
+        return self.size[0] * self.size[1]
+
+    @property
+    def bottom(self) -> float:
+        assert self.position is not None
+        assert self.size is not None
+        return self.position[2] - self.size[2] / 2
+
+    @property
+    def top(self) -> float:
+        assert self.size is not None
+        return self.bottom + self.size[2]
 
     @property
     def corners(self) -> list[Point]:
@@ -43,7 +64,7 @@ class UndecidedError(Exception):
 
 
 def relate(
-    subject: Box, anchor: Box, *, horizontal: bool = True
+    subject: Box, anchor: Box, decide: Decide, *, horizontal: bool = True
 ) -> tuple[frozenset[str], frozenset[str]]:
     """What holds of a pair in this direction, and what is observed of it.
 
@@ -59,16 +80,21 @@ def relate(
         near = not _above(distance_of(subject.corners, anchor.corners), 1.0)
     else:
         near = not _above(math.hypot(dx, dy), 1.5)
-    if not near:
-        return nothing, nothing
+    beside = near and horizontal
     observed = frozenset(
-        (["left", "front"] if horizontal else []) + (["on-top", "above"] if sized else [])
+        (["left", "front"] if beside else []) + (["on-top", "above", "inside"] if sized else [])
     )
     if sized:
         for upper, lower in ((subject, anchor), (anchor, subject)):
             if relation := _vertical(upper, lower):
                 return frozenset([relation] if upper is subject else []), observed
-    if not horizontal:
+        if _overlap(subject, anchor) and all(
+            not _above(upper.bottom - lower.top, -0.05)
+            for upper, lower in ((subject, anchor), (anchor, subject))
+        ):
+            holds, unobserved = _reaching(subject, anchor, decide)
+            return holds, observed - unobserved
+    if not beside:
         return nothing, observed
     if abs(abs(dx) - abs(dy)) <= _ROUNDING and abs(dx) != abs(dy):
         raise UndecidedError
@@ -77,20 +103,47 @@ def relate(
 
 
 def _vertical(upper: Box, lower: Box) -> str | None:
-    assert upper.size is not None
-    assert lower.size is not None
     assert upper.position is not None
     assert lower.position is not None
-    smaller = min(box.size[0] * box.size[1] for box in (upper, lower) if box.size is not None)
-    if not _above(common_area(upper.corners, lower.corners) / smaller, 0.3):
+    if not _overlap(upper, lower):
         return None
-    gap = upper.position[2] - upper.size[2] / 2 - (lower.position[2] + lower.size[2] / 2)
+    gap = upper.bottom - lower.top
     if _above(gap, 0.05):
         return "above"
     # Of two thin things the one with the higher centre lies on the other.
     if _above(gap, -0.05) and upper.position[2] > lower.position[2]:
         return "on-top"
     return None
+
+
+def _overlap(one: Box, other: Box) -> bool:
+    smaller = min(one.footprint, other.footprint)
+    return _above(common_area(one.corners, other.corners) / smaller, 0.3)
+
+
+def _reaching(subject: Box, anchor: Box, decide: Decide) -> tuple[frozenset[str], frozenset[str]]:
+    """What holds in this direction of boxes that reach into each other, and what is unobserved."""
+    nothing: frozenset[str] = frozenset()
+    smaller, larger = sorted((subject, anchor), key=lambda box: box.footprint)
+    if not _above(larger.footprint - smaller.footprint, 0.01 * larger.footprint):
+        volumes = [box.footprint * (box.top - box.bottom) for box in (smaller, larger)]
+        if not _above(max(volumes) - min(volumes), 0.01 * max(volumes)):
+            return nothing, frozenset(["on-top", "inside"])
+        if volumes[0] > volumes[1]:
+            smaller, larger = larger, smaller
+    rise, height = smaller.bottom - larger.bottom, larger.top - larger.bottom
+    fits = {
+        "on": not _above(0.2 * height, rise),
+        "under": not _above(rise, max(0.1, 0.2 * height)),
+        "in": not _above(smaller.top - smaller.bottom, 1.2 * height),
+    }
+    possible = frozenset(role for role, is_possible in fits.items() if is_possible)
+    role = decide(smaller.kind, larger.kind, possible)
+    # The relation of each role, as far as its subject is the subject here.
+    own = {"on": "on-top", "in": "inside"} if smaller is subject else {"under": "on-top"}
+    if role is not None:
+        return frozenset([own[role]] if role in own else []), nothing
+    return nothing, frozenset(own[role] for role in possible if role in own)
 
 
 def _above(value: float, threshold: float) -> bool:

@@ -86,7 +86,7 @@ def test_things_outside_the_vocabulary_are_left_out() -> None:
 
 def test_shapes_are_checked() -> None:
     nothing = np.zeros((A, 2, 2), bool)
-    with pytest.raises(ValueError, match=r"holds must have the shape \(4, 1, 1\)"):
+    with pytest.raises(ValueError, match=rf"holds must have the shape \({A}, 1, 1\)"):
         pool_instances(np.array([0]), np.ones(1), nothing, nothing)
     with pytest.raises(ValueError, match="confidence must have the shape"):
         pool_instances(np.array([0, 1]), np.ones(1), nothing, nothing)

@@ -19,9 +19,9 @@ from scene_client.schemas import RelationName
 relations = st.sampled_from(RELATIONS)
 
 
-def test_the_eight_relations() -> None:
-    assert CANONICAL == ("left", "front", "on-top", "above")
-    assert (*CANONICAL, "right", "behind", "under", "below") == RELATIONS
+def test_the_ten_relations() -> None:
+    assert CANONICAL == ("left", "front", "on-top", "above", "inside")
+    assert (*CANONICAL, "right", "behind", "under", "below", "contains") == RELATIONS
     assert {name: opposite(name) for name in CANONICAL} == OPPOSITES
 
 

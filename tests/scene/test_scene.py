@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from app.scene import PoseRelations, Scene, SceneObject, Viewpoint, observe
-from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP, STACKED
+from tests.scene.role_counts import LABELS, role_counts
 
 DESK = SceneObject("desk", "desk", 0, position=(2.0, 0.0, 0.4), size=(0.8, 1.6, 0.8))
 MONITOR = SceneObject("monitor", "monitor", 1, position=(2.0, 0.2, 1.0), size=(0.1, 0.5, 0.4))
@@ -38,16 +39,17 @@ def test_bad_objects_are_refused(change: dict[str, Any], message: str) -> None:
     ("change", "message"),
     [
         ({"objects": (DESK, DESK)}, "have the same id"),
-        ({"relations": ((4, 0, 1),)}, "a relation index must be from 0 to 3, not 4"),
+        ({"relations": ((5, 0, 1),)}, "a relation index must be from 0 to 4, not 5"),
         ({"relations": ((0, 0, 2),)}, "object index 2"),
         ({"relations": ((0, -1, 1),)}, "object index -1"),
         ({"relations": ((0, 1, 1),)}, "'monitor' has the relation left to itself"),
         ({"relations": ((0, 0, 1), (0, 1, 0))}, "'left' is stated from 'desk' to 'monitor'"),
         ({"relations_complete": True}, "relations is None"),
         (
-            {"poses": PoseRelations(np.zeros((4, 1, 1), bool), np.zeros((4, 1, 1), bool))},
+            {"poses": PoseRelations(np.zeros((5, 1, 1), bool), np.zeros((5, 1, 1), bool))},
             "poses must have the shape",
         ),
+        ({"excluded": np.zeros((4, 2, 2), bool)}, "excluded must have the shape"),
     ],
 )
 def test_bad_scenes_are_refused(change: dict[str, Any], message: str) -> None:
@@ -82,11 +84,36 @@ def test_typical_sizes_take_the_place_of_unknown_ones() -> None:
     assert observe(Scene((DESK, stranger)), typical_sizes=sizes).relations == without.relations
 
 
-def test_given_relations_are_not_overruled() -> None:
-    scene = Scene((DESK, MONITOR), relations=())
-    assert observe(scene) is scene
-    bare = Scene((SceneObject("a", "a", 0), SceneObject("b", "b", 1)))
-    assert observe(bare) is bare
+def test_counts_decide_between_the_roles_of_boxes_that_reach_into_each_other() -> None:
+    bin_ = SceneObject("bin", "bin", LABELS.index("bin"), 1.0, (2.1, 0.4, 0.2), (0.3, 0.3, 0.4))
+    desk = replace(DESK, class_index=LABELS.index("desk"))
+    roles = role_counts({(bin_.class_index or 0, desk.class_index or 0): (0, 9, 0)})
+    assert observe(Scene((desk, bin_)), roles=roles).relations == ((ON_TOP, 0, 1),)
+    assert observe(Scene((desk, bin_))).relations == ()
+    # A label outside the vocabulary has no counts.
+    assert observe(Scene((desk, replace(bin_, class_index=None))), roles=roles).relations == ()
+
+
+def test_stated_relations_are_not_overruled_but_poses_exclude_others() -> None:
+    """The monitor stands on the desk, 20 cm to the left, and the sofa is far away."""
+    sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
+    objects = (DESK, MONITOR, sofa)
+    stated = Scene(objects, relations=((ON_TOP, 2, 0), (LEFT, 1, 0)))
+    seen, derived = observe(stated, viewpoint=Viewpoint(0, 0, 0)), observe(Scene(objects))
+    assert (seen, seen.poses) == (stated, None)
+    assert seen.excluded is not None
+    assert derived.excluded is not None
+    added = derived.excluded ^ seen.excluded
+    assert np.argwhere(added).tolist() == [[LEFT, 1, 0], [ON_TOP, 2, 0]]
+    assert seen.excluded[[*STACKED], 0, 2].all()
+    assert not seen.excluded[ON_TOP, 1, 0]
+    assert not seen.excluded[[LEFT, FRONT], 2, 0].any()
+
+
+def test_scenes_without_poses_stay_as_they_are() -> None:
+    for relations in (None, ((LEFT, 0, 1),)):
+        bare = Scene((SceneObject("a", "a", 0), SceneObject("b", "b", 1)), relations)
+        assert observe(bare) is bare
 
 
 def test_things_without_a_position_stay_unobserved() -> None:

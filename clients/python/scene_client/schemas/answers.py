@@ -112,11 +112,21 @@ class SceneWarning(Reply):
 
     code: Annotated[
         Literal[
-            "implausible-position", "implausible-size", "flat-scene", "unknown-sizes", "not-judged"
+            "implausible-position",
+            "implausible-size",
+            "implausible-scale",
+            "y-axis-up",
+            "rolled-objects",
+            "flat-scene",
+            "unknown-sizes",
+            "not-judged",
         ],
         Field(
             description="implausible-position: an object is more than 100 m from the viewer. "
             "implausible-size: all sides of an object are below 1 mm, or one is above 20 m. "
+            "implausible-scale: the sizes of the objects differ from the typical sizes of their "
+            "classes by a common factor. y-axis-up: the sizes fit only if the y axis points up. "
+            "rolled-objects: furniture lies on its side, but its size fits an upright object. "
             "flat-scene: all objects have the same depth in an optical frame. unknown-sizes: "
             "vertical relations of an object are unobserved, because its size is unknown. "
             "not-judged: the model has too few training scenes to judge objects or relations, and "
