@@ -7,7 +7,7 @@ therefore gets the same questions, whether the evaluation uses one data source o
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple, TypeAlias
 from zlib import crc32
 
@@ -152,13 +152,13 @@ def some_instances(encoded: EncodedScene, structure: Flags, rng: Rng) -> Part:
 
 
 def occupied_place(
-    encoded: EncodedScene, structure: Flags, shown: Flags, rng: Rng
+    encoded: EncodedScene, structure: Flags, shown: Flags, rng: Rng, relations: Collection[int]
 ) -> tuple[int, int] | None:
     """Draw a place that is related to a shown object and contains another object.
 
     The draw ignores whether the object at the place is shown or hidden. If only places of hidden
     objects were drawn, a missing object would seem more likely at every place. `shown` is True for
-    shown objects, (instances,).
+    shown objects, (instances,). The place has one of these canonical `relations`.
 
     Returns:
         The canonical relation of the place, and the index of the shown object, which is the object
@@ -167,6 +167,7 @@ def occupied_place(
     is_thing = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds & annotated_relations(encoded)
     places = np.argwhere((holds & is_thing[:, None] & (is_thing & shown)).any(1))
+    places = places[np.isin(places[:, 0], list(relations))]
     if not len(places):
         return None
     relation, anchor = places[rng.integers(len(places))]

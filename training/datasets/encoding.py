@@ -282,13 +282,14 @@ def _from_lists(
 def _apply_rules(
     relations: PoseRelations, objects: Sequence[AnnotatedObject], meaning: Meaning
 ) -> None:
-    """Apply the data source's rule for unlisted relations to relations derived from positions."""
+    """Apply the data source's rule for unlisted relations to relations derived from positions.
+
+    Boxes with sizes show all their stacked relations, except roles that remain open.
+    """
     located = np.array([thing.position is not None for thing in objects])
-    sized = located & np.array([thing.size is not None for thing in objects])
+    pairs = located[:, None] & located & ~np.eye(len(objects), dtype=np.bool_)
     for relation, unlisted in enumerate(meaning.unlisted):
-        if unlisted == "off":
-            annotated = sized if relation in STACKED else located
-            pairs = annotated[:, None] & annotated & ~np.eye(len(objects), dtype=np.bool_)
+        if unlisted == "off" and relation not in STACKED:
             relations.observed[relation] |= pairs
         elif unlisted == "unobserved":
             relations.observed[relation] &= relations.holds[relation]
@@ -304,7 +305,7 @@ def _from_poses(
     if not scene.viewer_frame:
         viewpoint = room_viewpoint(scene.scene_id, positions)
         positions, yaws = to_viewer_frame(positions, viewpoint, yaws)
-    return derive_relations(positions, sizes, yaws), positions
+    return derive_relations(positions, sizes, yaws, classes=classes, roles=roles), positions
 
 
 def _add_supports(

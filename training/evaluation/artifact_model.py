@@ -14,6 +14,7 @@ from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES, Scene
 from training.datasets.batches import Batch, SceneTensors
 from training.evaluation.asking import (
+    instances_of,
     missing_probabilities,
     missing_score,
     of_classes,
@@ -86,7 +87,7 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
         evidence = batch.holds * batch.observed * given
         for row, classes in enumerate(batch.classes):
             n = int((classes >= 0).sum())
-            scene, first = _instances(classes[:n], batch.counts[row, :n])
+            scene, first = instances_of(classes[:n], batch.counts[row, :n])
             observed = set(map(tuple, evidence[row].nonzero().tolist()))
             # a(x, y) and a(y, x) can both hold between classes, but for different instances.
             last = first + batch.counts[row, :n].clamp(min=1) - 1
@@ -112,7 +113,7 @@ def placed_score(artifact: Artifact) -> PlacedScore:
         rows = []
         for row, v in enumerate(places.v):
             classes = v.nonzero().squeeze(1)
-            scene, first = _instances(classes, places.counts[row, classes])
+            scene, first = instances_of(classes, places.counts[row, classes])
             relation = CANONICAL[int(places.relation[row])]
             anchor = int(first[int((classes == places.anchor[row]).nonzero())])
             # The request names the relation from the missing object to the anchor.
@@ -123,12 +124,6 @@ def placed_score(artifact: Artifact) -> PlacedScore:
         return torch.from_numpy(np.stack(rows)).to(places.v.dtype)
 
     return score
-
-
-def _instances(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
-    """Return a scene with `counts` objects of each class, and the first object index per class."""
-    copies = counts.clamp(min=1).long()
-    return of_classes(classes.repeat_interleave(copies).tolist()), copies.cumsum(0) - copies
 
 
 def floor_model() -> Model:

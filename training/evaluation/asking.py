@@ -99,6 +99,12 @@ def of_classes(classes: Sequence[int]) -> Scene:
     return Scene(tuple(SceneObject(str(k), str(c), c) for k, c in enumerate(classes)))
 
 
+def instances_of(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
+    """Return a scene with `counts` objects of each class, and the first object index per class."""
+    copies = counts.clamp(min=1).long()
+    return of_classes(classes.repeat_interleave(copies).tolist()), copies.cumsum(0) - copies
+
+
 def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
     """Return the scene with one more object, of the class `intruder`."""
     thing = SceneObject("intruder", artifact.vocabulary.labels[intruder], intruder)

@@ -21,17 +21,19 @@ does not return are left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from app.questions import misplaced, missing, outliers, relations
+from app.questions.placements import Place
 from app.registry import NEVER, AlarmLine, AlarmLines, Artifact, Calibration, CountSlope, Slope
-from app.scene import CANONICAL, Scene, canonicalise
+from app.scene import CANONICAL, Scene, Vocabulary, canonicalise
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Ints, Rng
 from training.datasets.batches import SceneTensors
@@ -173,34 +175,63 @@ def collect_missing(artifact: Artifact, scenes: SceneTensors, size: Size, seed: 
     return _items(columns, len(scenes), parts.skipped)
 
 
+class PlaceQuestion(NamedTuple):
+    """A question about the hidden classes at a place of a scene.
+
+    Attributes:
+        placed: (V,) bool, the hidden classes at the place.
+        usable: (V,) bool, the classes without structure that may be asked: neither listed, nor
+            hidden with an unknown relation to the anchor.
+    """
+
+    scene: Scene
+    place: Place
+    placed: Flags
+    usable: Flags
+
+
+def place_question(
+    vocabulary: Vocabulary, encoded: EncodedScene, rng: Rng, relations: Collection[int]
+) -> PlaceQuestion | None:
+    """Draw a part of a scene and a place at one of its objects; None if there is none."""
+    structure = vocabulary.structure
+    hidden = _draw_hidden(structure, encoded, rng)
+    if hidden is None:
+        return None
+    is_hidden = np.isin(encoded.instance_classes, hidden)
+    place = occupied_place(encoded, structure, ~is_hidden, rng, relations)
+    if place is None:
+        return None
+    relation, anchor = place
+    kept = thing_instances(encoded, structure, hidden)
+    placed, unannotated = np.zeros((2, len(structure)), dtype=np.bool_)
+    placed[encoded.instance_classes[encoded.instance_holds[relation, :, anchor] & is_hidden]] = True
+    is_annotated = annotated_relations(encoded)[relation, :, anchor]
+    unannotated[encoded.instance_classes[~is_annotated & is_hidden]] = True
+    usable = ~structure & ~(unannotated & ~placed)
+    usable[encoded.instance_classes[kept]] = False
+    at = Place(relation, kept.index(anchor), outgoing=True)
+    return PlaceQuestion(labels_alone(encoded, kept), at, placed, usable)
+
+
 def ask_placed(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Answered | None:
     """Ask for the hidden classes at one place, which is a relation to an object.
 
     A class is left out if it is unknown whether the class has this relation to the object.
     """
-    hidden = _draw_hidden(artifact, encoded, rng)
-    if hidden is None:
+    question = place_question(artifact.vocabulary, encoded, rng, range(artifact.spec.A))
+    if question is None:
         return None
-    structure = artifact.vocabulary.structure
-    is_hidden = np.isin(encoded.instance_classes, hidden)
-    place = occupied_place(encoded, structure, ~is_hidden, rng)
-    if place is None:
-        return None
-    relation, anchor = place
-    kept = thing_instances(encoded, structure, hidden)
-    labels = np.array(artifact.vocabulary.labels, dtype=object)[encoded.instance_classes]
-    placed = set(labels[encoded.instance_holds[relation, :, anchor] & is_hidden])
-    is_annotated = annotated_relations(encoded)[relation, :, anchor]
-    unannotated = set(labels[~is_annotated & is_hidden]) - placed
-    at = CANONICAL[relation], kept.index(anchor)
-    entries = missing(artifact, labels_alone(encoded, kept), at=at, details=False)["missing"]
-    annotated = [entry for entry in entries if entry["label"] not in unannotated]
-    return [(entry["probability"], entry["label"] in placed) for entry in annotated]
+    scene, place, placed, usable = question
+    at = CANONICAL[place.relation], place.anchor
+    labels = artifact.vocabulary.labels
+    entries = missing(artifact, scene, at=at, details=False)["missing"]
+    answers = [(entry["probability"], labels.index(entry["label"])) for entry in entries]
+    return [(p, bool(placed[index])) for p, index in answers if usable[index]]
 
 
-def _draw_hidden(artifact: Artifact, encoded: EncodedScene, rng: Rng) -> Ints | None:
+def _draw_hidden(structure: Flags, encoded: EncodedScene, rng: Rng) -> Ints | None:
     """Draw the classes that a random part of a scene hides; None if the scene has no part."""
-    structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
     order: Ints = rng.permutation(classes[~structure[classes]])
     listed = up_to_longest(len(order), rng) if encoded.complete else 0

@@ -107,7 +107,7 @@ def calibrate(
         placement=fit_placements(artifact, complete, seed),
         relation_given=fit_with_observed(artifact, complete, alone, seed),
         at=fit_at(artifact, related, seed),
-        **fit_misplaced(artifact, related, seed),
+        **fit_misplaced(artifact, related.scenes, seed),
     ).calibration
 
 

@@ -26,8 +26,9 @@ from app.scene import CANONICAL, Scene
 from app.scene.relations import STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Floats, Ints
-from training.datasets.batches import SceneTensors, subset
+from training.datasets.batches import SceneTensors
 from training.datasets.cases import RIDGE, logistic
+from training.evaluation.asking import instances_of
 from training.evaluation.calibration_task import place_question
 from training.evaluation.missing_tasks import removed_places
 from training.evaluation.model import Places

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from app.registry import Artifact, Calibration
+from app.registry import Artifact, Calibration, Places
 from app.scene import Vocabulary
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
@@ -22,7 +22,10 @@ def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
 
 
 def draft_artifact(
-    machine: BoltzmannMachine, vocabulary: Vocabulary, calibration: Calibration | None = None
+    machine: BoltzmannMachine,
+    vocabulary: Vocabulary,
+    calibration: Calibration | None = None,
+    places: Places | None = None,
 ) -> Artifact:
     """Return a model in memory, without files. The default calibration leaves log-odds as is."""
     return Artifact(
@@ -33,4 +36,5 @@ def draft_artifact(
         digest="",
         card="",
         path=Path(),
+        places=places,
     )

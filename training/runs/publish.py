@@ -34,6 +34,7 @@ from training.fit.draft import as_stored, draft_artifact
 from training.fit.long_chains import measure_drift
 from training.fit.objects import ObjectScenes
 from training.fit.offset_statistics import fit_offsets
+from training.fit.place_statistics import fit_places
 from training.runs.config_files import load_config, shipped_configs
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
@@ -86,15 +87,15 @@ def publish_run(
     machine = as_stored(run.machine)
     progress("calibrating")
     if measured is None:
-        calibrated = calibrated_draft(run, scenes.vocabulary, data)
+        calibrated = calibrated_draft(run, scenes)
         evaluated = calibrated = with_statistics(calibrated, scenes)
         test = data
     else:
         measured_run, measured_scenes = measured
         measured_run.require(measured_scenes.digest)
         test = measured_scenes.training_data()
-        evaluated = calibrated_draft(measured_run, measured_scenes.vocabulary, test)
-        calibrated = calibrated_draft(run, scenes.vocabulary, data, evaluated.calibration)
+        evaluated = calibrated_draft(measured_run, measured_scenes)
+        calibrated = calibrated_draft(run, scenes, evaluated.calibration)
         evaluated = with_statistics(evaluated, measured_scenes)
         calibrated = with_statistics(calibrated, scenes)
     alarms = untouched_alarms(calibrated, scenes.parts["validation"])
@@ -215,7 +216,7 @@ def with_statistics(artifact: Artifact, scenes: SplitScenes) -> Artifact:
 def _publish_rounded(store: Store, description: Description, artifact: Artifact) -> Artifact:
     """Publish weights and statistics in half precision."""
     state = dict(artifact.weights.arrays)
-    for statistics in (artifact.offsets, artifact.counts):
+    for statistics in (artifact.offsets, artifact.counts, artifact.places):
         if statistics is not None:
             state |= statistics.tensors()
     return store.publish(description, state, storage_dtype="float16")
@@ -226,18 +227,19 @@ def _now() -> datetime:
 
 
 def calibrated_draft(
-    run: FinishedRun, vocabulary: Vocabulary, data: TrainingData, chosen: Calibration | None = None
+    run: FinishedRun, scenes: SplitScenes, chosen: Calibration | None = None
 ) -> Artifact:
     """Return the calibrated model of a run in half precision. `chosen`: see `calibrate_objects`."""
-    machine = as_stored(run.machine)
+    machine, vocabulary = as_stored(run.machine), scenes.vocabulary
+    places = fit_places(scenes.parts["train"], scenes.roles, vocabulary)
     calibration = calibrate(
-        draft_artifact(machine, vocabulary),
-        data,
+        draft_artifact(machine, vocabulary, places=places),
+        scenes.training_data(),
         run.config.objects,
         run.config.training.seed,
         chosen,
     )
-    return draft_artifact(machine, vocabulary, calibration)
+    return draft_artifact(machine, vocabulary, calibration, places)
 
 
 def _measure(
