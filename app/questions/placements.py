@@ -122,7 +122,7 @@ def placements(
             objects[column] = at.anchor
     slopes, log_counts = artifact.relation_slopes.placement, present.log_counts[anchors]
     rows, relations, outgoing, columns, p = likeliest_places(
-        slopes, forward, backward, log_counts, posterior.listed + 1, PLACES, first
+        slopes, forward, backward, log_counts, PLACES, first
     )
     places = len(rows) // len(candidates)  # the same number for each candidate
     likely = np.flatnonzero(p >= LEAST_SHARE * np.repeat(p[::places], places))

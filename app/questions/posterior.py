@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from app.inference import MachineSpec
 from app.inference.posterior import ScenePosterior, context_of
 from app.inference.relations import ObservedRelations
-from app.questions.ranking import bend
 from app.registry.artifact import Artifact
-from app.registry.description import Calibration, CountSlope, Slope
+from app.registry.description import CountSlope, Slope
 from app.scene.scene import Scene, instance_evidence, pool_classes, pool_relations
 
 Floats = NDArray[np.floating[Any]]

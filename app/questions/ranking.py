@@ -2,7 +2,7 @@
 
 Entries with equal values keep the order of their indices. Several functions take tables of
 `RelationSlopes`, which contain the calibration of relations. Each table has one row for each
-relation, with intercept, slope, log_count, log_classes, and K bends (at, change).
+relation, with intercept, slope and log_count.
 """
 
 from __future__ import annotations
@@ -20,44 +20,23 @@ Floats = NDArray[np.floating[Any]]
 
 
 @compiled
-def bend(entry: Floats, logits: Floats) -> None:
-    """Add change·(x - at) to each log-odds x above ``at``, for each bend of a relation, in place.
-
-    Args:
-        entry: (4 + 2K,) row of the relation in a table of `RelationSlopes`.
-        logits: (n,) log-odds x.
-    """
-    for j in range(len(logits) if len(entry) > 4 else 0):
-        x = y = logits[j]
-        for k in range(4, len(entry), 2):
-            y += entry[k + 1] * max(x - entry[k], np.float32(0.0))
-        logits[j] = y
-
-
-@compiled
-def relation_probability(
-    slopes: Floats, log_odds: Floats, log_count: Floats, classes: int
-) -> Floats:
+def relation_probability(slopes: Floats, log_odds: Floats, log_count: Floats) -> Floats:
     """Return the probability that each relation holds between two objects, (B, A, N).
 
     The shape is (B candidate classes, A relations, N pairs of classes). B is 1 without candidates.
 
     Args:
-        slopes: (A, 4 + 2K) table of `RelationSlopes`.
+        slopes: (A, 3) table of `RelationSlopes`.
         log_odds: (B, A, N) log-odds of the relation between classes.
         log_count: (N,) log of the number of object pairs with these two classes.
-        classes: number of distinct classes in the scene without structure.
     """
     p = np.empty_like(log_odds)
-    size = np.log(classes)
     for a in range(p.shape[1]):
-        slope, weight = slopes[a, 1], slopes[a, 2]
-        intercept = np.float32(slopes[a, 0] + slopes[a, 3] * size)
+        intercept, slope, weight = slopes[a, 0], slopes[a, 1], slopes[a, 2]
         for b in range(len(p)):
             row, logits = log_odds[b, a], p[b, a]
             for j in range(len(row)):
                 logits[j] = intercept + slope * row[j] + weight * log_count[j]
-            bend(slopes[a], logits)
     # One loop over all rows is faster than one loop per row, because a row may be short.
     flat = p.reshape(-1)
     for e in range(len(flat)):
@@ -156,16 +135,13 @@ def likeliest_classes(logits, usable, count):
 
 
 @compiled
-def likeliest_relations(
-    slopes, log_odds, log_counts, classes, row, judged, least, opposites, count
-):
+def likeliest_relations(slopes, log_odds, log_counts, row, judged, least, opposites, count):
     """Return the `count` likeliest relations between N objects, likeliest first.
 
     Args:
-        slopes: (A, 4 + 2K) table of `RelationSlopes`.
+        slopes: (A, 3) table of `RelationSlopes`.
         log_odds: (A, n, n) log-odds of the A relations between the n classes of the scene.
         log_counts: (n,) log of the number of instances of each class.
-        classes: number of classes in the scene without structure.
         row: (N,) index of each object's class among the n classes.
         judged: (N, N) bool, True for the ordered pairs of objects to judge.
         least: minimum probability of a relation in the result.
@@ -182,7 +158,7 @@ def likeliest_relations(
         for j in range(n):
             counts[i, j] = log_counts[i] + log_counts[j]
     log_odds = log_odds.reshape(1, A, n * n)
-    p = relation_probability(slopes, log_odds, counts.reshape(-1), classes).reshape(A, n, n)
+    p = relation_probability(slopes, log_odds, counts.reshape(-1)).reshape(A, n, n)
     names = 2 * A if opposites else A
     grid, usable = np.zeros((size, size, names), p.dtype), np.zeros((size, size, names), np.bool_)
     for x in range(size):
@@ -201,7 +177,7 @@ def likeliest_relations(
 
 
 @compiled
-def likeliest_places(slopes, forward, backward, log_counts, classes, count, first):
+def likeliest_places(slopes, forward, backward, log_counts, count, first):
     """Return the k likeliest places of each of N candidate classes, likeliest first.
 
     A place is a relation a to an anchor j, which is a class of the scene. The number of the place
@@ -209,13 +185,12 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
     subject if d = 1.
 
     Args:
-        slopes: (A, 4 + 2K) table of `RelationSlopes`.
+        slopes: (A, 3) table of `RelationSlopes`.
         forward: (N, A, m) log-odds of relations with a candidate as subject and an anchor as
             object.
         backward: (N, A, m) log-odds of relations with an anchor as subject and a candidate as
             object.
         log_counts: (m,) log of the number of instances of each anchor's class.
-        classes: number of distinct classes in the scene without structure, including the candidate.
         count: maximum of k.
         first: number of a place that comes first even if other places are likelier. -1 means that
             the order depends only on the probabilities.
@@ -227,8 +202,8 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
     """
     N, A, m = forward.shape
     size = A * m
-    to = relation_probability(slopes, forward, log_counts, classes)
-    back = relation_probability(slopes, backward, log_counts, classes)
+    to = relation_probability(slopes, forward, log_counts)
+    back = relation_probability(slopes, backward, log_counts)
     p, usable = np.empty(2 * size, forward.dtype), np.ones(2 * size, np.bool_)
     kept, begin = min(count, 2 * size), 0
     if first >= 0:
@@ -322,7 +297,7 @@ def observed_pairs(triples, row, judged, classes, relations):
 
 
 @compiled
-def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classes, least, count):
+def disagreeing(slopes, forward, backward, log_counts, holds, of_classes, least, count):
     """Return the `count` pairs whose observed relations differ most from the expected relation.
 
     The expected relation of a pair is its likeliest relation. The observed probability is the
@@ -331,11 +306,10 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
     expected relation is not observed between any two objects of its classes.
 
     Args:
-        slopes: (A, 4 + 2K) table of `RelationSlopes`.
+        slopes: (A, 3) table of `RelationSlopes`.
         forward: (A, P) log-odds of the relations from subject to object.
         backward: (A, P) log-odds of the relations from object to subject.
         log_counts: (P,) log of the number of object pairs with these two classes.
-        classes: number of distinct classes in the scene without structure.
         holds, of_classes: (P,) bit sets of the relations of the pair and of its classes; see
             `observed_pairs`.
         least: minimum probability of an expected relation.
@@ -346,8 +320,8 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
         expected relation, and observed probability.
     """
     A, P = forward.shape
-    to = relation_probability(slopes, forward.reshape(1, A, P), log_counts, classes)[0]
-    back = relation_probability(slopes, backward.reshape(1, A, P), log_counts, classes)[0]
+    to = relation_probability(slopes, forward.reshape(1, A, P), log_counts)[0]
+    back = relation_probability(slopes, backward.reshape(1, A, P), log_counts)[0]
     expected, ratio = np.empty(P, np.int64), np.empty(P, np.float64)
     likely, usable = np.empty((2, P), np.float64), np.zeros(P, np.bool_)
     p = np.empty(2 * A, forward.dtype)

@@ -92,9 +92,8 @@ def relations(
     least = min_probability * (1 - 1e-5)
     table = slopes.relation_given if relations_given(scene) else slopes.relation
     log_odds, log_counts, row = posterior.relation_log_odds(), present.log_counts, present.row
-    listed = max(1, posterior.listed)
     subjects, objects, kinds, p = likeliest_relations(
-        table, log_odds, log_counts, listed, row, judged, least, include_opposites, top_k
+        table, log_odds, log_counts, row, judged, least, include_opposites, top_k
     )
     columns = subjects.tolist(), objects.tolist(), kinds.tolist(), significant(p)
     disagreements = _disagreements(
@@ -168,11 +167,11 @@ def _disagreements(
     if not len(subjects):
         return []
     i, j = present.row[subjects], present.row[objects]
-    table, n = artifact.relation_slopes.relation_given, max(1, posterior.listed)
+    table = artifact.relation_slopes.relation_given
     forward, backward = posterior.log_odds_apart(i, j)
     log_counts, least = present.log_counts[i] + present.log_counts[j], max(least, EXPECTED)
     pairs, expected, p, observed_p = disagreeing(
-        table, forward, backward, log_counts, n, holds, of_classes, least, top_k
+        table, forward, backward, log_counts, holds, of_classes, least, top_k
     )
     columns = subjects[pairs], objects[pairs], holds[pairs], expected
     disagreements = [

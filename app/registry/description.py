@@ -30,24 +30,13 @@ class CountSlope(Frozen):
     log_count: float = 0.0
 
 
-class PairSlope(CountSlope):
-    """Calibration of a relation between two objects.
-
-    The calibration adds log_classes·log(number of classes in the scene) to the formula of
-    `CountSlope`, because annotators list a smaller share of the relations in a larger scene.
-    Structural classes do not count. n is the number of object pairs with the two classes. The
-    result x is then converted by a piecewise-linear curve. Each bend (at, change) adds
-    change·(x - at) if x is above ``at``.
-    """
-
-    log_classes: float = 0.0
-    bends: Many[tuple[float, float]] = ()
-
-
-PairSlopes = Annotated[Many[PairSlope], Field(max_length=len(CANONICAL))]
+PairSlopes = Annotated[Many[CountSlope], Field(max_length=len(CANONICAL))]
 
 PAIR_CALIBRATIONS: Final = ("relation", "relation_given", "placement")
-"""Fields of `Calibration` with one `PairSlope` for each canonical relation."""
+"""Fields of `Calibration` with one `CountSlope` for each canonical relation.
+
+n of this entry is the number of object pairs with the two classes of the relation.
+"""
 
 
 class PlaceFit(Frozen):
@@ -195,18 +184,17 @@ class Calibration(Frozen):
     @classmethod
     def neutral(cls, relations: int) -> Self:
         """Return the calibration with default values for A = ``relations`` canonical relations."""
-        neutral = (PairSlope(),) * relations
+        neutral = (CountSlope(),) * relations
         at = (PlaceFit(),) * relations
         return cls(relation=neutral, relation_given=neutral, placement=neutral, at=at)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelationSlopes:
-    """Calibration tables of the A canonical relations, each (A, 4 + 2K).
+    """Calibration tables of the A canonical relations, each (A, 3).
 
-    Each row of a table is the `PairSlope` of one relation: intercept, slope, log_count,
-    log_classes, and K bends of two numbers each. The tables have the names of their fields in
-    `Calibration`.
+    Each row of a table is the `CountSlope` of one relation: intercept, slope, log_count. The tables
+    have the names of their fields in `Calibration`.
     """
 
     relation: Floats
@@ -219,13 +207,9 @@ class RelationSlopes:
         return cls(*(_table(getattr(calibration, name)) for name in PAIR_CALIBRATIONS))
 
 
-def _table(entries: tuple[PairSlope, ...]) -> Floats:
-    bends = max((len(e.bends) for e in entries), default=0)
-    table = np.zeros((len(entries), 4 + 2 * bends), np.float32)
-    for row, e in zip(table, entries, strict=True):
-        row[:4] = e.intercept, e.slope, e.log_count, e.log_classes
-        row[4 : 4 + 2 * len(e.bends)] = np.ravel(e.bends)
-    return table
+def _table(entries: tuple[CountSlope, ...]) -> Floats:
+    rows = [(entry.intercept, entry.slope, entry.log_count) for entry in entries]
+    return np.array(rows, np.float32).reshape(-1, 3)
 
 
 class ClassEntry(Frozen):

@@ -26,6 +26,8 @@ ON_TOP: Final = 2
 ABOVE: Final = 3
 INSIDE: Final = 4
 
+LATERAL: Final = (LEFT, FRONT)
+"""Indices of the relations of neighbours that stand beside each other."""
 VERTICAL: Final = (ON_TOP, ABOVE)
 """Indices of the relations of an object to an object under it."""
 SUPPORTS: Final = (ON_TOP, INSIDE)

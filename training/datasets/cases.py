@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
 from app.scene import CANONICAL, Scene, SceneObject, Vocabulary
-from app.scene.relations import STACKED
+from app.scene.relations import ABOVE, LATERAL, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints, Rng
 from training.datasets.batches import SceneTensors, subset
@@ -67,19 +67,25 @@ def annotated_relations(encoded: EncodedScene) -> Flags:
     """Return a mask of the relations whose truth is annotated without selection bias.
 
     The mask has the shape (relations, instances, instances). It contains a relation only if the
-    data source also shows that the relation does not hold. So people's sentences show nothing
-    here. If the objects have positions, left and front are annotated for all pairs, because they do
-    not hold beyond the neighbours. Without positions, the neighbours are the pairs that an annotator
-    selected.
+    data source also shows that the relation does not hold. So people's sentences only show that
+    left and front do not hold between stacked objects. If the objects have positions, left and
+    front are annotated for all pairs, because they do not hold beyond the neighbours. Without
+    positions, an annotator selected the neighbours. A camera frame shows only neighbours. Boxes
+    show too few relations above: people say that a picture hangs above a sofa, although the two
+    boxes do not overlap.
     """
-    positions = encoded.instance_positions
+    positions, source = encoded.instance_positions, SOURCES.get(encoded.source)
+    of_one_view = source is not None and source.of_one_view
     annotated = encoded.instance_observed.copy()
+    stacked = encoded.instance_holds[[*STACKED]].any(0)
+    stacked |= stacked.T
     for a, unlisted in enumerate(meaning_of(encoded.source, listed=positions is None).unlisted):
-        if unlisted == "off for neighbours" and positions is not None:
+        if a in LATERAL and positions is not None and unlisted != "unobserved":
             located = np.isfinite(positions).all(1)
             annotated[a] = located[:, None] & located & ~np.eye(len(located), dtype=np.bool_)
-        elif unlisted not in ("off", "off for supported"):
-            annotated[a] = False
+            annotated[a] &= not of_one_view
+        elif unlisted not in ("off", "off for supported") or (a == ABOVE and positions is not None):
+            annotated[a] &= stacked & (a in LATERAL)
     return annotated
 
 

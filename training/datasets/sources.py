@@ -14,15 +14,16 @@ unobserved. The meaning depends on the data source and on the relation:
 | scenes of the user with listed relations | off | off | off | off |
 
 Two rules apply to every data source. First, if on-top, inside or above is listed for a pair of
-objects, all unlisted relations of the pair are false in both directions. (1 to 10 % of such pairs also have a
-listed left or front.) Second, a relation that an annotator marked as false is false.
+objects, all unlisted relations of the pair are false in both directions. (1 to 10 % of such pairs
+also have a listed left or front.) Second, a relation that an annotator marked as false is false.
 
 With poses, two objects are neighbours if they are close by the rule of `app.scene.geometry`.
 Without poses, two objects with at least one listed relation are neighbours. 3DSSG compares heights
-only within a class, so an unlisted above is unobserved. 3DSSG lists the support of half of the small
-objects, such as 51 % of the pillows. If the support of an object is listed, other supports are
-false. Supports are also walls, and objects that the object leans against or is a part of. 3DSSG lists left and front only between
-objects on the same support, so left and front of distant pairs are unobserved.
+only within a class, so an unlisted above is unobserved. 3DSSG lists the support of half of the
+small objects, such as 51 % of the pillows. If the support of an object is listed, other supports
+are false. Walls are also supports, and objects that the object leans against or is a part of.
+3DSSG lists left and front only between objects on the same support, so left and front of distant
+pairs are unobserved.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ LISTS: Final = Meaning()
 """Meaning for scenes of the user with listed relations: an unlisted relation is false."""
 
 BOXES: Final = Meaning(lateral="off for neighbours")
-"""Meaning for relations derived from boxes. Without sizes, on-top and above are unobserved."""
+"""Meaning for relations derived from boxes. Without sizes, stacked objects show no relation."""
 
 _CENTRES: Final = Meaning(on_top="unobserved", inside="unobserved", above="unobserved")
 _SELECTED: Final = replace(_CENTRES, lateral="unobserved")

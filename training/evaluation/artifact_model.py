@@ -17,7 +17,6 @@ from training.evaluation.asking import (
     instances_of,
     missing_probabilities,
     missing_score,
-    of_classes,
     outlier_flags,
     room_score,
     suspicion_score,

@@ -4,18 +4,18 @@ All fits use validation scenes. Without enough scenes for `outlier` or `misplace
 None and the model gives no judgement. An unfitted entry of another question keeps the model's own
 probability. `training.fit.calibrate_objects` fits the entries about objects.
 
-The probability of a relation means that it holds in a home with both objects. So the fits use only
-data sources that annotate true and false relations alike (`annotated_relations`), such as real rooms
-with listed supports. All fits are logistic regressions (Platt scaling). One source of generated
-rooms has more examples than all other sources together. The fits therefore give large sources a
-lower weight. A robot lists few objects or many, so each scene takes part as a whole and in parts.
+The probability of a relation means that it holds in a home with both objects. So the fits use
+only data sources that annotate true and false relations alike (`annotated_relations`), such as
+real rooms with listed supports. All fits are logistic regressions (Platt scaling). One source of
+generated rooms has more examples than all other sources together. The fits therefore give large
+sources a lower weight. A robot lists few objects or many, so each scene takes part as a whole and
+in parts.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -23,15 +23,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.special import expit
 
 from app.inference.relations import NO_UNIT
 from app.questions.outliers import stated_log_odds
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
-from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
+from app.registry import Artifact, Calibration, CountSlope, Slope, Thresholds
 from app.scene import Scene
+from app.scene.relations import LATERAL, ON_TOP, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Rng
 from training.datasets.batches import TrainingData, subset
@@ -55,19 +55,14 @@ from training.fit.objects import ObjectScenes, served_popularity
 _SCENES = 2500
 _LISTED = 20  # relations that an answer of the service lists by default
 _MOST_OF_A_PART = 8  # classes of a part of a scene
+_POSSIBLE = -3.5  # least log-odds of a relation that may well hold
 _OF_THE_REST = 0.02
 _ROUNDS = 3
 # Column indices of the table of examples. Column 0 is the scene.
-_RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 5, 6
-# The weight of an example is the number of listed examples of its source, to the power -_POWER.
-# Accuracy of the likeliest of eight relations on pairs of 3DSSG: .62 with _POWER 0, .73 with .25,
-# and .82 with .5. A frequency table of the training data has an accuracy of .75.
-_POWER = 0.5
-# The calibration curve of all relations: number of bends, minimum slope, and penalty on a squared
-# change of slope, in units of log-likelihood.
-_BENDS = 7
-_LEAST_SLOPE = 0.05
-_STIFFNESS = 2.0
+_RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 4, 5
+# The weight of an example is the number of likely examples of its source, to the power -_POWER. So
+# the rooms of one generator do not outweigh the real rooms and people's sentences.
+_POWER = 0.75
 _UNKNOWN = -1.0  # truth of an example whose data source does not annotate the relation
 # Number of objects that are removed from each scene in turn to fit placements. With one removed
 # object, the fit depends too much on chance.
@@ -100,12 +95,11 @@ def calibrate(
     if not len(related):
         return objects
     complete = [encoded for encoded in related.scenes if annotated_relations(encoded).any()]
-    alone = fit_relations(artifact, complete, seed)
     return recalibrated(
         artifact,
-        relation=alone,
+        relation=fit_relations(artifact, complete, seed),
         placement=fit_placements(artifact, complete, seed),
-        relation_given=fit_with_observed(artifact, complete, alone, seed),
+        relation_given=fit_with_observed(artifact, complete, seed),
         at=fit_at(artifact, related, seed),
         **fit_misplaced(artifact, related.scenes, seed),
     ).calibration
@@ -113,7 +107,7 @@ def calibrate(
 
 def fit_relations(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
-) -> tuple[PairSlope, ...]:
+) -> tuple[CountSlope, ...]:
     """Fit the probability that a relation holds between two instances.
 
     The input is the log-odds of the relation between the two classes. The fit uses scenes without
@@ -122,8 +116,8 @@ def fit_relations(
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     parts = [_part_of(encoded, structure, rng) for encoded in scenes]
-    blocks = _examples_of_pairs(artifact, [*scenes, *parts])
-    return _fit_listed(_examples(blocks), artifact.spec.A, _LISTED)
+    examples = _examples(_examples_of_pairs(artifact, [*scenes, *parts]))
+    return _fit_possible(examples, artifact.spec.A)
 
 
 def _part_of(encoded: EncodedScene, structure: Flags, rng: Rng) -> EncodedScene:
@@ -135,17 +129,14 @@ def _part_of(encoded: EncodedScene, structure: Flags, rng: Rng) -> EncodedScene:
 
 
 def fit_with_observed(
-    artifact: Artifact, scenes: Sequence[EncodedScene], alone: tuple[PairSlope, ...], seed: int = 0
-) -> tuple[PairSlope, ...]:
+    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+) -> tuple[CountSlope, ...]:
     """Fit the probability of relations when half of the pairs of a scene are observed.
 
-    The fit examines the other half of the pairs. `alone`, the fit without observed relations,
-    determines the ranking of relations. Only the overall curve is fitted again. Separate slopes
-    would depend on the few data sources that list many relations, and made answers for other
-    sources worse.
+    The fit examines the other half of the pairs.
     """
-    blocks = _examples_of_pairs(artifact, scenes, np.random.default_rng(seed))
-    return _fit_curve(_examples(blocks), alone, _LISTED)
+    examples = _examples(_examples_of_pairs(artifact, scenes, np.random.default_rng(seed)))
+    return _fit_possible(examples, artifact.spec.A)
 
 
 def _examples_of_pairs(
@@ -173,7 +164,7 @@ def _examples_of_pairs(
 
 def fit_placements(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
-) -> tuple[PairSlope, ...]:
+) -> tuple[CountSlope, ...]:
     """Fit the probability of relations between a removed object and the objects of its scene.
 
     The fit is mainly to the likeliest relations, because an answer lists them. The scenes are whole
@@ -203,8 +194,8 @@ def fit_placements(
         for values, ends in zip(tables, directions, strict=True):
             truth = np.where(annotated[:, *ends], holds[:, *ends], _UNKNOWN)
             a, anchor = map(np.ravel, np.indices(truth.shape))
-            count, size = np.log(present.counts[anchors])[anchor], np.log(posterior.listed + 1)
-            columns = number, a, values[0].ravel(), count, size, truth.ravel()
+            count = np.log(present.counts[anchors])[anchor]
+            columns = number, a, values[0].ravel(), count, truth.ravel()
             rows = np.broadcast_arrays(*columns, sources.index(encoded.source))
             blocks.append(np.stack(rows, 1).astype(np.float64))
     return _fit_listed(_examples(blocks), artifact.spec.A, PLACES)
@@ -216,88 +207,40 @@ def _examples(blocks: list[Floats]) -> Floats:
     return examples[examples[:, _LOGIT] > NO_UNIT]
 
 
-def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[PairSlope, ...]:
-    """Fit all relations, mainly to the `listed` examples of each scene with the highest log-odds.
+def _fit_possible(examples: Floats, relations: int) -> tuple[CountSlope, ...]:
+    """Fit the slopes to the examples with log-odds of at least `_POSSIBLE`.
+
+    Most pairs of objects have no relation, and their log-odds are far lower. They would determine
+    the slopes.
+    """
+    examples = examples[examples[:, _TRUTH] != _UNKNOWN]
+    is_possible = examples[:, _LOGIT] >= _POSSIBLE
+    weight = np.where(is_possible, 1.0, _OF_THE_REST)
+    return _fit_by_kind(examples, relations, weight * _source_weights(examples, is_possible))
+
+
+def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[CountSlope, ...]:
+    """Fit the slopes, mainly to the `listed` likeliest examples of each scene.
 
     An answer lists only these examples. Selection by high log-odds also selects errors, so listed
     relations hold less often than unselected relations with equal log-odds. Examples outside the
     list have a small weight. Examples without annotation take part only in the ranking.
     """
     annotated = examples[:, _TRUTH] != _UNKNOWN
-    slopes = _fit_by_relation(examples[annotated], relations, np.ones(annotated.sum()))
+    slopes = _fit_by_kind(examples[annotated], relations, np.ones(annotated.sum()))
     for _ in range(_ROUNDS):
         is_listed = _is_listed(examples, slopes, listed)[annotated]
         weight = np.where(is_listed, 1.0, _OF_THE_REST)
         weight *= _source_weights(examples[annotated], is_listed)
-        slopes = _fit_by_relation(examples[annotated], relations, weight)
-    return _fit_curve(examples, slopes, listed)
+        slopes = _fit_by_kind(examples[annotated], relations, weight)
+    return slopes
 
 
-def _fit_curve(
-    examples: Floats, slopes: tuple[PairSlope, ...], listed: int
-) -> tuple[PairSlope, ...]:
-    """Fit one rising curve from logits to log-odds, for all relations, to the listed examples.
-
-    The curve makes the mean probability equal to the share of true relations over all data sources.
-    It keeps the ranking by `slopes`, a fit in which sources have similar weights.
-    """
-    is_used = _is_listed(examples, slopes, listed) & (examples[:, _TRUTH] != _UNKNOWN)
-    examples = examples[is_used]
-    truth = examples[:, _TRUTH] > 0
-    if len(np.unique(truth)) < 2:
-        return slopes
-    intercept, slope, bends = rising_curve(_logits(examples, slopes), truth)
-    return tuple(
-        PairSlope(
-            intercept=intercept + slope * entry.intercept,
-            slope=slope * entry.slope,
-            log_count=slope * entry.log_count,
-            log_classes=slope * entry.log_classes,
-            bends=bends,
-        )
-        for entry in slopes
-    )
-
-
-def rising_curve(
-    logits: Floats, truth: Flags
-) -> tuple[float, float, tuple[tuple[float, float], ...]]:
-    """Fit the log-odds that an example is true as a rising, piecewise linear function of its logit.
-
-    A penalty on changes of slope stabilises the curve where examples are few.
-
-    Returns:
-        Intercept and slope of the line at the lowest logits, and the bends (logit, change of slope)
-        of the curve; see `PairSlope`.
-    """
-    knots = np.quantile(logits, np.linspace(0, 1, _BENDS + 2)[1:-1])
-    edges = np.concatenate([[-np.inf], knots, [np.inf]])
-    pieces = np.clip(logits[:, None], edges[:-1], edges[1:])
-    pieces -= np.concatenate([[0.0], knots])
-    sign = np.where(truth, -1.0, 1.0)
-
-    def loss(weights: Floats) -> tuple[float, Floats]:
-        wrong = sign * (weights[0] + pieces @ weights[1:])
-        pull = sign * expit(wrong)
-        change = np.diff(weights[1:])
-        gradient = np.concatenate([[pull.sum()], pieces.T @ pull])
-        gradient[1:-1] -= 2 * _STIFFNESS * change
-        gradient[2:] += 2 * _STIFFNESS * change
-        return float(np.logaddexp(0, wrong).sum() + _STIFFNESS * (change**2).sum()), gradient
-
-    bounds = [(None, None)] + [(_LEAST_SLOPE, None)] * (_BENDS + 1)
-    start = np.concatenate([[0.0], np.ones(_BENDS + 1)])
-    intercept, slope, *others = minimize(loss, start, jac=True, bounds=bounds).x.tolist()
-    changes = np.diff([slope, *others]) / slope
-    bend_logits = (intercept + slope * knots).tolist()
-    return intercept, slope, tuple(zip(bend_logits, changes.tolist(), strict=True))
-
-
-def _logits(examples: Floats, slopes: tuple[PairSlope, ...]) -> Floats:
-    """Return the logits of the examples before the curve is applied."""
-    table = np.array([(s.slope, s.log_count, s.log_classes, s.intercept) for s in slopes])
+def _logits(examples: Floats, slopes: tuple[CountSlope, ...]) -> Floats:
+    """Return the calibrated log-odds of the examples."""
+    table = np.array([(s.slope, s.log_count, s.intercept) for s in slopes])
     weights = table[examples[:, _RELATION].astype(np.int64)]
-    return (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1) + weights[:, 3]
+    return (examples[:, _LOGIT:_TRUTH] * weights[:, :2]).sum(1) + weights[:, 2]
 
 
 def _source_weights(examples: Floats, is_listed: Flags) -> Floats:
@@ -308,7 +251,7 @@ def _source_weights(examples: Floats, is_listed: Flags) -> Floats:
     return (np.maximum(counts, 1.0) ** -_POWER)[key]
 
 
-def _is_listed(examples: Floats, slopes: tuple[PairSlope, ...], listed: int) -> Flags:
+def _is_listed(examples: Floats, slopes: tuple[CountSlope, ...], listed: int) -> Flags:
     """Mark the `listed` examples of each scene with the highest log-odds, (examples,) bool."""
     logits = _logits(examples, slopes)
     order = np.lexsort((-logits, examples[:, 0]))
@@ -319,19 +262,25 @@ def _is_listed(examples: Floats, slopes: tuple[PairSlope, ...], listed: int) -> 
     return is_listed
 
 
-def _fit_by_relation(examples: Floats, relations: int, weight: Floats) -> tuple[PairSlope, ...]:
-    """Fit one slope for each relation; a relation with one truth value keeps its log-odds."""
-    fitted = []
-    for a in range(relations):
-        rows = examples[:, _RELATION] == a
+def _fit_by_kind(examples: Floats, relations: int, weight: Floats) -> tuple[CountSlope, ...]:
+    """Fit one slope to left and front, and one to on-top for all relations of stacked objects.
+
+    Complete sources show hundreds of times more pairs with on-top than with inside, and no pairs
+    with above. A kind with one truth value keeps its log-odds.
+    """
+    entries = [CountSlope()] * relations
+    for fitted, kind in ((LATERAL, LATERAL), ((ON_TOP,), STACKED)):
+        rows = np.isin(examples[:, _RELATION], fitted)
         truth = examples[rows, _TRUTH] > 0
-        entry = PairSlope()
-        if len(np.unique(truth)) == 2:
-            features = examples[rows, _LOGIT : _LOGIT + 2]
-            slope, count, intercept = logistic(features, truth, weight[rows])
-            entry = PairSlope(intercept=intercept, slope=slope, log_count=count)
-        fitted.append(entry)
-    return tuple(fitted)
+        if len(np.unique(truth)) < 2:
+            continue
+        features = examples[rows, _LOGIT : _LOGIT + 2]
+        slope, count, intercept = logistic(features, truth, weight[rows])
+        entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
+        for a in kind:
+            if a < relations:
+                entries[a] = entry
+    return tuple(entries)
 
 
 def _instance_pairs(
@@ -342,10 +291,10 @@ def _instance_pairs(
     structure: Flags,
     pairs: Flags,
 ) -> Floats:
-    """Return the examples of a scene, (examples, 7).
+    """Return the examples of a scene, (examples, 6).
 
     The columns are: scene, relation, log-odds between the classes, log n_i + log n_j of the
-    instance counts, log of the number of classes without structure, truth value and data source.
+    instance counts, truth value and data source.
     Relations without annotation are examples only if their log-odds are high enough for the list of
     an answer.
     """
@@ -362,8 +311,7 @@ def _instance_pairs(
     examples = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
     relation, i, j = np.nonzero(examples)
     truth = np.where(annotated, scene.instance_holds[: len(values)], _UNKNOWN)[examples]
-    size = math.log(max(1, int((~structure[evidence.classes]).sum())))
-    columns = number, relation, log_odds[examples], logs[i] + logs[j], size, truth, source
+    columns = number, relation, log_odds[examples], logs[i] + logs[j], truth, source
     return np.stack(np.broadcast_arrays(*columns), 1)
 
 

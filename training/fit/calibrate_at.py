@@ -22,8 +22,8 @@ from scipy.special import logsumexp
 from app.questions.placements import Place, place_log_p
 from app.questions.posterior import Posterior
 from app.registry import Artifact, PlaceFit
-from app.scene import CANONICAL, Scene
-from app.scene.relations import STACKED
+from app.scene import Scene
+from app.scene.relations import LATERAL, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Floats, Ints
 from training.datasets.batches import SceneTensors
@@ -37,13 +37,12 @@ _QUESTIONS: Final = 150  # maximum questions of each source in the fit of the we
 _LISTED: Final = 10  # classes that an answer lists by default
 _LEAST_TRUE: Final = 10  # minimum true examples of a fit of intercept and slope
 _ALL_BUT_ONE: Final = 1.0  # coverage of a scene from which one class is removed
-_LATERAL: Final = tuple(a for a in range(len(CANONICAL)) if a not in STACKED)
 
 
 def fit_at(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> tuple[PlaceFit, ...]:
     """Return the entry of each relation. Relations without questions keep the default entry."""
     entries = [PlaceFit()] * artifact.spec.A
-    for kind in (_LATERAL, STACKED):
+    for kind in (LATERAL, STACKED):
         relations = [a for a in kind if a < artifact.spec.A]
         weights = _fit_weights(artifact, scenes, relations, seed)
         entry = _fit_scale(artifact, scenes.scenes, relations, weights, seed)

@@ -18,7 +18,6 @@ from app.registry import (
     Store,
     VocabularyEntry,
 )
-from app.scene import Vocabulary
 from training.datasets.batches import TrainingData
 from training.datasets.sources import SOURCES
 from training.datasets.vocabulary import with_aliases, with_room_aliases
