@@ -27,15 +27,17 @@ def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
     path = table(
         tmp_path,
         "virtualhome_placing\tfood bread\ton-top\ttable\t1\tattic",
-        "virtualhome_placing\tcup\tinside\ttable\t1\t",
+        "virtualhome_placing\tcup\tat\ttable\t1\t",
+        "virtualhome_placing\tcup\tinside\tcabinet\t1\t",
         "tidybot\tcups\ton-top\tcup\t1\t",
         "tidybot\tbread\tbelow\ttable\t2\t",
     )
-    first, second = read_prior_scenes(path)
+    first, inside, second = read_prior_scenes(path)
     assert [thing.label for thing in first.objects] == ["bread", "table"]
     assert (first.source, first.group, first.relations) == (
         SOURCE, "bread table", ((0, "on-top", 1),)
     )  # fmt: skip
+    assert (inside.group, inside.relations) == ("cup cabinet", ((0, "inside", 1),))
     assert (second.group, second.relations) == (first.group, ((0, "below", 1),))
 
 
