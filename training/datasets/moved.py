@@ -111,10 +111,9 @@ def moved_by_triple(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[
 
 
 def _supports(encoded: EncodedScene) -> Flags:
-    """Return which instances stand on or in which instances, (instances, instances)."""
+    """Return which instances are on-top of or inside which instances, (instances, instances)."""
     holds = encoded.instance_holds
-    mask: Flags = np.any(holds[[a for a in SUPPORTS if a < len(holds)]], axis=0)
-    return mask
+    return np.any(holds[[a for a in SUPPORTS if a < len(holds)]], axis=0)
 
 
 def _strangers(encoded: EncodedScene) -> Flags:
@@ -192,7 +191,11 @@ class _Boxes:
         usable = np.isfinite(centre).all(1) & np.isfinite(size).all(1)
         usable &= ~structure[encoded.instance_classes]
         strange = _strangers(encoded) & usable[:, None] & usable
-        return cls(centre, size, yaw, usable, _supports(encoded), strange)
+        boxes = cls(centre, size, yaw, usable, _supports(encoded), strange)
+        # "The bin is under the desk" is stored as "the desk is on top of the bin".
+        is_around = boxes.bottom[:, None] < boxes.top - CONTACT
+        is_larger = boxes.area[:, None] > boxes.area
+        return replace(boxes, supports=boxes.supports & ~(is_around & is_larger))
 
     @property
     def area(self) -> Floats:

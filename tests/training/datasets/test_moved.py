@@ -122,6 +122,23 @@ def test_only_the_object_and_those_on_it_move() -> None:
         assert scene.relations is None
 
 
+def test_a_table_stays_if_an_object_under_it_moves() -> None:
+    """The relation "under" is stored as on-top of the larger object."""
+    chair = AnnotatedObject("2", "chair", position=(3.0, 0.0, 0.3), size=(0.5, 0.5, 0.6))
+    scene = encoded((*things("table", "bed"), chair))
+    scene.instance_holds[:] = False
+    scene.instance_holds[ON_TOP, 0, 2] = True
+    before = posed_scene(scene).objects
+    moved_objects = set()
+    for seed in range(40):
+        moved, i = moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(seed))
+        stay = {k for k, thing in enumerate(moved.objects) if thing == before[k]}
+        assert stay == {0, 1, 2} - {i}
+        moved_objects.add(i)
+    # Both stand on the floor, and can move onto the bed.
+    assert moved_objects == {0, 2}
+
+
 def test_spots_on_the_floor_are_free_and_near() -> None:
     near = {CUP: TABLE, STRAW: CUP, PILLOW: BED}
     for scene, i in MOVES:
