@@ -233,7 +233,12 @@ def misplaced_score(artifact: Artifact) -> MisplacedScore | None:
     if artifact.calibration.misplaced is None:
         return None
     sizes = artifact.vocabulary.sizes
-    return lambda scene: questions.misplaced(artifact, observe(scene, typical_sizes=sizes))
+    roles = None if artifact.places is None else artifact.places.roles
+
+    def score(scene: Scene) -> list[dict[str, Any]]:
+        return questions.misplaced(artifact, observe(scene, typical_sizes=sizes, roles=roles))
+
+    return score
 
 
 def relation_probabilities(

@@ -29,8 +29,8 @@ def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
         "virtualhome_placing\tfood bread\ton-top\ttable\t1\tattic",
         "virtualhome_placing\tcup\tat\ttable\t1\t",
         "virtualhome_placing\tcup\tinside\tcabinet\t1\t",
-        "tidybot\tcups\ton-top\tcup\t1\t",
-        "tidybot\tbread\tbelow\ttable\t2\t",
+        "ithor_receptacles\tcups\ton-top\tcup\t1\t",
+        "ithor_receptacles\tbread\tbelow\ttable\t2\t",
     )
     first, inside, second = read_prior_scenes(path)
     assert [thing.label for thing in first.objects] == ["bread", "table"]
@@ -44,7 +44,7 @@ def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
 @pytest.mark.parametrize("relation", ["on-top", "inside"])
 def test_votes_of_housekeep_never_enter_training(tmp_path: Path, relation: str) -> None:
     votes = f"housekeep_votes\tcup\t{relation}\tdesk\t5\tkitchen"
-    path = table(tmp_path, votes, "tidybot\tcup\ton-top\ttable\t1\tkitchen")
+    path = table(tmp_path, votes, "ithor_receptacles\tcup\ton-top\ttable\t1\tkitchen")
     (scene,) = read_prior_scenes(path)
     assert scene.group == "cup table"
     # An outside test reads them.

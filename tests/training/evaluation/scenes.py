@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from app.scene import CANONICAL, pool_instances
+from app.scene.stands import UNKNOWN
 from training.datasets import EncodedScene
 from training.datasets.batches import SceneTensors, scene_tensors
 
@@ -53,6 +54,7 @@ def scene(
         instance_classes=labels,
         instance_holds=holds[:relations],
         instance_observed=observed[:relations],
+        instance_stands=np.full(n, UNKNOWN),
         unknown=unknown,
     )
 

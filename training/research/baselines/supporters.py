@@ -21,8 +21,9 @@ import numpy as np
 from scipy.special import expit
 from torch import Tensor
 
-from app.scene import Scene, observe
-from app.scene.relations import FRONT, ON_TOP, SUPPORTS
+from app.scene import Scene, SceneObject, observe
+from app.scene.relations import SUPPORTS
+from app.scene.stands import FLOOR, HANGS, stands_of
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors
@@ -76,11 +77,16 @@ def _evidence(scene: Scene) -> tuple[Flags, Flags]:
             supports[i, j] |= a in SUPPORTS
         return supports, np.zeros(n, dtype=np.bool_)
     supports = np.any(poses.holds[[*SUPPORTS]], axis=0)
-    sizes = [thing.size for thing in scene.objects]
-    area = np.array([np.nan if size is None else size[0] * size[1] for size in sizes])
-    # Boxes that reach into each other are neighbours, and leave it open what is on top.
-    is_undecided = poses.observed[FRONT] & ~poses.observed[ON_TOP] & (area[:, None] < area)
-    return supports, np.isfinite(area) & ~np.any(supports | is_undecided, axis=1)
+    bottoms = np.array([_bottom(thing) for thing in scene.objects])
+    floor = float(np.fmin.reduce(bottoms))
+    stands = stands_of(poses.holds, poses.observed, bottoms, floor)
+    return supports, np.isin(stands, (FLOOR, HANGS))
+
+
+def _bottom(thing: SceneObject) -> float:
+    if thing.position is None or thing.size is None:
+        return np.nan
+    return thing.position[2] - thing.size[2] / 2
 
 
 def _annotated(encoded: EncodedScene) -> tuple[Flags, Flags]:
@@ -90,7 +96,8 @@ def _annotated(encoded: EncodedScene) -> tuple[Flags, Flags]:
     holds = encoded.instance_holds
     supports: Flags = np.any(holds[[a for a in SUPPORTS if a < len(holds)]], axis=0)
     is_complete = meaning_of(encoded.source).on_top == "off" and encoded.instance_observed.any()
-    return supports, ~np.any(supports, axis=1) & is_complete
+    is_apart = np.isin(encoded.instance_stands, (FLOOR, HANGS))
+    return supports, ~np.any(supports, axis=1) & (is_apart | is_complete)
 
 
 def _supporters(
