@@ -107,8 +107,8 @@ def test_from_rooms_to_answers(tmp_path):
     assert again == pytest.approx(card, abs=1e-6)
     # Everyday facts are measured where their folder is.
     assert {task.split()[0] for task, _, _ in card} - {"Everyday"} == {
-        "T1", "T1a", "T1b", "T2", "T2-at", "T3", "T3b", "T4", "Calibration", "Offsets", "Counts",
-        "Rooms",
+        "T1", "T1a", "T1b", "T2", "T2-at", "T3", "T3b", "T3c", "T4", "Calibration", "Offsets",
+        "Counts", "Rooms",
     }  # fmt: skip
     same_offsets_as_training_alone_teaches(artifact, load_config(str(config)))
     same_weights_with_refitted_statistics(artifact, tmp_path / "store")

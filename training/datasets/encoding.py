@@ -59,6 +59,10 @@ class EncodedScene:
         instance_positions: centres of the instances in metres, (instances, 3), in the viewer axes
             from which relations were derived. NaN means an unknown centre. None means that the
             relations do not come from positions.
+        instance_sizes: extents of the instances in metres before their rotation, (instances, 3).
+            NaN means an unknown size. None as for the positions.
+        instance_yaws: rotations of the instances about the z axis in radians, (instances,), in the
+            same viewer axes. None as for the positions.
         instance_stands: what holds each instance, (instances,); see `app.scene.stands`.
         weight: weight of the scene in the training of objects.
         complete: True if the object list of the scene is nearly complete; see `Meaning`.
@@ -75,6 +79,8 @@ class EncodedScene:
     unknown: tuple[str, ...]
     instance_stands: Ints
     instance_positions: Floats | None = None
+    instance_sizes: Floats | None = None
+    instance_yaws: Floats | None = None
     weight: float = 1.0
     complete: bool = True
 
@@ -83,7 +89,9 @@ class EncodedScene:
         index = np.flatnonzero(kept)
         holds = self.instance_holds[:, index][:, :, index]
         observed = self.instance_observed[:, index][:, :, index]
-        classes, positions = self.instance_classes[index], self.instance_positions
+        classes = self.instance_classes[index]
+        boxes = (self.instance_positions, self.instance_sizes, self.instance_yaws)
+        positions, sizes, yaws = (None if part is None else part[index] for part in boxes)
         room = self.evidence.room_type
         return replace(
             self,
@@ -92,7 +100,9 @@ class EncodedScene:
             instance_holds=holds,
             instance_observed=observed,
             instance_stands=self.instance_stands[index],
-            instance_positions=None if positions is None else positions[index],
+            instance_positions=positions,
+            instance_sizes=sizes,
+            instance_yaws=yaws,
         )
 
 
@@ -168,8 +178,8 @@ class _Encoder:
         classes = [self.index(thing.label) for thing in scene.objects]
         kept = [i for i, c in enumerate(classes) if c is not None and c not in left_out]
         indices = np.array([-1 if c is None else c for c in classes], dtype=np.int64)
-        relations, positions = _relations(scene, meaning, indices, self.roles)
-        stands = _stands(scene, relations, positions, self._is_structure(indices))[kept]
+        relations, boxes = _relations(scene, meaning, indices, self.roles)
+        stands = _stands(scene, relations, boxes, self._is_structure(indices))[kept]
         holds = relations.holds[:, kept][:, :, kept]
         observed = relations.observed[:, kept][:, :, kept]
         instance_classes = np.array([classes[i] for i in kept], dtype=np.int64)
@@ -200,7 +210,9 @@ class _Encoder:
             # One spelling of each label without a class.
             instance_stands=stands,
             unknown=tuple(sorted({label_key(label): label for label in labels}.values())),
-            instance_positions=None if positions is None else positions[kept],
+            instance_positions=None if boxes is None else boxes[kept, :3],
+            instance_sizes=None if boxes is None else boxes[kept, 3:6],
+            instance_yaws=None if boxes is None else boxes[kept, 6],
             weight=min(1.0, share),
             complete=meaning.complete_objects,
         )
@@ -210,15 +222,14 @@ class _Encoder:
 
 
 def _stands(
-    scene: AnnotatedScene, relations: PoseRelations, positions: Floats | None, structure: Flags
+    scene: AnnotatedScene, relations: PoseRelations, boxes: Floats | None, structure: Flags
 ) -> Ints:
     """Return what holds each object of a scene, (objects,); see `app.scene.stands`.
 
     Without positions, a listed support that is neither the floor nor an object is a wall.
     """
-    if positions is not None:
-        heights = np.array([math.nan if t.size is None else t.size[2] for t in scene.objects])
-        bottoms = positions[:, 2] - heights / 2
+    if boxes is not None:
+        bottoms = boxes[:, 2] - boxes[:, 5] / 2
         if np.isfinite(bottoms).any():
             holds, observed = relations.holds, relations.observed
             stands = stands_of(holds, observed, bottoms, float(np.nanmin(bottoms)))
@@ -235,12 +246,15 @@ def _stands(
 def _relations(
     scene: AnnotatedScene, meaning: Meaning, classes: Ints, roles: RoleCounts | None
 ) -> tuple[PoseRelations, Floats | None]:
-    """Derive all relations, as `encode` describes. Return them and their positions, or None."""
-    n, positions = len(scene.objects), None
+    """Derive all relations, as `encode` describes. Return them and their boxes, or None.
+
+    The columns of the boxes, (objects, 7), are the position, the size and the yaw.
+    """
+    n, boxes = len(scene.objects), None
     if scene.relations is not None:
         return _from_lists(scene, scene.relations, meaning), None
     if any(thing.position is not None for thing in scene.objects):
-        relations, positions = _from_poses(scene, classes, roles)
+        relations, boxes = _from_poses(scene, classes, roles)
         _apply_rules(relations, scene.objects, meaning)
     elif any(thing.box2d is not None for thing in scene.objects):
         relations = derive_from_boxes([thing.box2d or (math.nan,) * 4 for thing in scene.objects])
@@ -250,7 +264,7 @@ def _relations(
     for subject, relation, anchor in scene.false_relations:
         denied = canonicalise(subject, relation, anchor)
         relations.holds[denied], relations.observed[denied] = False, True
-    return relations, positions
+    return relations, boxes
 
 
 def _from_lists(
@@ -305,7 +319,8 @@ def _from_poses(
     if not scene.viewer_frame:
         viewpoint = room_viewpoint(scene.scene_id, positions)
         positions, yaws = to_viewer_frame(positions, viewpoint, yaws)
-    return derive_relations(positions, sizes, yaws, classes=classes, roles=roles), positions
+    boxes = np.column_stack([positions, sizes, yaws])
+    return derive_relations(positions, sizes, yaws, classes=classes, roles=roles), boxes
 
 
 def _add_supports(

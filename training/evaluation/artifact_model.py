@@ -15,6 +15,7 @@ from app.scene import CANONICAL, OPPOSITES, Scene
 from training.datasets.batches import Batch, SceneTensors
 from training.evaluation.asking import (
     instances_of,
+    misplaced_score,
     missing_probabilities,
     missing_score,
     outlier_flags,
@@ -66,6 +67,7 @@ def artifact_model(
         relations=relation_score(artifact, given=False),
         completion=completion,
         false_relations=completion,
+        misplaced=misplaced_score(artifact) if calibrated else None,
         rooms=room_score(artifact, profiles),
         generate=lambda _: sampler,
         density=lambda _: density(),
@@ -117,7 +119,9 @@ def placed_score(artifact: Artifact) -> PlacedScore:
             anchor = int(first[int((classes == places.anchor[row]).nonzero())])
             # The request names the relation from the missing object to the anchor.
             name = relation if places.outgoing[row] else OPPOSITES[relation]
-            p = missing_probabilities(artifact, scene, at=(name, anchor))
+            # A model without this relation cannot use the place.
+            at = (name, anchor) if places.relation[row] < artifact.spec.A else None
+            p = missing_probabilities(artifact, scene, at=at)
             tiny = np.finfo(np.float64).tiny
             rows.append(np.where(p >= 0, np.log(np.maximum(p, tiny)), -np.inf))
         return torch.from_numpy(np.stack(rows)).to(places.v.dtype)

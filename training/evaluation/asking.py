@@ -18,11 +18,11 @@ from torch import Tensor
 from app import questions
 from app.questions import Sensitivity
 from app.registry import Artifact
-from app.scene import CANONICAL, Scene, SceneObject, canonicalise
+from app.scene import CANONICAL, Scene, SceneObject, canonicalise, observe
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats
 from training.datasets.cases import scene_of
-from training.evaluation.model import RoomScore
+from training.evaluation.model import MisplacedScore, RoomScore
 
 Case = TypeVar("Case")
 
@@ -223,6 +223,22 @@ def _judged(
 
 def _scenes(v: Tensor) -> Iterator[Scene]:
     return (of_classes(row.nonzero().squeeze(1).tolist()) for row in v)
+
+
+def misplaced_score(artifact: Artifact) -> MisplacedScore | None:
+    """Return a function from a scene to its misplaced relations, or None if none are judged.
+
+    Relations of scenes with poses follow from the poses, as in a request in viewer axes.
+    """
+    if artifact.calibration.misplaced is None:
+        return None
+    sizes = artifact.vocabulary.sizes
+    roles = None if artifact.places is None else artifact.places.roles
+
+    def score(scene: Scene) -> list[dict[str, Any]]:
+        return questions.misplaced(artifact, observe(scene, typical_sizes=sizes, roles=roles))
+
+    return score
 
 
 def relation_probabilities(

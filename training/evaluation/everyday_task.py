@@ -50,6 +50,7 @@ Lower is better for the alarms in plain scenes (scenes without intruder) and for
 """
 
 _VERTICAL = ("on-top", "under", "above", "below")
+_NEWER = ("inside", "contains")
 _RELATIONS = 50
 _LISTED = 5
 _DRAWN = 8
@@ -139,12 +140,17 @@ def _count_hits(names: Sequence[str], rows: Sequence[Sequence[bool]]) -> Lines:
 
 
 def _relation_probabilities(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
-    """Return the probability of each of the eight relations of the subject to the other object."""
+    """Return the probability of each of the eight relations of the subject to the other object.
+
+    The facts were written before the relations inside and contains existed, so these are left out.
+    """
     scene = _scene(artifact, [subject, other])
     answer = questions.relations(artifact, scene, top_k=_RELATIONS, include_opposites=True)
     p: dict[str, float] = {}
     for entry in answer["relations"]:
         name = entry["relation"]
+        if name in _NEWER:
+            continue
         name = name if entry["subject"] == subject else opposite(name)
         p[name] = max(p.get(name, 0.0), entry["probability"])
     return p

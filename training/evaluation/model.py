@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import torch
 from torch import Tensor
 
 from app.questions import Sensitivity
 from app.registry import Artifact
+from app.scene import Scene
 from training.datasets.batches import Batch
 from training.evaluation.setting import Setting
 
@@ -55,6 +56,9 @@ class Places:
 PlacedScore = Callable[[Places], Tensor]
 # Function that returns scores (B, A, n, n) of the relations between the classes of a batch.
 RelationScore = Callable[[Batch], Tensor]
+# Function from a scene, as a request states it, to the entries of `misplaced` of `/outliers`. The
+# first entry has the highest probability.
+MisplacedScore = Callable[[Scene], Sequence[Mapping[str, Any]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +134,7 @@ class Model:
         relations: score of T1a, relations of a scene.
         completion: score of T1b; the batch observes the given triples.
         false_relations: score of T3b; the batch observes all triples, one of them false.
+        misplaced: score of T3c, moved objects.
         rooms: log-probabilities of the room types.
         generate: function that takes the setting and returns the sampler of T4, or None.
         density: function that takes the setting and returns the density of objects, or None.
@@ -145,6 +150,7 @@ class Model:
     relations: RelationScore | None = None
     completion: RelationScore | None = None
     false_relations: RelationScore | None = None
+    misplaced: MisplacedScore | None = None
     rooms: RoomScore | None = None
     generate: Callable[[Setting], Sampler | None] | None = None
     density: Callable[[Setting], ObjectDensity | None] | None = None

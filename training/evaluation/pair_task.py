@@ -1,27 +1,32 @@
-"""T1 pairs: which of eight relations holds between two vertically related classes?
+"""T1 pairs: which relation holds between two classes, one of them on, under or in the other?
 
 A question is a pair of different classes of a scene for which the scene lists a vertical relation
 (on-top, under, above, below). The evidence is the labels of all objects of the scene, without
-relations. The eight relations are the four canonical relations in both directions. A pair may have
-several listed relations; each of them is correct.
+relations. The candidates are eight relations: the canonical relations without inside, in both
+directions. A pair may have several listed relations; each of them is correct.
 
     accuracy   share of pairs whose most probable relation is listed (expectation over ties)
     log-loss   -log of the listed relations' share of the eight probabilities, in nats
+
+A second set of questions are the pairs with a listed inside or contains, the inside pairs. Their
+candidates are all ten relations. The metric is the accuracy.
 
 Pairs with structure classes are excluded. Scenes without such a pair are skipped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.registry import Artifact
-from app.scene import CANONICAL
+from app.scene.relations import INSIDE, VERTICAL
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors, seen_triples
@@ -34,8 +39,6 @@ from training.evaluation.setting import Outcome, Setting
 RARE = 10
 """A class is rare if training relates it to at most this many classes."""
 
-VERTICAL = (CANONICAL.index("on-top"), CANONICAL.index("above"))
-
 # Lower bound of the listed relations' share, so that the log-loss of a pair is at most 21 nats.
 _LEAST = 1e-9
 
@@ -47,8 +50,8 @@ class ScenePairs:
     Attributes:
         place: index of the scene in its set.
         ends: (P, 2) indices into the scene's classes, the smaller index first.
-        listed: (P, 8) bool, relations of the first class to the second, then of the second to the
-            first.
+        listed: (P, 2 A) bool, canonical relations of the first class to the second, then of the
+            second to the first.
     """
 
     place: int
@@ -57,19 +60,21 @@ class ScenePairs:
     listed: Flags
 
 
-# Function that returns probabilities (P, 8) for the pairs of a scene.
+# Function that returns probabilities (P, 2 A) for the pairs of a scene.
 PairScore = Callable[[ScenePairs], Floats]
 
 
-def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
-    """Return the vertical pairs of every scene that has such pairs."""
+def listed_pairs(
+    scenes: SceneTensors, structure: Tensor, relations: Sequence[int] = VERTICAL
+) -> list[ScenePairs]:
+    """Return the pairs with one of these listed relations, for every scene that has such pairs."""
     not_structure = ~structure.numpy()
     pairs = []
     for index, scene in enumerate(scenes.scenes):
         holds = scene.evidence.holds
-        vertical = holds[[a for a in VERTICAL if a < len(holds)]].any(0)
+        related = holds[[a for a in relations if a < len(holds)]].any(0)
         is_thing = not_structure[scene.evidence.classes]
-        pair = np.triu(vertical | vertical.T, 1) & is_thing[:, None] & is_thing
+        pair = np.triu(related | related.T, 1) & is_thing[:, None] & is_thing
         ends = np.argwhere(pair)
         if len(ends):
             x, y = ends.T
@@ -122,34 +127,75 @@ def log_loss(p: Floats, listed: Flags) -> Floats:
     return np.asarray(-np.log(np.maximum(share, _LEAST)))
 
 
+def without_inside(columns: NDArray[Any]) -> NDArray[Any]:
+    """Return the columns of the eight relations without inside and contains, (P, 2 A) → (P, 8)."""
+    relation = np.arange(columns.shape[1]) % (columns.shape[1] // 2)
+    return columns[:, relation != INSIDE]
+
+
 def pairs_task(model: Model, setting: Setting) -> Outcome | None:
-    """Measure T1 pairs; the primary metric is the accuracy over all pairs."""
-    related = {q.place for q in vertical_pairs(setting.scenes, setting.structure)}
+    """Measure T1 pairs; the primary metric is the accuracy over all vertical pairs."""
+    metrics: dict[str, Metric] = {}
+    count = 0
+    if answers := _ask(model, setting, VERTICAL):
+        p, listed = without_inside(answers.p), without_inside(answers.listed)
+        hits, loss = accuracy(p, listed), log_loss(p, listed)
+        metrics = {"accuracy": answers.mean(hits), "log-loss": answers.mean(loss)}
+        for name, mask in _hard_pairs(answers.classes, setting).items():
+            if mask.any():
+                metrics[f"accuracy, {name}"] = answers.mean(hits, mask)
+                metrics[f"log-loss, {name}"] = answers.mean(loss, mask)
+        count = len(answers.scenes)
+    if answers := _ask(model, setting, (INSIDE,)):
+        hits = accuracy(answers.p, answers.listed)
+        metrics["accuracy of ten, inside pairs"] = answers.mean(hits)
+        count = max(count, len(answers.scenes))
+    return Outcome(metrics, count, 0) if metrics else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Answers:
+    """The answers about N pairs of some scenes.
+
+    Attributes:
+        scene: (N,) index of the scene of each pair.
+        classes: (N, 2) class indices of each pair.
+        p, listed: (N, 2 A) probability of each relation, and True for listed relations.
+    """
+
+    scenes: SceneTensors
+    scene: Ints
+    classes: Ints
+    p: Floats
+    listed: Flags
+
+    def mean(self, values: Floats, mask: Flags | None = None) -> Ratio:
+        """Return the mean of values (N,) of the pairs in `mask`, with one value for each group."""
+        chosen = np.ones(len(values), dtype=np.bool_) if mask is None else mask
+        ratio = Ratio.of_items(self.scene[chosen], values[chosen], len(self.scenes))
+        return ratio.by(self.scenes.group_ids)
+
+
+def _ask(model: Model, setting: Setting, relations: Sequence[int]) -> _Answers | None:
+    """Ask about the pairs with one of these listed relations, or return None without pairs."""
+    related = {q.place for q in listed_pairs(setting.scenes, setting.structure, relations)}
     if not related:
         return None
-    index = torch.tensor(sorted(related), dtype=torch.int64)
-    scenes = setting.at(index).some()
-    questions = vertical_pairs(scenes, setting.structure)
+    scenes = setting.at(torch.tensor(sorted(related), dtype=torch.int64)).some()
+    questions = listed_pairs(scenes, setting.structure, relations)
     if model.artifact is not None:
         score = service_score(model.artifact)
     elif model.relations is not None:
         score = baseline_score(scenes, model.relations)
     else:
         return None
-    p = np.concatenate(ask_every(score, questions))
-    listed = np.concatenate([q.listed for q in questions])
-    scene = np.repeat([q.place for q in questions], [len(q.ends) for q in questions])
-    hits, loss = accuracy(p, listed), log_loss(p, listed)
-    metrics: dict[str, Metric] = {
-        "accuracy": Ratio.of_items(scene, hits, len(scenes)),
-        "log-loss": Ratio.of_items(scene, loss, len(scenes)),
-    }
-    classes = np.concatenate([q.scene.evidence.classes[q.ends] for q in questions])
-    for name, mask in _hard_pairs(classes, setting).items():
-        if mask.any():
-            metrics[f"accuracy, {name}"] = Ratio.of_items(scene[mask], hits[mask], len(scenes))
-            metrics[f"log-loss, {name}"] = Ratio.of_items(scene[mask], loss[mask], len(scenes))
-    return Outcome.over(scenes, metrics, 0)
+    return _Answers(
+        scenes,
+        np.repeat([q.place for q in questions], [len(q.ends) for q in questions]),
+        np.concatenate([q.scene.evidence.classes[q.ends] for q in questions]),
+        np.concatenate(ask_every(score, questions)),
+        np.concatenate([q.listed for q in questions]),
+    )
 
 
 def _hard_pairs(classes: Ints, setting: Setting) -> dict[str, Flags]:

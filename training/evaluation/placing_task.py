@@ -5,9 +5,9 @@ question is an object and a room of a source. The candidates are all receptacles
 source. The relevant ones are those with votes for the object.
 
 The service answers as for a robot at a receptacle: the scene lists the receptacle, and `/missing`
-returns the probability that the object is there and on top of it. This probability ranks the
-receptacles. The models do not know the relation inside, so inside is asked as on-top. A receptacle
-that the model does not know, or for which it does not propose the object, ranks last.
+returns the probability that the object is there, on top of it or inside it. This probability ranks
+the receptacles. A receptacle that the model does not know, or for which it does not propose the
+object, ranks last.
 
 Metric: mean average precision (mAP). For ties, the average precision is the expectation under
 random order. Two rivals rank the same receptacles: by their votes for all other objects of the room
@@ -26,15 +26,14 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from app.registry import Artifact
-from app.scene import Scene, SceneObject
+from app.scene import CANONICAL, Scene, SceneObject
+from app.scene.relations import SUPPORTS
 from training.datasets.array_types import Flags, Floats
 from training.datasets.priors import Placing
 from training.evaluation.asking import missing_probabilities
 from training.evaluation.metrics import Metric, Ratio
 
 TASK: Final = "Placing"
-
-_ANCHOR: Final = ("on-top", 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +120,7 @@ def average_precision(score: Floats, relevant: Flags) -> float:
 
 
 def ask_places(artifact: Artifact, room: Room, *, with_room: bool) -> Floats:
-    """Return the probability of each object on each receptacle, (n, m).
+    """Return the probability of each object on or in each receptacle, (n, m).
 
     The value is -inf if the model does not know the receptacle or does not propose the object.
 
@@ -138,8 +137,11 @@ def ask_places(artifact: Artifact, room: Room, *, with_room: bool) -> Floats:
         if (index := vocabulary.index(label)) is None:
             continue
         scene = Scene((SceneObject("receptacle", label, index),), room_type=room_type)
-        p = missing_probabilities(artifact, scene, at=_ANCHOR, candidates=candidates)
-        scores[rows, column] = p[candidates]
+        scores[rows, column] = sum(
+            missing_probabilities(artifact, scene, (CANONICAL[a], 0), candidates)[candidates]
+            for a in SUPPORTS
+            if a < artifact.spec.A
+        )
     return scores
 
 

@@ -24,6 +24,7 @@ from training.evaluation.evidence_tasks import (
 from training.evaluation.generation_task import generation_task
 from training.evaluation.missing_tasks import SIZES, missing_task, placed_task, structure_task
 from training.evaluation.model import Model
+from training.evaluation.moved_task import METRICS, moved_task
 from training.evaluation.outlier_tasks import LAWS, LENGTHS, alarms_task, outliers_task
 from training.evaluation.pair_task import pairs_task
 from training.evaluation.relation_tasks import completion_task, placement_task, relations_task
@@ -85,8 +86,11 @@ TASKS: dict[str, Task] = {
     "T1 pairs": Task(
         "relation of two objects",
         pairs_task,
-        shown=("accuracy", "log-loss", "accuracy, unseen pairs", "accuracy, rare classes"),
-        card=("accuracy", "log-loss"),
+        shown=(
+            *("accuracy", "log-loss", "accuracy, unseen pairs", "accuracy, rare classes"),
+            "accuracy of ten, inside pairs",
+        ),
+        card=("accuracy", "log-loss", "accuracy of ten, inside pairs"),
     ),
     "T1 with evidence": _carded(
         "relations, with more evidence",
@@ -136,6 +140,7 @@ TASKS: dict[str, Task] = {
         _each(("change of hit@1",), OF_OBJECTS),
     ),
     "T3b placement": _carded("false relation", placement_task, ("hit@1",), of_objects=False),
+    "T3c moved": _carded("moved object", moved_task, METRICS, of_objects=False),
     "T4 generate": _objects(
         "generated scenes",
         generation_task,

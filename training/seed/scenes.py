@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.scene import Vocabulary
+from app.scene import Vocabulary, canonicalise
 from training.datasets import (
     AnnotatedScene,
     EncodedScene,
@@ -25,6 +25,9 @@ from training.datasets.splits import Protocol
 
 SPLITS: Final[dict[str, Protocol]] = {"scenes": "paper", "groups": "paper groups"}
 """Splits by name. "scenes" is the split of the paper, "groups" keeps near-duplicates together."""
+
+RELATIONS: Final = 4
+"""Number of canonical relations: left, front, on-top and above. The paper has no inside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +81,23 @@ def read_material(source: str, folder: Path) -> dict[str, Material]:
         DatasetError: the file is missing or invalid.
     """
     path = Path(source)
-    scenes = read_scenes(path if path.suffix else folder / f"{source}.jsonl.gz")
+    read = read_scenes(path if path.suffix else folder / f"{source}.jsonl.gz")
+    scenes = [_of_the_paper(scene) for scene in read]
     classes = source_vocabulary(scenes)
     objects = [replace(entry, structure=False) for entry in classes.objects]
     vocabulary = Vocabulary(objects, classes.room_types, classes.room_aliases)
     encoded = {scene.scene_id: scene for scene in encode(scenes, vocabulary)}
     return {name: _material(scenes, encoded, vocabulary, how) for name, how in SPLITS.items()}
+
+
+def _of_the_paper(scene: AnnotatedScene) -> AnnotatedScene:
+    """Return the scene with only the `RELATIONS` of the paper and their opposites."""
+
+    def kept(triples: Sequence[tuple[int, str, int]]) -> tuple[tuple[int, str, int], ...]:
+        return tuple(triple for triple in triples if canonicalise(*triple)[0] < RELATIONS)
+
+    relations = None if scene.relations is None else kept(scene.relations)
+    return replace(scene, relations=relations, false_relations=kept(scene.false_relations))
 
 
 def _material(
@@ -112,7 +126,7 @@ def _material(
 
 def _keys(scene: EncodedScene, V: int) -> np.ndarray:
     """Return the listed triples of a scene as sorted integers (relation * V + i) * V + j."""
-    relation, subject, object_ = scene.evidence.holds.nonzero()
+    relation, subject, object_ = scene.evidence.holds[:RELATIONS].nonzero()
     classes = scene.evidence.classes
     return np.sort((relation * V + classes[subject]) * V + classes[object_])
 
@@ -128,5 +142,5 @@ def _scenes(
         v,
         r,
         torch.tensor([len(own) for own in keys]),
-        torch.tensor([bool(scene.evidence.observed.any()) for scene in scenes]),
+        torch.tensor([bool(scene.evidence.observed[:RELATIONS].any()) for scene in scenes]),
     )

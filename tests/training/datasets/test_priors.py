@@ -27,22 +27,24 @@ def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
     path = table(
         tmp_path,
         "virtualhome_placing\tfood bread\ton-top\ttable\t1\tattic",
-        "virtualhome_placing\tcup\tinside\ttable\t1\t",
-        "tidybot\tcups\ton-top\tcup\t1\t",
-        "tidybot\tbread\tbelow\ttable\t2\t",
+        "virtualhome_placing\tcup\tat\ttable\t1\t",
+        "virtualhome_placing\tcup\tinside\tcabinet\t1\t",
+        "ithor_receptacles\tcups\ton-top\tcup\t1\t",
+        "ithor_receptacles\tbread\tbelow\ttable\t2\t",
     )
-    first, second = read_prior_scenes(path)
+    first, inside, second = read_prior_scenes(path)
     assert [thing.label for thing in first.objects] == ["bread", "table"]
     assert (first.source, first.group, first.relations) == (
         SOURCE, "bread table", ((0, "on-top", 1),)
     )  # fmt: skip
+    assert (inside.group, inside.relations) == ("cup cabinet", ((0, "inside", 1),))
     assert (second.group, second.relations) == (first.group, ((0, "below", 1),))
 
 
 @pytest.mark.parametrize("relation", ["on-top", "inside"])
 def test_votes_of_housekeep_never_enter_training(tmp_path: Path, relation: str) -> None:
     votes = f"housekeep_votes\tcup\t{relation}\tdesk\t5\tkitchen"
-    path = table(tmp_path, votes, "tidybot\tcup\ton-top\ttable\t1\tkitchen")
+    path = table(tmp_path, votes, "ithor_receptacles\tcup\ton-top\ttable\t1\tkitchen")
     (scene,) = read_prior_scenes(path)
     assert scene.group == "cup table"
     # An outside test reads them.

@@ -163,7 +163,8 @@ def test_jsonl_of_known_sources(tmp_path: Path) -> None:
     path = tmp_path / "known.jsonl"
     path.write_text("\n".join(map(json.dumps, lines)))
     vrd, graph, sentence, bedroom = read_scenes(path)
-    assert (sentence.relations, sentence.false_relations) == (((0, "on-top", 1),), ())
+    assert sentence.relations == ((0, "on-top", 1), (0, "inside", 1))
+    assert sentence.false_relations == ((1, "inside", 0),)
     assert vrd.relations == ((0, "on-top", 1),)
     assert graph.relations == ((0, "on-top", 1), (1, "below", 0))
     assert bedroom.relations is None

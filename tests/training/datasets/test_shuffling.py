@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.scene import CANONICAL, ClassEvidence, pool_instances
+from app.scene.stands import UNKNOWN
 from training.datasets import EncodedScene, shuffle_objects
 
 V = 9
@@ -43,6 +44,7 @@ def made(
         instance_classes=classes,
         instance_holds=holds,
         instance_observed=observed,
+        instance_stands=np.full(len(classes), UNKNOWN),
         unknown=unknown,
     )
 

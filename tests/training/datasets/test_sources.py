@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from app.scene import ObjectClass, Vocabulary
-from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+from app.scene.relations import ABOVE, FRONT, INSIDE, LEFT, ON_TOP
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
@@ -40,7 +40,8 @@ def test_people_mention_few_of_the_relations_that_hold(source: str) -> None:
     found = encoded(source, relations=((1, "on-top", 0), (2, "left", 1)))
     assert np.argwhere(found.instance_holds).tolist() == [[LEFT, 2, 1], [ON_TOP, 1, 0]]
     beside = {(LEFT, 0, 1), (LEFT, 1, 0), (FRONT, 0, 1), (FRONT, 1, 0)}
-    assert off(found) == {(ON_TOP, 0, 1), (ABOVE, 0, 1), (ABOVE, 1, 0)} | beside
+    stacked = {(ON_TOP, 0, 1), (ABOVE, 0, 1), (ABOVE, 1, 0), (INSIDE, 0, 1), (INSIDE, 1, 0)}
+    assert off(found) == stacked | beside
 
 
 def test_an_object_on_a_support_may_also_be_listed_beside_it() -> None:
@@ -66,10 +67,12 @@ def test_denied_relations_are_off_and_listed_ones_of_them_unobserved() -> None:
     assert off(encoded("robot", false_relations=((1, "on-top", 0),))) == {(ON_TOP, 1, 0)}
 
 
-def test_3dssg_annotates_supports_throughout_and_sides_of_related_pairs() -> None:
-    found = encoded("3dssg", relations=((1, "on-top", 0), (2, "left", 0)))
-    pairs = ~np.eye(3, dtype=bool)
-    assert (found.instance_observed[ON_TOP] == pairs).all()
+def test_3dssg_annotates_all_supports_of_some_objects_and_sides_of_related_pairs() -> None:
+    listed = ((1, "on-top", 0), (2, "left", 0))
+    found = encoded("3dssg", relations=listed, supported=(1,))
+    for relation in (ON_TOP, INSIDE):
+        known = np.argwhere(found.instance_observed[relation]).tolist()
+        assert known == [[0, 1], [1, 0], [1, 2]]
     related = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=bool)
     assert (found.instance_observed[LATERAL] == related).all()
     assert np.argwhere(found.instance_observed[ABOVE]).tolist() == [[0, 1], [1, 0]]
@@ -105,7 +108,8 @@ def test_virtualhome_lists_all_supports_and_no_sides() -> None:
     assert np.argwhere(found.instance_holds).tolist() == [[ON_TOP, 1, 0]]
     assert (found.instance_observed[ON_TOP] == pairs).all()
     assert np.argwhere(found.instance_observed[LEFT]).tolist() == [[0, 1], [1, 0]]
-    assert relation_of("virtualhome", "inside") is None
+    assert (found.instance_observed[INSIDE] == pairs).all()
+    assert relation_of("virtualhome", "close") is None
 
 
 def test_an_unlisted_class_of_a_coarse_source_is_unobserved() -> None:

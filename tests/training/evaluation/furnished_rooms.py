@@ -7,12 +7,14 @@ from functools import cache
 import torch
 
 from app.registry import Artifact, Calibration, CountSlope
+from app.scene import CANONICAL
 from tests.questions.artifacts import lines
 from training.datasets import annotated_classes, encode, generate_rooms, rooms_vocabulary
 from training.datasets.batches import SceneTensors, scene_tensors
 from training.fit.draft import draft_artifact
 from training.machines import MachineSpec, build
 
+A = len(CANONICAL)
 VOCABULARY = rooms_vocabulary()
 STRUCTURE = torch.from_numpy(VOCABULARY.structure.copy())
 
@@ -26,13 +28,13 @@ def rooms(count: int, seed: int) -> SceneTensors:
 @cache
 def room_model() -> Artifact:
     """An untrained machine with random weights."""
-    spec = MachineSpec("triway", V=len(VOCABULARY), A=4, units=6, K=3, C=len(VOCABULARY.room_types))
+    spec = MachineSpec("triway", V=len(VOCABULARY), A=A, units=6, K=3, C=len(VOCABULARY.room_types))
     machine = build(spec)
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
-    calibration = Calibration.neutral(4).model_copy(
+    calibration = Calibration.neutral(A).model_copy(
         update={
             "outlier": CountSlope(slope=-1.0),
             "outlier_lines": lines(0.0, 0.0, 0.0),

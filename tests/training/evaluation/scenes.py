@@ -9,7 +9,8 @@ from itertools import count
 import numpy as np
 import torch
 
-from app.scene import pool_instances
+from app.scene import CANONICAL, pool_instances
+from app.scene.stands import UNKNOWN
 from training.datasets import EncodedScene
 from training.datasets.batches import SceneTensors, scene_tensors
 
@@ -31,12 +32,12 @@ def scene(
     room: int = -1,
     group: str | None = None,
     name: str | None = None,
-    relations: int = 4,
+    relations: int = len(CANONICAL),
     annotated: bool = True,
 ) -> EncodedScene:
     """One instance of each entry of `classes`; triples (a, i, j) name classes, first instances."""
     n = len(classes)
-    holds = np.zeros((4, n, n), dtype=np.bool_)
+    holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     for a, i, j in triples:
         holds[a, classes.index(i), classes.index(j)] = True
     labels = np.array(classes, dtype=np.int64)
@@ -53,6 +54,7 @@ def scene(
         instance_classes=labels,
         instance_holds=holds[:relations],
         instance_observed=observed[:relations],
+        instance_stands=np.full(n, UNKNOWN),
         unknown=unknown,
     )
 
@@ -69,7 +71,7 @@ def tensors(scenes: Sequence[EncodedScene], classes: int = V) -> SceneTensors:
 
 
 def random_scenes(
-    number: int, classes: int = WIDE, relations: int = 4, seed: int = 0
+    number: int, classes: int = WIDE, relations: int = len(CANONICAL), seed: int = 0
 ) -> list[EncodedScene]:
     """Scenes of three to five classes with random triples; no two have the same classes."""
     rng = np.random.default_rng(seed)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from app.registry import CountSlope
+from app.scene import CANONICAL
 from tests.questions.answers import missing, relations
 from tests.questions.artifacts import LARGER, calibration, larger_artifact
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
@@ -49,9 +50,9 @@ def test_relations_are_compared_with_what_was_listed():
     entry = DATA.scenes[4]
     asked = replace(scene_of(entry, range(len(entry.instance_classes)), ()), room_type=None)
     answers = relations(ARTIFACT, asked)
-    names = ("left", "front", "on-top", "above")
     listed = [
-        bool(entry.instance_holds[names.index(a.relation), a.subject, a.object]) for a in answers
+        bool(entry.instance_holds[CANONICAL.index(a.relation), a.subject, a.object])
+        for a in answers
     ]
     ours = found.scene == 4
     assert found.score[ours].tolist() == [answer.probability for answer in answers]

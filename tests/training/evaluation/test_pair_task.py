@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from app.scene import CANONICAL
+from app.scene.relations import INSIDE
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
@@ -20,13 +22,18 @@ from tests.training.evaluation.scenes import (
     tensors,
 )
 from training.datasets.batches import seen_triples
-from training.evaluation import pair_task as pairs
 from training.evaluation.asking import LeakError, labels_alone, relation_probabilities
 from training.evaluation.model import Model
-from training.evaluation.pair_task import RARE, pairs_task, service_score, vertical_pairs
+from training.evaluation.pair_task import (
+    RARE,
+    listed_pairs,
+    pairs_task,
+    service_score,
+    without_inside,
+)
 from training.evaluation.setting import Setting
 
-LEFT, ON, ABOVE = 0, 2, 3
+LEFT, ON, ABOVE, A = 0, 2, 3, len(CANONICAL)
 DATA = tensors(random_scenes(20), WIDE)
 
 
@@ -53,10 +60,10 @@ def test_only_vertical_relations_between_two_things_are_asked():
             scene([0, 1], [(LEFT, 0, 1)]),
         ]
     )
-    (asked,) = vertical_pairs(data, structure)
+    (asked,) = listed_pairs(data, structure)
     assert asked.scene.evidence.classes[asked.ends].tolist() == [[0, 1]]
     # left(0, 1) and on-top(1, 0): the first to the second, then back.
-    assert np.flatnonzero(asked.listed[0]).tolist() == [LEFT, 4 + ON]
+    assert np.flatnonzero(asked.listed[0]).tolist() == [LEFT, A + ON]
 
 
 EITHER = [scene([0, 1], [(ON, 1, 0)]), scene([0, 1], [(ON, 0, 1)])]
@@ -88,9 +95,43 @@ def test_perfect_and_ignorant_scores():
     setting = Setting(DATA, WIDE_STRUCTURE)
     assert pairs_task(Model(relations=knowing(DATA)), setting).metrics["accuracy"].value == 1
     ignorant = pairs_task(Model(relations=flat), setting).metrics
-    listed = np.concatenate([one.listed for one in vertical_pairs(DATA, WIDE_STRUCTURE)])
+    asked = np.concatenate([one.listed for one in listed_pairs(DATA, WIDE_STRUCTURE)])
+    listed = without_inside(asked)
+    assert listed.shape == (len(asked), 8)
     assert ignorant["accuracy"].value == pytest.approx(listed.mean())
     assert ignorant["log-loss"].value == pytest.approx(-np.log(listed.mean(1)).mean())
+
+
+def test_inside_is_no_candidate_of_vertical_pairs():
+    """The model prefers inside. Among the eight, on-top is the likeliest."""
+    data = tensors([scene([0, 1], [(ON, 1, 0)])])
+    likely = log_odds({(INSIDE, True): 0.9, (ON, True): 0.6, (LEFT, True): 0.2})
+    metrics = pairs_task(Model(relations=likely), Setting(data, NO_STRUCTURE)).metrics
+    assert metrics["accuracy"].value == 1
+    assert metrics["log-loss"].value == pytest.approx(-np.log(0.6 / 0.8), rel=1e-4)
+    assert "accuracy of ten, inside pairs" not in metrics
+
+
+def test_inside_pairs_have_ten_candidates():
+    structure = NO_STRUCTURE.clone()
+    structure[3] = True
+    scenes = [
+        scene([0, 1, 3], [(INSIDE, 1, 0), (INSIDE, 1, 3)]),
+        scene([0, 1], [(INSIDE, 0, 1)]),
+        scene([0, 1], [(LEFT, 0, 1)]),
+    ]
+    setting = Setting(tensors(scenes), structure)
+    for p, accuracy in (
+        ({(INSIDE, True): 0.5, (ON, True): 0.4}, 1 / 2),
+        ({(INSIDE, True): 0.5, (INSIDE, False): 0.6}, 1 / 2),
+        ({(INSIDE, True): 0.5, (ON, True): 0.6}, 0),
+    ):
+        outcome = pairs_task(Model(relations=log_odds(p)), setting)
+        values = {name: metric.value for name, metric in outcome.metrics.items()}
+        assert values == {"accuracy of ten, inside pairs": accuracy}
+        assert outcome.scenes == 2
+    ignorant = pairs_task(Model(relations=flat), setting).metrics
+    assert ignorant["accuracy of ten, inside pairs"].value == pytest.approx(1 / 10)
 
 
 def test_pairs_without_a_possible_relation_count_as_a_guess():
@@ -144,14 +185,14 @@ def test_no_relation_is_shown():
 
 
 def test_a_score_that_follows_the_order_is_caught():
-    turns = iter(vertical_pairs(DATA, WIDE_STRUCTURE) * 3)
+    turns = iter(listed_pairs(DATA, WIDE_STRUCTURE) * 3)
 
     def cheat(batch):
         asked = next(turns)
         values = torch.full(batch.holds.shape, -5.0)
         for (x, y), listed in zip(asked.ends.tolist(), asked.listed, strict=True):
             values[0, :, min(x, values.shape[2] - 1), min(y, values.shape[2] - 1)] = (
-                10.0 * torch.from_numpy(listed[:4].astype(np.float32))
+                10.0 * torch.from_numpy(listed[:A].astype(np.float32))
             )
         return values
 
@@ -160,7 +201,7 @@ def test_a_score_that_follows_the_order_is_caught():
 
 
 def test_the_service_is_asked_about_its_first_instances():
-    asked = next(one for one in vertical_pairs(rooms(20, 2), STRUCTURE) if len(one.ends) > 2)
+    asked = next(one for one in listed_pairs(rooms(20, 2), STRUCTURE) if len(one.ends) > 2)
     p = service_score(room_model())(asked)
     every = relation_probabilities(room_model(), labels_alone(asked.scene))
     own = asked.scene.instance_classes
@@ -178,4 +219,3 @@ def test_the_limit_counts_scenes_with_such_a_pair():
     assert pairs_task(Model(relations=flat), setting).scenes == 2
     assert pairs_task(Model(relations=flat), replace(setting, scenes=tensors(silent))) is None
     assert pairs_task(Model(), setting) is None
-    assert pairs.VERTICAL == (ON, ABOVE)

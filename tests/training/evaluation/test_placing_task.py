@@ -61,12 +61,15 @@ def test_average_precision_is_its_mean_over_the_orders_of_ties():
 
 
 def asked_one_by_one(artifact, thing, place, room_type=None):
-    """The answer to one request about one candidate on one listed receptacle."""
+    """The sum of the answers about one candidate on, and in, one listed receptacle."""
     index = artifact.vocabulary.index(place)
     scene = Scene((SceneObject("it", place, index),), room_type=room_type)
     candidate = artifact.vocabulary.index(thing)
-    answer = questions.missing(artifact, scene, candidates=[candidate], at=("on-top", 0))
-    return answer["missing"][0]["probability"]
+    answers = [
+        questions.missing(artifact, scene, candidates=[candidate], at=(name, 0))["missing"]
+        for name in ("on-top", "inside")
+    ]
+    return sum(answer[0]["probability"] for answer in answers)
 
 
 @pytest.mark.parametrize(("name", "room_type"), [("mAP", None), ("mAP, room type listed", 0)])

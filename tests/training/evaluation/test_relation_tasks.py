@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.scene import ObjectClass, Vocabulary
+from app.scene import CANONICAL, ObjectClass, Vocabulary
 from tests.questions.artifacts import larger_artifact
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
@@ -37,6 +37,7 @@ from training.evaluation.relation_tasks import (
     unseen,
 )
 
+A = len(CANONICAL)
 DATA = tensors(random_scenes(30), WIDE)
 FLOOR = torch.tensor([False, True, False, False, False])
 
@@ -89,7 +90,7 @@ def test_scores_that_know_everything_or_nothing():
     ranking = rank_relations(DATA, WIDE_STRUCTURE, flat)
     n = np.array([len(evidence.classes) for evidence in related(1)])
     R = ranking.annotated[ranking.annotated > 0]
-    assert ranking.hits[ranking.annotated > 0] == pytest.approx(R**2 / (4 * n * (n - 1)))
+    assert ranking.hits[ranking.annotated > 0] == pytest.approx(R**2 / (A * n * (n - 1)))
     half = complete_scenes(DATA, WIDE_STRUCTURE, knowing(DATA))
     assert rank(half, len(DATA)).pooled().value == 1.0
     for asked in complete_scenes(DATA, WIDE_STRUCTURE, flat):
@@ -113,7 +114,7 @@ def test_expected_hits_shares_ties():
 def test_structure_is_no_end_of_a_relation():
     data = tensors([scene([0, 1, 2], [(0, 0, 1), (0, 0, 2), (1, 0, 2)])])
     (scored,) = score_scenes(data, FLOOR, flat)
-    assert (len(scored.score), scored.truth.sum()) == (4 * 2, 2)
+    assert (len(scored.score), scored.truth.sum()) == (A * 2, 2)
     assert placement_scores(data, FLOOR, flat).scene.tolist() == [0, 0]
 
 
@@ -153,7 +154,7 @@ def test_halves_are_disjoint_and_together_the_truth():
         assert int(one.holds.sum()) == int(truth.sum()) // 2
         assert bool((one.observed == (one.holds > 0)).all())
         mirrored = given.mT & ~given
-        assert len(own.score) == 4 * n * (n - 1) - int((given | mirrored).sum())
+        assert len(own.score) == A * n * (n - 1) - int((given | mirrored).sum())
         assert own.truth.sum() == int((truth & ~given & ~mirrored).sum())
 
 
@@ -190,8 +191,9 @@ def test_the_split_depends_on_the_scene_alone():
 def test_classes_related_both_ways_are_stated_of_different_instances():
     """Two lamps on either side of a bed: left(lamp, bed) and left(bed, lamp) hold of classes."""
     artifact = larger_artifact("triway-implications")
-    both = scene([0, 1, 1], [(0, 0, 1), (0, 1, 0)])
-    data = tensors([both, scene([0, 1, 1], [(0, 0, 1)])], artifact.spec.V)
+    classes, known = [0, 1, 1], artifact.spec.A
+    both = scene(classes, [(0, 0, 1), (0, 1, 0)], relations=known)
+    data = tensors([both, scene(classes, [(0, 0, 1)], relations=known)], artifact.spec.V)
     batch = data.batch(torch.arange(2))
     told = telling(batch, batch.holds > 0)
     values = relation_score(artifact, given=True)(told)

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import chi2, invgamma, norm
 
 from app.registry import Offsets
+from app.scene import CANONICAL
 from app.scene.relations import LEFT, ON_TOP
 from tests.training.evaluation.scenes import scene
 from training.datasets import encode, generate_rooms, rooms_vocabulary
@@ -184,7 +185,7 @@ def rooms():
 def test_an_artifact_can_hold_what_was_learnt(rooms):
     scenes, vocabulary = rooms
     offsets = fit_offsets(scenes, len(vocabulary))
-    again = Offsets.from_tensors(offsets.tensors(), 4, len(vocabulary))
+    again = Offsets.from_tensors(offsets.tensors(), len(CANONICAL), len(vocabulary))
     for name, tensor in offsets.tensors().items():
         assert np.array_equal(again.tensors()[name], tensor)
         if tensor.ndim > 1:

@@ -160,11 +160,12 @@ def test_structure_changes_nothing(data, whole):
 
 
 def test_both_losses_fall(data):
-    config = small_config(**{"objects.steps": 40, "relations.epochs": 6})
+    """The loss of relations varies by a tenth between epochs."""
+    config = small_config(**{"objects.steps": 40, "relations.epochs": 30})
     curve = Trainer(config, data).run().curve
     for phase in ("objects", "relations"):
         losses = [point.loss for point in curve if point.phase == phase]
-        assert losses[-1] < 0.95 * losses[0]
+        assert losses[-1] < 0.85 * losses[0]
 
 
 @pytest.mark.parametrize("phase", ["objects", "relations"])

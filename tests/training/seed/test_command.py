@@ -9,6 +9,7 @@ import time
 from collections import Counter
 
 import pytest
+import torch
 
 from tests.conftest import REPOSITORY, run_program
 from tests.training.commands import invoke
@@ -42,6 +43,24 @@ def test_scenes_are_split_and_encoded(tmp_path):
             assert part.r.sum(1).tolist() == part.labelled.tolist()
             assert part.labelled.tolist() == [2 * flag for flag in part.annotated.tolist()]
     assert Counter(material.digest for material in materials.values()).most_common()[0][1] == 1
+
+
+def test_inside_is_left_out(tmp_path):
+    """Scenes that list inside or contains are the scenes without these triples."""
+    listed = ((1, "on-top", 0), (1, "left", 2))
+    for name, inside in (("with", ((1, "inside", 0), (2, "contains", 1))), ("without", ())):
+        scenes = [scene(k, (*listed, *inside) if k % 2 else inside) for k in range(40)]
+        write_jsonl(scenes, tmp_path / f"{name}.jsonl")
+    files = [tmp_path / f"{name}.jsonl" for name in ("with", "without")]
+    read = [read_material(str(file), tmp_path) for file in files]
+    for split in SPLITS:
+        first, second = (materials[split] for materials in read)
+        assert first.digest == second.digest
+        assert torch.equal(first.triples, second.triples)
+        assert set(first.triples[:, 0].tolist()) == {0, 2}
+        for part in ("train", "validation", "test"):
+            mine, other = getattr(first, part), getattr(second, part)
+            assert all(map(torch.equal, vars(mine).values(), vars(other).values()))
 
 
 @pytest.fixture(scope="module")

@@ -19,10 +19,11 @@ from typing import Any, Final, TypeAlias, TypeVar
 import numpy as np
 from torch import Tensor
 
-from training.datasets.batches import SceneTensors
+from training.datasets.batches import SceneTensors, has_relations
 from training.datasets.cases import some_scenes
 from training.evaluation.missing_tasks import leave_one_out_at
 from training.evaluation.model import (
+    MisplacedScore,
     Model,
     ObjectDensity,
     ObjectScore,
@@ -31,10 +32,11 @@ from training.evaluation.model import (
     RelationScore,
     Trial,
 )
+from training.evaluation.moved_task import ask_moved, moved_cases
 from training.evaluation.parts import validation_score
 from training.evaluation.relation_tasks import complete_scenes, rank, rank_relations
 
-_SCENES = 1000  # maximum scenes in `placed_mrr`
+_SCENES = 1000  # maximum scenes in `placed_mrr` and `named_moved`
 
 Score = TypeVar("Score")
 Proposals: TypeAlias = Generator[tuple[Parameters, Score], float, None]
@@ -103,6 +105,20 @@ def r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -
 def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
     """Return the R-precision of half of the relations, given the other half (task T1b)."""
     return rank(complete_scenes(scenes, structure, score), len(scenes)).pooled().value
+
+
+def named_moved(scenes: SceneTensors, structure: Tensor, score: MisplacedScore) -> float:
+    """Return the share of moved objects that are named first (T3c).
+
+    At most `_SCENES` scenes take part. If no object can move, the value is 0.
+
+    Raises:
+        ValueError: no scene has a relation.
+    """
+    if not has_relations(scenes):
+        raise ValueError("no scene has a relation, so no object can move")
+    cases = moved_cases(some_scenes(scenes, _SCENES), structure)
+    return float(ask_moved(score, cases)[:, 0].mean()) if cases else 0.0
 
 
 def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDensity) -> float:

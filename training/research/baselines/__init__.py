@@ -15,7 +15,13 @@ from training.evaluation.baselines import (
 )
 from training.evaluation.baselines.fitting import Baseline
 from training.evaluation.room_task import mean_log_p
-from training.research.baselines import networks, object_models, relation_models, room_models
+from training.research.baselines import (
+    networks,
+    object_models,
+    relation_models,
+    room_models,
+    supporters,
+)
 
 _EVERY: tuple[Baseline, ...] = (
     POPULARITY,
@@ -49,6 +55,10 @@ _EVERY: tuple[Baseline, ...] = (
         ("completion",),
     ),
     PLACED,
+    Baseline(
+        *("frequency table of supporters", supporters.supporter_table, fitting.named_moved),
+        ("misplaced",),
+    ),
     Baseline(
         "pairwise, by likelihood",
         object_models.pairwise_densities,

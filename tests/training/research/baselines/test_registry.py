@@ -28,6 +28,7 @@ from training.evaluation.baselines.fitting import (
 )
 from training.evaluation.density_task import independent_density
 from training.evaluation.missing_tasks import removed_places
+from training.evaluation.moved_task import moved_cases
 from training.evaluation.relation_tasks import telling
 from training.research.baselines import BASELINES
 
@@ -37,6 +38,7 @@ OF_RELATIONS = [one for one in EVERY if one.scores == RELATIONS]
 COMPLETIONS = [one for one in EVERY if one.scores == ("completion",)]
 OF_ROOMS = [one for one in EVERY if one.scores == ("rooms",)]
 (DENSITY,) = (one for one in EVERY if one.scores == ("density",))
+(SUPPORTERS,) = (one for one in EVERY if one.scores == ("misplaced",))
 
 
 def named(baselines):
@@ -68,6 +70,9 @@ def answers(baseline: Baseline, score, scenes):
         return score(removed_places(scenes, STRUCTURE)[2])
     if baseline is DENSITY:
         return score.log_unnormalised(scenes.v)
+    if baseline is SUPPORTERS:
+        cases = moved_cases(scenes, STRUCTURE)
+        return torch.tensor([entry["probability"] for case in cases for entry in score(case.moved)])
     if baseline in OF_ROOMS:
         return score(scenes.v, "toy")
     return score(scenes.batch(torch.arange(20)))

@@ -1,0 +1,236 @@
+"""Cases of moved objects by hand: what moves, where to, and what stays."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.scene import ObjectClass, Vocabulary
+from app.scene.footprints import overlap_and_gap
+from app.scene.relations import FRONT, INSIDE, LEFT, ON_TOP
+from training.datasets import AnnotatedObject, AnnotatedScene, encode
+from training.datasets.moved import (
+    has_boxes,
+    moved_by_pose,
+    moved_by_triple,
+    moved_scene,
+    posed_scene,
+    untouched_scene,
+)
+
+LABELS = ("table", "cup", "straw", "bed", "pillow", "chair")
+VOCABULARY = Vocabulary([*map(ObjectClass, LABELS), ObjectClass("wall", structure=True)], [])
+TABLE, CUP, STRAW, BED, PILLOW, CHAIR, WALL = range(7)
+POSES = {
+    "table": ((3.0, 0.0, 0.35), (1.0, 1.0, 0.7), 0.0),
+    "cup": ((3.0, 0.2, 0.75), (0.1, 0.1, 0.1), 0.3),
+    "straw": ((3.0, 0.2, 0.825), (0.05, 0.05, 0.05), 0.0),
+    "bed": ((3.0, 3.0, 0.25), (2.0, 2.0, 0.5), 0.5),
+    "pillow": ((3.5, 3.0, 0.55), (0.5, 0.4, 0.1), 0.5),
+    "chair": ((1.0, -2.0, 0.5), (0.5, 0.5, 1.0), 0.0),
+    "wall": ((6.0, 0.0, 1.25), (0.5, 8.0, 2.5), 0.0),
+}
+SEEDS = range(400)
+
+
+def things(*labels: str) -> tuple[AnnotatedObject, ...]:
+    fields = ("position", "size", "yaw")
+    return tuple(
+        AnnotatedObject(str(k), label, **dict(zip(fields, POSES[label], strict=True)))
+        for k, label in enumerate(labels)
+    )
+
+
+def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
+    values: dict[str, Any] = {"scene_id": "s", "source": "t", "group": "g", "room_type": None}
+    values |= {"objects": objects, "viewer_frame": True} | fields
+    return encode([AnnotatedScene(**values)], VOCABULARY)[0]
+
+
+ROOM = encoded(things(*LABELS, "wall"))
+MOVES = [
+    case
+    for seed in SEEDS
+    if (case := moved_by_pose(ROOM, VOCABULARY.structure, np.random.default_rng(seed)))
+]
+
+
+def box(scene: Any, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centre (1, 2), size (1, 2) and yaw (1,) of the footprint of an object."""
+    thing = scene.objects[i]
+    return np.array([thing.position[:2]]), np.array([thing.size[:2]]), np.array([thing.yaw])
+
+
+def bottom(scene: Any, i: int) -> float:
+    return scene.objects[i].position[2] - scene.objects[i].size[2] / 2
+
+
+def gap(scene: Any, i: int, j: int) -> float:
+    return float(overlap_and_gap(*box(scene, i), *box(scene, j))[1][0])
+
+
+def place(scene: Any, i: int) -> str:
+    """The object at whose top an object stands; else "floor", or the object around it."""
+    touched = [j for j in range(len(LABELS)) if j != i and gap(scene, i, j) == 0]
+    for j in touched:
+        if abs(bottom(scene, i) - bottom(scene, j) - scene.objects[j].size[2]) < 1e-9:
+            return LABELS[j]
+    assert abs(bottom(scene, i)) < 1e-9
+    carried = {(CUP, STRAW), (STRAW, CUP)}
+    around = [LABELS[j] for j in touched if (i, j) not in carried]
+    return f"under {around[0]}" if around else "floor"
+
+
+def test_poses_are_kept() -> None:
+    scene = posed_scene(ROOM)
+    for thing, label in zip(scene.objects, (*LABELS, "wall"), strict=True):
+        assert (thing.position, thing.size, thing.yaw) == POSES[label]
+        assert thing.class_index == VOCABULARY.index(label)
+    assert scene.relations is None
+    assert untouched_scene(ROOM, VOCABULARY.structure, np.random.default_rng(0)) == scene
+
+
+def test_objects_move_to_every_wrong_place() -> None:
+    places = Counter((LABELS[i], place(scene, i)) for scene, i in MOVES)
+    assert len(MOVES) == len(SEEDS)
+    assert set(places) == {
+        *(("cup", at) for at in ("bed", "pillow", "chair", "floor", "under table")),
+        *(("straw", at) for at in ("table", "bed", "pillow", "chair", "floor")),
+        *(("pillow", at) for at in ("table", "chair", "floor", "under bed")),
+        # Lifted from the floor. The chair is too small for the table.
+        *(("table", "bed"), ("chair", "table"), ("chair", "bed")),
+    }
+    lifted = sum(n for (label, _), n in places.items() if label in ("table", "chair"))
+    to_floor = sum(n for (_, at), n in places.items() if at == "floor")
+    under = sum(n for (_, at), n in places.items() if at.startswith("under"))
+    assert lifted / len(MOVES) == pytest.approx(1 / 3, abs=0.08)
+    assert to_floor / len(MOVES) == pytest.approx(2 / 9, abs=0.07)
+    assert under / len(MOVES) == pytest.approx(2 / 9, abs=0.07)
+
+
+def test_only_the_object_and_those_on_it_move() -> None:
+    on = {TABLE: {CUP, STRAW}, CUP: {STRAW}, BED: {PILLOW}}
+    before = np.array([thing.position for thing in posed_scene(ROOM).objects])
+    for scene, i in MOVES:
+        steps = np.array([thing.position for thing in scene.objects]) - before
+        for j, step in enumerate(steps):
+            moves = j == i or j in on.get(i, ())
+            assert step == pytest.approx(steps[i] if moves else np.zeros(3), abs=1e-12)
+        assert scene.relations is None
+
+
+def test_a_table_stays_if_an_object_under_it_moves() -> None:
+    """The relation "under" is stored as on-top of the larger object."""
+    chair = AnnotatedObject("2", "chair", position=(3.0, 0.0, 0.3), size=(0.5, 0.5, 0.6))
+    scene = encoded((*things("table", "bed"), chair))
+    scene.instance_holds[:] = False
+    scene.instance_holds[ON_TOP, 0, 2] = True
+    before = posed_scene(scene).objects
+    moved_objects = set()
+    for seed in range(40):
+        moved, i = moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(seed))
+        stay = {k for k, thing in enumerate(moved.objects) if thing == before[k]}
+        assert stay == {0, 1, 2} - {i}
+        moved_objects.add(i)
+    # Both stand on the floor, and can move onto the bed.
+    assert moved_objects == {0, 2}
+
+
+def test_spots_on_the_floor_are_free_and_near() -> None:
+    near = {CUP: TABLE, STRAW: CUP, PILLOW: BED}
+    for scene, i in MOVES:
+        if place(scene, i) == "floor":
+            others = [j for j in range(len(LABELS)) if j != i and {i, j} != {CUP, STRAW}]
+            assert all(gap(scene, i, j) > 0 for j in others)
+            if i != STRAW:
+                assert gap(scene, i, near[i]) < 1
+
+
+def test_equal_seeds_give_equal_cases() -> None:
+    again = moved_scene(ROOM, VOCABULARY.structure, np.random.default_rng(SEEDS[-1]))
+    assert again == MOVES[-1]
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        ("chair",),
+        # The only other object is the supporter, and the step down would be .1 m.
+        ("cup", "straw"),
+        # Structure neither moves nor carries.
+        ("chair", "wall"),
+    ],
+)
+def test_scenes_without_a_wrong_place(labels: tuple[str, ...]) -> None:
+    scene = encoded(things(*labels))
+    assert moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(0)) is None
+
+
+def test_objects_without_a_box_stay() -> None:
+    objects = (*things("table", "cup", "chair"), AnnotatedObject("3", "bed"))
+    scene = encoded(objects)
+    for seed in range(20):
+        moved, i = moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(seed))
+        assert i != 3
+        assert moved.objects[3].position is None
+
+
+# ---------------------------------------------------------------------------- without poses
+
+BARE = tuple(AnnotatedObject(str(k), label) for k, label in enumerate((*LABELS, "cup", "wall")))
+LISTED = (
+    (CUP, "on-top", TABLE),
+    (STRAW, "inside", CUP),
+    (PILLOW, "on-top", BED),
+    (PILLOW, "on-top", CHAIR),
+    (PILLOW, "left", TABLE),
+    (TABLE, "front", CHAIR),
+    (6, "on-top", BED),
+    (PILLOW, "on-top", 7),
+)
+
+
+def test_one_support_is_replaced() -> None:
+    scene = encoded(BARE, relations=LISTED)
+    listed = {
+        *(
+            (ON_TOP, CUP, TABLE),
+            (INSIDE, STRAW, CUP),
+            (ON_TOP, PILLOW, BED),
+            (ON_TOP, PILLOW, CHAIR),
+        ),
+        *((LEFT, PILLOW, TABLE), (FRONT, TABLE, CHAIR), (ON_TOP, 6, BED)),
+    }
+    assert not has_boxes(scene)
+    altered = Counter()
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        moved, i = moved_scene(scene, VOCABULARY.structure, rng)
+        stated = set(moved.relations)
+        (new,) = stated - listed
+        assert new[:2] == (ON_TOP, i)
+        k = new[2]
+        lost = {t for t in listed if t[0] in (ON_TOP, INSIDE) and t[1] == i}
+        lost |= {t for t in listed if {t[1], t[2]} == {i, k}}
+        assert listed - stated == lost
+        altered[i, k] += 1
+        whole = untouched_scene(scene, VOCABULARY.structure, np.random.default_rng(seed))
+        assert set(whole.relations) == listed
+    # A cup supports the straw, and both cups have the same class. Walls carry nothing.
+    assert set(altered) == {
+        *((CUP, k) for k in (PILLOW, CHAIR, 6)),
+        *((6, k) for k in (PILLOW, CHAIR, CUP)),
+        *((STRAW, k) for k in (TABLE, BED, PILLOW, CHAIR)),
+        *((PILLOW, k) for k in (TABLE, CUP, STRAW, 6)),
+    }
+
+
+def test_scenes_without_a_support_have_no_moved_object() -> None:
+    for relations in ((), ((CUP, "left", TABLE), (CUP, "left", BED))):
+        scene = encoded(BARE[:4], relations=relations)
+        assert moved_by_triple(scene, VOCABULARY.structure, np.random.default_rng(0)) is None
+    with pytest.raises(ValueError, match="do not come from positions"):
+        moved_by_pose(scene, VOCABULARY.structure, np.random.default_rng(0))

@@ -1,0 +1,147 @@
+"""T3c by hand: what is asked, and what counts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+import pytest
+
+from app import questions
+from app.registry import Slope, Thresholds
+from app.scene import observe
+from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
+from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
+from training.datasets.moved import has_boxes
+from training.evaluation import moved_task as module
+from training.evaluation.artifact_model import artifact_model
+from training.evaluation.asking import LeakError, misplaced_score
+from training.evaluation.model import Model
+from training.evaluation.moved_task import flagged, moved_cases, moved_task
+from training.evaluation.setting import Setting
+
+LEFT, ON = 0, 2
+POSED = rooms(20, 2)
+LISTED = tensors(
+    [
+        *(scene([0, 1, 2, 3], [(ON, 1, 0), (ON, 2, 0), (LEFT, 1, 2)]) for _ in range(8)),
+        *(scene([0, 1], [(LEFT, 1, 0)]) for _ in range(2)),
+        scene([0, 1]),
+    ]
+)
+BOTH = [(POSED, STRUCTURE), (LISTED, NO_STRUCTURE)]
+
+
+def keyed(request):
+    """What tells two requests apart."""
+    return request.relations, tuple(thing.position for thing in request.objects)
+
+
+def oracle(scenes, structure, *, names=("moved", "subject")):
+    """A score that knows the moved objects."""
+    moved = {keyed(case.moved): case.object for case in moved_cases(scenes, structure)}
+
+    def score(request):
+        if keyed(request) not in moved:
+            return [{"subject": "0", "probability": 0.3}]
+        right = dict.fromkeys(names, moved[keyed(request)])
+        return [{"subject": "", "probability": 0.9} | right, {"subject": "0", "probability": 0.95}]
+
+    return Model(misplaced=score)
+
+
+@pytest.mark.parametrize(("scenes", "structure"), BOTH)
+def test_each_scene_is_asked_twice(scenes, structure):
+    cases = moved_cases(scenes, structure)
+    assert len(cases) == (len(POSED) if scenes is POSED else 8)
+    for case in cases:
+        encoded = scenes.scenes[case.place]
+        index = int(case.object)
+        for request in (case.moved, case.untouched):
+            assert request.room_type is None
+            assert [thing.class_index for thing in request.objects] == (
+                encoded.instance_classes.tolist()
+            )
+        if has_boxes(encoded):
+            assert case.moved.relations is case.untouched.relations is None
+            assert case.moved.objects[index] != case.untouched.objects[index]
+        else:
+            assert set(case.untouched.relations) == set(
+                map(tuple, np.argwhere(encoded.instance_holds).tolist())
+            )
+            (new,) = set(case.moved.relations) - set(case.untouched.relations)
+            assert new[:2] == (ON, index)
+
+
+@pytest.mark.parametrize(("scenes", "structure"), BOTH)
+@pytest.mark.parametrize(
+    ("names", "named", "is_flagged"),
+    [(("moved", "subject"), 1, 1), (("moved",), 1, 1), (("subject",), 0, 1), ((), 0, 0)],
+)
+def test_the_field_moved_names_and_a_subject_flags(scenes, structure, names, named, is_flagged):
+    model = oracle(scenes, structure, names=names)
+    outcome = moved_task(model, Setting(scenes, structure))
+    values = {name: metric.value for name, metric in outcome.metrics.items()}
+    # The second entry is about object 0, which moves in some rooms.
+    zero = np.mean([case.object == "0" for case in moved_cases(scenes, structure)])
+    assert values == {
+        "named first": named,
+        "flagged at 5 % alarms": pytest.approx(max(is_flagged, zero)),
+    }
+    related = sum(bool(entry.evidence.holds.any()) for entry in scenes.scenes)
+    assert (outcome.scenes, outcome.skipped) == (related, 2 if scenes is LISTED else 0)
+
+
+def test_the_threshold_alarms_in_at_most_one_of_twenty_scenes_of_the_source():
+    untouched = np.concatenate([np.arange(40) / 40, 10 + np.arange(10)])
+    source = np.repeat([0, 1], [40, 10])
+    suspicion = np.concatenate([np.full(20, 37 / 40), np.full(20, 37.5 / 40), np.full(10, 19.0)])
+    # Two of 40 scenes exceed 37 / 40. Ten scenes allow no alarm.
+    expected = np.repeat([False, True, False], [20, 20, 10])
+    assert flagged(suspicion, untouched, source).tolist() == expected.tolist()
+    for k in (0, 1):
+        mine = source == k
+        alarms = flagged(untouched[mine], untouched[mine], source[mine])
+        assert alarms.mean() == (0.05 if k == 0 else 0.0)
+
+
+def test_a_model_without_entries_names_and_flags_nothing():
+    outcome = moved_task(Model(misplaced=lambda _: []), Setting(LISTED, NO_STRUCTURE))
+    assert [metric.value for metric in outcome.metrics.values()] == [0, 0]
+    assert moved_task(Model(), Setting(LISTED, NO_STRUCTURE)) is None
+    silent = tensors([scene([0, 1], [(LEFT, 1, 0)])])
+    assert moved_task(Model(misplaced=lambda _: []), Setting(silent, NO_STRUCTURE)) is None
+
+
+def test_at_most_so_many_scenes_are_asked(monkeypatch):
+    monkeypatch.setattr(module, "_SCENES", 3)
+    assert moved_task(oracle(*BOTH[1]), Setting(*BOTH[1])).scenes == 3
+
+
+def test_a_score_that_follows_the_order_is_caught():
+    turn = count()
+    leaking = Model(misplaced=lambda _: [{"subject": "0", "probability": next(turn) / 1e4}])
+    with pytest.raises(LeakError):
+        moved_task(leaking, Setting(LISTED, NO_STRUCTURE))
+
+
+def test_the_service_sees_the_poses_of_a_request():
+    artifact = room_model()
+    assert misplaced_score(artifact) is None
+    judging = artifact.calibration.model_copy(
+        update={
+            "misplaced": Slope(intercept=0.0, slope=-1.0),
+            "misplaced_thresholds": Thresholds(low=0.9, medium=0.8, high=0.7),
+        }
+    )
+    artifact = replace(artifact, calibration=judging)
+    case = moved_cases(POSED, STRUCTURE)[0]
+    entries = misplaced_score(artifact)(case.moved)
+    assert entries == questions.misplaced(
+        artifact, observe(case.moved, typical_sizes=VOCABULARY.sizes)
+    )
+    assert entries
+    setting = Setting(POSED, STRUCTURE, limit=4)
+    values = moved_task(artifact_model(artifact, POSED), setting).metrics.values()
+    assert all(0 <= metric.value <= 1 for metric in values)

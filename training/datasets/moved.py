@@ -1,0 +1,295 @@
+"""Cases of moved objects: one object of a scene stands at a wrong place.
+
+Scenes with boxes get the altered pose of the object. Other scenes get an altered support relation.
+An object is wrong on another object if no pair of their two classes stands on or in each other in
+the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from app.scene import Scene, SceneObject
+from app.scene.footprints import overlap_and_gap
+from app.scene.geometry import CONTACT
+from app.scene.relations import ON_TOP, SUPPORTS
+from training.datasets.array_types import Flags, Floats, Rng
+from training.datasets.cases import draw_true_relations, scene_of
+from training.datasets.encoding import EncodedScene
+
+_ATTEMPTS: Final = 50  # random spots that are tried
+_LIFTED: Final = 1 / 3  # share of cases in which an object is lifted from the floor
+_LEAST_STEP: Final = 0.3  # minimum height in metres between the old and the new place
+_LEAST_AREA: Final = 0.5  # minimum area under a lifted object, as a share of its footprint
+_REACH: Final = 0.5  # maximum distance in metres between a supporter and an object beside it
+_CENTRAL: Final = 0.25  # half of the share of a top, along each axis, where centres are placed
+
+
+def has_boxes(encoded: EncodedScene) -> bool:
+    """Return whether the scene has an object with position and size."""
+    if encoded.instance_positions is None or encoded.instance_sizes is None:
+        return False
+    centre, size = encoded.instance_positions, encoded.instance_sizes
+    return bool((np.isfinite(centre) & np.isfinite(size)).all(1).any())
+
+
+def posed_scene(encoded: EncodedScene) -> Scene:
+    """Return a scene with the poses of all instances, without relations.
+
+    Raises:
+        ValueError: the relations of the scene do not come from positions.
+    """
+    centre, size, yaw = _poses(encoded)
+    bare = scene_of(encoded, range(len(yaw)), ())
+    poses = zip(bare.objects, centre, size, yaw.tolist(), strict=True)
+    objects = tuple(
+        SceneObject(
+            *(thing.id, thing.label, thing.class_index),
+            position=_point(at) if np.isfinite(at).all() else None,
+            size=_point(extents) if np.isfinite(extents).all() else None,
+            yaw=turn,
+        )
+        for thing, at, extents, turn in poses
+    )
+    return replace(bare, objects=objects)
+
+
+def _poses(encoded: EncodedScene) -> tuple[Floats, Floats, Floats]:
+    centre, size, yaw = encoded.instance_positions, encoded.instance_sizes, encoded.instance_yaws
+    if centre is None or size is None or yaw is None:
+        raise ValueError(f"the relations of scene {encoded.scene_id!r} do not come from positions")
+    return centre, size, yaw
+
+
+def _point(row: Floats) -> tuple[float, float, float]:
+    x, y, z = row.tolist()
+    return x, y, z
+
+
+def untouched_scene(encoded: EncodedScene, structure: Flags, rng: Rng) -> Scene | None:
+    """Return the scene of `moved_scene` before the move, with an equal `rng`."""
+    if has_boxes(encoded):
+        return posed_scene(encoded)
+    triples = draw_true_relations(encoded, structure, rng)
+    return scene_of(encoded, range(len(encoded.instance_classes)), triples) if triples else None
+
+
+def moved_scene(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Scene, int] | None:
+    """Return `moved_by_pose` for a scene with boxes, and `moved_by_triple` for other scenes."""
+    move = moved_by_pose if has_boxes(encoded) else moved_by_triple
+    return move(encoded, structure, rng)
+
+
+def moved_by_triple(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Scene, int] | None:
+    """Return a scene with one altered support relation, and the index of the moved object.
+
+    The scene states at most 40 true relations. One of them, object i on or in object j, becomes
+    "i on top of k". The other support relations of i are left out, and all relations between i and
+    j or k. The result is None if the scene has no such relation or no such object k.
+    """
+    triples = draw_true_relations(encoded, structure, rng) or []
+    supports = [(i, j) for a, i, j in triples if a in SUPPORTS]
+    strange: Flags = _strangers(encoded) & ~structure[encoded.instance_classes]
+    for index in rng.permutation(len(supports)).tolist():
+        i, j = supports[index]
+        anchors = np.flatnonzero(strange[i])
+        if not len(anchors):
+            continue
+        k = int(rng.choice(anchors))
+        kept = [
+            (a, x, y)
+            for a, x, y in triples
+            if {x, y} not in ({i, j}, {i, k}) and not (a in SUPPORTS and x == i)
+        ]
+        every = range(len(encoded.instance_classes))
+        return scene_of(encoded, every, [*kept, (ON_TOP, i, k)]), i
+    return None
+
+
+def _supports(encoded: EncodedScene) -> Flags:
+    """Return which instances are on-top of or inside which instances, (instances, instances)."""
+    holds = encoded.instance_holds
+    return np.any(holds[[a for a in SUPPORTS if a < len(holds)]], axis=0)
+
+
+def _strangers(encoded: EncodedScene) -> Flags:
+    """Return the pairs of instances whose classes never support each other in the scene."""
+    classes, row = np.unique(encoded.instance_classes, return_inverse=True)
+    related = np.zeros((len(classes), len(classes)), dtype=np.bool_)
+    i, j = np.nonzero(_supports(encoded))
+    related[row[i], row[j]] = related[row[j], row[i]] = True
+    strange: Flags = ~related[row[:, None], row] & ~np.eye(len(row), dtype=np.bool_)
+    return strange
+
+
+def moved_by_pose(encoded: EncodedScene, structure: Flags, rng: Rng) -> tuple[Scene, int] | None:
+    """Return a scene with one object at a wrong place, and the index of this object.
+
+    The scene has poses and no relations. Objects on the moved object move with it. In two thirds of
+    the cases, the object stands on or in a larger object, its supporter. With equal probability, it
+    moves to one of three places:
+
+    - on another object, whose footprint is at least as large;
+    - to the floor beside its supporter, at a spot without other objects;
+    - under its supporter, if it is not higher.
+
+    In one third, an object on the floor moves onto another object. This object is at least .3 m
+    high, and its footprint has at least half of the area. Every move changes the height by at least
+    .3 m, except a move onto another object. If a place does not exist, another one is tried. The
+    result is None if the scene has none.
+
+    Raises:
+        ValueError: the relations of the scene do not come from positions.
+    """
+    bare = posed_scene(encoded)
+    boxes = _Boxes.of(encoded, structure)
+    for pairs, place in _kinds(boxes, rng):
+        for i in rng.permutation(np.flatnonzero(pairs.any(1))).tolist():
+            group = boxes.group(i)
+            for j in rng.permutation(np.flatnonzero(pairs[i] & ~group)).tolist():
+                if (centre := place(boxes, i, j, rng)) is not None:
+                    return _shifted(bare, group, centre - boxes.centre[i]), i
+    return None
+
+
+def _shifted(scene: Scene, group: Flags, step: Floats) -> Scene:
+    """Return the scene with the objects of a group shifted by (x, y, z) metres."""
+    objects = tuple(
+        replace(thing, position=_point(np.add(thing.position, step)))
+        if moves and thing.position is not None
+        else thing
+        for thing, moves in zip(scene.objects, group.tolist(), strict=True)
+    )
+    return replace(scene, objects=objects)
+
+
+@dataclass(frozen=True, eq=False)
+class _Boxes:
+    """The boxes of n instances.
+
+    Attributes:
+        centre, size: centres, and extents before the rotation by `yaw`, (n, 3).
+        usable: True for instances with position and size that are not structure, (n,).
+        supports: True if instance i stands on or in instance j, (n, n).
+        strange: pairs of usable instances whose classes never support each other, (n, n).
+    """
+
+    centre: Floats
+    size: Floats
+    yaw: Floats
+    usable: Flags
+    supports: Flags
+    strange: Flags
+
+    @classmethod
+    def of(cls, encoded: EncodedScene, structure: Flags) -> _Boxes:
+        centre, size, yaw = _poses(encoded)
+        usable = np.isfinite(centre).all(1) & np.isfinite(size).all(1)
+        usable &= ~structure[encoded.instance_classes]
+        strange = _strangers(encoded) & usable[:, None] & usable
+        boxes = cls(centre, size, yaw, usable, _supports(encoded), strange)
+        # "The bin is under the desk" is stored as "the desk is on top of the bin".
+        is_around = boxes.bottom[:, None] < boxes.top - CONTACT
+        is_larger = boxes.area[:, None] > boxes.area
+        return replace(boxes, supports=boxes.supports & ~(is_around & is_larger))
+
+    @property
+    def area(self) -> Floats:
+        area: Floats = self.size[:, 0] * self.size[:, 1]
+        return area
+
+    @property
+    def bottom(self) -> Floats:
+        return self.centre[:, 2] - self.size[:, 2] / 2
+
+    @property
+    def top(self) -> Floats:
+        return self.centre[:, 2] + self.size[:, 2] / 2
+
+    @property
+    def floor(self) -> float:
+        """Lowest bottom of the usable instances."""
+        return float(self.bottom[self.usable].min(initial=np.inf))
+
+    def group(self, i: int) -> Flags:
+        """Return instance i and all instances that stand on it, directly or not, (n,)."""
+        group = np.arange(len(self.yaw)) == i
+        while (carried := self.supports[:, group].any(1) & ~group).any():
+            group |= carried
+        return group
+
+    def beside(self, j: int, share: Floats, margin: float) -> Floats:
+        """Return a point (x, y) at a share of the extents of instance j, plus a margin in metres.
+
+        The share and the margin are measured from the centre, along the axes of the instance.
+        """
+        x, y = share * (self.size[j, :2] + 2 * margin)
+        cos, sin = np.cos(self.yaw[j]), np.sin(self.yaw[j])
+        return np.array([cos * x - sin * y, sin * x + cos * y]) + self.centre[j, :2]
+
+    def is_free(self, i: int, point: Floats, obstacles: Flags) -> bool:
+        """Return whether the footprint of instance i at a point (x, y) touches no obstacle (n,)."""
+        rows = np.flatnonzero(obstacles)
+        count = len(rows), 1
+        mine = np.tile(point, count), np.tile(self.size[i, :2], count)
+        others = self.centre[rows, :2], self.size[rows, :2], self.yaw[rows]
+        _, gap = overlap_and_gap(*mine, np.full(len(rows), self.yaw[i]), *others)
+        return bool((gap > 0).all())
+
+
+_Place = Callable[[_Boxes, int, int, Rng], Floats | None]
+
+
+def _kinds(boxes: _Boxes, rng: Rng) -> Iterator[tuple[Flags, _Place]]:
+    """Yield the kinds of moves in random order: pairs (moved, other instance), and the place."""
+    usable, area, bottom, height = boxes.usable, boxes.area, boxes.bottom, boxes.size[:, 2]
+    smaller = usable[:, None] & usable & (area[:, None] < area)
+    supported = boxes.supports & smaller
+    fits = boxes.strange & (area[:, None] <= area)
+    is_high = bottom >= boxes.floor + _LEAST_STEP
+    is_deep = bottom[:, None] >= bottom + _LEAST_STEP
+    kinds: list[tuple[Flags, _Place]] = [
+        (fits & supported.any(1, keepdims=True), _onto),
+        (supported & is_high[:, None], _to_floor),
+        (supported & is_deep & (height[:, None] <= height), _under),
+    ]
+    kinds = [kinds[k] for k in rng.permutation(len(kinds)).tolist()]
+    on_floor = (bottom <= boxes.floor + CONTACT) & ~boxes.supports.any(1)
+    carries: Flags = boxes.strange & (height >= _LEAST_STEP) & (_LEAST_AREA * area[:, None] <= area)
+    lifted = carries & on_floor[:, None], _onto
+    kinds.insert(0 if rng.random() < _LIFTED else len(kinds), lifted)
+    yield from kinds
+
+
+def _onto(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats | None:
+    """Return a centre of instance i on the top of instance j, apart from the objects on it."""
+    bottom = boxes.top[j]
+    height = boxes.size[i, 2]
+    obstacles = boxes.usable & ~boxes.group(i)
+    obstacles &= (boxes.top > bottom) & (boxes.bottom < bottom + height)
+    obstacles[j] = False
+    for _ in range(_ATTEMPTS):
+        point = boxes.beside(j, rng.uniform(-_CENTRAL, _CENTRAL, 2), 0.0)
+        if boxes.is_free(i, point, obstacles):
+            return np.array([*point, bottom + height / 2])
+    return None
+
+
+def _to_floor(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats | None:
+    """Return a centre of instance i on the floor near instance j, apart from all objects."""
+    obstacles = boxes.usable & ~boxes.group(i)
+    margin = _REACH + float(np.hypot(*boxes.size[i, :2])) / 2
+    for _ in range(_ATTEMPTS):
+        point = boxes.beside(j, rng.uniform(-0.5, 0.5, 2), margin)
+        if boxes.is_free(i, point, obstacles):
+            return np.array([*point, boxes.floor + boxes.size[i, 2] / 2])
+    return None
+
+
+def _under(boxes: _Boxes, i: int, j: int, rng: Rng) -> Floats:  # noqa: ARG001
+    """Return the centre of instance i with its bottom at the bottom of instance j."""
+    return np.array([*boxes.centre[i, :2], boxes.bottom[j] + boxes.size[i, 2] / 2])

@@ -1,0 +1,132 @@
+"""T3c: one object of a scene stands at a wrong place. Which object has moved?
+
+Each scene is asked twice: with a moved object, and untouched. Scenes with boxes are asked as poses,
+without relations. An object then stands on another object, on the floor or under its supporter.
+Other scenes state at most 40 relations, one of them an altered support. See
+`training.datasets.moved`. The room type is not stated. Scenes without a possible move are skipped.
+
+    named first             share of scenes whose first misplaced relation names the moved object in
+                            the field `moved`
+    flagged at 5 % alarms   share of scenes in which the highest probability about the moved object
+                            exceeds a threshold. At this threshold, at most 5 % of the untouched
+                            scenes of the same source have an alarm
+
+A misplaced relation is about the object in its field `moved`. Without this field, it is about its
+subject.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from torch import Tensor
+
+from app.scene import Scene
+from training.datasets.array_types import Flags, Floats, Ints
+from training.datasets.batches import SceneTensors
+from training.datasets.cases import scene_rng, some_scenes
+from training.datasets.moved import moved_scene, untouched_scene
+from training.evaluation.asking import ask_every
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.model import MisplacedScore, Model
+from training.evaluation.setting import Outcome, Setting
+
+ALARMS: Final = 0.05
+"""Share of untouched scenes with an alarm at the threshold."""
+
+METRICS: Final = ("named first", "flagged at 5 % alarms")
+
+_SCENES: Final = 300  # maximum number of scenes of a source
+
+
+@dataclass(frozen=True, eq=False)
+class MovedCase:
+    """A scene with a moved object, and the same scene without the move.
+
+    Attributes:
+        place: index of the scene in its set.
+        object: id of the moved object.
+    """
+
+    place: int
+    moved: Scene
+    object: str
+    untouched: Scene
+
+
+def moved_cases(scenes: SceneTensors, structure: Tensor, seed: int = 0) -> list[MovedCase]:
+    """Return a case for each scene in which an object can move."""
+    is_structure: Flags = structure.numpy()
+    cases = []
+    for place, encoded in enumerate(scenes.scenes):
+        case = moved_scene(encoded, is_structure, scene_rng(encoded, seed))
+        untouched = untouched_scene(encoded, is_structure, scene_rng(encoded, seed))
+        if case is not None and untouched is not None:
+            scene, index = case
+            scene, untouched = (replace(entry, room_type=None) for entry in (scene, untouched))
+            cases.append(MovedCase(place, scene, scene.objects[index].id, untouched))
+    return cases
+
+
+def ask_moved(score: MisplacedScore, cases: Sequence[MovedCase]) -> Floats:
+    """Return the answers to N cases, (N, 3).
+
+    The columns are 1 if the moved object is named first, the highest probability about the moved
+    object, and the highest probability in the untouched scene. Without an entry, the value is 0.
+    """
+
+    def ask(case: MovedCase) -> Floats:
+        entries, untouched = score(case.moved), score(case.untouched)
+        is_first = bool(entries) and entries[0].get("moved") == case.object
+        return np.array([is_first, _highest(entries, case.object), _highest(untouched)])
+
+    return np.array(ask_every(ask, cases)).reshape(-1, 3)
+
+
+def _highest(entries: Sequence[Mapping[str, Any]], object_: str | None = None) -> float:
+    """Return the highest probability of the entries about an object; None means all entries."""
+    values = [
+        float(entry["probability"])
+        for entry in entries
+        if object_ is None or (entry.get("moved") or entry["subject"]) == object_
+    ]
+    return max(values, default=0.0)
+
+
+def flagged(suspicion: Floats, untouched: Floats, source: Ints) -> Flags:
+    """Return whether each suspicion exceeds the threshold of its source, (N,).
+
+    Args:
+        suspicion: (N,) highest probability about the moved object.
+        untouched: (N,) highest probability in the untouched scene.
+        source: (N,) index of the data source.
+    """
+    is_flagged = np.zeros(len(source), dtype=np.bool_)
+    for name in np.unique(source):
+        mine = source == name
+        alarms = int(ALARMS * mine.sum())
+        threshold = np.sort(untouched[mine])[-1 - alarms]
+        is_flagged[mine] = suspicion[mine] > threshold
+    return is_flagged
+
+
+def moved_task(model: Model, setting: Setting) -> Outcome | None:
+    """Measure T3c."""
+    if model.misplaced is None:
+        return None
+    scenes = some_scenes(setting.some(related=True), _SCENES, setting.seed)
+    cases = moved_cases(scenes, setting.structure, setting.seed)
+    if not cases:
+        return None
+    first, suspicion, untouched = ask_moved(model.misplaced, cases).T
+    place = np.array([case.place for case in cases])
+    is_flagged = flagged(suspicion, untouched, scenes.source.numpy()[place])
+    values = first, is_flagged.astype(np.float64)
+    metrics: dict[str, Metric] = {
+        name: Ratio.of_items(place, value, len(scenes))
+        for name, value in zip(METRICS, values, strict=True)
+    }
+    return Outcome.over(scenes, metrics, len(scenes) - len(cases))
