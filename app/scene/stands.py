@@ -37,8 +37,9 @@ def floor_level(bottoms: Floats, weights: Floats) -> float:
 def stands_of(holds: Flags, observed: Flags, bottoms: Floats, floor: float) -> NDArray[np.int64]:
     """Return what holds each of n boxes, (n,).
 
-    The value is `UNKNOWN` if a bottom is unknown, or if a box reaches into another box and its
-    relation to this box is open.
+    A low object stands on the floor, also if a rug is under it. A desk stands on the floor, also if
+    a bin is under it ("the desk is on top of the bin"). The value is `UNKNOWN` if a bottom is
+    unknown, or if a box reaches into another box and its relation to this box is open.
 
     Args:
         holds, observed: (A, n, n) relations between the boxes; see `PoseRelations`.
@@ -48,7 +49,8 @@ def stands_of(holds: Flags, observed: Flags, bottoms: Floats, floor: float) -> N
     is_known = np.isfinite(bottoms)
     supports = [*SUPPORTS]
     is_open = (~observed[supports] & is_known & ~np.eye(len(bottoms), dtype=np.bool_)).any((0, 2))
-    stands = np.where(bottoms <= floor + CLEARANCE, FLOOR, HANGS)
-    stands[~is_known | is_open] = UNKNOWN
-    stands[holds[supports].any((0, 2))] = SUPPORTED
+    stands = np.where(holds[supports].any((0, 2)), SUPPORTED, HANGS)
+    stands[is_known & is_open & (stands == HANGS)] = UNKNOWN
+    stands[bottoms <= floor + CLEARANCE] = FLOOR
+    stands[~is_known] = UNKNOWN
     return stands

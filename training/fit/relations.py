@@ -44,7 +44,7 @@ from torch.nn.utils.parametrize import cached
 from training.datasets.batches import Batch, SceneTensors, relation_units, subset
 from training.fit.configuration import RelationsConfig
 from training.fit.parts import means_of_parts
-from training.fit.residuals import with_counted_residuals
+from training.fit.residuals import lower_unseen_roles, with_counted_residuals
 from training.fit.sharing import bake_shared_weights
 from training.machines import BoltzmannMachine
 from training.machines.machine import OBJECT_WEIGHTS
@@ -241,14 +241,19 @@ class RelationFit:
         for name, weight in self._weights.items():
             weight.copy_(values[name])
 
-    def finish(self) -> BoltzmannMachine:
-        """Return the machine for storage, with averaged weights and counted residuals."""
+    def finish(self, parents: Tensor) -> BoltzmannMachine:
+        """Return the machine for storage, with averaged weights and counted residuals.
+
+        Args:
+            parents: (classes,) index of the parent of each class, -1 without a parent.
+        """
         self._set(self._average)
         machine = self.machine
         bake_shared_weights(machine, (*SHARED_ROWS, *SHARED_COLUMNS))
         if machine.has_residuals and len(self.train) and machine.residual.requires_grad:
             likelihood = self.likelihood
             offsets = likelihood.offsets.detach()
+            lower_unseen_roles(machine, self.train, parents)
             return with_counted_residuals(machine, self.train, offsets, likelihood.source_weights)
         return machine
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from app.scene.relations import STACKED
 from training.datasets.array_types import Floats, Ints
 from training.datasets.batches import SceneTensors, relation_units
 from training.fit.parts import means_of_parts
@@ -21,6 +22,38 @@ _SPEAKING_SCENES = 2
 _LEAST_RESIDUAL = 0.1
 _NEWTON_STEPS = 12
 _BATCH = 64
+
+
+# Change of the log-odds of a relation in which training shows a class in no scene.
+_UNSEEN_ROLE = -6.0
+
+
+@torch.no_grad()
+def lower_unseen_roles(machine: BoltzmannMachine, train: SceneTensors, parents: Tensor) -> None:
+    """Lower the weights of classes that no training scene shows on, in or above an object.
+
+    Factors extrapolate: they put windows on tables. A class has a role, as the subject or as the
+    object of a stacked relation, if a scene shows it, its parent or one of its kinds in this role.
+
+    Args:
+        parents: (classes,) index of the parent of each class, -1 without a parent.
+    """
+    seen = np.zeros((2, machine.spec.A, machine.spec.V), dtype=np.bool_)
+    for scene in train.scenes:
+        relation, subject, object_ = scene.evidence.holds.nonzero()
+        classes = scene.evidence.classes
+        seen[0, relation, classes[subject]] = seen[1, relation, classes[object_]] = True
+    kinds = np.flatnonzero(parents.numpy() >= 0)
+    of_kind = seen[:, :, kinds]
+    of_parent = seen[:, :, parents.numpy()[kinds]]
+    for role in range(2):
+        for a in range(machine.spec.A):
+            np.logical_or.at(seen[role, a], parents.numpy()[kinds], of_kind[role, a])
+    seen[:, :, kinds] |= of_parent
+    for name, role in (("s", seen[0]), ("o", seen[1])):
+        for a in STACKED:
+            if a < machine.spec.A:
+                machine.get_parameter(name)[a, torch.from_numpy(~role[a])] += _UNSEEN_ROLE
 
 
 def with_counted_residuals(

@@ -172,7 +172,7 @@ class Trainer:
             self.seconds += point.seconds
             passed(point)
         began = time.perf_counter()
-        machine = self._relation_fit.finish()
+        machine = self._relation_fit.finish(self.data.parents)
         fit_scene_rates(machine, self.scenes, self.config.objects, self.config.training.seed)
         store_samples(machine, self.scenes, self.config.training.seed)
         self.seconds += time.perf_counter() - began

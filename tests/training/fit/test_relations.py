@@ -75,7 +75,7 @@ def trained(machine, scenes, **changes):
     fit = RelationFit(machine, scenes, CONFIG.model_copy(update=changes), seed=0)
     while not fit.finished:
         fit.epoch(lambda *_: None)
-    return fit.finish(), fit
+    return fit.finish(torch.full((machine.spec.V,), -1)), fit
 
 
 def of_whole_scenes(machine, batch, generator):
