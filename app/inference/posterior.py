@@ -20,7 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.objects import ObjectScorer
-from app.inference.relations import Between, Context, ObservedRelations, RelationUnits
+from app.inference.relations import (
+    Between,
+    Context,
+    ObservedRelations,
+    RelationUnits,
+    to_log_odds,
+)
 from app.inference.weights import Weights
 
 Floats = NDArray[np.float32]
@@ -145,17 +151,18 @@ class ScenePosterior:
         """
         return self._units.log_odds(self._between)
 
-    def unit_log_odds(self, relation: Indices, subject: Indices, object_: Indices) -> Floats:
-        """Return the log-odds of E relations, (E,).
+    def alone_log_odds(self) -> Floats:
+        """Return the log-odds of every relation given the objects alone, (A, n, n)."""
+        return self._alone
 
-        The observation of a relation is not evidence for the same relation.
+    def relation_change(self) -> Floats:
+        """Return the change of every logit by observed relations of other pairs, (A, n, n)."""
+        change = self._between.apart
+        return change if len(change) else np.zeros_like(self._between.mean)
 
-        Args:
-            relation, subject, object_: (E,) indices of canonical relations, and of their subject
-                and object classes in the scene.
-        """
-        log_odds: Floats = self.relation_log_odds()[relation, subject, object_]
-        return log_odds
+    @cached_property
+    def _alone(self) -> Floats:
+        return to_log_odds(self._between.mean, self._between.spread)
 
     def log_odds_apart(self, i: Indices, j: Indices) -> tuple[Floats, Floats]:
         """Return the log-odds (A, P) of all relations from classes i to j, and (A, P) from j to i.

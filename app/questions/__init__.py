@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from app.questions.generate import GENERATE, generate
 from app.questions.missing import MISSING, missing
-from app.questions.outliers import OUTLIERS, Sensitivity, misplaced, outliers
+from app.questions.outliers import OUTLIERS, misplaced, outliers
 from app.questions.question import Question
 from app.questions.relations import RELATIONS, relations
 from app.questions.rooms import ROOMS, rooms
@@ -30,7 +30,6 @@ QUESTIONS: Final[tuple[Question[Any], ...]] = (RELATIONS, MISSING, OUTLIERS, ROO
 __all__ = [
     "QUESTIONS",
     "Question",
-    "Sensitivity",
     "generate",
     "misplaced",
     "missing",

@@ -1,11 +1,16 @@
 """Misplaced relations: which observed relations are wrong, and which object has moved?
 
-An entry is an observed relation, or an object that nothing supports. There are four kinds:
+An entry is an observed relation, or an object that nothing supports. There are five kinds:
 
     lateral   left or front
     support   an object on or in another object
-    over      above, or on top of an object under it: a desk over a bin
+    above     an object above another object
+    under     an object under another object: a bin under a desk
     stand     an object that stands on the floor or hangs; it has no relation
+
+"Under" is the opposite of on-top, so both have one unit: "the desk is on top of the bin". The words
+of the request tell them apart. Otherwise the roles of the two classes do (`Places.roles`). An
+object above another object is no sign of a fault if a third object supports it.
 
 The log-odds that an entry is wrong are a weighted sum of three terms (`app.registry.Judgement`):
 
@@ -13,9 +18,9 @@ The log-odds that an entry is wrong are a weighted sum of three terms (`app.regi
     d   change of these log-odds by the other observed relations
     s   log p(stand) of the object that would have moved
 
-The stand of an object is what holds it (`app.scene.stands`). With the shares S of the floor, of the
-wall and of supports for the class of object i (`Places.stands`), and the odds o_ij that i is on or in
-object j:
+The stand of an object is what holds it (`app.scene.stands`). `Places.stands` has the shares S of
+the floor, of the wall and of supports for the class of object i. o_ij are the odds that i is on or
+in object j:
 
     p(floor) = S_floor    p(hangs) = S_wall    p(on or in j) = S_support · o_ij / (1 + sum_k o_ik)
 
@@ -25,8 +30,8 @@ object. Without them, only a stated support shows the stand of its subject.
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Any, Final, NamedTuple
+from collections.abc import Collection, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,15 +42,18 @@ from app.questions.posterior import Posterior
 from app.questions.reading import Triple
 from app.registry.artifact import Artifact
 from app.registry.description import KINDS, Judgement, Sensitivity
-from app.scene.relations import ABOVE, CANONICAL, INSIDE, LATERAL, ON_TOP, opposite
-from app.scene.scene import Scene
+from app.scene.relations import ABOVE, CANONICAL, INSIDE, LATERAL, ON_TOP, SUPPORTS, opposite
+from app.scene.roles import ON, UNDER, role_counts
+from app.scene.scene import Scene, SceneObject, extent_of
 from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, floor_level, stands_of
 
-LATERAL_KIND, SUPPORT, OVER, STAND = range(len(KINDS))
+BESIDE, SUPPORT, OVER, BELOW, STAND = range(len(KINDS))
 """Indices of the kinds in `KINDS`."""
 
 THE_FLOOR: Final = "floor"
 """Name of the floor in an entry about an object that stands on the floor or hangs above it."""
+
+_LEAST_P: Final = 1e-6  # minimum of p(stand)
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -77,7 +85,6 @@ def entries_of(
     Args:
         flipped: relations of the scene that the request states by their opposite.
     """
-    stands, log_p = _stands(artifact, posterior, scene, flipped)
     row, is_structure = posterior.present.row, artifact.vocabulary.structure
     is_thing = ~is_structure[posterior.present.classes][row]
     stated = [
@@ -85,17 +92,30 @@ def entries_of(
         for a, i, j in scene.relations or ()
         if a < artifact.spec.A and is_thing[i] and is_thing[j]
     ]
+    unders = {triple for triple in stated if _is_under(artifact, posterior, triple, flipped)}
+    supports = [(i, j) for a, i, j in stated if a in SUPPORTS and (a, i, j) not in unders]
+    stands, log_p = _stands(artifact, posterior, scene, supports)
     alone, change = posterior.alone_log_odds(), posterior.relation_change()
     rows: list[tuple[int, int, int]] = []
     kinds: list[int] = []
     terms: list[tuple[float, float, float]] = []
     movers: list[int] = []
     for a, i, j in stated:
-        kind, mover = _kind(a, i, j, stands, log_p, (a, i, j) in flipped)
-        z, d = alone[a, row[i], row[j]], change[a, row[i], row[j]]
+        mover = j if (a, i, j) in flipped and a != INSIDE else i
+        z, d, s = float(alone[a, row[i], row[j]]), float(change[a, row[i], row[j]]), 0.0
+        if a in LATERAL:
+            kind = BESIDE
+        elif (a, i, j) in unders:
+            kind, mover, s = BELOW, j, float(log_p[j]) if stands[j] == FLOOR else 0.0
+        elif a == ABOVE:
+            kind = OVER
+            if stands[i] == SUPPORTED:
+                z = d = 0.0
+        else:
+            kind, mover, s = SUPPORT, i, float(log_p[i])
         rows.append((a, i, j))
         kinds.append(kind)
-        terms.append((float(z), float(d), 0.0 if kind == LATERAL_KIND else float(log_p[mover])))
+        terms.append((z, d, s))
         movers.append(mover)
     if scene.poses is not None:
         for i in np.flatnonzero(is_thing & ((stands == FLOOR) | (stands == HANGS))).tolist():
@@ -111,38 +131,35 @@ def entries_of(
     )
 
 
-def _kind(
-    a: int, i: int, j: int, stands: Indices, log_p: Floats, is_flipped: bool
-) -> tuple[int, int]:
-    """Return the kind of a relation a(i, j), and the object that would have moved.
-
-    Of two objects over each other, the object with the less likely stand would have moved. Without
-    positions, it is the subject in the words of the request.
-    """
-    if a in LATERAL:
-        return LATERAL_KIND, j if is_flipped else i
-    if a == INSIDE or (a == ON_TOP and stands[i] == SUPPORTED):
-        return SUPPORT, i
-    if log_p[i] != log_p[j]:
-        return OVER, i if log_p[i] < log_p[j] else j
-    return OVER, j if is_flipped else i
+def _is_under(
+    artifact: Artifact, posterior: Posterior, triple: Triple, flipped: Collection[Triple]
+) -> bool:
+    """Return whether on-top(i, j) means that j is under i, and not that i stands on j."""
+    a, i, j = triple
+    if a != ON_TOP or triple in flipped:
+        return a == ON_TOP
+    if artifact.places is None:
+        return False
+    classes = posterior.present.classes[posterior.present.row]
+    roles = artifact.places.roles
+    under = role_counts(roles, int(classes[j]), int(classes[i]))[UNDER]
+    return bool(under > role_counts(roles, int(classes[i]), int(classes[j]))[ON])
 
 
 def _stands(
-    artifact: Artifact, posterior: Posterior, scene: Scene, flipped: Collection[Triple]
+    artifact: Artifact, posterior: Posterior, scene: Scene, supports: Sequence[tuple[int, int]]
 ) -> tuple[Indices, Floats]:
-    """Return what holds each of N objects, and log p of it, (N,) each; 0 for an unknown stand."""
+    """Return what holds each of N objects, and log p of it, (N,) each; 0 for an unknown stand.
+
+    Args:
+        supports: pairs of objects (i, j) with i on or in j.
+    """
     present, places = posterior.present, artifact.places
     stands, log_p = np.full(len(present.row), UNKNOWN), np.zeros(len(present.row))
     if places is None:
         return stands, log_p
     classes = present.classes[present.row]
     shares = places.stands[classes].astype(np.float64)
-    supports = [
-        (i, j)
-        for a, i, j in scene.relations or ()
-        if a == INSIDE or (a == ON_TOP and (a, i, j) not in flipped)
-    ]
     if scene.poses is not None:
         bottoms = np.array([_bottom(artifact, thing) for thing in scene.objects])
         floor = floor_level(bottoms, shares[:, FLOOR])
@@ -157,17 +174,16 @@ def _stands(
         best = np.zeros(len(stands))
         for i, j in supports:
             best[i] = max(best[i], p[i, j])
-        log_p[is_supported] = np.log(np.maximum(best[is_supported], 1e-12))
+        log_p[is_supported] = np.log(np.maximum(best[is_supported], _LEAST_P))
     log_p[artifact.vocabulary.structure[classes]] = 0.0
     return stands, log_p
 
 
-def _bottom(artifact: Artifact, thing: Any) -> float:
+def _bottom(artifact: Artifact, thing: SceneObject) -> float:
     """Return the height of the bottom of an object in metres, or NaN if it is unknown."""
     if thing.position is None:
         return float("nan")
-    size = artifact.vocabulary.extent(thing)
-    return float(thing.position[2] - size[2] / 2)
+    return thing.position[2] - extent_of(thing, artifact.vocabulary.sizes)[2] / 2
 
 
 def _support_shares(artifact: Artifact, posterior: Posterior) -> Floats:
@@ -205,37 +221,38 @@ def misplaced_fields(
     """Judge the observed relations, and the objects that nothing supports.
 
     The answer lists every observed relation of known classes. An object on the floor, or hanging
-    above it, is listed only if it is misplaced. The entry that is most probably wrong comes first.
-    Entries with equal probabilities keep the order of `Scene.relations`.
+    above it, is listed only if it reaches the most sensitive alarm line. The entry that is most
+    probably wrong comes first. Entries with equal probabilities keep the order of
+    `Scene.relations`.
 
     Returns:
         The fields of `scene_client.schemas.MisplacedRelation`.
     """
     entries = entries_of(artifact, posterior, scene, flipped)
-    log_odds = np.full(len(entries.kind), -np.inf)
-    is_misplaced = np.zeros(len(entries.kind), np.bool_)
-    is_judged = np.zeros(len(entries.kind), np.bool_)
+    n = len(entries.kind)
+    log_odds, is_misplaced, is_listed = np.full(n, -np.inf), np.zeros(n, bool), np.zeros(n, bool)
     for kind, name in enumerate(KINDS):
         judgement: Judgement | None = getattr(artifact.calibration.misplaced, name)
         rows = np.flatnonzero(entries.kind == kind)
         if judgement is None or not len(rows):
             continue
         log_odds[rows] = wrong_log_odds(judgement, entries.terms[rows])
-        line = getattr(judgement.lines, sensitivity)
-        is_misplaced[rows] = sigmoid(log_odds[rows]) >= line.threshold(len(rows))
-        is_judged[rows] = True
-    listed = is_judged & (is_misplaced | (entries.kind != STAND))
+        p = sigmoid(log_odds[rows])
+        is_misplaced[rows] = p >= getattr(judgement.lines, sensitivity).threshold(len(rows))
+        is_listed[rows] = kind != STAND or p >= judgement.lines.high.threshold(len(rows))
+    is_listed |= is_misplaced
     order = np.argsort(-log_odds, kind="stable")
-    order = order[listed[order]]
-    numbers = significant(sigmoid(log_odds[order]))
+    order = order[is_listed[order]]
     return [
         _spelled(scene, entries.triple[k].tolist(), flipped)
         | {
             "probability": probability,
             "is_misplaced": bool(is_misplaced[k]),
-            "moved": scene.objects[entries.mover[k]].id if is_misplaced[k] else None,
+            "moved": scene.objects[entries.mover[k]].id,
         }
-        for k, probability in zip(order.tolist(), numbers, strict=True)
+        for k, probability in zip(
+            order.tolist(), significant(sigmoid(log_odds[order])), strict=True
+        )
     ]
 
 

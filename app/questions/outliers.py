@@ -22,7 +22,7 @@ half of the largest increase are ignored.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,17 +39,15 @@ from app.questions.answer import (
     rounded_number,
     significant,
 )
-from app.questions.posterior import Posterior, calibrated, false_log_odds
+from app.questions.misplaced import misplaced_fields
+from app.questions.posterior import Posterior, calibrated
 from app.questions.question import REFUSED, SCENES, WITH_TOILET, Example, Options, Question
 from app.questions.ranking import best
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
-from app.registry.description import AlarmLine, CountSlope
-from app.scene.relations import CANONICAL, opposite
+from app.registry.description import AlarmLine, CountSlope, Sensitivity
 from app.scene.scene import Scene
 from scene_client.schemas import OutliersAnswer, OutliersRequest, SceneWarning
-
-Sensitivity = Literal["low", "medium", "high"]
 
 COMPANIONS: Final = 3
 """Maximum number of companions in the answer for one outlier."""
@@ -109,7 +107,7 @@ def outliers(
         line: AlarmLine = getattr(lines, sensitivity)
         threshold = line.threshold(0 if posterior is None else posterior.listed)
     if posterior is not None:
-        wrong = _misplaced(artifact, posterior, scene, sensitivity, flipped)
+        wrong = misplaced_fields(artifact, posterior, scene, sensitivity, flipped)
         if entry is not None and threshold is not None:
             judged = _judged(artifact, entry, posterior, scene, threshold, details=details)
     if size_limit is not None:
@@ -172,7 +170,7 @@ def misplaced(
     """Judge every stated relation like `outliers`, but do not judge objects."""
     if not scene.objects:
         return []
-    return _misplaced(artifact, Posterior(artifact, scene), scene, sensitivity, ())
+    return misplaced_fields(artifact, Posterior(artifact, scene), scene, sensitivity, ())
 
 
 def intruders(artifact: Artifact, scene: Scene) -> NDArray[np.int64]:
@@ -208,62 +206,6 @@ def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isinf(logits), 0.0, sigmoid(logits))
 
 
-def stated_log_odds(
-    artifact: Artifact, posterior: Posterior, scene: Scene
-) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]]]:
-    """Return the n stated relations that the machine knows, and their log-odds.
-
-    Returns:
-        The triples (relation, subject, object), (3, n), and the log-odds that each relation holds,
-        given the rest of the scene, (n,).
-    """
-    stated = [triple for triple in scene.relations or () if triple[0] < artifact.spec.A]
-    relation, subject, object_ = triples = np.array(stated, dtype=np.int64).reshape(-1, 3).T.copy()
-    if not stated:
-        return triples, np.zeros(0)
-    row = posterior.present.row
-    return triples, posterior.unit_log_odds(relation, row[subject], row[object_])
-
-
-def _misplaced(
-    artifact: Artifact,
-    posterior: Posterior,
-    scene: Scene,
-    sensitivity: Sensitivity,
-    flipped: Collection[Triple],
-) -> list[Fields]:
-    """Judge the stated relations that the machine knows, least likely first.
-
-    Relations with equal log-odds keep the order of `Scene.relations`.
-
-    Returns:
-        The fields of `scene_client.schemas.MisplacedRelation`.
-    """
-    entry, presets = artifact.calibration.misplaced, artifact.calibration.misplaced_thresholds
-    triples, log_odds = stated_log_odds(artifact, posterior, scene)
-    if entry is None or presets is None or not len(log_odds):
-        return []
-    order = np.argsort(log_odds, kind="stable")
-    p = sigmoid(false_log_odds(entry, log_odds[order]))
-    is_misplaced = (p >= getattr(presets, sensitivity)).tolist()
-    return [
-        _spelled(scene, triple, flipped) | {"probability": probability, "is_misplaced": flag}
-        for triple, probability, flag in zip(
-            map(tuple, triples.T[order].tolist()), significant(p), is_misplaced, strict=True
-        )
-    ]
-
-
-def _spelled(scene: Scene, triple: Triple, flipped: Collection[Triple]) -> Fields:
-    """Convert a canonical relation to the name, subject and object that the request uses."""
-    relation, subject, object_ = triple
-    name = CANONICAL[relation]
-    if triple in flipped:
-        subject, name, object_ = object_, opposite(name), subject
-    things = scene.objects
-    return {"subject": things[subject].id, "relation": name, "object": things[object_].id}
-
-
 def _companions(
     artifact: Artifact, present: NDArray[np.int64], flagged: NDArray[np.int64]
 ) -> list[list[str]]:
@@ -290,7 +232,7 @@ def _unjudged(artifact: Artifact, scene: Scene) -> list[SceneWarning]:
     """Return a warning for objects, and one for relations, if the model gives no judgement."""
     parts = {
         "objects": bool(scene.objects) and artifact.calibration.outlier is None,
-        "relations": bool(scene.relations) and artifact.calibration.misplaced is None,
+        "relations": bool(scene.relations) and not artifact.calibration.misplaced.judges_relations,
     }
     return [
         SceneWarning(
@@ -378,6 +320,7 @@ _EXAMPLE_ANSWER: Final = {
             "object": "nightstand_1",
             "probability": 0.05,
             "is_misplaced": False,
+            "moved": None,
         }
     ],
 }

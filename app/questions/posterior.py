@@ -12,7 +12,7 @@ from app.inference import MachineSpec
 from app.inference.posterior import ScenePosterior, context_of
 from app.inference.relations import ObservedRelations
 from app.registry.artifact import Artifact
-from app.registry.description import CountSlope, Slope
+from app.registry.description import CountSlope
 from app.scene.scene import Scene, instance_evidence, pool_classes, pool_relations
 
 Floats = NDArray[np.floating[Any]]
@@ -127,11 +127,3 @@ def calibrated(entry: CountSlope, z: Floats, n: int | NDArray[np.integer[Any]]) 
     """
     log_odds: Floats = entry.intercept + entry.log_count * np.log(n) + entry.slope * z
     return log_odds
-
-
-def false_log_odds(entry: Slope, log_odds: Floats) -> Floats:
-    """Convert the log-odds that stated relations hold to the log-odds that they are false.
-
-    `entry` is `Calibration.misplaced`.
-    """
-    return entry.intercept + entry.slope * log_odds

@@ -3,18 +3,18 @@
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.counts import Counts
 from app.registry.description import (
-    NEVER,
     AlarmLine,
     AlarmLines,
     Calibration,
     CountSlope,
     DataSource,
     Description,
+    Judgement,
     Metric,
+    Misplaced,
     PlaceFit,
+    Sensitivity,
     Sharpness,
-    Slope,
-    Thresholds,
     VocabularyEntry,
 )
 from app.registry.errors import ArtifactError, RegistryError, StoreError
@@ -27,7 +27,6 @@ from app.registry.references import AliasTarget
 from app.registry.store import Store, StoreState
 
 __all__ = [
-    "NEVER",
     "AlarmLine",
     "AlarmLines",
     "AliasTarget",
@@ -40,19 +39,20 @@ __all__ = [
     "DataSource",
     "Description",
     "Example",
+    "Judgement",
     "Manifest",
     "Metric",
+    "Misplaced",
     "ModelSet",
     "Offsets",
     "PlaceFit",
     "Places",
     "RegistryError",
+    "Sensitivity",
     "Sharpness",
-    "Slope",
     "Store",
     "StoreError",
     "StoreState",
-    "Thresholds",
     "VocabularyEntry",
     "load_artifact",
     "load_model_set",

@@ -169,8 +169,11 @@ def _metrics(description: Description) -> str:
     calibration = description.calibration
     unjudged = [
         f"`/outliers` judges no {part}, because the calibration had too few scenes."
-        for part, entry in (("objects", calibration.outlier), ("relations", calibration.misplaced))
-        if entry is None
+        for part, is_judged in (
+            ("objects", calibration.outlier is not None),
+            ("relations", calibration.misplaced.judges_relations),
+        )
+        if not is_judged
     ]
     parts = [_MEASURED, table, _PROBABILITIES, *unjudged]
     return "\n\n".join(parts) + note

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,13 +57,6 @@ class PlaceFit(Frozen):
 PlaceFits = Annotated[Many[PlaceFit], Field(max_length=len(CANONICAL))]
 
 
-class Slope(Frozen):
-    """Calibration of a logit z that does not depend on counts: log-odds = intercept + slope·z."""
-
-    intercept: float
-    slope: float
-
-
 class Sharpness(Frozen):
     """Calibration of probabilities p of exclusive answers: p^(slope + log_count·log n) / sum.
 
@@ -78,39 +71,61 @@ class Sharpness(Frozen):
         return max(self.slope + self.log_count * math.log(max(n, 1)), 0.05)
 
 
-class Thresholds(Frozen):
-    """Minimum probability at which the service reports an outlier or a misplaced relation.
-
-    A request selects the threshold by its sensitivity: low, medium or high.
-    """
-
-    low: Annotated[float, Field(ge=0, le=1)]
-    medium: Annotated[float, Field(ge=0, le=1)]
-    high: Annotated[float, Field(ge=0, le=1)]
-
-
-NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
-"""Thresholds that raise no alarm below a probability of 1."""
+Sensitivity = Literal["low", "medium", "high"]
+"""Name of an alarm line."""
 
 
 class AlarmLine(Frozen):
-    """Minimum log-odds of an outlier in a list of n classes: intercept + log_count·log n."""
+    """Minimum log-odds of an alarm in a list of n entries: intercept + log_count·log n."""
 
     intercept: float
     log_count: float = 0.0
 
     def threshold(self, n: int) -> float:
-        """Return the minimum probability of an outlier in a list of n classes."""
+        """Return the minimum probability of an alarm in a list of n entries."""
         # tanh cannot overflow.
         return 0.5 + 0.5 * math.tanh((self.intercept + self.log_count * math.log(max(n, 1))) / 2)
 
 
 class AlarmLines(Frozen):
-    """The alarm line of each sensitivity. A short list has a higher line than a whole scene."""
+    """The alarm line of each sensitivity."""
 
     low: AlarmLine
     medium: AlarmLine
     high: AlarmLine
+
+
+KINDS: Final = ("lateral", "support", "above", "under", "stand")
+"""Kinds of entries in `misplaced`; see `app.questions.misplaced`."""
+
+
+class Judgement(Frozen):
+    """The log-odds that an entry of `misplaced` is wrong, and the lines of an alarm.
+
+    The log-odds are intercept + relation·z + change·d + stand·s; see `app.questions.misplaced`.
+    n of the lines is the number of entries of the kind in the scene.
+    """
+
+    intercept: float
+    relation: float
+    change: float
+    stand: float
+    lines: AlarmLines
+
+
+class Misplaced(Frozen):
+    """The judgement of each kind of entry. None: training had too few scenes for the fit."""
+
+    lateral: Judgement | None = None
+    support: Judgement | None = None
+    above: Judgement | None = None
+    under: Judgement | None = None
+    stand: Judgement | None = None
+
+    @property
+    def judges_relations(self) -> bool:
+        """Whether the model judges any kind of relation."""
+        return any(getattr(self, kind) is not None for kind in KINDS if kind != "stand")
 
 
 class Calibration(Frozen):
@@ -132,8 +147,6 @@ class Calibration(Frozen):
             proportional to popularity^alpha, where popularity is the odds of the class.
         outlier_lines: minimum log-odds of an outlier, by the number of listed classes without
             structure. None exactly if `outlier` is None.
-        misplaced_thresholds: minimum probability of a misplaced (probably false) relation. None
-            exactly if `misplaced` is None.
         rooms: calibration of the probabilities of the room types.
         rare_rooms: indices of the room types that `/generate` refuses, because too few training
             scenes have them.
@@ -152,9 +165,7 @@ class Calibration(Frozen):
             places.
         at: calibration of each canonical relation for a missing object at the place that a request
             names.
-        misplaced: calibration that converts the log-odds of a stated relation to the log-odds that
-            the relation is false. None means that training had too few scenes with relations for
-            the fit: the model then judges no relation.
+        misplaced: calibration of the observed relations, and of objects on the floor or on a wall.
     """
 
     coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -162,7 +173,6 @@ class Calibration(Frozen):
     popularity: Many[float | None] = ()
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
     outlier_lines: AlarmLines | None = None
-    misplaced_thresholds: Thresholds | None = None
     rooms: Sharpness = Sharpness()
     rare_rooms: Many[Count] = ()
     smallest: Many[Count] = ()
@@ -172,13 +182,12 @@ class Calibration(Frozen):
     relation_given: PairSlopes
     placement: PairSlopes
     at: PlaceFits
-    misplaced: Slope | None = None
+    misplaced: Misplaced = Misplaced()
 
     @model_validator(mode="after")
-    def _has_fits_with_thresholds(self) -> Self:
-        for fit, limits in (("outlier", "outlier_lines"), ("misplaced", "misplaced_thresholds")):
-            if (getattr(self, fit) is None) != (getattr(self, limits) is None):
-                raise ValueError(f"{fit} and {limits} must both have a value, or neither")
+    def _has_fit_with_lines(self) -> Self:
+        if (self.outlier is None) != (self.outlier_lines is None):
+            raise ValueError("outlier and outlier_lines must both have a value, or neither")
         return self
 
     @classmethod

@@ -69,6 +69,16 @@ def possible_roles(rise: float, height: float, larger_height: float) -> NDArray[
     return possible
 
 
+def role_counts(roles: RoleCounts, i: int, j: int) -> NDArray[np.float32]:
+    """Return the counts of the roles of a smaller class i at a larger class j, (3,)."""
+    key = i * len(roles.anchor) + j
+    row = int(np.searchsorted(roles.pair, key))
+    if row < len(roles.pair) and roles.pair[row] == key:
+        counts: NDArray[np.float32] = roles.counts[row]
+        return counts
+    return np.zeros(3, np.float32)
+
+
 @compiled
 def likely_role(
     roles: tuple[NDArray[Any], NDArray[Any], NDArray[Any]], i: int, j: int, possible: NDArray[Any]

@@ -201,7 +201,7 @@ def observe(
     indices = [-1 if thing.class_index is None else thing.class_index for thing in objects]
     poses = derive_relations(
         np.array([thing.position or _UNKNOWN for thing in objects]),
-        np.array([_extent(thing, typical_sizes) for thing in objects]),
+        np.array([extent_of(thing, typical_sizes) for thing in objects]),
         np.array([thing.yaw for thing in objects]),
         horizontal=not has_no_viewer,
         classes=np.array(indices),
@@ -235,7 +235,8 @@ def _in_viewer_frame(
     return tuple(turned)
 
 
-def _extent(thing: SceneObject, typical_sizes: NDArray[np.float64] | None) -> Sequence[float]:
+def extent_of(thing: SceneObject, typical_sizes: NDArray[np.float64] | None) -> Sequence[float]:
+    """Return the extents of an object, else those typical of its class, else NaN."""
     if thing.size is not None and max(thing.size) >= SMALLEST:
         return thing.size
     if typical_sizes is not None and thing.class_index is not None:

@@ -1,10 +1,13 @@
 """Counts of the roles that pairs of classes have in words.
 
-The table serves pairs whose boxes reach into each other. Words do not tell where the object is in
-the box: people say "on the shelf" of a book between two boards. So the table reads "on" as "in" for
-larger objects that contain things: classes whose share of "in" among "on" and "in" is `_CONTAINS`.
-Fridges, shelves and bathtubs contain things. Beds and sofas do not: an object on them reaches into
-their box, because the box includes a headboard or a back.
+The table serves pairs whose boxes reach into each other. "The bin is under the desk" counts for the
+bin. "The lamp is on the desk" does not count for the desk: its box does not reach into the lamp.
+
+Words do not tell where the object is in the box: people say "on the shelf" of a book between two
+boards. So the table reads "on" as "in" for larger objects that contain things: classes whose share
+of "in" among "on" and "in" is at least `_CONTAINS`. Fridges, shelves and bathtubs contain things.
+Beds and sofas do not: an object on them reaches into their box, because the box includes a
+headboard or a back.
 """
 
 from __future__ import annotations
@@ -16,14 +19,15 @@ from typing import Final
 
 import numpy as np
 
-from app.scene import RoleCounts, Vocabulary, canonicalise
-from app.scene.relations import ABOVE, INSIDE, ON_TOP
+from app.scene import RoleCounts, Vocabulary
 from app.scene.roles import IN, ON, UNDER
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 
 _OF_KIN: Final = 0.5  # weight of a pair in which a class is replaced by its parent or its kind
 # Share of "in" from which a class contains things. In the public data, shelf has .10 and chair .06.
 _CONTAINS: Final = 0.08
+
+_ROLES: Final = {"on-top": ON, "under": UNDER, "below": UNDER, "inside": IN}
 
 Role = tuple[int, int, int]
 """A role, the class in this role, and the class of the larger object."""
@@ -52,15 +56,10 @@ def count_roles(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> Rol
 def _stated_roles(scene: AnnotatedScene) -> Iterable[Role]:
     """Yield role, index of the object in this role and index of the larger object."""
     for subject, relation, anchor in scene.relations or ():
-        a, i, j = canonicalise(subject, relation, anchor)
-        if a == INSIDE:
-            yield IN, i, j
-        elif a == ON_TOP:
-            # "under" is stored as on-top(larger, smaller), so it counts for both directions.
-            yield ON, i, j
-            yield UNDER, j, i
-        elif a == ABOVE:
-            yield UNDER, j, i
+        if relation in _ROLES:
+            yield _ROLES[relation], subject, anchor
+        elif relation == "contains":
+            yield IN, anchor, subject
 
 
 def lift_of(thing: AnnotatedObject, support: AnnotatedObject) -> float | None:

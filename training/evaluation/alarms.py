@@ -21,8 +21,7 @@ import numpy as np
 from scipy.stats import beta
 
 from app import questions
-from app.questions.outliers import Sensitivity
-from app.registry import Artifact
+from app.registry import Artifact, Sensitivity
 from app.scene import Scene
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Rng

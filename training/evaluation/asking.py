@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from app import questions
-from app.questions import Sensitivity
-from app.registry import Artifact
+from app.registry import Artifact, Sensitivity
 from app.scene import CANONICAL, Scene, SceneObject, canonicalise, observe
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats
@@ -230,7 +229,7 @@ def misplaced_score(artifact: Artifact) -> MisplacedScore | None:
 
     Relations of scenes with poses follow from the poses, as in a request in viewer axes.
     """
-    if artifact.calibration.misplaced is None:
+    if not artifact.calibration.misplaced.judges_relations:
         return None
     sizes = artifact.vocabulary.sizes
     roles = None if artifact.places is None else artifact.places.roles

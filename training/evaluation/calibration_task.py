@@ -32,7 +32,15 @@ import torch
 
 from app.questions import misplaced, missing, outliers, relations
 from app.questions.placements import Place
-from app.registry import NEVER, AlarmLine, AlarmLines, Artifact, Calibration, CountSlope, Slope
+from app.registry import (
+    AlarmLine,
+    AlarmLines,
+    Artifact,
+    Calibration,
+    CountSlope,
+    Judgement,
+    Misplaced,
+)
 from app.scene import CANONICAL, Scene, Vocabulary, canonicalise
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Ints, Rng
@@ -76,12 +84,13 @@ def uncalibrated(artifact: Artifact) -> Artifact:
     Calibration multiplies log-odds by a slope. The slope -1 turns the log-odds of an object or
     relation into the log-odds that the object or relation is wrong.
     """
+    lines = AlarmLines(low=_NO_ALARM, medium=_NO_ALARM, high=_NO_ALARM)
+    plain = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=0.0, lines=lines)
     neutral = Calibration.neutral(artifact.spec.A).model_copy(
         update={
             "outlier": CountSlope(slope=-1.0),
-            "outlier_lines": AlarmLines(low=_NO_ALARM, medium=_NO_ALARM, high=_NO_ALARM),
-            "misplaced": Slope(intercept=0.0, slope=-1.0),
-            "misplaced_thresholds": NEVER,
+            "outlier_lines": lines,
+            "misplaced": Misplaced(lateral=plain, support=plain, above=plain, under=plain),
         }
     )
     return replace(artifact, calibration=neutral)

@@ -9,8 +9,7 @@ from typing import Any, Protocol, TypeAlias
 import torch
 from torch import Tensor
 
-from app.questions import Sensitivity
-from app.registry import Artifact
+from app.registry import Artifact, Sensitivity
 from app.scene import Scene
 from training.datasets.batches import Batch
 from training.evaluation.setting import Setting

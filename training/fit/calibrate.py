@@ -23,31 +23,25 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from app.inference.relations import NO_UNIT
-from app.questions.outliers import stated_log_odds
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
-from app.registry import Artifact, Calibration, CountSlope, Slope, Thresholds
-from app.scene import Scene
+from app.registry import Artifact, Calibration, CountSlope
 from app.scene.relations import LATERAL, ON_TOP, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Rng
 from training.datasets.batches import TrainingData, subset
 from training.datasets.cases import (
-    RIDGE,
     Triple,
-    altered_scene,
     annotated_relations,
-    draw_true_relations,
     logistic,
     observed_pairs,
     removed_class,
     scene_of,
 )
-from training.evaluation.alarms import ALARMS
 from training.fit.calibrate_at import fit_at
+from training.fit.calibrate_misplaced import fit_misplaced
 from training.fit.calibrate_objects import calibrate_objects, recalibrated
 from training.fit.configuration import ObjectsConfig
 from training.fit.objects import ObjectScenes, served_popularity
@@ -67,11 +61,6 @@ _UNKNOWN = -1.0  # truth of an example whose data source does not annotate the r
 # Number of objects that are removed from each scene in turn to fit placements. With one removed
 # object, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
-# Minimum thresholds. If true and false relations hardly overlap, the target shares would need
-# alarms for relations that probably hold.
-_LEAST = {"low": 0.5, "medium": 0.3, "high": 0.2}
-_SOURCE_SCENES = 200  # minimum number of scenes of a source with its own quantile
-_JUDGED_SCENES = 20  # minimum number of scenes with relations for a judgement of relations
 
 
 def calibrate(
@@ -101,7 +90,7 @@ def calibrate(
         placement=fit_placements(artifact, complete, seed),
         relation_given=fit_with_observed(artifact, complete, seed),
         at=fit_at(artifact, related, seed),
-        **fit_misplaced(artifact, related.scenes, seed),
+        misplaced=fit_misplaced(artifact, related.scenes, seed),
     ).calibration
 
 
@@ -313,65 +302,3 @@ def _instance_pairs(
     truth = np.where(annotated, scene.instance_holds[: len(values)], _UNKNOWN)[examples]
     columns = number, relation, log_odds[examples], logs[i] + logs[j], truth, source
     return np.stack(np.broadcast_arrays(*columns), 1)
-
-
-def fit_misplaced(
-    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
-) -> dict[str, Any]:
-    """Fit `misplaced` and `misplaced_thresholds` to log-odds given the rest of the scene.
-
-    Each scene takes part untouched and with one false relation. Both entries are None if fewer than
-    `_JUDGED_SCENES` scenes have relations, or if false relations are not less likely than true
-    relations. The model then judges no relation.
-    """
-    rng = np.random.default_rng(seed)
-    structure = artifact.vocabulary.structure
-    rows: list[tuple[float, bool]] = []
-    untouched: list[tuple[EncodedScene, float]] = []
-    for encoded in scenes:
-        triples = draw_true_relations(encoded, structure, rng)
-        altered = triples and altered_scene(encoded, structure, triples, rng)
-        if not triples or not altered:
-            continue
-        scene, false = altered
-        log_odds_of = _log_odds(artifact, replace(scene, relations=tuple(triples)))
-        untouched.append((encoded, min(log_odds_of.values())))
-        rows += [(z, False) for z in log_odds_of.values()]
-        rows += [(z, triple == false) for triple, z in _log_odds(artifact, scene).items()]
-    unfitted: dict[str, Any] = {"misplaced": None, "misplaced_thresholds": None}
-    if len(untouched) < _JUDGED_SCENES:
-        return unfitted
-    examples = np.array(rows)
-    slope, intercept = logistic(examples[:, :1], examples[:, 1] > 0, C=RIDGE)
-    if slope >= 0:
-        return unfitted
-    sources = np.array([encoded.source for encoded, _ in untouched], dtype=np.str_)
-    worst = expit(intercept + slope * np.array([least for _, least in untouched]))
-    limits = Thresholds(
-        **{
-            name: max(_LEAST[name], hardest_quantile(worst, sources, 1 - share))
-            for name, share in ALARMS.items()
-        }
-    )
-    entry = Slope(intercept=intercept, slope=slope)
-    return {"misplaced": entry, "misplaced_thresholds": limits}
-
-
-def hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) -> float:
-    """Return the highest quantile of the values, (N,), over the large sources.
-
-    A robot sees scenes of one source. Small sources count as one. A value equal to the quantile is
-    below it.
-    """
-    names, sizes = np.unique(sources, return_counts=True)
-    small = np.isin(sources, names[sizes < _SOURCE_SCENES])
-    parts = [sources == name for name in names[sizes >= _SOURCE_SCENES]]
-    parts += [small] if small.any() else []
-    highest = max(float(np.quantile(values[part], share)) for part in parts)
-    return float(np.nextafter(highest, np.inf))
-
-
-def _log_odds(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
-    """Return the log-odds of each stated relation given the rest of the scene."""
-    triples, log_odds = stated_log_odds(artifact, Posterior(artifact, scene), scene)
-    return dict(zip(map(tuple, triples.T.tolist()), log_odds.tolist(), strict=True))

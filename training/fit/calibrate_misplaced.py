@@ -1,0 +1,216 @@
+"""Fit the judgement of observed relations, and of objects on the floor or on a wall.
+
+Each validation scene takes part up to four times: with listed true relations, with one of them
+altered, with its boxes or listed relations as they are, and with one moved object
+(`training.datasets.moved`). A logistic regression for each kind of entry turns its terms into the
+log-odds that the entry is wrong (`app.questions.misplaced`). The alarm lines keep the share of
+untouched scenes with an alarm. Long lists have a higher line than short ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logit
+
+from app.questions.misplaced import BESIDE, Entries, entries_of, wrong_log_odds
+from app.questions.posterior import Posterior
+from app.registry import AlarmLine, AlarmLines, Artifact, Judgement, Misplaced
+from app.registry.description import KINDS
+from app.scene import Scene
+from app.scene.scene import observe
+from training.datasets import EncodedScene
+from training.datasets.array_types import Flags, Floats, Ints, Rng
+from training.datasets.cases import RIDGE, altered_scene, draw_true_relations, logistic, scene_rng
+from training.datasets.moved import moved_scene, untouched_scene
+from training.evaluation.alarms import ALARMS
+
+_SCENES: Final = 250  # maximum scenes of a source
+_LEAST_SCENES: Final = 20  # minimum untouched scenes with entries of a kind
+_SOURCE_SCENES: Final = 60  # minimum scenes of a source with its own alarm line
+_LENGTHS: Final = (1, 2, 4, 8, 16, 32)
+"""Numbers of entries to which the alarm lines are fitted."""
+# Minimum probabilities of an alarm. If right and wrong entries hardly overlap, the target shares
+# would need alarms for relations that probably hold.
+_LEAST: Final = {"low": 0.5, "medium": 0.3, "high": 0.15}
+# Share of the alarms that each kind of entry may raise. Wrong supports are the surest signs.
+_BUDGET: Final = {"lateral": 0.05, "support": 0.45, "above": 0.1, "under": 0.1, "stand": 0.3}
+
+
+class _Cases(NamedTuple):
+    """The entries of many scenes, (entries,).
+
+    Attributes:
+        scene: number of the scene, in which one entry or no entry is wrong.
+        source: data source of the scene.
+        untouched: True for entries of a scene without a wrong entry.
+        wrong: True for wrong entries.
+    """
+
+    scene: Ints
+    source: NDArray[np.str_]
+    untouched: Flags
+    kind: Ints
+    terms: Floats
+    wrong: Flags
+
+    def rows(self, mask: Flags) -> _Cases:
+        return _Cases(*(column[mask] for column in self))
+
+
+def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0) -> Misplaced:
+    """Return the judgement of each kind of entry. A kind with too few scenes gets None."""
+    cases = _cases(artifact, _some(scenes, seed), seed)
+    return Misplaced(
+        **{
+            name: _fit_kind(cases.rows(cases.kind == kind), _BUDGET[name])
+            for kind, name in enumerate(KINDS)
+        }
+    )
+
+
+def _some(scenes: Sequence[EncodedScene], seed: int) -> list[EncodedScene]:
+    """Return at most `_SCENES` random scenes of each source."""
+    rng = np.random.default_rng(seed)
+    counts: dict[str, int] = {}
+    chosen = []
+    for k in rng.permutation(len(scenes)).tolist():
+        source = scenes[k].source
+        counts[source] = counts.get(source, 0) + 1
+        if counts[source] <= _SCENES:
+            chosen.append(scenes[k])
+    return chosen
+
+
+def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Cases:
+    columns: list[list[NDArray[np.generic]]] = [[] for _ in _Cases._fields]
+    number = 0
+    for encoded in scenes:
+        for scene, wrong in _questions(artifact, encoded, seed):
+            bare = replace(scene, room_type=None)
+            entries = entries_of(artifact, Posterior(artifact, bare), bare)
+            is_wrong, usable = _truth(entries, wrong)
+            size = int(usable.sum())
+            number += 1
+            for column, values in zip(
+                columns,
+                (
+                    np.full(size, number),
+                    np.full(size, encoded.source),
+                    np.full(size, wrong is None),
+                    entries.kind[usable],
+                    entries.terms[usable],
+                    is_wrong[usable],
+                ),
+                strict=True,
+            ):
+                column.append(values)
+    if not number:
+        empty = np.zeros(0, np.int64)
+        return _Cases(empty, empty.astype(np.str_), empty > 0, empty, np.zeros((0, 3)), empty > 0)
+    return _Cases(*(np.concatenate(column) for column in columns))
+
+
+def _questions(
+    artifact: Artifact, encoded: EncodedScene, seed: int
+) -> Iterator[tuple[Scene, tuple[int, int, int] | int | None]]:
+    """Yield scenes, each with its wrong triple, its moved object, or None."""
+    structure = artifact.vocabulary.structure
+    rng: Rng = scene_rng(encoded, seed)
+    triples = draw_true_relations(encoded, structure, rng)
+    altered = altered_scene(encoded, structure, triples, rng) if triples else None
+    if triples and altered:
+        yield replace(altered[0], relations=tuple(triples)), None
+        yield altered
+    state = scene_rng(encoded, seed + 1), scene_rng(encoded, seed + 1)
+    untouched, moved = untouched_scene(encoded, structure, state[0]), None
+    if untouched is not None:
+        moved = moved_scene(encoded, structure, state[1])
+    if untouched is not None and moved is not None:
+        sizes = artifact.vocabulary.sizes
+        roles = None if artifact.places is None else artifact.places.roles
+        yield observe(untouched, typical_sizes=sizes, roles=roles), None
+        yield observe(moved[0], typical_sizes=sizes, roles=roles), moved[1]
+
+
+def _truth(entries: Entries, wrong: tuple[int, int, int] | int | None) -> tuple[Flags, Flags]:
+    """Return which entries are wrong, and which have a known truth, (n,) each.
+
+    A moved object makes its own support wrong. Its other relations may be right or wrong.
+    """
+    if isinstance(wrong, tuple):
+        is_wrong: Flags = (entries.triple == np.array(wrong)).all(1)
+        return is_wrong, np.ones(len(is_wrong), np.bool_)
+    if wrong is None:
+        return np.zeros(len(entries.kind), np.bool_), np.ones(len(entries.kind), np.bool_)
+    about: Flags = (entries.triple[:, 1:] == wrong).any(1)
+    is_wrong = (entries.mover == wrong) & (entries.kind != BESIDE)
+    return is_wrong, ~about | is_wrong
+
+
+def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
+    """Fit the judgement of one kind of entry; None with too few scenes or without any sense."""
+    untouched = cases.rows(cases.untouched)
+    if len(np.unique(untouched.scene)) < _LEAST_SCENES or not cases.wrong.any():
+        return None
+    varies = cases.terms.std(0) > 0
+    if not varies.any():
+        return None
+    weights = np.zeros(3)
+    *fitted, intercept = logistic(cases.terms[:, varies], cases.wrong, C=RIDGE)
+    weights[varies] = fitted
+    # A likelier relation, and a likelier stand, never make an entry more suspicious.
+    weights = np.minimum(weights, 0.0)
+    if not weights.any():
+        return None
+    relation, change, stand = weights.tolist()
+    silent = AlarmLines(**dict.fromkeys(ALARMS, AlarmLine(intercept=0.0)))
+    judgement = Judgement(
+        intercept=intercept, relation=relation, change=change, stand=stand, lines=silent
+    )
+    return judgement.model_copy(update={"lines": _alarm_lines(judgement, untouched, budget)})
+
+
+def _alarm_lines(judgement: Judgement, untouched: _Cases, budget: float) -> AlarmLines:
+    """Fit the alarm lines to the highest log-odds among n random entries of untouched scenes."""
+    log_odds = wrong_log_odds(judgement, untouched.terms)
+    rng = np.random.default_rng(0)
+    points: dict[str, list[tuple[float, float]]] = {name: [] for name in ALARMS}
+    starts = np.flatnonzero(np.diff(untouched.scene, prepend=-1))
+    lists = np.split(log_odds, starts[1:])
+    sources = untouched.source[starts]
+    for n in _LENGTHS:
+        kept = [k for k, values in enumerate(lists) if len(values) >= n]
+        if len(kept) < _LEAST_SCENES:
+            break
+        highest = np.array([rng.permutation(lists[k])[:n].max() for k in kept])
+        for name, share in ALARMS.items():
+            limit = hardest_quantile(highest, sources[kept], 1 - budget * share)
+            points[name].append((float(np.log(n)), limit))
+    return AlarmLines(**{name: _line(points[name], _LEAST[name]) for name in ALARMS})
+
+
+def _line(points: Sequence[tuple[float, float]], least: float) -> AlarmLine:
+    """Return a line that does not fall with the number of entries, at least at this probability."""
+    x, y = np.array(points).T
+    slope = max(float(np.polyfit(x, y, 1)[0]), 0.0) if len(x) > 1 else 0.0
+    intercept = float(np.mean(y - slope * x))
+    return AlarmLine(intercept=max(intercept, float(logit(least))), log_count=slope)
+
+
+def hardest_quantile(values: Floats, sources: NDArray[np.str_], share: float) -> float:
+    """Return the highest quantile of the values, (N,), over the large sources.
+
+    A robot sees scenes of one source. Small sources count as one. A value equal to the quantile is
+    below it.
+    """
+    names, sizes = np.unique(sources, return_counts=True)
+    small = np.isin(sources, names[sizes < _SOURCE_SCENES])
+    parts = [sources == name for name in names[sizes >= _SOURCE_SCENES]]
+    parts += [small] if small.any() else []
+    highest = max(float(np.quantile(values[part], share)) for part in parts)
+    return float(np.nextafter(highest, np.inf))
