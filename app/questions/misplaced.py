@@ -9,8 +9,9 @@ An entry is an observed relation, or an object that nothing supports. There are 
     stand     an object that stands on the floor or hangs; it has no relation
 
 "Under" is the opposite of on-top, so both have one unit: "the desk is on top of the bin". The words
-of the request tell them apart. Otherwise the roles of the two classes do (`Places.roles`). An
-object above another object is no sign of a fault if a third object supports it.
+of the request tell them apart. Otherwise the roles of the two classes do (`Places.roles`). People
+also say "under" for "below", so z of such an entry is the larger of the two. An object above
+another object is no sign of a fault if a third object supports it.
 
 The log-odds that an entry is wrong are a weighted sum of three terms (`app.registry.Judgement`):
 
@@ -30,6 +31,7 @@ object. Without them, only a stated support shows the stand of its subject.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple
 
@@ -44,8 +46,8 @@ from app.registry.artifact import Artifact
 from app.registry.description import KINDS, Judgement, Sensitivity
 from app.scene.relations import ABOVE, CANONICAL, INSIDE, LATERAL, ON_TOP, SUPPORTS, opposite
 from app.scene.roles import ON, UNDER, role_counts
-from app.scene.scene import Scene, SceneObject, extent_of
-from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, floor_level, stands_of
+from app.scene.scene import Scene, extent_of
+from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
 
 BESIDE, SUPPORT, OVER, BELOW, STAND = range(len(KINDS))
 """Indices of the kinds in `KINDS`."""
@@ -54,6 +56,8 @@ THE_FLOOR: Final = "floor"
 """Name of the floor in an entry about an object that stands on the floor or hangs above it."""
 
 _LEAST_P: Final = 1e-6  # minimum of p(stand)
+EXPLAINED: Final = 5.0  # z of an object above another object that is no sign of a fault
+_NOWHERE: Final = (math.nan, math.nan, math.nan)
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -92,9 +96,14 @@ def entries_of(
         for a, i, j in scene.relations or ()
         if a < artifact.spec.A and is_thing[i] and is_thing[j]
     ]
-    unders = {triple for triple in stated if _is_under(artifact, posterior, triple, flipped)}
+    heights = None if scene.poses is None else _heights(artifact, scene)
+    if heights is None:
+        unders = {triple for triple in stated if _is_under(artifact, posterior, triple, flipped)}
+    else:
+        around = heights.around
+        unders = {(a, i, j) for a, i, j in stated if a == ON_TOP and around[i, j]}
     supports = [(i, j) for a, i, j in stated if a in SUPPORTS and (a, i, j) not in unders]
-    stands, log_p = _stands(artifact, posterior, scene, supports)
+    stands, log_p = _stands(artifact, posterior, scene, supports, heights)
     alone, change = posterior.alone_log_odds(), posterior.relation_change()
     rows: list[tuple[int, int, int]] = []
     kinds: list[int] = []
@@ -107,17 +116,23 @@ def entries_of(
             kind = BESIDE
         elif (a, i, j) in unders:
             kind, mover, s = BELOW, j, float(log_p[j]) if stands[j] == FLOOR else 0.0
+            z = max(z, float(alone[ABOVE, row[i], row[j]]))
+        elif a == ABOVE and stands[i] == FLOOR:
+            kind, mover, s = BELOW, j, float(log_p[j]) if stands[j] == FLOOR else 0.0
+            z = max(z, float(alone[ON_TOP, row[i], row[j]]))
         elif a == ABOVE:
             kind = OVER
-            if stands[i] == SUPPORTED:
-                z = d = 0.0
+            if stands[i] == HANGS:
+                s = float(log_p[i])
+            elif stands[i] == SUPPORTED or heights is not None:
+                z = max(z, EXPLAINED)
         else:
             kind, mover, s = SUPPORT, i, float(log_p[i])
         rows.append((a, i, j))
         kinds.append(kind)
         terms.append((z, d, s))
         movers.append(mover)
-    if scene.poses is not None:
+    if heights is not None:
         for i in np.flatnonzero(is_thing & ((stands == FLOOR) | (stands == HANGS))).tolist():
             rows.append((ON_TOP if stands[i] == FLOOR else ABOVE, i, -1))
             kinds.append(STAND)
@@ -147,12 +162,17 @@ def _is_under(
 
 
 def _stands(
-    artifact: Artifact, posterior: Posterior, scene: Scene, supports: Sequence[tuple[int, int]]
+    artifact: Artifact,
+    posterior: Posterior,
+    scene: Scene,
+    supports: Sequence[tuple[int, int]],
+    heights: Heights | None,
 ) -> tuple[Indices, Floats]:
     """Return what holds each of N objects, and log p of it, (N,) each; 0 for an unknown stand.
 
     Args:
         supports: pairs of objects (i, j) with i on or in j.
+        heights: heights of the boxes, or None for a scene without poses.
     """
     present, places = posterior.present, artifact.places
     stands, log_p = np.full(len(present.row), UNKNOWN), np.zeros(len(present.row))
@@ -160,10 +180,9 @@ def _stands(
         return stands, log_p
     classes = present.classes[present.row]
     shares = places.stands[classes].astype(np.float64)
-    if scene.poses is not None:
-        bottoms = np.array([_bottom(artifact, thing) for thing in scene.objects])
-        floor = floor_level(bottoms, shares[:, FLOOR])
-        stands = stands_of(scene.poses.holds, scene.poses.observed, bottoms, floor)
+    if heights is not None and scene.poses is not None:
+        floor = floor_level(heights.bottoms, shares[:, FLOOR])
+        stands = stands_of(scene.poses.holds, scene.poses.observed, heights, floor)
     else:
         stands[[i for i, _ in supports]] = SUPPORTED
     is_unsupported = (stands == FLOOR) | (stands == HANGS)
@@ -179,11 +198,10 @@ def _stands(
     return stands, log_p
 
 
-def _bottom(artifact: Artifact, thing: SceneObject) -> float:
-    """Return the height of the bottom of an object in metres, or NaN if it is unknown."""
-    if thing.position is None:
-        return float("nan")
-    return thing.position[2] - extent_of(thing, artifact.vocabulary.sizes)[2] / 2
+def _heights(artifact: Artifact, scene: Scene) -> Heights:
+    sizes = artifact.vocabulary.sizes
+    centres = np.array([thing.position or _NOWHERE for thing in scene.objects])
+    return Heights.of(centres, np.array([extent_of(thing, sizes) for thing in scene.objects]))
 
 
 def _support_shares(artifact: Artifact, posterior: Posterior) -> Floats:

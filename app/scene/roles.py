@@ -21,6 +21,7 @@ SAME: Final = 0.01  # footprints or volumes count as equal up to this share of t
 LEAST_RISE: Final = 0.2  # minimum height of an object on the larger, as a share of its height
 MAX_RISE: Final = 0.10  # height in metres above the bottom of the larger that counts as the floor
 MAX_HEIGHT: Final = 1.2  # maximum height of an object in the larger, as a share of its height
+LEAST_WEIGHT: Final = 0.5  # minimum smoothed count of a role that decides
 LEAST_SHARE: Final = 0.8  # minimum share of a role among the possible roles of a pair
 # Weight of the roles at the larger class, in counts. They decide for pairs that were never seen.
 _OF_ANCHOR: Final = 2.0
@@ -85,7 +86,8 @@ def likely_role(
 ) -> int:
     """Return the role of a smaller object of class i at a larger object of class j, or -1.
 
-    The result is -1 if no role has `LEAST_SHARE` of the smoothed counts.
+    The result is -1 if no role has `LEAST_SHARE` of the smoothed counts, and at least
+    `LEAST_WEIGHT`.
 
     Args:
         roles: see `RoleCounts`.
@@ -108,4 +110,5 @@ def likely_role(
         if not possible[role]:
             weight[role] = 0.0
     best = int(np.argmax(weight))
-    return best if weight[best] > 0 and weight[best] >= LEAST_SHARE * weight.sum() else -1
+    is_clear = weight[best] >= max(LEAST_WEIGHT, LEAST_SHARE * weight.sum())
+    return best if is_clear else -1

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.scene.relations import SUPPORTS
+from app.scene.geometry import CONTACT
+from app.scene.relations import ABOVE, INSIDE, ON_TOP, SUPPORTS
 
 UNKNOWN, FLOOR, HANGS, SUPPORTED = -1, 0, 1, 2
 """An object stands on the floor, hangs on a wall or from the ceiling, or is on or in an object."""
 
 CLEARANCE: Final = 0.10  # maximum height in metres of the bottom of an object on the floor
+CLOSE: Final = 0.15  # maximum gap in metres to an object that may support an object above it
 
 Flags = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -34,23 +36,50 @@ def floor_level(bottoms: Floats, weights: Floats) -> float:
     return float(bottoms[order][np.searchsorted(total, total[-1] / 2)])
 
 
-def stands_of(holds: Flags, observed: Flags, bottoms: Floats, floor: float) -> NDArray[np.int64]:
+class Heights(NamedTuple):
+    """Bottoms, tops and footprint areas of n boxes, in metres and square metres; NaN: unknown."""
+
+    bottoms: Floats
+    tops: Floats
+    areas: Floats
+
+    @classmethod
+    def of(cls, centres: Floats, sizes: Floats) -> Heights:
+        """Return the heights of boxes with these centres and extents, (n, 3) each."""
+        half = sizes[:, 2] / 2
+        return cls(centres[:, 2] - half, centres[:, 2] + half, sizes[:, 0] * sizes[:, 1])
+
+    @property
+    def around(self) -> Flags:
+        """Whether box i reaches below the top of a smaller box j, (n, n).
+
+        "i is on top of j" then means that j is under i, as a bin is under a desk.
+        """
+        is_deep = self.bottoms[:, None] < self.tops - CONTACT
+        around: Flags = is_deep & (self.areas[:, None] >= self.areas)
+        return around
+
+
+def stands_of(holds: Flags, observed: Flags, heights: Heights, floor: float) -> NDArray[np.int64]:
     """Return what holds each of n boxes, (n,).
 
-    A low object stands on the floor, also if a rug is under it. A desk stands on the floor, also if
-    a bin is under it ("the desk is on top of the bin"). The value is `UNKNOWN` if a bottom is
-    unknown, or if a box reaches into another box and its relation to this box is open.
+    A low object stands on the floor, also if it is on a rug. The value is `UNKNOWN` if a bottom is
+    unknown, if a box reaches into another box and its relation to this box is open, or if a box is
+    closely above another box.
 
     Args:
         holds, observed: (A, n, n) relations between the boxes; see `PoseRelations`.
-        bottoms: (n,) heights in metres; NaN where unknown.
         floor: height of the floor in metres.
     """
+    bottoms, tops, _ = heights
     is_known = np.isfinite(bottoms)
-    supports = [*SUPPORTS]
-    is_open = (~observed[supports] & is_known & ~np.eye(len(bottoms), dtype=np.bool_)).any((0, 2))
-    stands = np.where(holds[supports].any((0, 2)), SUPPORTED, HANGS)
-    stands[is_known & is_open & (stands == HANGS)] = UNKNOWN
+    other = ~np.eye(len(bottoms), dtype=np.bool_)
+    is_close = (holds[ABOVE] & (bottoms[:, None] - tops <= CLOSE)).any(1)
+    is_open = (~observed[[*SUPPORTS]] & is_known & other).any((0, 2))
+    carried = holds[ON_TOP] & ~heights.around & (tops > floor + CLEARANCE)
+    stands = np.where(is_close, UNKNOWN, HANGS)
     stands[bottoms <= floor + CLEARANCE] = FLOOR
+    stands[is_open] = UNKNOWN
+    stands[(carried | holds[INSIDE]).any(1)] = SUPPORTED
     stands[~is_known] = UNKNOWN
     return stands

@@ -30,7 +30,7 @@ from app.scene import (
 from app.scene.geometry import CONTACT
 from app.scene.relations import INSIDE, ON_TOP, STACKED, SUPPORTS
 from app.scene.roles import IN, ON, likely_role
-from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, stands_of
+from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, stands_of
 from scene_client.image_plane import are_neighbours, relation_between
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.names import Names, curated_names
@@ -229,10 +229,12 @@ def _stands(
     Without positions, a listed support that is neither the floor nor an object is a wall.
     """
     if boxes is not None:
-        bottoms = boxes[:, 2] - boxes[:, 5] / 2
-        if np.isfinite(bottoms).any():
-            holds, observed = relations.holds, relations.observed
-            stands = stands_of(holds, observed, bottoms, float(np.nanmin(bottoms)))
+        heights = Heights.of(boxes[:, :3], boxes[:, 3:6])
+        if np.isfinite(heights.bottoms).any():
+            stands = stands_of(
+                *(relations.holds, relations.observed, heights),
+                floor=float(np.nanmin(heights.bottoms)),
+            )
             stands[[thing.supported_by is not None for thing in scene.objects]] = SUPPORTED
             return stands
     stands = np.full(len(scene.objects), UNKNOWN)
