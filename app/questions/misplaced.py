@@ -219,13 +219,29 @@ def _support_shares(artifact: Artifact, posterior: Posterior) -> Floats:
     structure = artifact.vocabulary.structure[present.classes][row]
     by_object[:, structure] = 0.0
     np.fill_diagonal(by_object, 0.0)
-    return by_object / (1.0 + by_object.sum(1, keepdims=True))
+    shares: Floats = by_object / (1.0 + by_object.sum(1, keepdims=True))
+    return shares
 
 
 def wrong_log_odds(judgement: Judgement, terms: Floats) -> Floats:
     """Return the log-odds that entries of one kind are wrong, (n,). `terms` is (n, 3)."""
     weights = np.array([judgement.relation, judgement.change, judgement.stand])
     log_odds: Floats = judgement.intercept + terms @ weights
+    return log_odds
+
+
+def wrong_relations(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
+    """Return the log-odds that each judged relation of a scene is wrong."""
+    entries = entries_of(artifact, Posterior(artifact, scene), scene)
+    log_odds: dict[Triple, float] = {}
+    for kind, name in enumerate(KINDS):
+        judgement: Judgement | None = getattr(artifact.calibration.misplaced, name)
+        rows = np.flatnonzero((entries.kind == kind) & (entries.triple[:, 2] >= 0))
+        if judgement is None or not len(rows):
+            continue
+        values = wrong_log_odds(judgement, entries.terms[rows]).tolist()
+        triples = entries.triple[rows].tolist()
+        log_odds |= {(a, i, j): z for (a, i, j), z in zip(triples, values, strict=True)}
     return log_odds
 
 

@@ -21,14 +21,25 @@ from app.questions.ranking import likeliest_places
 from app.registry.artifact import Artifact
 from app.registry.offsets import UNOBSERVED, Offsets, look_up
 from app.scene.geometry import Axes
-from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP, RELATIONS, canonicalise, opposite
-from app.scene.scene import Scene
+from app.scene.relations import (
+    CANONICAL,
+    FRONT,
+    INSIDE,
+    LEFT,
+    ON_TOP,
+    RELATIONS,
+    canonicalise,
+    opposite,
+)
+from app.scene.scene import Scene, extent_of
 
 PLACES: Final = 3
 """Maximum number of placements in the answer for one class."""
 
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
+LEAST_LIKELY: Final = 0.05  # least probability of a placement
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
+_TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 _UNTURNED: Final = np.eye(3)
 _PER_METRE: Final = 1000.0  # offsets are rounded to millimetres
 
@@ -93,8 +104,8 @@ def placements(
     The candidate is subject or object of the relation. Structural classes (floor, wall) are never
     anchors. If a class has several instances, the first instance is the anchor. If an object stands
     on top of another object, candidates are never placed under the upper object. A further place
-    has at least `LEAST_SHARE` of the probability of the first place. An offset needs an anchor
-    with a position.
+    has at least `LEAST_SHARE` of the probability of the first place. Without a place of probability
+    `LEAST_LIKELY`, the list is empty. An offset needs an anchor with a position.
 
     Args:
         candidates: (N,) indices of absent classes.
@@ -120,12 +131,19 @@ def placements(
         for column in np.flatnonzero(anchors == present.row[at.anchor]).tolist():
             first = ((0 if at.outgoing else A) + at.relation) * len(anchors) + column
             objects[column] = at.anchor
+    if A > INSIDE:
+        fits = _fits_inside(artifact, scene, candidates, objects)
+        forward[:, INSIDE][~fits[0]] = NO_UNIT
+        backward[:, INSIDE][~fits[1]] = NO_UNIT
     slopes, log_counts = artifact.relation_slopes.placement, present.log_counts[anchors]
     rows, relations, outgoing, columns, p = likeliest_places(
         slopes, forward, backward, log_counts, PLACES, first
     )
     places = len(rows) // len(candidates)  # the same number for each candidate
-    likely = np.flatnonzero(p >= LEAST_SHARE * np.repeat(p[::places], places))
+    is_likely = (p >= LEAST_SHARE * np.repeat(p[::places], places)) & (p >= LEAST_LIKELY)
+    if first >= 0:
+        is_likely[::places] = True
+    likely = np.flatnonzero(is_likely)
     rows, relations, outgoing = rows[likely], relations[likely], outgoing[likely]
     columns = columns[likely]
     numbers = objects[columns].tolist()
@@ -149,6 +167,24 @@ def placements(
             entry["offset"] = offset
         entries[row].append(entry)
     return entries
+
+
+def _fits_inside(
+    artifact: Artifact, scene: Scene, candidates: NDArray[np.int64], objects: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return whether each candidate fits into each object, and each object into each candidate.
+
+    Both arrays are (N candidates, m objects). A box fits into another box if each of its extents,
+    in order of size, is at most `_TIGHT` times that of the other. Candidates have the typical size
+    of their class. A box of unknown size fits everywhere.
+    """
+    sizes = artifact.vocabulary.sizes
+    inner = np.sort(sizes[candidates], axis=1)[:, None]
+    outer = np.sort([extent_of(scene.objects[k], sizes) for k in objects.tolist()], axis=1)
+    # A comparison with NaN is False.
+    too_large = np.any(inner > _TIGHT * outer, axis=2)
+    too_small = np.any(outer > _TIGHT * inner, axis=2)
+    return np.logical_not(too_large), np.logical_not(too_small)
 
 
 def _offset_fields(

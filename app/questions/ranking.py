@@ -18,6 +18,11 @@ from app.inference.relations import NO_UNIT
 
 Floats = NDArray[np.floating[Any]]
 
+EXCLUDED = np.float32(-1.0)
+"""Evidence that a relation cannot hold."""
+LEAST_LIKELY = np.float32(0.01)
+"""Maximum probability of a relation that cannot hold."""
+
 
 @compiled
 def relation_probability(slopes: Floats, log_odds: Floats, log_count: Floats) -> Floats:
@@ -52,6 +57,19 @@ def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
     """
     total = np.maximum(forward + backward, np.float32(1.0))
     return forward / total, backward / total
+
+
+@inlined
+def with_evidence(p, evidence, opposite):
+    """Return the probability of a relation a(x, y), given the evidence about it and about a(y, x).
+
+    A relation cannot hold in both directions.
+    """
+    if evidence > EXCLUDED:
+        return evidence
+    if evidence == EXCLUDED or opposite > EXCLUDED:
+        return min(p, LEAST_LIKELY)
+    return p
 
 
 @compiled
@@ -135,7 +153,9 @@ def likeliest_classes(logits, usable, count):
 
 
 @compiled
-def likeliest_relations(slopes, log_odds, log_counts, row, judged, least, opposites, count):
+def likeliest_relations(
+    slopes, log_odds, log_counts, row, judged, evidence, least, opposites, count
+):
     """Return the `count` likeliest relations between N objects, likeliest first.
 
     Args:
@@ -144,13 +164,16 @@ def likeliest_relations(slopes, log_odds, log_counts, row, judged, least, opposi
         log_counts: (n,) log of the number of instances of each class.
         row: (N,) index of each object's class among the n classes.
         judged: (N, N) bool, True for the ordered pairs of objects to judge.
+        evidence: (A, N, N) probability of each observed relation, `EXCLUDED` for a relation that
+            cannot hold, and NaN for other relations. It is empty if the scene shows no relations.
         least: minimum probability of a relation in the result.
         opposites: whether the result also contains opposite relations. The opposite of relation a
             has the number A + a.
         count: maximum number k of relations.
 
     Returns:
-        Four arrays (k,): subjects, objects, relations and probabilities.
+        Five arrays (k,): subjects, objects, relations, probabilities, and the probabilities without
+        the evidence.
     """
     (A, n), size = log_odds.shape[:2], len(row)
     counts = np.empty((n, n), log_counts.dtype)
@@ -161,19 +184,29 @@ def likeliest_relations(slopes, log_odds, log_counts, row, judged, least, opposi
     p = relation_probability(slopes, log_odds, counts.reshape(-1)).reshape(A, n, n)
     names = 2 * A if opposites else A
     grid, usable = np.zeros((size, size, names), p.dtype), np.zeros((size, size, names), np.bool_)
+    expected = np.zeros((size, size, names), p.dtype)
     for x in range(size):
         for y in range(size):
             if judged[x, y]:
                 i, j = row[x], row[y]
                 for a in range(A):
                     to, back = exclusive(p[a, i, j], p[a, j, i])
+                    expected[x, y, a] = to
+                    if opposites:
+                        expected[x, y, A + a] = back
+                    if len(evidence):
+                        shown, opposite = evidence[a, x, y], evidence[a, y, x]
+                        to = with_evidence(to, shown, opposite)
+                        back = with_evidence(back, opposite, shown)
                     grid[x, y, a], usable[x, y, a] = to, to >= least
                     if opposites:
                         grid[x, y, A + a], usable[x, y, A + a] = back, back >= least
     values = grid.reshape(-1)
     indices = best(values, usable.reshape(-1), count)
     pair = indices // names
-    return pair // size, pair % size, indices % names, values[indices].astype(np.float64)
+    of_model = expected.reshape(-1)[indices].astype(np.float64)
+    probabilities = values[indices].astype(np.float64)
+    return pair // size, pair % size, indices % names, probabilities, of_model
 
 
 @compiled

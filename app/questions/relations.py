@@ -4,7 +4,7 @@ A disagreement is a pair of objects whose observed relation is not the relation 
 scene suggests. To find disagreements, the module judges each pair with an observed relation a
 second time. It then treats all relations between the two classes as unobserved, in both directions.
 Otherwise an observation would be evidence for itself: if left is observed, the model also knows
-that front does not hold. The pair is a disagreement if the likeliest of the eight relations is
+that front does not hold. The pair is a disagreement if the likeliest of the ten relations is
 unobserved and has a probability of at least `EXPECTED`.
 
 The model has relation units between classes. If a class has several instances, a relation of any
@@ -25,11 +25,11 @@ from app.questions.answer import RELATION_BYTES, Fields, SizeLimit, significant
 from app.questions.names import ErrorList
 from app.questions.posterior import Posterior, Present, relations_given
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
-from app.questions.ranking import disagreeing, likeliest_relations, observed_pairs
+from app.questions.ranking import EXCLUDED, disagreeing, likeliest_relations, observed_pairs
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, OPPOSITES, canonicalise, opposite
-from app.scene.scene import Scene
+from app.scene.scene import Scene, instance_evidence
 from scene_client.schemas import RelationsAnswer, RelationsRequest
 
 EXPECTED = 0.5
@@ -52,8 +52,10 @@ def relations(
 ) -> Fields:
     """Return the likeliest relations between the objects of a scene, and its disagreements.
 
-    Observed relations are evidence for other relations, but an observed relation is not evidence
-    for itself. Structural classes (floor, wall) are left out unless `pairs` contains them.
+    An observed relation has the probability of its evidence. Beside it stands the probability that
+    the model expects without this observation. A relation that is observed not to hold, or that the
+    boxes exclude, has at most .01. Structural classes (floor, wall) are left out unless `pairs`
+    contains them.
 
     Args:
         scene: the objects, their observed relations and the room type.
@@ -92,10 +94,12 @@ def relations(
     least = min_probability * (1 - 1e-5)
     table = slopes.relation_given if relations_given(scene) else slopes.relation
     log_odds, log_counts, row = posterior.relation_log_odds(), present.log_counts, present.row
-    subjects, objects, kinds, p = likeliest_relations(
-        table, log_odds, log_counts, row, judged, least, include_opposites, top_k
+    evidence = _evidence(scene, artifact.spec.A)
+    subjects, objects, kinds, p, of_model = likeliest_relations(
+        table, log_odds, log_counts, row, judged, evidence, least, include_opposites, top_k
     )
     columns = subjects.tolist(), objects.tolist(), kinds.tolist(), significant(p)
+    expected = significant(of_model)
     disagreements = _disagreements(
         artifact, scene, posterior, judged, flipped, top_k=top_k, least=least
     )
@@ -106,18 +110,44 @@ def relations(
     names = CANONICAL[: artifact.spec.A]
     names += tuple([OPPOSITES[name] for name in names])
     observed, things = set(scene.relations or ()), scene.objects
-    entries: list[Fields] = [
-        {
-            "subject": things[subject].id,
-            "relation": names[kind],
-            "object": things[object_].id,
-            "probability": probability,
-            "observed": bool(observed) and canonicalise(subject, names[kind], object_) in observed,
-        }
-        for subject, object_, kind, probability in zip(*columns, strict=True)
-        if probability >= min_probability
-    ]
+    entries: list[Fields] = []
+    for subject, object_, kind, probability, own in zip(*columns, expected, strict=True):
+        if probability < min_probability:
+            continue
+        name = names[kind]
+        is_observed = bool(observed) and canonicalise(subject, name, object_) in observed
+        entries.append(
+            {
+                "subject": things[subject].id,
+                "relation": name,
+                "object": things[object_].id,
+                "probability": probability,
+                "observed": is_observed,
+                "expected": own if is_observed else None,
+            }
+        )
     return {"relations": entries, "disagreements": disagreements}
+
+
+def _evidence(scene: Scene, relations: int) -> NDArray[np.float32]:
+    """Return the evidence about the relations of a scene; see `likeliest_relations`.
+
+    The probability of an observed relation is the product of the confidences of its objects.
+    """
+    n = len(scene.objects)
+    if scene.excluded is None and not relations_given(scene):
+        return np.zeros((0, 0, 0), np.float32)
+    holds, observed = instance_evidence(scene)
+    excluded = observed & ~holds
+    if scene.excluded is not None:
+        excluded = excluded | scene.excluded
+    confidence = np.array([thing.confidence for thing in scene.objects], np.float32)
+    evidence = np.full((relations, n, n), np.nan, np.float32)
+    evidence[excluded[:relations]] = EXCLUDED
+    both = np.broadcast_to(confidence[:, None] * confidence, evidence.shape)
+    shown = holds[:relations]
+    evidence[shown] = both[shown]
+    return evidence
 
 
 def _judged(
@@ -260,7 +290,7 @@ _EXAMPLES: Final = {
         "two instances of one class", {"objects": ["chair", "chair", "desk"], "top_k": 10}
     ),
     "pairs": Example(
-        "all eight relations of one ordered pair of objects",
+        "all ten relations of one ordered pair of objects",
         {**BEDROOM, "pairs": [{"subject": "lamp_1", "object": "bed"}], "include_opposites": True},
     ),
     "likely": Example(
@@ -280,8 +310,9 @@ _EXAMPLE_ANSWER: Final = {
             "subject": "lamp_1",
             "relation": "on-top",
             "object": "nightstand_1",
-            "probability": 0.83,
+            "probability": 0.92,
             "observed": True,
+            "expected": 0.83,
         },
         {
             "subject": "nightstand_1",
@@ -289,6 +320,7 @@ _EXAMPLE_ANSWER: Final = {
             "object": "bed",
             "probability": 0.41,
             "observed": False,
+            "expected": None,
         },
     ],
     "disagreements": [

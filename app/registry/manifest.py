@@ -22,7 +22,7 @@ from app.registry.errors import ArtifactError
 from app.registry.fields import Count, Frozen, Many, Sha256, to_json
 from app.registry.offsets import PREFIX as OFFSETS
 
-FORMAT: Final = 6
+FORMAT: Final = 7
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -54,7 +54,7 @@ class FileEntry(Frozen):
 class Manifest(Description):
     """The description of a model, its stored tensors and the checksums of its other files."""
 
-    format: Literal[6] = FORMAT
+    format: Literal[7] = FORMAT
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
     files: dict[str, FileEntry]
 

@@ -113,7 +113,7 @@ class Places(TensorGroup):
         return ratio
 
     @cached_property
-    def _by_anchor(self) -> tuple[tuple[Indices, Indices, Floats, Floats], ...]:
+    def _by_anchor(self) -> tuple[tuple[NDArray[Any], ...], ...]:
         """For anchors as subjects, then as objects: the triples in the order of their anchor.
 
         The arrays are the first row of each (relation, anchor) and the end, (A V + 1,); class i and

@@ -142,8 +142,14 @@ class Request(Ticket):
     ) -> Reading:
         """Return a scene converted for a model. The queue of the model reads large scenes."""
         arguments = scene, model.vocabulary, self.limits, self.look_ups
-        profiles = model.artifact.manifest.vocabulary.profiles
-        read = partial(read_scene, *arguments, profiles=profiles, may_be_empty=may_be_empty)
+        artifact = model.artifact
+        read = partial(
+            read_scene,
+            *arguments,
+            roles=None if artifact.places is None else artifact.places.roles,
+            profiles=artifact.manifest.vocabulary.profiles,
+            may_be_empty=may_be_empty,
+        )
         relations = len(scene.relations or ())
         if len(scene.objects) <= MANY_OBJECTS and relations <= MANY_RELATIONS:
             return read()

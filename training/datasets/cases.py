@@ -81,7 +81,7 @@ def annotated_relations(encoded: EncodedScene) -> Flags:
     stacked |= stacked.T
     for a, unlisted in enumerate(meaning_of(encoded.source, listed=positions is None).unlisted):
         if a in LATERAL and positions is not None and unlisted != "unobserved":
-            located = np.isfinite(positions).all(1)
+            located: Flags = np.all(np.isfinite(positions), axis=1)
             annotated[a] = located[:, None] & located & ~np.eye(len(located), dtype=np.bool_)
             annotated[a] &= not of_one_view
         elif unlisted not in ("off", "off for supported") or (a == ABOVE and positions is not None):

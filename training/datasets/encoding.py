@@ -239,7 +239,7 @@ def _stands(
             return stands
     stands = np.full(len(scene.objects), UNKNOWN)
     stands[[*scene.supported]] = HANGS
-    supports = relations.holds[[*SUPPORTS]].any(0)
+    supports: Flags = np.any(relations.holds[[*SUPPORTS]], axis=0)
     stands[supports[:, structure].any(1)] = FLOOR
     stands[supports[:, ~structure].any(1)] = SUPPORTED
     return stands

@@ -84,12 +84,12 @@ def _table(own: Counter[Role], vocabulary: Vocabulary) -> RoleCounts:
             anchor[m, role] += (1.0 if m == j else _OF_KIN) * count
     keys = np.array(sorted(pairs), np.int64)
     counts = np.zeros((len(keys), 3), np.float32)
-    for row, key in enumerate(keys.tolist()):
-        counts[row] = pairs[key]
+    for number, key in enumerate(keys.tolist()):
+        counts[number] = pairs[key]
     contains = anchor[:, IN] >= _CONTAINS * np.maximum(anchor[:, ON] + anchor[:, IN], 1)
-    for table, is_container in ((anchor, contains), (counts, contains[keys % V])):
-        table[is_container, IN] += table[is_container, ON]
-        table[is_container, ON] = 0
+    for table, rows in ((anchor, contains), (counts, contains[keys % V])):
+        table[rows, IN] += table[rows, ON]
+        table[rows, ON] = 0
     return RoleCounts(keys, counts, anchor)
 
 

@@ -88,7 +88,7 @@ def run_candidate(folder: Path, data: Path | None, say: Progress) -> Candidate:
     scenes = prepare(run.config, root)
     run.require(scenes.digest)
     say(f"calibrating {folder}")
-    artifact = calibrated_draft(run, scenes.vocabulary, scenes.training_data())
+    artifact = calibrated_draft(run, scenes)
     return Candidate(str(folder), run.config, scenes.digests, artifact, root)
 
 

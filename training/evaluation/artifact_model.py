@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from app.questions.misplaced import wrong_relations
 from app.questions.posterior import Posterior
+from app.questions.reading import Triple
 from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES, Scene
 from training.datasets.batches import Batch, SceneTensors
@@ -66,7 +68,7 @@ def artifact_model(
         at_place=placed_score(artifact),
         relations=relation_score(artifact, given=False),
         completion=completion,
-        false_relations=completion,
+        false_relations=false_relation_score(artifact) if calibrated else completion,
         misplaced=misplaced_score(artifact) if calibrated else None,
         rooms=room_score(artifact, profiles),
         generate=lambda _: sampler,
@@ -88,20 +90,51 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
         evidence = batch.holds * batch.observed * given
         for row, classes in enumerate(batch.classes):
             n = int((classes >= 0).sum())
-            scene, first = instances_of(classes[:n], batch.counts[row, :n])
-            observed = set(map(tuple, evidence[row].nonzero().tolist()))
-            # a(x, y) and a(y, x) can both hold between classes, but for different instances.
-            last = first + batch.counts[row, :n].clamp(min=1) - 1
-            triples = [
-                (a, *(last[[x, y]] if (a, y, x) in observed and x > y else first[[x, y]]).tolist())
-                for a, x, y in sorted(observed)
-            ]
-            scene = Scene(scene.objects, tuple(triples) or None)
+            scene, _ = _with_relations(classes[:n], batch.counts[row, :n], evidence[row])
             values = Posterior(artifact, scene).relation_log_odds()
             log_odds[row, : len(values), :n, :n] = torch.from_numpy(values)
         return log_odds
 
     return score
+
+
+def false_relation_score(artifact: Artifact) -> RelationScore:
+    """Return a function that computes the log-odds that observed relations hold.
+
+    `/outliers` ranks the observed relations by these log-odds. Other entries are -inf.
+    """
+
+    def score(batch: Batch) -> Tensor:
+        log_odds = torch.full(batch.holds.shape, -torch.inf)
+        evidence = batch.holds * batch.observed
+        for row, classes in enumerate(batch.classes):
+            n = int((classes >= 0).sum())
+            scene, triples = _with_relations(classes[:n], batch.counts[row, :n], evidence[row])
+            wrong = wrong_relations(artifact, scene)
+            for pair, stated in triples.items():
+                log_odds[(row, *pair)] = -wrong.get(stated, 0.0)
+        return log_odds
+
+    return score
+
+
+def _with_relations(
+    classes: Tensor, counts: Tensor, evidence: Tensor
+) -> tuple[Scene, dict[Triple, Triple]]:
+    """Return a scene with instances of the classes, and with relations between classes.
+
+    The relations are those above 0 in `evidence`, (A, n, n). a(x, y) and a(y, x) can both hold
+    between classes, but for different instances. The second result maps the relations of classes to
+    those of instances.
+    """
+    scene, first = instances_of(classes, counts)
+    observed = set(map(tuple, evidence.nonzero().tolist()))
+    last = first + counts.clamp(min=1) - 1
+    triples: dict[Triple, Triple] = {}
+    for a, x, y in sorted(observed):
+        index = last if (a, y, x) in observed and x > y else first
+        triples[a, x, y] = (a, int(index[x]), int(index[y]))
+    return Scene(scene.objects, tuple(triples.values()) or None), triples
 
 
 def placed_score(artifact: Artifact) -> PlacedScore:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +82,8 @@ class _Cases(NamedTuple):
     wrong: Flags
 
     def rows(self, mask: Flags) -> _Cases:
-        return _Cases(*(column[mask] for column in self))
+        columns: Any = (column[mask] for column in self)
+        return _Cases(*columns)
 
 
 def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0) -> Misplaced:
@@ -137,7 +138,8 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
         none = np.zeros(0, np.int64)
         names, no = none.astype(np.str_), none > 0
         return _Cases(none, names, no, no, none, np.zeros((0, 3)), no)
-    return _Cases(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
+    columns: Any = (np.concatenate(column) for column in zip(*blocks, strict=True))
+    return _Cases(*columns)
 
 
 def _shown_kinds(encoded: EncodedScene) -> list[int]:

@@ -21,9 +21,9 @@ import numpy as np
 from scipy.special import expit
 from torch import Tensor
 
-from app.scene import Scene, SceneObject, observe
+from app.scene import Scene, observe
 from app.scene.relations import SUPPORTS
-from app.scene.stands import FLOOR, HANGS, stands_of
+from app.scene.stands import FLOOR, HANGS, Heights, stands_of
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Ints
 from training.datasets.batches import SceneTensors
@@ -77,16 +77,12 @@ def _evidence(scene: Scene) -> tuple[Flags, Flags]:
             supports[i, j] |= a in SUPPORTS
         return supports, np.zeros(n, dtype=np.bool_)
     supports = np.any(poses.holds[[*SUPPORTS]], axis=0)
-    bottoms = np.array([_bottom(thing) for thing in scene.objects])
-    floor = float(np.fmin.reduce(bottoms))
-    stands = stands_of(poses.holds, poses.observed, bottoms, floor)
+    unknown = (np.nan,) * 3
+    centres = np.array([thing.position or unknown for thing in scene.objects])
+    heights = Heights.of(centres, np.array([thing.size or unknown for thing in scene.objects]))
+    floor = float(np.fmin.reduce(heights.bottoms))
+    stands = stands_of(poses.holds, poses.observed, heights, floor)
     return supports, np.isin(stands, (FLOOR, HANGS))
-
-
-def _bottom(thing: SceneObject) -> float:
-    if thing.position is None or thing.size is None:
-        return np.nan
-    return thing.position[2] - thing.size[2] / 2
 
 
 def _annotated(encoded: EncodedScene) -> tuple[Flags, Flags]:
