@@ -26,6 +26,8 @@ from app.questions.misplaced import (
     BESIDE,
     EXPLAINED,
     OVER,
+    STAND,
+    SUPPORT,
     Entries,
     entries_of,
     wrong_log_odds,
@@ -53,6 +55,7 @@ from training.evaluation.alarms import ALARMS
 _SCENES: Final = 250  # maximum scenes of a source
 _LEAST_SCENES: Final = 20  # minimum untouched scenes with entries of a kind
 _SOURCE_SCENES: Final = 60  # minimum scenes of a source with its own alarm line
+_OF_WORDS: Final = 0.1  # weight of an altered on-top that is asked in the words "under"
 _LENGTHS: Final = (1, 2, 4, 8, 16, 32)
 """Numbers of entries to which the alarm lines are fitted."""
 # Minimum probabilities of an alarm. If right and wrong entries hardly overlap, the target shares
@@ -71,6 +74,7 @@ class _Cases(NamedTuple):
         untouched: True for entries of a scene without a wrong entry.
         complete: True for entries of a source that annotates all supports.
         wrong: True for wrong entries.
+        weight: weight of the entry in the fit.
     """
 
     scene: Ints
@@ -80,6 +84,7 @@ class _Cases(NamedTuple):
     kind: Ints
     terms: Floats
     wrong: Flags
+    weight: Floats
 
     def rows(self, mask: Flags) -> _Cases:
         columns: Any = (column[mask] for column in self)
@@ -128,16 +133,17 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
                     scene=np.full(size, len(blocks)),
                     source=np.full(size, encoded.source),
                     untouched=np.full(size, wrong is None),
-                    complete=np.full(size, len(shown) == len(KINDS)),
+                    complete=np.full(size, STAND in shown),
                     kind=entries.kind[usable],
                     terms=entries.terms[usable],
                     wrong=is_wrong[usable],
+                    weight=np.full(size, _OF_WORDS if flipped else 1.0),
                 )
             )
     if not blocks:
         none = np.zeros(0, np.int64)
         names, no = none.astype(np.str_), none > 0
-        return _Cases(none, names, no, no, none, np.zeros((0, 3)), no)
+        return _Cases(none, names, no, no, none, np.zeros((0, 3)), no, np.zeros(0))
     columns: Any = (np.concatenate(column) for column in zip(*blocks, strict=True))
     return _Cases(*columns)
 
@@ -146,7 +152,7 @@ def _shown_kinds(encoded: EncodedScene) -> list[int]:
     """Return the kinds of entries whose truth the scene shows."""
     if annotated_relations(encoded)[ON_TOP].any():
         return list(range(len(KINDS)))
-    return [OVER, BELOW]
+    return [BESIDE, SUPPORT, OVER, BELOW]
 
 
 def _questions(
@@ -204,7 +210,7 @@ def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
     if not varies.any():
         return None
     weights = np.zeros(3)
-    *fitted, intercept = logistic(cases.terms[:, varies], cases.wrong, C=RIDGE)
+    *fitted, intercept = logistic(cases.terms[:, varies], cases.wrong, cases.weight, C=RIDGE)
     weights[varies] = fitted
     # A likelier relation, and a likelier stand, never make an entry more suspicious.
     weights = np.minimum(weights, 0.0)
