@@ -22,6 +22,7 @@ from app.registry.artifact import Artifact
 from app.registry.offsets import UNOBSERVED, Offsets, look_up
 from app.scene.geometry import Axes
 from app.scene.relations import (
+    ABOVE,
     CANONICAL,
     FRONT,
     INSIDE,
@@ -32,6 +33,7 @@ from app.scene.relations import (
     opposite,
 )
 from app.scene.scene import Scene, extent_of
+from app.scene.stands import HANGS, SUPPORTED
 
 PLACES: Final = 3
 """Maximum number of placements in the answer for one class."""
@@ -39,6 +41,8 @@ PLACES: Final = 3
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 LEAST_LIKELY: Final = 0.05  # least probability of a placement
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
+_USUAL: Final = 0.5  # share of a stand that is usual for a class
+_LEAST_STAND: Final = 0.005  # least share of a stand
 _TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 _UNTURNED: Final = np.eye(3)
 _PER_METRE: Final = 1000.0  # offsets are rounded to millimetres
@@ -131,6 +135,7 @@ def placements(
         for column in np.flatnonzero(anchors == present.row[at.anchor]).tolist():
             first = ((0 if at.outgoing else A) + at.relation) * len(anchors) + column
             objects[column] = at.anchor
+    _lower_unseen(artifact, candidates, present.classes[anchors], forward, backward)
     if A > INSIDE:
         fits = _fits_inside(artifact, scene, candidates, objects)
         forward[:, INSIDE][~fits[0]] = NO_UNIT
@@ -167,6 +172,36 @@ def placements(
             entry["offset"] = offset
         entries[row].append(entry)
     return entries
+
+
+def _lower_unseen(
+    artifact: Artifact,
+    candidates: NDArray[np.int64],
+    anchors: NDArray[np.int64],
+    forward: NDArray[np.floating[Any]],
+    backward: NDArray[np.floating[Any]],
+) -> None:
+    """Lower the log-odds of stacked relations that training never shows, in place.
+
+    The share of a stand is that of the subject's class: objects on a wall for the relation above,
+    and supported objects for on-top and inside. A share below `_USUAL` lowers the odds in
+    proportion. So a blackboard does not stand on a chair.
+
+    Args:
+        candidates, anchors: class indices, (N,) and (m,).
+        forward, backward: log-odds with the candidate and with the anchor as subject, (N, A, m).
+    """
+    places = artifact.places
+    if places is None:
+        return
+    change = np.log(np.minimum(np.maximum(places.stands, _LEAST_STAND) / _USUAL, 1.0))
+    missing, listed = candidates[:, None], anchors[None]
+    for relation, stand in ((ON_TOP, SUPPORTED), (ABOVE, HANGS), (INSIDE, SUPPORTED)):
+        if relation < forward.shape[1]:
+            shown = places.shows(relation, missing, listed)
+            forward[:, relation] += np.where(shown, 0.0, change[missing, stand])
+            shown = places.shows(relation, listed, missing)
+            backward[:, relation] += np.where(shown, 0.0, change[listed, stand])
 
 
 def _fits_inside(

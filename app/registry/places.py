@@ -28,6 +28,7 @@ PREFIX: Final = "places."
 
 _PLACE: Final = 10.0  # smoothing s, in scenes
 _RELATION: Final = 3.0  # smoothing m, in scenes
+_SHOWN: Final = 2.0  # minimum number of scenes that show a relation
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -111,6 +112,17 @@ class Places(TensorGroup):
         held[classes[begin:end]] += counts[begin:end]
         ratio: Floats = np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
         return ratio
+
+    def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
+        """Return whether training shows the relation between pairs of classes.
+
+        A single scene may be an error, so two scenes are needed. The class indices of subjects and objects are broadcast against each other.
+        """
+        V = len(self.frequency)
+        keys = (relation * V + subject) * V + other
+        rows = np.minimum(np.searchsorted(self.triple, keys), len(self.triple) - 1)
+        shown: NDArray[np.bool_] = (self.triple[rows] == keys) & (self.held[rows] >= _SHOWN)
+        return shown
 
     @cached_property
     def _by_anchor(self) -> tuple[tuple[NDArray[Any], ...], ...]:
