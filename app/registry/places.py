@@ -116,7 +116,8 @@ class Places(TensorGroup):
     def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
         """Return whether training shows the relation between pairs of classes.
 
-        A single scene may be an error, so two scenes are needed. The class indices of subjects and objects are broadcast against each other.
+        A single scene may be an error, so two scenes are needed. The class indices of subjects and
+        objects are broadcast against each other.
         """
         V = len(self.frequency)
         keys = (relation * V + subject) * V + other

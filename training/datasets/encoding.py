@@ -207,8 +207,8 @@ class _Encoder:
             instance_classes=instance_classes,
             instance_holds=holds,
             instance_observed=observed,
-            # One spelling of each label without a class.
             instance_stands=stands,
+            # One spelling of each label without a class.
             unknown=tuple(sorted({label_key(label): label for label in labels}.values())),
             instance_positions=None if boxes is None else boxes[kept, :3],
             instance_sizes=None if boxes is None else boxes[kept, 3:6],
