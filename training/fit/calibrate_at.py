@@ -68,7 +68,8 @@ def _fit_weights(
     artifact: Artifact, scenes: SceneTensors, relations: Sequence[int], seed: int
 ) -> PlaceFit:
     """Fit the weights of the relation and of the counts to removed classes."""
-    row, target, places = removed_places(scenes, torch.from_numpy(artifact.vocabulary.structure))
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+    row, target, places = removed_places(scenes, structure)
     source = scenes.source[row].numpy()
     usable = np.isin(places.relation.numpy(), relations)
     rng = np.random.default_rng(seed)
