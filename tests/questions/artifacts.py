@@ -8,12 +8,13 @@ import torch
 
 from app.registry.artifact import Artifact
 from app.registry.description import (
-    NEVER,
+    KINDS,
     AlarmLine,
     AlarmLines,
     Calibration,
     CountSlope,
-    Slope,
+    Judgement,
+    Misplaced,
 )
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL
@@ -49,13 +50,17 @@ def lines(low: float, medium: float, high: float, log_count: float = 0.0) -> Ala
 
 
 NO_ALARM = lines(1e3, 1e3, 1e3)
+UNLIKELY = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=-1.0, lines=NO_ALARM)
 
 
 def calibration(relations: int, **changes: object) -> Calibration:
     """A neutral calibration without outliers, so every generated scene is plausible."""
-    line = {"outlier": CountSlope(slope=-1.0), "misplaced": Slope(intercept=0.0, slope=-1.0)}
-    never = {"outlier_lines": NO_ALARM, "misplaced_thresholds": NEVER}
-    return Calibration(**{**dict(Calibration.neutral(relations)), **line, **never, **changes})
+    judging = {
+        "outlier": CountSlope(slope=-1.0),
+        "outlier_lines": NO_ALARM,
+        "misplaced": Misplaced(**dict.fromkeys(KINDS, UNLIKELY)),
+    }
+    return Calibration(**{**dict(Calibration.neutral(relations)), **judging, **changes})
 
 
 def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:

@@ -18,10 +18,10 @@ from app.registry import (
     Calibration,
     CountSlope,
     Description,
+    Judgement,
     Manifest,
-    Slope,
+    Misplaced,
     StoreError,
-    Thresholds,
     VocabularyEntry,
 )
 from app.registry.manifest import MANIFEST
@@ -55,13 +55,13 @@ SPECS: dict[str, dict[str, Any]] = {
 }
 PROFILES = {"rbm": (), "gbm": (), "triway": ("homes", "shops")}
 
-HALF = Thresholds(low=0.5, medium=0.5, high=0.5)
 EVEN = AlarmLine(intercept=0.0)
+LINES = AlarmLines(low=EVEN, medium=EVEN, high=EVEN)
+UNLIKELY = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=0.0, lines=LINES)
 JUDGING = {
     "outlier": CountSlope(slope=-1.0),
-    "outlier_lines": AlarmLines(low=EVEN, medium=EVEN, high=EVEN),
-    "misplaced": Slope(intercept=0.0, slope=-1.0),
-    "misplaced_thresholds": HALF,
+    "outlier_lines": LINES,
+    "misplaced": Misplaced(lateral=UNLIKELY, support=UNLIKELY),
 }
 
 
