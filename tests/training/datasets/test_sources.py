@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from app.scene import ObjectClass, Vocabulary
-from app.scene.relations import ABOVE, FRONT, INSIDE, LEFT, ON_TOP
+from app.scene import ObjectClass, RoleCounts, Vocabulary
+from app.scene.relations import ABOVE, FRONT, INSIDE, LEFT, ON_TOP, SUPPORTS
+from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
@@ -16,7 +17,14 @@ from training.datasets import (
     encode,
 )
 from training.datasets.batches import scene_tensors
-from training.datasets.sources import SOURCES, meaning_of, relation_of
+from training.datasets.cases import annotated_relations
+from training.datasets.sources import (
+    SOURCES,
+    meaning_of,
+    relation_of,
+    relations_of,
+    supported_subjects,
+)
 
 VOCABULARY = Vocabulary([ObjectClass("desk"), ObjectClass("monitor"), ObjectClass("pencil")])
 LATERAL, VERTICAL = [LEFT, FRONT], [ON_TOP, ABOVE]
@@ -76,6 +84,140 @@ def test_3dssg_annotates_all_supports_of_some_objects_and_sides_of_related_pairs
     related = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=bool)
     assert (found.instance_observed[LATERAL] == related).all()
     assert np.argwhere(found.instance_observed[ABOVE]).tolist() == [[0, 1], [1, 0]]
+
+
+def test_a_listed_support_that_is_no_object_excludes_all_other_supports() -> None:
+    """A monitor is attached to something, and the desk stands on the floor."""
+    vocabulary = Vocabulary([*VOCABULARY.objects, ObjectClass("floor", structure=True)])
+    labels = ("desk", "monitor", "pencil", "floor")
+    things = tuple(AnnotatedObject(label, label) for label in labels)
+    lists = ((0, "on-top", 3), (2, "on-top", 0)), False, (), (0, 1, 2)
+    (found,) = encode([AnnotatedScene("s", "3dssg", "g", None, things, *lists)], vocabulary)
+    assert found.instance_stands.tolist() == [FLOOR, HANGS, SUPPORTED, UNKNOWN]
+    things_alone = np.ones((3, 3), dtype=bool) & ~np.eye(3, dtype=bool)
+    for relation in SUPPORTS:
+        assert (found.instance_observed[relation, :3, :3] == things_alone).all()
+    assert np.argwhere(found.instance_holds).tolist() == [[ON_TOP, 2, 0]]
+
+
+PHRASES = [
+    ("3dssg", "standing on", "on-top", True),
+    ("3dssg", "standing in", "inside", True),
+    ("3dssg", "lying in", "inside", True),
+    ("3dssg", "hanging in", "inside", True),
+    ("3dssg", "attached to", None, True),
+    ("3dssg", "build in", None, True),
+    ("3dssg", "left", "left", False),
+    ("vrd", "in", "inside", False),
+    ("vrd", "inside", "inside", False),
+    ("vrd", "on", "on-top", False),
+    ("vrd", "next to", None, False),
+    ("procthor", "contains", "contains", False),
+]
+
+
+@pytest.mark.parametrize(("source", "phrase", "relation", "is_support"), PHRASES)
+def test_phrases_of_a_source(
+    source: str, phrase: str, relation: str | None, is_support: bool
+) -> None:
+    listed = [(4, phrase, 0), (4, phrase, 4), (4, phrase, 0)]
+    assert relations_of(source, listed) == (((4, relation, 0),) if relation else ())
+    assert supported_subjects(source, listed) == ((4,) if is_support else ())
+
+
+KITCHEN = Vocabulary([ObjectClass("fridge"), ObjectClass("milk"), ObjectClass("jar")])
+FRIDGE, MILK, JAR = range(3)
+# One jar is on the fridge in words, and one in it.
+ROLES = RoleCounts(
+    np.array([MILK * 3 + FRIDGE, JAR * 3 + FRIDGE]),
+    np.array([[0, 0, 9], [5, 0, 5]], dtype=np.float32),
+    np.zeros((3, 3), dtype=np.float32),
+)
+
+
+def linked(label: str, bottom: float, *, roles: RoleCounts | None = ROLES) -> EncodedScene:
+    """A fridge of 1.8 m, and an object at a height in metres that a link says it supports."""
+    fridge = AnnotatedObject("f", "fridge", (0.0, 0.0, 0.9), (0.8, 0.8, 1.8))
+    thing = AnnotatedObject("t", label, (0.0, 0.0, bottom + 0.1), (0.1, 0.1, 0.2), supported_by="f")
+    scene = AnnotatedScene("s", "procthor", "g", None, (fridge, thing), viewer_frame=True)
+    (found,) = encode([scene], KITCHEN, roles)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("label", "bottom", "relation"),
+    [
+        ("milk", 1.8, ON_TOP),
+        ("milk", 1.78, ON_TOP),
+        ("jar", 1.8, ON_TOP),
+        ("milk", 0.6, INSIDE),
+        ("jar", 0.6, None),
+    ],
+)
+def test_a_link_means_on_top_in_contact_and_else_the_role_of_the_classes(
+    label: str, bottom: float, relation: int | None
+) -> None:
+    found = linked(label, bottom)
+    thing, fridge = 1, 0
+    stated = [] if relation is None else [[relation, thing, fridge]]
+    assert np.argwhere(found.instance_holds).tolist() == stated
+    observed = found.instance_observed
+    assert observed[:, fridge, thing].all()
+    assert observed[[LEFT, FRONT, ABOVE], thing, fridge].all()
+    assert (observed[[*SUPPORTS], thing, fridge] == (relation is not None)).all()
+    assert found.instance_stands.tolist() == [FLOOR, SUPPORTED]
+
+
+def test_a_link_without_counts_of_roles_means_on_top() -> None:
+    found = linked("milk", 0.6, roles=None)
+    assert np.argwhere(found.instance_holds).tolist() == [[ON_TOP, 1, 0]]
+
+
+def annotated(found: EncodedScene) -> dict[int, set[tuple[int, int]]]:
+    """The annotated pairs of each relation that has some."""
+    mask = annotated_relations(found)
+    pairs = {a: {(int(i), int(j)) for i, j in np.argwhere(mask[a])} for a in range(len(mask))}
+    return {a: every for a, every in pairs.items() if every}
+
+
+ALL = {(i, j) for i in range(3) for j in range(3) if i != j}
+STACK = {(0, 1), (1, 0)}
+
+
+@pytest.mark.parametrize(
+    ("source", "pairs"),
+    [
+        # The pencil is beside the monitor, which stands on the desk.
+        ("nr3d", {LEFT: STACK, FRONT: STACK}),
+        ("vrd", {LEFT: STACK, FRONT: STACK}),
+        ("virtualhome", {LEFT: STACK, FRONT: STACK, ON_TOP: ALL, INSIDE: ALL}),
+        (
+            "3dssg",
+            {LEFT: STACK, FRONT: STACK, ON_TOP: STACK | {(1, 2)}, INSIDE: STACK | {(1, 2)}},
+        ),
+        ("robot", dict.fromkeys((LEFT, FRONT, ON_TOP, ABOVE, INSIDE), ALL)),
+    ],
+)
+def test_only_sources_that_show_false_relations_annotate_them(
+    source: str, pairs: dict[int, set[tuple[int, int]]]
+) -> None:
+    listed = ((1, "on-top", 0), (2, "left", 1))
+    assert annotated(encoded(source, relations=listed, supported=(1,))) == pairs
+
+
+def test_boxes_annotate_sides_of_all_pairs_and_no_above() -> None:
+    """The pencil is nine metres away, and one more desk has no position."""
+    objects = (
+        AnnotatedObject("0", "desk", (0.0, 0.0, 0.4), (0.8, 0.8, 0.8)),
+        AnnotatedObject("1", "monitor", (0.0, 0.0, 1.0), (0.4, 0.4, 0.4)),
+        AnnotatedObject("2", "pencil", (9.0, 0.0, 0.4), (0.1, 0.1, 0.1)),
+        AnnotatedObject("3", "desk"),
+    )
+    found = encoded("procthor", *objects)
+    assert found.instance_holds[ON_TOP, 1, 0]
+    assert annotated(found) == dict.fromkeys((LEFT, FRONT, ON_TOP, INSIDE), ALL)
+    # A camera frame shows only neighbours.
+    assert annotated(encoded("sunrgbd_bedrooms_3d", *objects[:3])) == {}
 
 
 @pytest.mark.parametrize("source", ["procthor", "rooms", "robot"])
