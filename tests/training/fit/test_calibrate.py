@@ -9,27 +9,22 @@ import numpy as np
 import pytest
 import torch
 
-from app.questions.posterior import Posterior, calibrated
-from app.registry import Calibration, CountSlope
+from app.questions.posterior import calibrated
+from app.registry import Calibration, CountSlope, Misplaced
 from app.scene import Vocabulary
-from tests.questions.artifacts import larger_artifact
-from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, rooms
+from app.scene.relations import ABOVE, INSIDE, LATERAL, LEFT, ON_TOP, STACKED
+from tests.questions.artifacts import artifact_of, random_machine
+from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, A, rooms
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from training.datasets.batches import TrainingData
 from training.datasets.cases import RIDGE, logistic
-from training.evaluation.alarms import ALARMS, untouched_alarms
-from training.evaluation.asking import of_classes
+from training.datasets.roles import count_roles
+from training.evaluation.alarms import ALARMS
 from training.evaluation.calibration_task import ask_outliers, collect, collect_missing
 from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.parts import draw_parts, exactly, up_to_longest
 from training.fit import calibrate_objects as of_objects
-from training.fit.calibrate import (
-    calibrate,
-    fit_misplaced,
-    fit_relations,
-    hardest_quantile,
-    rising_curve,
-)
+from training.fit.calibrate import calibrate, fit_placements, fit_relations, fit_with_observed
 from training.fit.calibrate_objects import (
     ALPHAS,
     COVERAGES,
@@ -40,7 +35,6 @@ from training.fit.calibrate_objects import (
     fit_line,
     fit_missing,
     fit_outliers,
-    recalibrated,
     score_intruders,
     score_lists,
     served_scenes,
@@ -54,6 +48,7 @@ from training.fit.objects import (
     served_popularity,
     start_objects,
 )
+from training.fit.place_statistics import fit_places
 from training.machines import MachineSpec, build
 
 ROOM_COUNT = 400
@@ -66,16 +61,17 @@ def model():
     scenes = ObjectScenes.of(rooms(ROOM_COUNT, 2), STRUCTURE, CONFIG)
     V, C = len(VOCABULARY), len(VOCABULARY.room_types)
     sources = len(scenes.sources)
-    spec = MachineSpec("triway", V=V, A=4, units=6, states=8, K=3, C=C, profiles=sources)
+    spec = MachineSpec("triway", V=V, A=A, units=6, states=8, K=3, C=C, profiles=sources)
     machine = build(spec).initialise(torch.Generator().manual_seed(0), 0.05)
     start_objects(machine, scenes)
     fit_objects(ObjectFit(machine, scenes, CONFIG, seed=0))
-    return draft_artifact(machine.eval().requires_grad_(False), VOCABULARY)
+    places = fit_places(rooms(ROOM_COUNT, 2).scenes, count_roles((), VOCABULARY), VOCABULARY)
+    return draft_artifact(machine.eval().requires_grad_(False), VOCABULARY, places=places)
 
 
 def data_of(validation) -> TrainingData:
     train = rooms(ROOM_COUNT, 2)
-    return TrainingData(train, validation, validation, STRUCTURE, 4, len(VOCABULARY.room_types))
+    return TrainingData(train, validation, validation, STRUCTURE, A, len(VOCABULARY.room_types))
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +85,7 @@ def judging(model, fitted):
 
 
 def test_every_entry_is_fitted(fitted):
-    neutral = Calibration.neutral(4)
+    neutral = Calibration.neutral(A)
     # No room type is rare here; see test_calibrate_rooms.
     entries = set(Calibration.model_fields) - {"popularity_weight", "rare_rooms"}
     assert {name for name in entries if getattr(fitted, name) == getattr(neutral, name)} == set()
@@ -98,9 +94,10 @@ def test_every_entry_is_fitted(fitted):
     # The likelier a class, the likelier it is missing, and the less likely it is an intruder.
     assert fitted.missing.slope > 0
     assert fitted.outlier.slope < 0
-    assert fitted.misplaced.slope < 0
-    limits = fitted.misplaced_thresholds
-    assert 1 >= limits.low >= limits.medium >= limits.high >= 0.2
+    # The likelier a stand, the less probably it is wrong.
+    assert fitted.misplaced.stand.stand < 0
+    # The machine has no relation weights, so the counts tell what stands where.
+    assert all(entry.counts > 0 for entry in fitted.at)
     scenes = ObjectScenes.of(rooms(ROOM_COUNT, 2), STRUCTURE, CONFIG)
     popularity = served_popularity(scenes, CONFIG).numpy()
     assert fitted.popularity == pytest.approx(popularity, abs=1e-4)
@@ -182,7 +179,7 @@ def test_the_coverage_that_ranks_best_is_chosen(monkeypatch):
 
     monkeypatch.setattr(of_objects, "unlisted_log_odds", log_odds)
     assert fit_missing(None, scenes, BARE)["coverage"] == 0.45
-    chosen = Calibration.neutral(4).model_copy(update={"coverage": 0.8})
+    chosen = Calibration.neutral(A).model_copy(update={"coverage": 0.8})
     assert fit_missing(None, scenes, BARE, chosen)["coverage"] == 0.8
 
 
@@ -365,42 +362,62 @@ def replace_scenes(scenes, count):
 def test_few_scenes_leave_the_model_without_judgements(model):
     few = calibrate(model, data_of(replace_scenes(rooms(60, 1), 15)), CONFIG)
     assert few.outlier is few.outlier_lines is None
-    assert few.misplaced is few.misplaced_thresholds is None
+    assert few.misplaced == Misplaced()
     assert few.missing != CountSlope()
 
 
 # --------------------------------------------------------------------------------------- relations
 
 
-def test_relations_are_fitted_to_what_is_known():
-    """Scenes of which nothing is known but what holds change no entry."""
-    artifact = larger_artifact("triway")
-    V = artifact.spec.V
-    known = random_scenes(60, V - 1)
+@pytest.fixture(scope="module")
+def random_artifact():
+    return artifact_of(random_machine(MachineSpec("triway", V=9, A=A, units=6, K=3, C=2), 0.7))
+
+
+FITS = pytest.mark.parametrize("fit", [fit_relations, fit_with_observed, fit_placements])
+
+
+def without(one, relations):
+    """The scene without the true relations of these kinds."""
+    holds = one.instance_holds.copy()
+    holds[list(relations)] = False
+    return replace(one, instance_holds=holds)
+
+
+@FITS
+def test_stacked_relations_take_the_fit_of_on_top(random_artifact, fit):
+    """Complete sources show few pairs with inside and none with above."""
+    scenes = random_scenes(60, 8)
+    entries = fit(random_artifact, scenes)
+    assert {entries[a] for a in STACKED} == {entries[ON_TOP]}
+    assert {entries[a] for a in LATERAL} == {entries[LEFT]}
+    assert len({entries[ON_TOP], entries[LEFT], CountSlope()}) == 3
+
+
+def test_only_on_top_determines_the_fit_of_stacked_relations(random_artifact):
+    scenes = random_scenes(60, 8)
+    entries = fit_relations(random_artifact, scenes)
+    fewer = fit_relations(random_artifact, [without(one, (ABOVE, INSIDE)) for one in scenes])
+    assert fewer == entries
+    flat = fit_relations(random_artifact, [without(one, (ON_TOP,)) for one in scenes])
+    assert {flat[a] for a in STACKED} == {CountSlope()}
+    assert flat[LEFT] == entries[LEFT]
+
+
+@FITS
+def test_sources_without_false_relations_take_no_part(random_artifact, fit):
+    """People mention sides of some pairs, and do not mention those of others.
+
+    Sources are numbered in the order of their names, and count by themselves.
+    """
+    known = random_scenes(60, 8)
     vague = [
-        replace(one, source="coco_captions", instance_observed=one.instance_holds)
-        for one in random_scenes(60, V - 1, seed=1)
+        replace(without(one, STACKED), source="coco_captions", instance_observed=one.instance_holds)
+        for one in random_scenes(60, 8, seed=1)
     ]
-    fitted = fit_relations(artifact, known)
-    assert all(entry.slope != 1.0 for entry in fitted)
-    # Sources are numbered in the order of their names, and count by themselves.
-    assert fit_relations(artifact, [*known, *vague]) == pytest.approx(fitted)
-    assert fit_relations(artifact, vague) == Calibration.neutral(4).relation
-
-
-def test_a_rising_curve_follows_a_bend_and_never_falls():
-    """20,000 draws: the standard error of a log-odds is below .05 where they lie."""
-    rng = np.random.default_rng(0)
-    logits = rng.normal(0, 2, 20_000)
-    places = np.linspace(-3, 3, 13)
-    for law in (lambda z: np.where(z < 0, 0.3 * z, 2 * z) - 0.5, lambda z: -z):
-        truth = rng.random(len(logits)) < 1 / (1 + np.exp(-law(logits)))
-        intercept, slope, bends = rising_curve(logits, truth)
-        line = intercept + slope * places
-        found = line + sum(change * np.maximum(line - at, 0) for at, change in bends)
-        assert (np.diff(found) > 0).all()
-        if law(1.0) > law(0.0):
-            assert found == pytest.approx(law(places), abs=0.3)
+    assert fit(random_artifact, vague) == Calibration.neutral(A).relation
+    if fit is fit_relations:
+        assert fit(random_artifact, [*known, *vague]) == pytest.approx(fit(random_artifact, known))
 
 
 def test_a_ridge_bounds_the_slope_of_few_examples_and_leaves_many_alone():
@@ -411,50 +428,3 @@ def test_a_ridge_bounds_the_slope_of_few_examples_and_leaves_many_alone():
     many = rng.normal(0, 2, (5000, 1))
     truth = rng.random(5000) < 1 / (1 + np.exp(1 - many[:, 0]))
     assert logistic(many, truth, C=RIDGE) == pytest.approx(logistic(many, truth), rel=0.01)
-
-
-@pytest.mark.parametrize(("count", "sign"), [(120, 1), (15, 1), (60, -1)])
-def test_misplaced_needs_enough_scenes_and_likely_true_relations(count, sign):
-    """The true relations of a scene are those that the machine finds most (or least) likely."""
-    artifact = larger_artifact("triway")
-    scenes = []
-    for k, one in enumerate(random_scenes(count, artifact.spec.V - 1)):
-        classes = one.evidence.classes
-        log_odds = sign * Posterior(artifact, of_classes(classes.tolist())).relation_log_odds()
-        a, i, j = np.unravel_index(np.argsort(-log_odds, axis=None), log_odds.shape)
-        triples = [(r, x, y) for r, x, y in zip(a, classes[i], classes[j], strict=True) if x < y]
-        scenes.append(scene(classes.tolist(), triples[:3], group=f"group {k}"))
-    found = fit_misplaced(artifact, scenes)
-    if (count, sign) != (120, 1):
-        assert found == {"misplaced": None, "misplaced_thresholds": None}
-        return
-    judging = recalibrated(artifact, **found)
-    for name, share in ALARMS.items():
-        (kept,) = (
-            one
-            for one in untouched_alarms(judging, scenes)
-            if (one.sensitivity, one.about) == (name, "relations")
-        )
-        assert kept.scenes == count
-        assert kept.alarms <= (share + 0.02) * count
-
-
-@pytest.mark.parametrize("share", ALARMS.values())
-def test_misplaced_relations_keep_the_share_in_each_large_source(share):
-    """The second source is far more varied: one quantile over both would raise more alarms."""
-    rng = np.random.default_rng(0)
-    values = np.concatenate([rng.normal(0, 1, 4000), rng.normal(0, 3, 4000)])
-    sources = np.repeat(["a", "b"], 4000)
-    limit = hardest_quantile(values, sources, 1 - share)
-    alarms = [(values[sources == name] >= limit).mean() for name in ("a", "b")]
-    assert alarms[1] == pytest.approx(share, abs=1e-3)
-    assert alarms[0] < share / 2
-
-
-def test_small_sources_count_as_one_and_equal_values_raise_no_alarm():
-    """199 and 150 scenes; each alone would have another quantile."""
-    values = np.concatenate([np.zeros(400), np.arange(199.0), np.full(150, 500.0)])
-    sources = np.repeat(["large", "a", "b"], [400, 199, 150])
-    limit = hardest_quantile(values, sources, 0.5)
-    assert limit == pytest.approx(np.median(values[400:]))
-    assert not (np.full(3, np.median(values[400:])) >= limit).any()
