@@ -53,7 +53,7 @@ from training.datasets.moved import moved_scene, untouched_scene
 from training.evaluation.alarms import ALARMS
 
 _SCENES: Final = 250  # maximum scenes of a source
-_LEAST_SCENES: Final = 20  # minimum untouched scenes with entries of a kind
+_LEAST_SCENES: Final = 20  # minimum validation scenes with entries of a kind
 _SOURCE_SCENES: Final = 60  # minimum scenes of a source with its own alarm line
 _OF_WORDS: Final = 0.1  # weight of an altered on-top that is asked in the words "under"
 _LENGTHS: Final = (1, 2, 4, 8, 16, 32)
@@ -70,6 +70,7 @@ class _Cases(NamedTuple):
 
     Attributes:
         scene: number of the scene, in which one entry or no entry is wrong.
+        encoded: number of the validation scene from which the scene was made.
         source: data source of the scene.
         untouched: True for entries of a scene without a wrong entry.
         complete: True for entries of a source that annotates all supports.
@@ -78,6 +79,7 @@ class _Cases(NamedTuple):
     """
 
     scene: Ints
+    encoded: Ints
     source: NDArray[np.str_]
     untouched: Flags
     complete: Flags
@@ -117,7 +119,7 @@ def _some(scenes: Sequence[EncodedScene], seed: int) -> list[EncodedScene]:
 
 def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Cases:
     blocks: list[_Cases] = []
-    for encoded in scenes:
+    for number, encoded in enumerate(scenes):
         shown = _shown_kinds(encoded)
         for scene, flipped, wrong in _questions(artifact, encoded, seed):
             bare = replace(scene, room_type=None)
@@ -131,6 +133,7 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
             blocks.append(
                 _Cases(
                     scene=np.full(size, len(blocks)),
+                    encoded=np.full(size, number),
                     source=np.full(size, encoded.source),
                     untouched=np.full(size, wrong is None),
                     complete=np.full(size, STAND in shown),
@@ -143,7 +146,7 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
     if not blocks:
         none = np.zeros(0, np.int64)
         names, no = none.astype(np.str_), none > 0
-        return _Cases(none, names, no, no, none, np.zeros((0, 3)), no, np.zeros(0))
+        return _Cases(none, none, names, no, no, none, np.zeros((0, 3)), no, np.zeros(0))
     columns: Any = (np.concatenate(column) for column in zip(*blocks, strict=True))
     return _Cases(*columns)
 
@@ -201,10 +204,10 @@ def _truth(entries: Entries, wrong: Triple | int | None) -> tuple[Flags, Flags]:
 def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
     """Fit the judgement of one kind of entry; None with too few scenes or without any sense."""
     untouched = cases.rows(cases.untouched)
-    if len(np.unique(untouched.scene)) < _LEAST_SCENES or not cases.wrong.any():
+    if len(np.unique(untouched.encoded)) < _LEAST_SCENES or not cases.wrong.any():
         return None
     complete = untouched.rows(untouched.complete)
-    if len(np.unique(complete.scene)) >= _LEAST_SCENES:
+    if len(np.unique(complete.encoded)) >= _LEAST_SCENES:
         untouched = complete
     varies = cases.terms.std(0) > 0
     if not varies.any():
