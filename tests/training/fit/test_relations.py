@@ -11,13 +11,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from app.scene.relations import ABOVE, INSIDE, LEFT, ON_TOP, STACKED
 from tests.enumeration.small_machines import random_weights
-from tests.training.evaluation.scenes import V, tensors, toy
+from tests.training.evaluation.scenes import V, scene, tensors, toy
 from training.datasets.batches import relation_units
 from training.fit.configuration import RelationsConfig
 from training.fit.parts import means_of_parts
 from training.fit.relations import SHARED_COLUMNS, SHARED_ROWS, RelationFit, RelationLikelihood
-from training.fit.residuals import with_counted_residuals
+from training.fit.residuals import lower_unseen_roles, with_counted_residuals
 from training.fit.sharing import bake_shared_weights, share_weights
 from training.machines import MachineSpec, build
 from training.machines.machine import OBJECT_WEIGHTS
@@ -327,3 +328,47 @@ def test_residuals_maximise_the_likelihood_of_triples_under_a_normal_prior(monke
         precision.append(float(error[unit].sum()) / (after[key] - before.get(key, 0.0)))
     assert precision[0] > 0
     assert precision == pytest.approx([precision[0]] * 3, rel=1e-3)
+
+
+DESK, LAMP, TABLE_LAMP, FLOOR_LAMP, WINDOW = range(V)
+KINDS = torch.tensor([-1, -1, LAMP, LAMP, -1])
+
+
+def lowered(scenes, parents, relations=5):
+    """The classes with lower weights as subject and as object, by relation."""
+    spec = MachineSpec("triway", V=V, A=relations, units=2, states=3, K=2)
+    machine = build(spec).initialise(torch.Generator().manual_seed(0), 0.1)
+    before = {name: machine.get_parameter(name).detach().clone() for name in ("s", "o")}
+    lower_unseen_roles(machine, tensors(scenes), parents)
+    changes = [machine.get_parameter(name).detach() - before[name] for name in ("s", "o")]
+    # A change is 0 or -6.
+    assert all(torch.isin((change * 1e3).round(), torch.tensor([0.0, -6e3])).all()
+               for change in changes)  # fmt: skip
+    return [[set(row.nonzero().flatten().tolist()) for row in change] for change in changes]
+
+
+def test_classes_that_no_scene_shows_in_a_role_get_lower_weights():
+    """A table lamp stands on a desk: so does a lamp, and no other kind of lamp."""
+    subjects, objects = lowered([scene([DESK, TABLE_LAMP], [(ON_TOP, TABLE_LAMP, DESK)])], KINDS)
+    assert subjects[ON_TOP] == {DESK, FLOOR_LAMP, WINDOW}
+    assert objects[ON_TOP] == {LAMP, TABLE_LAMP, FLOOR_LAMP, WINDOW}
+    # No scene shows objects in or above each other. Sides are no roles.
+    for a in (ABOVE, INSIDE):
+        assert subjects[a] == objects[a] == set(range(V))
+    assert subjects[LEFT] == objects[LEFT] == set()
+
+
+def test_kinds_have_the_roles_of_their_parent():
+    shown = [scene([LAMP, WINDOW], [(INSIDE, LAMP, WINDOW), (ABOVE, WINDOW, LAMP)])]
+    subjects, objects = lowered(shown, KINDS)
+    assert subjects[INSIDE] == objects[ABOVE] == {DESK, WINDOW}
+    subjects, objects = lowered(shown, NO_PARENTS)
+    assert subjects[INSIDE] == objects[ABOVE] == {DESK, TABLE_LAMP, FLOOR_LAMP, WINDOW}
+
+
+def test_machines_with_fewer_relations_have_fewer_roles():
+    assert max(STACKED) == INSIDE == 4
+    cut = [scene([DESK, LAMP], [(ON_TOP, LAMP, DESK)], relations=4)]
+    subjects, _ = lowered(cut, NO_PARENTS, relations=4)
+    assert len(subjects) == 4
+    assert subjects[ON_TOP] == set(range(V)) - {LAMP}
