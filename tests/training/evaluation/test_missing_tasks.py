@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry import CountSlope, PairSlope
+from app.registry import PlaceFit
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
 from tests.questions.answers import missing as ask_missing
-from tests.questions.artifacts import larger_artifact
+from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
@@ -227,9 +227,8 @@ def test_structure_and_equal_classes_are_not_asked():
 @pytest.mark.parametrize("name", ["rbm", "triway"])
 def test_the_question_names_the_place_as_a_robot_does(name, outgoing):
     """On-top of the first of two objects of class 2, by the relation as the missing object's."""
-    slope = PairSlope(intercept=0.2, slope=0.7, log_count=0.3, log_classes=-0.4)
-    counts = CountSlope(intercept=-0.3, slope=0.8, log_count=0.4)
-    artifact = larger_artifact(name, missing=counts, placement=(slope,) * 4, coverage=0.7)
+    entry = PlaceFit(relation=0.8, intercept=0.2, slope=0.7)
+    artifact = larger_artifact(name, at=(entry,) * LARGER[name].A, coverage=0.7)
     v = torch.zeros(2, artifact.spec.V)
     v[:, [0, 2, 5]] = 1.0
     number = v.clone()

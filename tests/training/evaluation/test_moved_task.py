@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from app import questions
-from app.registry import Slope, Thresholds
+from app.registry import Judgement, Misplaced
 from app.scene import observe
+from tests.questions.artifacts import lines
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.datasets.moved import has_boxes
@@ -129,10 +130,11 @@ def test_a_score_that_follows_the_order_is_caught():
 def test_the_service_sees_the_poses_of_a_request():
     artifact = room_model()
     assert misplaced_score(artifact) is None
+    terms = {"intercept": 0.0, "relation": -1.0, "change": -1.0, "stand": 0.0}
+    unlikely = Judgement(**terms, lines=lines(0.9, 0.8, 0.7))
     judging = artifact.calibration.model_copy(
         update={
-            "misplaced": Slope(intercept=0.0, slope=-1.0),
-            "misplaced_thresholds": Thresholds(low=0.9, medium=0.8, high=0.7),
+            "misplaced": Misplaced(lateral=unlikely, support=unlikely),
         }
     )
     artifact = replace(artifact, calibration=judging)
