@@ -24,8 +24,10 @@ _NEWTON_STEPS = 12
 _BATCH = 64
 
 
-# Change of the log-odds of a relation in which training shows a class in no scene.
+# Change of the log-odds of a relation in which training shows a class in no scene, and the minimum
+# number of scenes that annotate such relations of the class. Fewer scenes show nothing.
 _UNSEEN_ROLE = -6.0
+_CHANCES = 10
 
 
 @torch.no_grad()
@@ -34,15 +36,19 @@ def lower_unseen_roles(machine: BoltzmannMachine, train: SceneTensors, parents: 
 
     Factors extrapolate: they put windows on tables. A class has a role, as the subject or as the
     object of a stacked relation, if a scene shows it, its parent or one of its kinds in this role.
+    Classes with few annotated relations keep their weights.
 
     Args:
         parents: (classes,) index of the parent of each class, -1 without a parent.
     """
     seen = np.zeros((2, machine.spec.A, machine.spec.V), dtype=np.bool_)
+    chances = np.zeros((2, machine.spec.A, machine.spec.V), dtype=np.int64)
     for scene in train.scenes:
         relation, subject, object_ = scene.evidence.holds.nonzero()
         classes = scene.evidence.classes
         seen[0, relation, classes[subject]] = seen[1, relation, classes[object_]] = True
+        chances[0][:, classes] += scene.evidence.observed.any(2)
+        chances[1][:, classes] += scene.evidence.observed.any(1)
     kinds = np.flatnonzero(parents.numpy() >= 0)
     of_kind = seen[:, :, kinds]
     of_parent = seen[:, :, parents.numpy()[kinds]]
@@ -50,6 +56,7 @@ def lower_unseen_roles(machine: BoltzmannMachine, train: SceneTensors, parents: 
         for a in range(machine.spec.A):
             np.logical_or.at(seen[role, a], parents.numpy()[kinds], of_kind[role, a])
     seen[:, :, kinds] |= of_parent
+    seen |= chances < _CHANCES
     for name, role in (("s", seen[0]), ("o", seen[1])):
         for a in STACKED:
             if a < machine.spec.A:
