@@ -186,7 +186,8 @@ def _stands(
     else:
         stands[[i for i, _ in supports]] = SUPPORTED
     is_unsupported = (stands == FLOOR) | (stands == HANGS)
-    log_p[is_unsupported] = np.log(shares[is_unsupported, stands[is_unsupported]])
+    held = shares[is_unsupported, stands[is_unsupported]]
+    log_p[is_unsupported] = np.log(np.maximum(held, _LEAST_P))
     is_supported = stands == SUPPORTED
     if is_supported.any():
         p = shares[:, SUPPORTED, None] * _support_shares(artifact, posterior)

@@ -21,6 +21,7 @@ from app.registry.description import Description
 from app.registry.errors import ArtifactError
 from app.registry.fields import Count, Frozen, Many, Sha256, to_json
 from app.registry.offsets import PREFIX as OFFSETS
+from app.registry.places import PREFIX as PLACES
 
 FORMAT: Final = 7
 MAX_TENSORS: Final = 10_000
@@ -39,8 +40,8 @@ class TensorEntry(Frozen):
 
 
 def of_machine(tensors: Mapping[str, TensorEntry]) -> dict[str, TensorEntry]:
-    """Return the tensors of the machine, without offsets and counts."""
-    statistics = (OFFSETS, COUNTS)
+    """Return the tensors of the machine, without offsets, counts and places."""
+    statistics = (OFFSETS, COUNTS, PLACES)
     return {name: entry for name, entry in tensors.items() if not name.startswith(statistics)}
 
 
@@ -60,7 +61,7 @@ class Manifest(Description):
 
     @property
     def weights(self) -> dict[str, TensorEntry]:
-        """The tensors of the machine, without offsets and counts."""
+        """The tensors of the machine, without offsets, counts and places."""
         return of_machine(self.tensors)
 
     @field_validator("files")

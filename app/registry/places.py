@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from app.registry.errors import ArtifactError
 from app.registry.fields import TensorGroup
+from app.scene.relations import CANONICAL
 from app.scene.roles import RoleCounts
 
 PREFIX: Final = "places."
@@ -87,6 +88,8 @@ class Places(TensorGroup):
                 return f"{name} must be integers"
             if (keys[1:] <= keys[:-1]).any() or (keys[:1] < 0).any() or (keys[-1:] >= most).any():
                 return f"the keys in {name} must be ascending and in the range of the classes"
+        if not len(self.triple):
+            return "there must be at least one triple"
         numbers = self.held, self.role_counts, self.role_anchor, self.stands
         if any((array < 0).any() for array in numbers) or (self.frequency <= 0).any():
             return "counts must be at least 0, and frequencies must be above 0"
@@ -134,7 +137,7 @@ class Places(TensorGroup):
         """
         V = len(self.frequency)
         a, i, j = self.triple // V // V, self.triple // V % V, self.triple % V
-        A = int(a.max(initial=-1)) + 1
+        A = len(CANONICAL)  # a relation may have no triple
         share = self.frequency.astype(np.float64) / self.frequency.sum()
         tables = []
         for anchor, other in ((i, j), (j, i)):
