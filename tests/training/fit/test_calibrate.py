@@ -24,7 +24,13 @@ from training.evaluation.calibration_task import ask_outliers, collect, collect_
 from training.evaluation.intruders import draw_intruder_choices
 from training.evaluation.parts import draw_parts, exactly, up_to_longest
 from training.fit import calibrate_objects as of_objects
-from training.fit.calibrate import calibrate, fit_placements, fit_relations, fit_with_observed
+from training.fit.calibrate import (
+    calibrate,
+    fit_placements,
+    fit_relations,
+    fit_with_observed,
+    with_lower_lateral,
+)
 from training.fit.calibrate_objects import (
     ALPHAS,
     COVERAGES,
@@ -418,6 +424,27 @@ def test_sources_without_false_relations_take_no_part(random_artifact, fit):
     assert fit(random_artifact, vague) == Calibration.neutral(A).relation
     if fit is fit_relations:
         assert fit(random_artifact, [*known, *vague]) == pytest.approx(fit(random_artifact, known))
+
+
+@pytest.mark.parametrize(("intercept", "shift"), [(-0.2, 0.0), (0.2, -0.4), (0.5, -0.8), (5, 0)])
+def test_sides_are_lowered_until_the_listed_relation_of_stacked_objects_is_likeliest(
+    intercept, shift
+):
+    """On-top has the log-odds .05. If no shift is enough, nothing changes."""
+    machine = build(MachineSpec("triway", V=9, A=A, units=1, K=1, T=1))
+    machine.set_triples(torch.tensor([[ON_TOP, 1, 0]]))
+    with torch.no_grad():
+        machine.residual.fill_(0.05)
+    artifact = artifact_of(machine.eval().requires_grad_(False))
+    sides = CountSlope(intercept=intercept)
+    slopes = tuple(sides if a in LATERAL else CountSlope() for a in range(A))
+    stacked = scene([0, 1, 2], [(ON_TOP, 1, 0), (LEFT, 2, 0)])
+    lowered = with_lower_lateral(artifact, slopes, [stacked] * 3)
+    for a in range(A):
+        expected = intercept + shift if a in LATERAL else 0.0
+        assert lowered[a].intercept == pytest.approx(expected)
+    beside = scene([0, 1], [(LEFT, 1, 0)])
+    assert with_lower_lateral(artifact, slopes, [beside]) == slopes
 
 
 def test_a_ridge_bounds_the_slope_of_few_examples_and_leaves_many_alone():

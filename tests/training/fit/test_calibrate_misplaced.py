@@ -1,0 +1,272 @@
+"""The judgement of observed relations, in a world whose supports are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import log
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import expit, logit
+
+from app.questions import misplaced
+from app.questions.misplaced import BESIDE, STAND, SUPPORT, wrong_log_odds
+from app.registry import AlarmLine, AlarmLines, Judgement, Misplaced
+from app.scene import observe
+from app.scene.relations import ON_TOP
+from tests.questions.artifacts import artifact_of
+from tests.training.evaluation.furnished_rooms import VOCABULARY, A, rooms
+from tests.training.evaluation.scenes import scene
+from training.datasets.cases import draw_true_relations, scene_of, scene_rng
+from training.datasets.moved import moved_by_triple, moved_scene, posed_scene
+from training.datasets.roles import count_roles
+from training.evaluation.alarms import ALARMS
+from training.fit import calibrate_misplaced as module
+from training.fit.calibrate_misplaced import fit_misplaced, hardest_quantile
+from training.fit.draft import draft_artifact
+from training.fit.place_statistics import fit_places
+from training.machines import MachineSpec, build
+
+V, SUPPORTERS = 9, 4
+STRUCTURE = np.arange(V) == V - 1
+# Log-odds that a class i is on a class j. Classes 4 to 7 stand on classes 0 to 3.
+LOG_ODDS = np.full((V, V), -5.0)
+LOG_ODDS[SUPPORTERS : V - 1, :SUPPORTERS] = np.random.default_rng(1).normal(-1, 2.5, (4, 4))
+
+
+@pytest.fixture(scope="module")
+def artifact():
+    """A machine that knows the log-odds of supports, and nothing else."""
+    spec = MachineSpec("triway", V=V, A=A, units=1, K=1, T=V * V)
+    pairs = torch.cartesian_prod(torch.arange(V), torch.arange(V))
+    machine = build(spec).set_triples(torch.column_stack([torch.full((V * V,), ON_TOP), pairs]))
+    with torch.no_grad():
+        machine.residual.copy_(torch.from_numpy(LOG_ODDS.ravel()))
+    return artifact_of(machine.eval().requires_grad_(False))
+
+
+def world(count: int, seed: int):
+    """Scenes in which each of three things is on a supporter, drawn by the log-odds."""
+    rng = np.random.default_rng(seed)
+    scenes = []
+    for k in range(count):
+        things = rng.permutation(np.arange(SUPPORTERS, V - 1))[:3].tolist()
+        triples = []
+        for i in things:
+            odds = np.exp(LOG_ODDS[i, :SUPPORTERS])
+            triples.append((ON_TOP, i, int(rng.choice(SUPPORTERS, p=odds / odds.sum()))))
+        classes = [*range(SUPPORTERS), *sorted(things)]
+        scenes.append(scene(classes, triples, name=f"world {seed} {k}"))
+    return scenes
+
+
+@pytest.fixture(scope="module")
+def fitted(artifact):
+    return fit_misplaced(artifact, world(200, 0))
+
+
+def judging(artifact, judgement):
+    return replace(
+        artifact, calibration=artifact.calibration.model_copy(update={"misplaced": judgement})
+    )
+
+
+def test_wrong_supports_get_a_higher_probability(artifact, fitted):
+    """200 other scenes; a random answer ranks .5 of the pairs right, with a standard error of .03.
+
+    One of three supports is wrong. The machine knows only the log-odds of supports.
+    """
+    assert fitted.support.relation < 0
+    assert fitted.support.change == fitted.support.stand == 0
+    model, right, wrong = judging(artifact, fitted), [], []
+    for one in world(200, 1):
+        moved = moved_by_triple(one, STRUCTURE, scene_rng(one, 0))
+        if moved is None:
+            continue
+        request, index = moved
+        entries = misplaced(model, request)
+        assert {entry["moved"] for entry in entries} == {entry["subject"] for entry in entries}
+        for entry in entries:
+            (wrong if entry["moved"] == str(index) else right).append(entry["probability"])
+    assert len(wrong) > 150
+    assert np.mean(np.array(wrong)[:, None] > np.array(right)) > 0.75
+
+
+def test_kinds_without_true_and_wrong_entries_are_not_judged(fitted):
+    """The world has no side, no object above another one, and no stated under."""
+    assert fitted == Misplaced(support=fitted.support)
+
+
+def test_untouched_scenes_keep_the_share_of_alarms(artifact, fitted):
+    """400 other scenes. With these standard errors, a larger share has a probability below .002."""
+    model = judging(artifact, fitted)
+    for name, promise in ALARMS.items():
+        share = 0.45 * promise
+        alarms = 0
+        for one in world(400, 2):
+            triples = draw_true_relations(one, STRUCTURE, scene_rng(one, 0))
+            request = scene_of(one, range(len(one.instance_classes)), triples)
+            entries = misplaced(model, request, sensitivity=name)
+            alarms += any(entry["is_misplaced"] for entry in entries)
+        error = np.sqrt(share * (1 - share) * (1 / 400 + 1 / 200))
+        assert alarms / 400 <= share + 3 * error
+
+
+@pytest.mark.parametrize(("count", "is_judged"), [(19, False), (20, True)])
+def test_few_scenes_give_no_judgement(artifact, count, is_judged):
+    judgement = fit_misplaced(artifact, world(count, 3))
+    assert (judgement.support is not None) == is_judged
+    assert judgement.judges_relations == is_judged
+
+
+def test_no_scenes_give_no_judgement(artifact):
+    assert fit_misplaced(artifact, []) == Misplaced()
+    alone = [scene([0, 1, 2], name=f"alone {k}") for k in range(30)]
+    assert fit_misplaced(artifact, alone) == Misplaced()
+
+
+def test_a_machine_that_finds_true_supports_unlikely_does_not_judge(artifact):
+    """A likelier relation never makes an entry more suspicious."""
+    weights = {name: array.copy() for name, array in artifact.weights.arrays.items()}
+    weights["residual"] = -weights["residual"]
+    inverted = replace(artifact, weights=replace(artifact.weights, arrays=weights))
+    assert fit_misplaced(inverted, world(60, 0)).support is None
+
+
+@pytest.mark.slow
+def test_moved_boxes_stand_at_less_likely_places():
+    """Of rooms with boxes, and a machine that knows only what objects of each class stand on."""
+    spec = MachineSpec("triway", V=len(VOCABULARY), A=A, units=1, K=1)
+    train = rooms(200, 2).scenes
+    places = fit_places(train, count_roles((), VOCABULARY), VOCABULARY)
+    model = draft_artifact(build(spec).eval().requires_grad_(False), VOCABULARY, places=places)
+    fitted = fit_misplaced(model, rooms(80, 1).scenes)
+    assert fitted.stand.stand < 0
+    assert fitted.support.stand < 0
+    model, sizes = judging(model, fitted), VOCABULARY.sizes
+    before, after = [], []
+    for one in rooms(60, 3).scenes:
+        moved = moved_scene(one, VOCABULARY.structure, scene_rng(one, 0))
+        if moved is None:
+            continue
+        for request, values in ((posed_scene(one), before), (moved[0], after)):
+            entries = misplaced(model, observe(request, typical_sizes=sizes, roles=places.roles))
+            values.append(
+                max((e["probability"] for e in entries if e["moved"] == str(moved[1])), default=0.0)
+            )
+    assert len(after) > 40
+    assert np.mean(after) > np.mean(before) + 0.1
+
+
+SILENT = AlarmLines(**dict.fromkeys(ALARMS, AlarmLine(intercept=0.0)))
+BY_RELATION = Judgement(intercept=0.0, relation=-1.0, change=0.0, stand=0.0, lines=SILENT)
+
+
+def lists(count: int, size: int, seed: int, scale: float = 0.7):
+    """Untouched scenes with entries whose log-odds to be wrong are logistic."""
+    rng = np.random.default_rng(seed)
+    terms = np.zeros((count * size, 3))
+    terms[:, 0] = -rng.logistic(0.0, scale, count * size)
+    every = np.ones(count * size, dtype=np.bool_)
+    return module._Cases(
+        scene=np.repeat(np.arange(count), size),
+        encoded=np.repeat(np.arange(count), size),
+        source=np.full(count * size, "toy"),
+        untouched=every,
+        complete=every,
+        kind=np.full(count * size, SUPPORT),
+        terms=terms,
+        wrong=~every,
+        weight=np.ones(count * size),
+    )
+
+
+@pytest.mark.parametrize("budget", [0.1, 0.45])
+def test_lines_keep_the_share_at_each_length(budget):
+    """4,000 scenes of each length. The deviation from a line is below a tenth of the share."""
+    lines = module._alarm_lines(BY_RELATION, lists(4000, 32, 0), budget)
+    for name, promise in ALARMS.items():
+        share, line = budget * promise, getattr(lines, name)
+        error = np.sqrt(2 * share * (1 - share) / 4000)
+        for n in (1, 2, 8, 32):
+            drawn = lists(4000, n, n)
+            p = expit(wrong_log_odds(BY_RELATION, drawn.terms)).reshape(-1, n)
+            assert (p >= line.threshold(n)).any(1).mean() <= 1.1 * share + 4 * error
+        # The quantile of each length has a standard error of .7 / sqrt(4000 share).
+        assert line.log_count == pytest.approx(0.7, abs=0.03 + 1 / np.sqrt(4000 * share))
+
+
+def test_lines_of_lower_sensitivities_are_higher():
+    lines = module._alarm_lines(BY_RELATION, lists(400, 8, 0), 0.45)
+    for n in (1, 4, 16):
+        thresholds = [getattr(lines, name).threshold(n) for name in ("low", "medium", "high")]
+        assert thresholds == sorted(thresholds, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("values", "intercept", "slope"),
+    [
+        ((2.0, 2.5, 3.0), 2.0, 0.5),
+        ((3.0, 2.0, 1.0), 2.0, 0.0),
+        ((2.0, 5.0, 8.0), 4.0, 1.0),
+        ((-9.0, -9.0, -9.0), logit(0.3), 0.0),
+        ((2.0,), 2.0, 0.0),
+    ],
+)
+def test_a_line_rises_with_the_length_by_at_most_its_log(values, intercept, slope):
+    """The values are at lengths 1, e and e²."""
+    line = module._line(list(zip((0.0, 1.0, 2.0), values, strict=False)), least=0.3)
+    assert line.log_count == pytest.approx(slope)
+    assert line.intercept == pytest.approx(intercept)
+    assert line.threshold(10) >= line.threshold(1) >= 0.3 - 1e-9
+    assert line.threshold(10) <= expit(line.intercept + log(10)) + 1e-9
+
+
+@pytest.mark.parametrize("share", ALARMS.values())
+def test_the_share_is_kept_in_each_large_source(share):
+    """The second source is far more varied: one quantile over both would raise more alarms."""
+    rng = np.random.default_rng(0)
+    values = np.concatenate([rng.normal(0, 1, 4000), rng.normal(0, 3, 4000)])
+    sources = np.repeat(["a", "b"], 4000)
+    limit = hardest_quantile(values, sources, 1 - share)
+    alarms = [(values[sources == name] >= limit).mean() for name in ("a", "b")]
+    assert alarms[1] == pytest.approx(share, abs=1e-3)
+    assert alarms[0] < share / 2
+
+
+def test_small_sources_count_as_one_and_equal_values_raise_no_alarm():
+    """59 and 50 scenes; each alone would have another quantile."""
+    values = np.concatenate([np.zeros(100), np.arange(59.0), np.full(50, 500.0)])
+    sources = np.repeat(["large", "a", "b"], [100, 59, 50])
+    limit = hardest_quantile(values, sources, 0.5)
+    assert limit == pytest.approx(np.median(values[100:]))
+    assert not (np.full(3, np.median(values[100:])) >= limit).any()
+
+
+def entries_of(*rows):
+    """Entries (kind, triple, mover)."""
+    kinds, triples, movers = zip(*rows, strict=True)
+    n = len(rows)
+    return module.Entries(
+        np.array(triples), np.array(kinds), np.zeros((n, 3)), np.array(movers, dtype=np.int64)
+    )
+
+
+def test_a_moved_object_makes_its_support_wrong_and_its_other_relations_uncertain():
+    entries = entries_of(
+        (SUPPORT, (ON_TOP, 2, 0), 2),
+        (BESIDE, (0, 2, 1), 2),
+        (SUPPORT, (ON_TOP, 3, 2), 3),
+        (STAND, (ON_TOP, 2, -1), 2),
+        (SUPPORT, (ON_TOP, 1, 0), 1),
+    )
+    wrong, usable = module._truth(entries, 2)
+    assert wrong.tolist() == [True, False, False, True, False]
+    assert usable.tolist() == [True, False, False, True, True]
+    wrong, usable = module._truth(entries, (ON_TOP, 3, 2))
+    assert wrong.tolist() == [False, False, True, False, False]
+    assert usable.all()
+    wrong, usable = module._truth(entries, None)
+    assert not wrong.any()
+    assert usable.all()
