@@ -125,8 +125,9 @@ def test_probabilities_are_close_to_the_sum_over_all_states(name):
     assert (found >= NO_UNIT).all()
     if name in ("rbm", "gbm"):
         assert (found == NO_UNIT).any()
-    r, i, j = (k.ravel() for k in np.indices(found.shape))
-    np.testing.assert_array_equal(scene.unit_log_odds(r, i, j), found.ravel())
+    # No relation is observed.
+    np.testing.assert_array_equal(scene.alone_log_odds(), found)
+    assert not scene.relation_change().any()
 
 
 def test_the_neglected_directions_have_little_variance():

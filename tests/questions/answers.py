@@ -66,6 +66,7 @@ def without_minimums() -> Iterator[None]:
             ("missing", "LEAST_CHANGE"),
             ("rooms", "LEAST_CHANGE"),
             ("placements", "LEAST_SHARE"),
+            ("placements", "LEAST_LIKELY"),
         ):
             patch.setattr(import_module(f"app.questions.{module}"), minimum, 0)
         yield

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from app.registry.artifact import Artifact
@@ -16,6 +17,7 @@ from app.registry.description import (
     Judgement,
     Misplaced,
 )
+from app.registry.places import Places
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL
 from training.machines import BoltzmannMachine, MachineSpec, build
@@ -26,15 +28,15 @@ EXACT: dict[str, MachineSpec] = {
     name: SMALL[name]
     for name in ("rbm", "rbm-states", "gbm-one-layer", "triway-states", "triway-implications")
 }
-# Too large to enumerate, with structure and four relations.
+# Too large to enumerate, with structure and five relations.
 LARGER: dict[str, MachineSpec] = {
-    "rbm": MachineSpec("rbm", V=9, A=4, units=6, T=40, C=2),
-    "gbm": MachineSpec("gbm", V=9, A=4, units=6, H2=3, T=40),
-    "triway": MachineSpec("triway", V=9, A=4, units=6, H2=3, K=3, T=5, C=2, profiles=2),
+    "rbm": MachineSpec("rbm", V=9, A=5, units=6, T=40, C=2),
+    "gbm": MachineSpec("gbm", V=9, A=5, units=6, H2=3, T=40),
+    "triway": MachineSpec("triway", V=9, A=5, units=6, H2=3, K=3, T=5, C=2, profiles=2),
     "triway-states": MachineSpec(
-        "triway", V=9, A=4, units=5, states=4, K=3, T=60, C=2, profiles=2, coupled=True
+        "triway", V=9, A=5, units=5, states=4, K=3, T=60, C=2, profiles=2, coupled=True
     ),
-    "triway-implications": MachineSpec("triway", V=9, A=4, units=6, H2=3, K=3, T=5, C=2, G=2),
+    "triway-implications": MachineSpec("triway", V=9, A=5, units=6, H2=3, K=3, T=5, C=2, G=2),
 }
 LABELS = ("bed", "lamp", "desk", "chair", "sofa", "vase", "shelf", "rug", "wall")
 STRUCTURE = {"wall"}
@@ -50,20 +52,52 @@ def lines(low: float, medium: float, high: float, log_count: float = 0.0) -> Ala
 
 
 NO_ALARM = lines(1e3, 1e3, 1e3)
-UNLIKELY = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=-1.0, lines=NO_ALARM)
+
+
+def judging(lines: AlarmLines = NO_ALARM, stand: float = 0.0, **changes: object) -> Misplaced:
+    """The judgement of every kind by the log-odds of the relation. Changes replace judgements."""
+    judgement = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=stand, lines=lines)
+    return Misplaced(**{**dict.fromkeys(KINDS, judgement), **changes})
 
 
 def calibration(relations: int, **changes: object) -> Calibration:
     """A neutral calibration without outliers, so every generated scene is plausible."""
-    judging = {
+    judged = {
         "outlier": CountSlope(slope=-1.0),
         "outlier_lines": NO_ALARM,
-        "misplaced": Misplaced(**dict.fromkeys(KINDS, UNLIKELY)),
+        "misplaced": judging(),
     }
-    return Calibration(**{**dict(Calibration.neutral(relations)), **judging, **changes})
+    return Calibration(**{**dict(Calibration.neutral(relations)), **judged, **changes})
 
 
-def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:
+def places_of(V: int, triples: dict[tuple[int, int, int], float], **changes: np.ndarray) -> Places:
+    """Places with these numbers of scenes. Every stand has the same share, and no role is known."""
+    keys = sorted(((a * V + i) * V + j, held) for (a, i, j), held in triples.items())
+    arrays = {
+        "triple": np.array([key for key, _ in keys], np.int32),
+        "held": np.array([held for _, held in keys], np.float32),
+        "frequency": np.linspace(0.05, 0.45, V, dtype=np.float32),
+        "role_pair": np.zeros(0, np.int32),
+        "role_counts": np.zeros((0, 3), np.float32),
+        "role_anchor": np.zeros((V, 3), np.float32),
+        "stands": np.full((V, 3), 1 / 3, np.float32),
+    }
+    return Places(**{**arrays, **changes})
+
+
+# A lamp on a desk, a vase on a shelf, a bed above a rug, and a vase on a lamp in a single scene.
+PLACES = places_of(
+    9,
+    {(2, 1, 2): 30, (2, 5, 6): 12, (2, 0, 7): 8, (2, 5, 1): 1, (0, 3, 2): 20},
+    stands=np.float32([[0.9, 0.05, 0.05], [0.2, 0.2, 0.6], [0.9, 0.02, 0.08], [0.9, 0.01, 0.09],
+                       [0.96, 0.02, 0.02], [0.1, 0.1, 0.8], [0.5, 0.4, 0.1], [0.9, 0.05, 0.05],
+                       [0.98, 0.01, 0.01]]),
+)  # fmt: skip
+
+
+def artifact_of(
+    machine: BoltzmannMachine, places: Places | None = None, **changes: object
+) -> Artifact:
     """An artifact with a neutral calibration, except for the changed fields."""
     spec = machine.spec
     vocabulary = Vocabulary(
@@ -78,6 +112,7 @@ def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:
         digest="",
         card="",
         path=Path(),
+        places=places,
     )
 
 
@@ -95,7 +130,7 @@ def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> Artifac
     if machine.spec.coupled:
         machine.L[:, structure] = 0
         machine.Y[:, structure] = 0
-    return artifact_of(machine, **changes)
+    return artifact_of(machine, PLACES, **changes)
 
 
 def random_machine(spec: MachineSpec, scale: float) -> BoltzmannMachine:

@@ -211,24 +211,35 @@ def test_placements(case, classes, stated):
 @pytest.mark.parametrize("relation", ["left", "right"])
 @pytest.mark.parametrize("anchor", [0, 1, 2])
 def test_missing_at_a_place(case, relation, anchor):
+    """With the neutral calibration: the log-odds of the class and the log of p(r_e = 1)."""
     artifact, exact = case
     for entry in missing(artifact, scene_of([anchor]), at=(relation, 0)):
         i = LABELS.index(entry.label)
         triple = (0, i, anchor) if relation == "left" else (0, anchor, i)
         p = max(exact.relation(triple, [anchor, i]), math.exp(-30))
-        p *= sigmoid(exact.object(i, [anchor]) + exact.kappa(i, 0.5))
-        assert entry.probability == pytest.approx(p, abs=TOLERANCE)
+        z = exact.object(i, [anchor]) + exact.kappa(i, 0.5)
+        assert entry.probability == pytest.approx(sigmoid(z + math.log(p)), abs=TOLERANCE)
 
 
 @pytest.mark.parametrize(("classes", "stated"), SCENES[2:])
 def test_relations(case, classes, stated):
-    """The probability of each relation, made exclusive."""
+    """The probability of each relation, made exclusive. A stated relation holds."""
     artifact, exact = case
     entries = relations(artifact, scene_of(classes, stated), top_k=100)
     assert len(entries) == len(classes) * (len(classes) - 1) * artifact.spec.A
     for entry in entries:
         i, j = classes[entry.subject], classes[entry.object]
         p = exact.between(i, j, classes, triples(classes, stated))[entry.relation]
+        a = CANONICAL.index(entry.relation)
+        if (a, entry.subject, entry.object) in (stated or ()):
+            assert entry.observed
+            assert entry.probability == 1
+            assert entry.expected == pytest.approx(p, abs=TOLERANCE)
+            continue
+        assert not entry.observed
+        assert entry.expected is None
+        if (a, entry.object, entry.subject) in (stated or ()):
+            p = min(p, 0.01)
         assert entry.probability == pytest.approx(p, abs=TOLERANCE)
 
 

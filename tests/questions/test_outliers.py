@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from app.registry.description import AlarmLine, CountSlope, Thresholds
+from app.registry.description import AlarmLine, CountSlope
 from tests.questions.answers import misplaced, missing, outliers
-from tests.questions.artifacts import LABELS, STRUCTURE, larger_artifact, lines, scene_of
+from tests.questions.artifacts import LABELS, STRUCTURE, judging, larger_artifact, lines, scene_of
 from training.machines.arrays import machine_of
 
 LINE = CountSlope(intercept=0.2, slope=-0.8, log_count=0.1)
-LEVELS = {"low": 0.9, "medium": 0.6, "high": 0.3}
-PRESETS = Thresholds(**LEVELS)
+LEVELS = ("low", "medium", "high")
 VARIANTS = ["rbm", "gbm", "triway-states"]
 SLOPE = -0.6
 LINES = lines(2.0, 0.9, -0.4, log_count=SLOPE)
@@ -86,13 +85,15 @@ def test_an_alarm_line_far_from_zero_is_a_probability(intercept):
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_the_sensitivity_selects_the_threshold_of_misplaced_relations(name):
-    """The threshold of a request is for objects only."""
-    artifact = larger_artifact(name, misplaced_thresholds=PRESETS)
+def test_the_sensitivity_selects_the_alarm_line_of_misplaced_relations(name):
+    """n is the number of relations of one kind. The threshold of a request is for objects only."""
+    artifact = larger_artifact(name, misplaced=judging(LINES))
     scene = scene_of([0, 1, 2, 3], [(2, 1, 0), (0, 1, 2), (1, 3, 0)])
-    for level, threshold in LEVELS.items():
+    for level in LEVELS:
         answer = outliers(artifact, scene, sensitivity=level)
-        assert all(one.is_misplaced == (one.probability >= threshold) for one in answer.misplaced)
+        for one in answer.misplaced:
+            threshold = line(level, 1 if one.relation == "on-top" else 2)
+            assert one.is_misplaced == (one.probability >= threshold)
         assert answer.misplaced == misplaced(artifact, scene, sensitivity=level)
         own = outliers(artifact, scene, sensitivity=level, threshold=0.5)
         assert own.misplaced == answer.misplaced

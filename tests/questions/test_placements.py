@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.questions.placements import offsets_of
-from app.registry import Offsets, PairSlope
+from app.registry import CountSlope, Offsets
 from app.registry.offsets import UNOBSERVED
 from app.scene import CANONICAL, Scene, SceneObject
 from app.scene.geometry import viewer_axes
@@ -47,7 +47,7 @@ def test_only_likely_places_and_strong_reasons_are_listed():
 
 
 # On-top is likelier than all other relations.
-SLOPES = tuple(PairSlope(intercept=4.0 if a == ON_TOP else -4.0) for a in range(4))
+SLOPES = tuple(CountSlope(intercept=4.0 if a == ON_TOP else -4.0) for a in range(A))
 ARTIFACT = larger_artifact("triway", placement=SLOPES)
 
 
@@ -130,7 +130,7 @@ def test_unknown_offsets():
     assert offset_of(LEFT, 1, 2, axes=None) is None
     assert offset_of(FRONT, 1, 2, outgoing=False, axes=None) is None
     none = {"pair": np.zeros(0, np.int64), "pair_offset": np.zeros((0, 6), "f4")}
-    counts = {"relation_scenes": np.array([1, 0, 9, 9]), "pair_scenes": np.zeros(0, np.int64)}
+    counts = {"relation_scenes": np.array([1, 0, 9, 9, 9]), "pair_scenes": np.zeros(0, np.int64)}
     partial = replace(OFFSETS, **counts, **none)
     assert offset_of(FRONT, 1, 2, offsets=partial) is None
     assert offset_of(LEFT, 1, 2, offsets=partial).scenes == 0

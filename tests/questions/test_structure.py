@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from app.registry.description import CountSlope, PairSlope
+from app.registry.description import CountSlope, PlaceFit
 from app.scene import Scene
 from tests.questions.answers import missing, outliers, relations
 from tests.questions.artifacts import LARGER, STRUCTURE, larger_artifact, lines, scene_of
 
 # Every calibration depends on the number of classes.
-COUNTED = PairSlope(intercept=-0.3, slope=0.8, log_count=-0.2, log_classes=-0.7)
+COUNTED = CountSlope(intercept=-0.3, slope=0.8, log_count=-0.2)
 COUNTS = {
     "missing": CountSlope(intercept=0.1, slope=0.9, log_count=-0.5),
     "outlier": CountSlope(intercept=0.2, slope=-0.8, log_count=0.3),
     "outlier_lines": lines(2.0, 1.0, 0.0, log_count=-0.4),
-    **dict.fromkeys(("relation", "relation_given", "placement", "asked_place"), (COUNTED,) * 4),
+    "at": (PlaceFit(relation=0.5, counts=0.5, intercept=-0.2, slope=0.9),) * 5,
+    **dict.fromkeys(("relation", "relation_given", "placement"), (COUNTED,) * 5),
 }
 STATED = [(2, 1, 0), (0, 1, 2)]
 

@@ -24,6 +24,7 @@ from app.registry import (
     StoreError,
     VocabularyEntry,
 )
+from app.registry.description import KINDS
 from app.registry.manifest import MANIFEST
 from app.scene.vocabulary import ObjectClass, Vocabulary
 
@@ -38,12 +39,12 @@ VOCABULARY = Vocabulary(
 
 # One of each variant; a new one is put through the round trip by an entry here.
 SPECS: dict[str, dict[str, Any]] = {
-    "rbm": {"variant": "rbm", "V": 3, "A": 4, "units": 5, "C": 2, "T": 2},
-    "gbm": {"variant": "gbm", "V": 3, "A": 4, "units": 5, "H2": 2, "T": 2},
+    "rbm": {"variant": "rbm", "V": 3, "A": 5, "units": 5, "C": 2, "T": 2},
+    "gbm": {"variant": "gbm", "V": 3, "A": 5, "units": 5, "H2": 2, "T": 2},
     "triway": {
         "variant": "triway",
         "V": 3,
-        "A": 4,
+        "A": 5,
         "units": 2,
         "states": 4,
         "C": 2,
@@ -56,12 +57,12 @@ SPECS: dict[str, dict[str, Any]] = {
 PROFILES = {"rbm": (), "gbm": (), "triway": ("homes", "shops")}
 
 EVEN = AlarmLine(intercept=0.0)
-LINES = AlarmLines(low=EVEN, medium=EVEN, high=EVEN)
-UNLIKELY = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=0.0, lines=LINES)
+HALF = AlarmLines(low=EVEN, medium=EVEN, high=EVEN)
+WRONG = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=-1.0, lines=HALF)
 JUDGING = {
     "outlier": CountSlope(slope=-1.0),
-    "outlier_lines": LINES,
-    "misplaced": Misplaced(lateral=UNLIKELY, support=UNLIKELY),
+    "outlier_lines": HALF,
+    "misplaced": Misplaced(**dict.fromkeys(KINDS, WRONG)),
 }
 
 
@@ -86,7 +87,7 @@ def description(
             "created": "2020-02-02T20:20:20+00:00",
             "spec": SPECS[variant],
             "vocabulary": VocabularyEntry.of(VOCABULARY, profiles=PROFILES[variant]),
-            "calibration": Calibration.neutral(4).model_copy(update=JUDGING),
+            "calibration": Calibration.neutral(5).model_copy(update=JUDGING),
             "training": {"objects": {"steps": 800}, "seed": 7, "rate": 0.1},
             "data": [DATA],
             "metrics": [{"task": "missing", "source": "generated", "metric": "MRR", **FIGURE}],

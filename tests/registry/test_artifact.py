@@ -275,7 +275,7 @@ NOT_FINITE = [
 ]
 OUT_OF_RANGE = [
     (lambda t, row=row: t["triples"].__setitem__(1, row), "triples", "invalid_tensor")
-    for row in ((4, 0, 0), (0, 3, 0), (0, 0, -1), (0, 0, 1))  # the last one twice
+    for row in ((5, 0, 0), (0, 3, 0), (0, 0, -1), (0, 0, 1))  # the last one twice
 ]
 
 

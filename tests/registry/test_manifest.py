@@ -18,12 +18,12 @@ from app.registry import (
     Calibration,
     CountSlope,
     Description,
+    Judgement,
     Manifest,
-    PairSlope,
-    Slope,
-    Thresholds,
+    Misplaced,
+    PlaceFit,
 )
-from app.registry.description import VocabularyEntry
+from app.registry.description import KINDS, PAIR_CALIBRATIONS, VocabularyEntry
 from app.scene.relations import CANONICAL
 from tests.registry.small_artifacts import VOCABULARY, description, refused, resign
 
@@ -49,14 +49,17 @@ json_values = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(text, inner, max_size=3),
     max_leaves=8,
 )
-pair_slopes = st.builds(
-    PairSlope, intercept=number, slope=number, log_count=number, log_classes=number
-)
 share = st.floats(0, 1)
-thresholds = st.builds(Thresholds, low=share, medium=share, high=share)
 alarm_line = st.builds(AlarmLine, intercept=number, log_count=number)
 alarm_lines = st.builds(AlarmLines, low=alarm_line, medium=alarm_line, high=alarm_line)
 count_slopes = st.builds(CountSlope, intercept=number, slope=number, log_count=number)
+weight = st.floats(0, 1e9)
+place_fits = st.builds(
+    PlaceFit, relation=weight, counts=weight, intercept=number, slope=st.floats(1e-9, 1e9)
+)
+judgements = st.builds(
+    Judgement, intercept=number, relation=number, change=number, stand=number, lines=alarm_lines
+)
 changes = st.fixed_dictionaries(
     {},
     optional={
@@ -75,12 +78,9 @@ changes = st.fixed_dictionaries(
             popularity_weight=share,
             outlier=count_slopes,
             outlier_lines=alarm_lines,
-            misplaced=st.builds(Slope, intercept=number, slope=number),
-            misplaced_thresholds=thresholds,
-            **dict.fromkeys(
-                ("relation", "relation_given", "placement", "asked_place"),
-                st.tuples(*[pair_slopes] * 4),
-            ),
+            misplaced=st.builds(Misplaced, **dict.fromkeys(KINDS, st.none() | judgements)),
+            at=st.tuples(*[place_fits] * 5),
+            **dict.fromkeys(PAIR_CALIBRATIONS, st.tuples(*[count_slopes] * 5)),
         ),
         "tensors": st.dictionaries(
             text,
@@ -103,10 +103,10 @@ def test_reads_back_as_written(change: dict[str, Any]) -> None:
     read = Manifest.from_bytes(data)
     assert read == written
     assert read.to_bytes() == data
-    assert json.loads(data)["format"] == 6
+    assert json.loads(data)["format"] == 7
 
 
-@pytest.mark.parametrize("value", [5, 7, 6.0, "6", None, True])
+@pytest.mark.parametrize("value", [6, 8, 7.0, "7", None, True])
 def test_refuses_another_format(value: object) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"]
@@ -128,9 +128,9 @@ def test_refuses_another_format(value: object) -> None:
         (b"\xff\xfe", "truncated"),
         (b"[" * 200_000, "truncated"),
         (resign(b"{" + b'"a":[' * 100_000 + b"]" * 100_000 + b"}"), "invalid_manifest"),
-        (resign(b'{"format": 6, nonsense}'), "invalid_manifest"),
-        (b'{"format": 6}', "invalid_manifest"),
-        (resign(b'{"format": 6}'), "invalid_manifest"),
+        (resign(b'{"format": 7, nonsense}'), "invalid_manifest"),
+        (b'{"format": 7}', "invalid_manifest"),
+        (resign(b'{"format": 7}'), "invalid_manifest"),
     ],
 )
 def test_refuses_malformed_manifests(data: bytes, code: str) -> None:
@@ -173,12 +173,18 @@ def change_nested(members: dict[str, Any], path: str, value: object) -> None:
         ("vocabulary.objects.0.size", [1.0, 2.0]),
         ("vocabulary.objects.0.size", [1.0, 2.0, -3.0]),
         ("calibration.relation", []),
-        ("calibration.asked_place", []),
+        ("calibration.at", []),
+        ("calibration.at.0.slope", 0),
+        ("calibration.at.0.relation", -1),
+        ("calibration.at.0.counts", math.nan),
+        ("calibration.asked_place", []),  # of an older format
         ("calibration.placed", {}),
         ("calibration.coverage", 1.5),
         ("calibration.popularity", [math.inf]),
         ("calibration.evidence", {"poses_on_objects": 1.0}),  # of an older format
-        ("calibration.misplaced_thresholds.low", 1.5),
+        ("calibration.misplaced.under.lines", None),
+        ("calibration.misplaced.stand.stand", math.inf),
+        ("calibration.misplaced.beside", None),
         ("calibration.outlier_lines.low.intercept", math.inf),
         ("calibration.outlier_lines", None),  # the fit needs its lines
         ("calibration.outlier.slope", math.nan),
@@ -248,11 +254,13 @@ def test_a_description_can_always_be_written(change: dict[str, Any]) -> None:
 
 
 def test_neutral_calibration_changes_nothing() -> None:
-    neutral = Calibration.neutral(4)
-    assert neutral.relation == (PairSlope(intercept=0, slope=1, log_count=0, log_classes=0),) * 4
+    neutral = Calibration.neutral(5)
+    assert neutral.relation == (CountSlope(intercept=0, slope=1, log_count=0),) * 5
     assert neutral.missing == CountSlope(intercept=0, slope=1, log_count=0)
     assert (neutral.popularity, neutral.popularity_weight) == ((), 0)
-    assert neutral.misplaced is neutral.outlier is None
+    assert neutral.at == (PlaceFit(relation=1, counts=0, intercept=0, slope=1),) * 5
+    assert neutral.outlier is None
+    assert not neutral.misplaced.judges_relations
 
 
 def test_a_vocabulary_is_kept_whole() -> None:

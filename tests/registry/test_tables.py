@@ -10,7 +10,7 @@ import pytest
 from app.registry import Artifact, ArtifactError, Counts, Offsets, load_artifact, write_artifact
 from tests.registry.small_artifacts import description, refused, state
 
-A, V, C, M = 4, 3, 2, 4  # A, V and C as in `small_artifacts`
+A, V, C, M = 5, 3, 2, 4  # A, V and C as in `small_artifacts`
 BESIDE, ON_IT = (0, 1, 0.5, 0.5, 0.5, 0.25), (0, 0, 0.75, 0.5, 0.25, 0.125)
 
 
@@ -36,7 +36,7 @@ def offsets(**changes: np.ndarray) -> Offsets:
     other[2, 0] = (0, 0, 0.125, -0.1875, 0, 0)
     values = {
         "relation": relation,
-        "relation_scenes": np.array([3, 0, 20, 0], np.int32),
+        "relation_scenes": np.array([3, 0, 20, 0, 0], np.int32),
         "subject": subject,
         "object": other,
         "pair": np.array([(0 * V + 1) * V + 0, (2 * V + 1) * V + 0], np.int64),
@@ -115,7 +115,7 @@ INVALID_OFFSETS = [
     ({"pair": np.array([3, A * V * V], np.int64)}, "invalid_tensor"),
     ({"pair": np.array([3.0, 21.0], "f4")}, "invalid_tensor"),
     ({"pair_scenes": np.array([0, 12], np.int32)}, "invalid_tensor"),
-    ({"relation_scenes": np.array([-1, 0, 0, 0], np.int32)}, "invalid_tensor"),
+    ({"relation_scenes": np.array([-1, 0, 0, 0, 0], np.int32)}, "invalid_tensor"),
     ({"pair_offset": np.zeros((2, 6), "f4")}, "invalid_tensor"),
     ({"relation": np.zeros((A, 6), "f4")}, "invalid_tensor"),
     ({"subject": np.full((A, V, 6), -1, "f4")}, "invalid_tensor"),

@@ -1,0 +1,322 @@
+"""The entries of `misplaced`: their kinds, their terms, and the object that has moved."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from app.questions.misplaced import (
+    BELOW,
+    BESIDE,
+    EXPLAINED,
+    OVER,
+    STAND,
+    SUPPORT,
+    entries_of,
+    misplaced_fields,
+    wrong_log_odds,
+    wrong_relations,
+)
+from app.questions.posterior import Present, present
+from app.registry.description import Judgement
+from app.scene import ObjectClass, Scene, SceneObject, Vocabulary, observe
+from app.scene.relations import ABOVE, INSIDE, LEFT, ON_TOP
+from tests.questions.answers import misplaced
+from tests.questions.artifacts import judging, larger_artifact, lines, places_of, scene_of
+
+SIZES = {
+    "desk": (1.6, 0.8, 0.75),
+    "monitor": (0.6, 0.2, 0.4),
+    "bin": (0.3, 0.3, 0.4),
+    "stove": (0.6, 0.6, 0.9),
+    "pot": (0.25, 0.25, 0.2),
+    "sofa": (2.0, 0.9, 0.8),
+    "rug": (2.0, 1.4, 0.01),
+    "shelf": (1.0, 0.4, 2.0),
+    "wall": (4.0, 0.1, 2.5),
+}
+DESK, MONITOR, BIN, STOVE, POT, SOFA, RUG, SHELF, WALL = range(len(SIZES))
+V = len(SIZES)
+# Shares of the floor, of the wall and of supports, in this order.
+STANDS = {
+    DESK: (0.95, 0.01, 0.04),
+    MONITOR: (0.05, 0.15, 0.8),
+    BIN: (0.9, 0.02, 0.08),
+    STOVE: (0.96, 0.01, 0.03),
+    POT: (0.02, 0.08, 0.9),
+    SOFA: (0.97, 0.01, 0.02),
+    RUG: (0.9, 0.04, 0.06),
+    SHELF: (0.6, 0.35, 0.05),
+    WALL: (1.0, 0.0, 0.0),
+}
+# A bin is under a desk, and a monitor is on it.
+PLACES = places_of(
+    V,
+    {(ON_TOP, MONITOR, DESK): 9},
+    stands=np.array([*STANDS.values()], np.float32),
+    role_pair=np.array([MONITOR * V + DESK, BIN * V + DESK], np.int32),
+    role_counts=np.array([(9, 0, 0), (0, 5, 0)], np.float32),
+    role_anchor=np.array([(9, 5, 0), *[(0, 0, 0)] * (V - 1)], np.float32),
+)
+VOCABULARY = Vocabulary(
+    [ObjectClass(name, structure=name == "wall", size=size) for name, size in SIZES.items()],
+    ("office", "kitchen"),
+)
+ARTIFACT = replace(larger_artifact("triway"), vocabulary=VOCABULARY, places=PLACES)
+FLAT = -9.0  # log-odds of the relations that a test does not name
+
+
+@dataclass
+class Relations:
+    """A posterior with these log-odds of relations, and with these changes."""
+
+    present: Present
+    alone: np.ndarray
+    change: np.ndarray
+
+    def alone_log_odds(self):
+        return self.alone
+
+    def relation_change(self):
+        return self.change
+
+
+def posterior_of(scene, alone=(), change=()):
+    """Relations are triples of objects. Each object has a class of its own."""
+    listing = present(scene, ARTIFACT.spec)
+    n = len(listing.classes)
+    stub = Relations(listing, np.full((5, n, n), FLAT), np.zeros((5, n, n)))
+    for array, values in ((stub.alone, dict(alone)), (stub.change, dict(change))):
+        for (a, i, j), value in values.items():
+            array[a, listing.row[i], listing.row[j]] = value
+    return stub
+
+
+def stated(classes, triples):
+    """A scene without poses."""
+    names = list(SIZES)
+    objects = tuple(SceneObject(names[c], names[c], c) for c in classes)
+    return Scene(objects, tuple(triples))
+
+
+def posed(*bottoms, artifact=ARTIFACT):
+    """A scene of pairs of a class and the centre of its bottom, with relations from the poses."""
+    names = list(SIZES)
+    objects = tuple(
+        SceneObject(names[c], names[c], c, position=(x, y, z + SIZES[names[c]][2] / 2))
+        for c, (x, y, z) in bottoms
+    )
+    roles = None if artifact.places is None else artifact.places.roles
+    return observe(Scene(objects), typical_sizes=VOCABULARY.sizes, roles=roles)
+
+
+def entries(scene, alone=(), change=(), flipped=(), artifact=ARTIFACT):
+    """Entries as a dictionary from triples to kind, terms and mover."""
+    table = entries_of(artifact, posterior_of(scene, alone, change), scene, flipped)
+    rows = zip(*(column.tolist() for column in table), strict=True)
+    return {tuple(triple): (kind, terms, mover) for triple, kind, terms, mover in rows}
+
+
+# ------------------------------------------------------------------------------ stated relations
+
+
+def test_the_terms_of_a_hand_computed_example():
+    """A monitor on a desk, a bin under the desk, and the bin to the left of the monitor."""
+    on, under, left = (ON_TOP, 1, 0), (ON_TOP, 0, 2), (LEFT, 2, 1)
+    scene = stated([DESK, MONITOR, BIN], [on, under, left])
+    alone = {on: 1.0, under: -2.0, (ABOVE, 0, 2): -0.5, left: 0.25, (ON_TOP, 1, 2): -1.0}
+    change = {on: 0.5, under: -0.125, left: -1.5}
+    table = entries(scene, alone, change, flipped={under})
+    # The odds that the monitor is on or in the desk, and on or in the bin.
+    on_desk, on_bin = math.exp(1) + math.exp(FLAT), math.exp(-1) + math.exp(FLAT)
+    s = math.log(0.8 * on_desk / (1 + on_desk + on_bin))
+    assert table == {
+        on: (SUPPORT, pytest.approx([1.0, 0.5, s], rel=1e-5), 1),
+        # "Under" may mean below. The stand of the bin is unknown.
+        under: (BELOW, [-0.5, -0.125, 0.0], 2),
+        left: (BESIDE, [0.25, -1.5, 0.0], 2),
+    }
+
+
+@pytest.mark.parametrize(
+    ("triple", "is_flipped", "kind", "mover"),
+    [
+        ((LEFT, 0, 1), False, BESIDE, 0),
+        ((LEFT, 0, 1), True, BESIDE, 1),  # "the bin is to the right of the desk"
+        ((ON_TOP, 1, 0), False, SUPPORT, 1),
+        ((ON_TOP, 0, 1), True, BELOW, 1),  # "the bin is under the desk"
+        ((ON_TOP, 0, 1), False, BELOW, 1),  # "the desk is on the bin": the roles know better
+        ((INSIDE, 1, 0), False, SUPPORT, 1),
+        ((INSIDE, 1, 0), True, SUPPORT, 1),  # "the desk contains the bin"
+        ((ABOVE, 0, 1), False, OVER, 0),
+        ((ABOVE, 0, 1), True, OVER, 1),
+    ],
+)
+def test_kind_and_mover_of_a_stated_relation(triple, is_flipped, kind, mover):
+    table = entries(stated([DESK, BIN], [triple]), flipped={triple} if is_flipped else ())
+    assert {key: (k, m) for key, (k, _, m) in table.items()} == {triple: (kind, mover)}
+
+
+def test_without_counts_of_roles_an_object_on_another_has_moved():
+    """No source tells that a monitor is under a bin."""
+    table = entries(stated([BIN, MONITOR], [(ON_TOP, 0, 1)]))
+    assert [(kind, mover) for kind, _, mover in table.values()] == [(SUPPORT, 0)]
+
+
+def test_a_supported_object_above_another_is_no_sign_of_a_fault():
+    over = (ABOVE, 1, 2)
+    alone = entries(stated([DESK, MONITOR, RUG], [over]))
+    assert alone[over] == (OVER, [FLAT, 0.0, 0.0], 1)
+    held = entries(stated([DESK, MONITOR, RUG], [(ON_TOP, 1, 0), over]))
+    assert held[over] == (OVER, [EXPLAINED, 0.0, 0.0], 1)
+
+
+def test_structure_is_not_judged():
+    assert entries(stated([DESK, WALL], [(ON_TOP, 0, 1), (LEFT, 1, 0)])) == {}
+
+
+# ------------------------------------------------------------------------------------- poses
+
+STANDING = -1  # the floor as object of an entry
+
+
+def test_a_monitor_under_the_desk_has_moved():
+    """Its bottom is on the floor, so the desk is on top of it: the poses show no other role."""
+    under = (ON_TOP, 0, 1)
+    table = entries(posed((DESK, (0, 0, 0)), (MONITOR, (0, 0, 0))), {under: -3.0})
+    floor = math.log(0.05)
+    assert table[under] == (BELOW, pytest.approx([-3.0, 0, floor], rel=1e-5), 1)
+    assert table[ON_TOP, 1, STANDING] == (STAND, pytest.approx([0, 0, floor], rel=1e-5), 1)
+    assert table[ON_TOP, 0, STANDING][1] == pytest.approx([0, 0, math.log(0.95)], rel=1e-5)
+    assert len(table) == 3
+
+
+def test_a_rug_that_hangs_above_the_sofa_has_moved():
+    table = entries(posed((SOFA, (0, 0, 0)), (RUG, (0, 0, 1.5))), {(ABOVE, 1, 0): -2.0})
+    hangs = pytest.approx([-2.0, 0, math.log(0.04)], rel=1e-5)
+    assert table[ABOVE, 1, 0] == (OVER, hangs, 1)
+    assert table[ABOVE, 1, STANDING][0] == STAND
+
+
+def test_a_pot_below_the_floor_under_a_stove_has_moved():
+    """The stove stands on the floor, so it is not the object that is above."""
+    below = (ABOVE, 0, 1)
+    table = entries(posed((STOVE, (0, 0, 0)), (POT, (0, 0, -0.6))), {below: -4.0})
+    assert table[below] == (BELOW, pytest.approx([-4.0, 0, math.log(0.02)], rel=1e-5), 1)
+    # "Below" may mean under.
+    alone = {below: -4.0, (ON_TOP, 0, 1): -1.0}
+    table = entries(posed((STOVE, (0, 0, 0)), (POT, (0, 0, -0.6))), alone)
+    assert table[below][1][0] == -1.0
+
+
+def test_an_object_above_another_is_explained_by_its_support_or_by_an_unknown_stand():
+    """The monitor stands on the desk, above the rug. The pot is closely above the stove."""
+    desk = entries(posed((DESK, (0, 0, 0.01)), (MONITOR, (0, 0, 0.76)), (RUG, (0, 0, 0))))
+    assert desk[ABOVE, 1, 2] == (OVER, [EXPLAINED, 0.0, pytest.approx(0.0)], 1)
+    assert desk[ON_TOP, 1, 0][0] == SUPPORT
+    stove = entries(posed((STOVE, (0, 0, 0)), (POT, (0, 0, 1.0))))
+    assert stove[ABOVE, 1, 0] == (OVER, [EXPLAINED, 0.0, 0.0], 1)
+    assert (ABOVE, 1, STANDING) not in stove
+
+
+def test_the_support_of_a_class_never_on_the_floor_is_finite():
+    """A share of 0 counts as 1e-6."""
+    stands = PLACES.stands.copy()
+    stands[MONITOR] = (0, 0, 1)
+    artifact = replace(ARTIFACT, places=replace(PLACES, stands=stands))
+    table = entries(posed((MONITOR, (0, 0, 0)), (DESK, (4, 0, 0))), artifact=artifact)
+    assert table[ON_TOP, 0, STANDING][1][2] == pytest.approx(math.log(1e-6))
+
+
+@pytest.mark.parametrize("is_posed", [True, False])
+def test_without_places_stands_are_unknown(is_posed):
+    artifact = replace(ARTIFACT, places=None)
+    if is_posed:
+        scene = posed((DESK, (0, 0, 0)), (MONITOR, (0, 0, 0.75)), artifact=artifact)
+    else:
+        scene = stated([DESK, MONITOR], [(ON_TOP, 1, 0)])
+    table = entries(scene, {(ON_TOP, 1, 0): 1.5}, artifact=artifact)
+    assert table == {(ON_TOP, 1, 0): (SUPPORT, [1.5, 0.0, 0.0], 1)}
+    (entry,) = misplaced_fields(artifact, posterior_of(scene), scene, "medium", ())
+    assert (entry["subject"], entry["moved"]) == ("monitor", "monitor")
+
+
+# ------------------------------------------------------------------------------------ answers
+
+JUDGED = judging(lines(3.0, 2.0, 1.0), stand=-1.0)
+WITHOUT_STAND = JUDGED.model_copy(update={"stand": None})
+
+
+def fields_of(scene, alone=(), sensitivity="medium", flipped=(), judgements=JUDGED):
+    calibration = ARTIFACT.calibration.model_copy(update={"misplaced": judgements})
+    artifact = replace(ARTIFACT, calibration=calibration)
+    return misplaced_fields(artifact, posterior_of(scene, alone), scene, sensitivity, flipped)
+
+
+def test_the_log_odds_are_a_weighted_sum_of_the_terms():
+    judgement = Judgement(
+        intercept=0.5, relation=-1.0, change=2.0, stand=-0.25, lines=lines(0, 0, 0)
+    )
+    terms = np.array([[1.0, 0.5, -4.0], [0.0, 0.0, 0.0]])
+    assert wrong_log_odds(judgement, terms).tolist() == [0.5 - 1 + 1 + 1, 0.5]
+
+
+def test_the_answer_names_the_moved_object_of_each_entry():
+    scene = posed((DESK, (0, 0, 0)), (MONITOR, (0, 0, 0)))
+    answer = fields_of(scene, {(ON_TOP, 0, 1): 0.5})
+    # log-odds -0.5 + log 20 and log 20
+    expected = [
+        ("monitor", "on-top", "floor", 20.0),
+        ("desk", "on-top", "monitor", 20.0 * math.exp(-0.5)),
+    ]
+    for entry, (subject, relation, object_, odds) in zip(answer, expected, strict=True):
+        assert [entry[name] for name in ("subject", "relation", "object")] == [
+            subject, relation, object_,
+        ]  # fmt: skip
+        assert entry["moved"] == "monitor"
+        assert entry["probability"] == pytest.approx(odds / (1 + odds), rel=1e-4)
+        assert entry["is_misplaced"]
+
+
+def test_the_answer_uses_the_words_of_the_request():
+    under = (ON_TOP, 0, 1)
+    (entry,) = fields_of(stated([DESK, BIN], [under]), flipped={under})
+    words = [entry[name] for name in ("subject", "relation", "object", "moved")]
+    assert words == ["bin", "under", "desk", "bin"]
+
+
+@pytest.mark.parametrize("sensitivity", ["low", "medium", "high"])
+def test_objects_on_the_floor_are_listed_only_above_the_most_sensitive_line(sensitivity):
+    """The lines are at the odds e, e² and e³. Odds are 1/p(floor) or 1/p(hangs)."""
+    scene = posed(*((c, (4.0 * c, 0, 0)) for c in (DESK, MONITOR, BIN, POT, SOFA)),
+                  (SHELF, (40, 0, 0.9)))  # fmt: skip
+    answer = fields_of(scene, sensitivity=sensitivity)
+    odds = {"pot": 50, "monitor": 20, "shelf": 1 / 0.35}
+    assert [entry["moved"] for entry in answer] == [*odds]
+    line = math.exp({"low": 3, "medium": 2, "high": 1}[sensitivity])
+    for entry in answer:
+        assert entry["object"] == "floor"
+        assert entry["relation"] == ("above" if entry["moved"] == "shelf" else "on-top")
+        assert entry["is_misplaced"] == (odds[entry["moved"]] >= line)
+
+
+def test_a_kind_without_judgement_is_left_out():
+    scene = stated([DESK, MONITOR, BIN], [(ON_TOP, 1, 0), (LEFT, 2, 1)])
+    (entry,) = fields_of(scene, judgements=judging(lateral=None))
+    assert entry["relation"] == "on-top"
+    assert fields_of(posed((POT, (0, 0, 0))))
+    assert not fields_of(posed((POT, (0, 0, 0))), judgements=WITHOUT_STAND)
+
+
+def test_generation_uses_the_same_log_odds():
+    artifact = larger_artifact("triway")
+    scene = scene_of([0, 1, 2, 3], [(ON_TOP, 1, 2), (LEFT, 0, 3), (ABOVE, 1, 0)])
+    log_odds = wrong_relations(artifact, scene)
+    names = {(ON_TOP, 1, 2): "on-top", (LEFT, 0, 3): "left", (ABOVE, 1, 0): "above"}
+    answer = {entry.relation: entry.probability for entry in misplaced(artifact, scene)}
+    assert log_odds.keys() == names.keys()
+    for triple, z in log_odds.items():
+        assert answer[names[triple]] == pytest.approx(1 / (1 + math.exp(-z)), rel=1e-5)
