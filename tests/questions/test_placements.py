@@ -12,14 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from app.questions import placements
 from app.questions.placements import offsets_of
 from app.registry import CountSlope, Offsets
 from app.registry.offsets import UNOBSERVED
-from app.scene import CANONICAL, Scene, SceneObject
+from app.scene import CANONICAL, ObjectClass, Scene, SceneObject, Vocabulary
 from app.scene.geometry import viewer_axes
-from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP, canonicalise
+from app.scene.relations import ABOVE, FRONT, INSIDE, LEFT, ON_TOP, canonicalise
+from app.scene.stands import HANGS, SUPPORTED
 from tests.questions.answers import missing, without_minimums
-from tests.questions.artifacts import LARGER, larger_artifact, scene_of
+from tests.questions.artifacts import LABELS, LARGER, larger_artifact, places_of, scene_of
 
 V = LARGER["triway"].V
 A = len(CANONICAL)
@@ -44,6 +46,19 @@ def test_only_likely_places_and_strong_reasons_are_listed():
             further_places += likely
             reasons += strong
     assert {*further_places} == {*reasons} == {True, False}
+
+
+def test_no_place_is_listed_below_one_in_twenty():
+    """The place of `at` is always listed."""
+    scene, log_odds = scene_of([0, 1, 2]), math.log(0.05 / 0.95)
+    for change, count in ((-0.01, 0), (0.01, 3)):
+        slopes = (CountSlope(intercept=log_odds + change, slope=0.0),) * A
+        artifact = larger_artifact("triway", placement=slopes)
+        entries = missing(artifact, scene)
+        assert {len(entry.placements) for entry in entries} == {count}
+        entries = missing(artifact, scene, at=("left", 1))
+        assert {entry.placements[0].object for entry in entries} == {1}
+        assert {len(entry.placements) for entry in entries} == {max(count, 1)}
 
 
 # On-top is likelier than all other relations.
@@ -161,3 +176,88 @@ def test_placements_have_the_offsets_of_their_classes(name):
             relation, subject, _ = canonicalise("missing", place.relation, "anchor")
             anchor = scene.objects[place.object].class_index
             assert place.offset == offset_of(relation, index, anchor, subject == "missing")
+
+
+# ---------------------------------------------------------------------- what training never shows
+
+SHOWN = {(ON_TOP, 1, 2): 2.0, (ON_TOP, 5, 2): 1.0, (INSIDE, 5, 6): 4.0}
+
+
+def lowered(stands):
+    """The change of the log-odds of all relations between all pairs of classes, (V, A, V) twice."""
+    artifact = replace(ARTIFACT, places=places_of(V, SHOWN, stands=np.float32(stands)))
+    forward, backward = np.zeros((V, A, V)), np.zeros((V, A, V))
+    classes = np.arange(V)
+    placements._lower_unseen(artifact, classes, classes, forward, backward)
+    return forward, backward
+
+
+def test_relations_that_training_never_shows_are_lowered_by_the_stand_of_the_subject():
+    stands = np.random.default_rng(0).dirichlet([1, 1, 1], V)
+    stands[3] = (1.0, 0.0, 0.0)
+    forward, backward = lowered(stands)
+    stand_of = {ON_TOP: SUPPORTED, ABOVE: HANGS, INSIDE: SUPPORTED}
+    for i, a, j in np.ndindex(V, A, V):
+        share = max(stands[i, stand_of[a]], 0.005) if a in stand_of else 1.0
+        is_shown = SHOWN.get((a, i, j), 0) >= 2
+        change = 0.0 if is_shown else min(math.log(share / 0.5), 0.0)
+        assert forward[i, a, j] == pytest.approx(change, abs=1e-5)
+        assert backward[j, a, i] == pytest.approx(change, abs=1e-5)
+    assert (forward < 0).any()
+
+
+def test_without_places_nothing_is_lowered():
+    forward = np.zeros((2, A, 1))
+    without = replace(ARTIFACT, places=None)
+    placements._lower_unseen(without, np.array([0, 1]), np.array([2]), forward, forward)
+    assert not forward.any()
+
+
+# ------------------------------------------------------------------------------- what fits inside
+
+
+def test_a_box_fits_into_a_box_with_larger_extents_in_order_of_size():
+    """20 % of tolerance. The size of an object replaces the typical size of its class."""
+    sizes = {"bed": (2.0, 1.5, 0.5), "lamp": (0.2, 0.2, 0.5), "shelf": (0.3, 1.0, 2.0)}
+    vocabulary = Vocabulary([ObjectClass(label, size=sizes.get(label)) for label in LABELS[:V]])
+    artifact = replace(ARTIFACT, vocabulary=vocabulary)
+    bed, lamp, shelf, vase = 0, 1, 6, 5
+    objects = (
+        SceneObject("shelf", "shelf", shelf),
+        SceneObject("box", "shelf", shelf, size=(0.45, 0.18, 0.18)),
+        SceneObject("narrow", "shelf", shelf, size=(3.0, 3.0, 0.16)),
+        SceneObject("unknown", "vase", vase),
+    )
+    candidates = np.array([bed, lamp, vase])
+    into, around = placements._fits_inside(
+        artifact, Scene(objects), candidates, np.arange(len(objects))
+    )
+    assert into.tolist() == [
+        [False, False, False, True],
+        [True, True, False, True],
+        [True, True, True, True],
+    ]
+    assert around.tolist() == [
+        [True, True, False, True],
+        [False, True, False, True],
+        [True, True, True, True],
+    ]
+
+
+@pytest.mark.usefixtures("without_minimums")
+def test_no_place_is_inside_an_object_that_is_too_small():
+    sizes = {"sofa": (2.0, 0.9, 0.8), "vase": (0.1, 0.1, 0.3)}
+    classes = [ObjectClass(label, size=sizes.get(label)) for label in LABELS[:V]]
+    inside = tuple(CountSlope(intercept=9.0 if a == INSIDE else -9.0) for a in range(A))
+    artifact = larger_artifact("triway-states", placement=inside)
+    artifact = replace(artifact, vocabulary=Vocabulary(classes, ("bedroom", "office")), places=None)
+
+    def first(candidate, anchor):
+        (entry,) = missing(artifact, scene_of([anchor]), candidates=[candidate])
+        return {place.relation: place.probability for place in entry.placements}
+
+    sofa, vase, chair = 4, 5, 3
+    # The relation of a pair without unit has a probability of 0.
+    assert first(sofa, vase).get("inside", 0) < 1e-6
+    assert first(vase, sofa).get("contains", 0) < 1e-6
+    assert first(sofa, chair)["inside"] > 1e-3

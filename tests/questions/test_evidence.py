@@ -1,0 +1,121 @@
+"""What is observed in the answer to relations: probabilities of evidence, and exclusions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.scene import OPPOSITES, Scene, SceneObject, observe
+from app.scene.relations import ABOVE, CANONICAL, INSIDE, LEFT, ON_TOP
+from tests.questions.answers import relations
+from tests.questions.artifacts import LABELS, larger_artifact, scene_of
+
+ARTIFACT = larger_artifact("triway-states", scale=1.5)
+A = len(CANONICAL)
+SIZE = (0.5, 0.5, 0.5)
+
+
+def boxes(*bottoms, confidence=1.0, stated=None):
+    """Boxes of 50 cm, of a class each."""
+    objects = tuple(
+        SceneObject(LABELS[k], LABELS[k], k, confidence, (x, y, z + 0.25), SIZE)
+        for k, (x, y, z) in enumerate(bottoms)
+    )
+    return Scene(objects, stated)
+
+
+def entries(scene, **options):
+    """A dictionary from (relation, subject, object) to the entry."""
+    answer = relations(ARTIFACT, scene, top_k=4096, **options)
+    return {(entry.relation, entry.subject, entry.object): entry for entry in answer}
+
+
+def test_an_observed_relation_has_the_confidence_of_its_objects():
+    """`expected` is the probability without the observation. Machines have no implications."""
+    objects = tuple(
+        replace(thing, confidence=c)
+        for thing, c in zip(scene_of([0, 1, 2]).objects, (0.9, 0.5, 1.0), strict=True)
+    )
+    plain, scene = entries(Scene(objects)), Scene(objects, ((ON_TOP, 1, 2), (LEFT, 0, 1)))
+    answer = entries(scene)
+    assert answer["on-top", 1, 2].probability == pytest.approx(0.5)
+    assert answer["left", 0, 1].probability == pytest.approx(0.45)
+    for key, entry in answer.items():
+        if key in {("on-top", 1, 2), ("left", 0, 1)}:
+            assert entry.observed
+            assert entry.expected == pytest.approx(plain[key].probability, rel=1e-5)
+        else:
+            assert not entry.observed
+            assert entry.expected is None
+
+
+def test_the_opposite_of_an_observed_relation_cannot_hold():
+    plain, answer = entries(scene_of([0, 1])), entries(scene_of([0, 1], [(LEFT, 0, 1)]))
+    p = plain["left", 1, 0].probability
+    assert p > 0.01
+    assert answer["left", 1, 0].probability == pytest.approx(0.01)
+    unrelated = {key for key in plain if key[0] != "left"}
+    assert len(unrelated) == 8
+    for key in unrelated:
+        assert answer[key] == plain[key]
+
+
+def test_a_complete_list_excludes_all_other_relations():
+    answer = entries(scene_of([0, 1, 2], [(ON_TOP, 1, 2)], complete=True))
+    assert answer.pop(("on-top", 1, 2)).probability == 1
+    assert all(entry.probability <= 0.0100001 for entry in answer.values())
+    assert {entry.probability for entry in answer.values()} & {pytest.approx(0.01)}
+
+
+@pytest.mark.parametrize("stated", [None, ((ABOVE, 2, 3),)])
+def test_boxes_exclude_stacked_relations_in_both_directions(stated):
+    """The first two boxes are 2 m apart. Stated relations replace those of the poses only."""
+    bottoms = [(0, 0, 0), (2.5, 0, 0), (9, 0, 0), (9, 0, 0.7)]
+    scene = observe(boxes(*bottoms, stated=stated))
+    plain, answer = entries(scene_of([0, 1, 2, 3])), entries(scene)
+    excluded = 0
+    for a in (ON_TOP, ABOVE, INSIDE):
+        for i, j in ((0, 1), (1, 0)):
+            key = CANONICAL[a], i, j
+            assert answer[key].probability <= 0.0100001
+            assert not answer[key].observed
+            excluded += plain[key].probability > 0.02
+    assert excluded > 2
+    # Box 3 is above box 2, as the poses show.
+    assert answer["above", 3, 2].observed == (stated is None)
+    if stated is None:
+        assert answer["above", 3, 2].probability == 1
+        assert answer["on-top", 3, 2].probability <= 0.0100001
+    else:
+        # A stated relation counts more than the boxes.
+        assert answer["above", 2, 3].observed
+        assert answer["above", 2, 3].probability == 1
+        assert answer["above", 3, 2].probability <= 0.0100001
+
+
+def test_unknown_positions_exclude_nothing():
+    scene = observe(scene_of([0, 1]))
+    assert scene.excluded is None
+    assert entries(scene) == entries(scene_of([0, 1]))
+
+
+def test_opposites_have_the_evidence_of_their_relation():
+    scene = observe(boxes((0, 0, 0), (0, 0, 0.5), (0.7, 0, 0), confidence=0.8))
+    both, plain = entries(scene, include_opposites=True), entries(scene)
+    assert any(entry.observed for entry in plain.values())
+    assert len(both) == 2 * len(plain)
+    for (name, i, j), entry in plain.items():
+        other = both[OPPOSITES[name], j, i]
+        assert other[3:] == entry[3:] == both[name, i, j][3:]
+    on = both["under", 0, 1]
+    assert on.observed
+    assert on.probability == pytest.approx(0.64)
+
+
+def test_least_probabilities_count_the_evidence():
+    scene = scene_of([0, 1, 2], [(ON_TOP, 1, 2)])
+    answer = entries(scene, min_probability=0.999)
+    assert np.all([entry.probability >= 0.999 for entry in answer.values()])
+    assert ("on-top", 1, 2) in answer
