@@ -107,7 +107,7 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
     if not answer.misplaced:
         return table
     misplaced_rows = [
-        (*_relation(entry), "misplaced" if entry.is_misplaced else "", entry.moved or "")
+        (*_relation(entry), *(("misplaced", entry.moved or "") if entry.is_misplaced else ("", "")))
         for entry in answer.misplaced[:MOST_MISPLACED]
     ]
     columns = ("subject", "relation", "object", "probability of being wrong", "", "moved")

@@ -67,7 +67,7 @@ class MisplacedRelation(ScoredRelation):
     is_misplaced: bool = False
     """true if `probability` reaches the threshold for `sensitivity`"""
     moved: str | None = None
-    """for a misplaced relation: the id of its object that probably stands in the wrong place"""
+    """id of the object that stands in the wrong place if the relation is misplaced"""
 
 
 class OutliersAnswer(Answer):
