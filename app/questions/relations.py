@@ -116,16 +116,16 @@ def relations(
             continue
         name = names[kind]
         is_observed = bool(observed) and canonicalise(subject, name, object_) in observed
-        entries.append(
-            {
-                "subject": things[subject].id,
-                "relation": name,
-                "object": things[object_].id,
-                "probability": probability,
-                "observed": is_observed,
-                "expected": own if is_observed else None,
-            }
-        )
+        entry: Fields = {
+            "subject": things[subject].id,
+            "relation": name,
+            "object": things[object_].id,
+            "probability": probability,
+            "observed": is_observed,
+        }
+        if is_observed:
+            entry["expected"] = own
+        entries.append(entry)
     return {"relations": entries, "disagreements": disagreements}
 
 
@@ -320,7 +320,6 @@ _EXAMPLE_ANSWER: Final = {
             "object": "bed",
             "probability": 0.41,
             "observed": False,
-            "expected": None,
         },
     ],
     "disagreements": [

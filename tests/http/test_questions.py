@@ -98,7 +98,7 @@ async def test_disagreements_name_the_pairs_as_they_were_stated(
             expected.append(entry["expected"])
             assert expected[-1] != relation
     # All but the likeliest relation itself.
-    assert len(expected) == 7
+    assert len(expected) == 9
     assert len(set(expected)) == 1
     assert (await ask(client, "relations", objects=objects))["disagreements"] == []
 
