@@ -154,20 +154,23 @@ def test_a_stored_model_is_asked_the_questions_of_a_file(tmp_path):
     learnt = {"source": "placing_priors", "scenes": 3, "digest": "0" * 64, "terms": "MIT"}
     data = [learnt | {"research_only": False}]
     Store(store).publish(description("tiny", data=data), state())
-    places = ("tidybot\t{}\ton-top\tbed\t1\tbedroom", "my_home\t{}\tinside\tbox\t1\tbedroom")
+    places = (
+        "ithor_receptacles\t{}\ton-top\tbed\t1\tbedroom",
+        "my_home\t{}\tinside\tbox\t1\tbedroom",
+    )
     rows = [place.format(thing) for place in places for thing in ("lamp", "rug")]
     (tmp_path / "places.tsv").write_text("\n".join(["\t".join(COLUMNS), *rows]))
     (tmp_path / "homes.jsonl").write_text('{"objects": ["bed", "lamp", "rug"]}\n' * 2)
     files = [part for name in ("places.tsv", "homes.jsonl") for part in ("--file", tmp_path / name)]
     figures = tmp_path / "figures.json"
     output = invoke("evaluate", "tiny", *files, "--store", store, "--json", figures)
-    assert "tiny: tidybot is training data of this model" in output
+    assert "tiny: ithor_receptacles is training data of this model" in output
     assert "tiny: 2 of 6 objects are left out, because their labels are unknown" in output
-    assert output.index("places.tsv") < output.index("left out: all receptacles are right")
+    assert output.index("places.tsv") < output.index("left out: all receptacles are")
     rows = json.loads(figures.read_text())["tiny"]
     origins = {(Path(row["file"]).name, row["source"], row["in_training"]) for row in rows}
     assert origins == {
-        ("places.tsv", "tidybot", True),
+        ("places.tsv", "ithor_receptacles", True),
         ("places.tsv", "my_home", False),
         ("homes.jsonl", "homes", False),
     }
