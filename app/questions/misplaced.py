@@ -255,9 +255,9 @@ def misplaced_fields(
 ) -> list[Fields]:
     """Judge the observed relations, and the objects that nothing supports.
 
-    The answer lists every observed relation of known classes. An object on the floor, or hanging
-    above it, is listed only if it reaches the most sensitive alarm line. The entry that is most
-    probably wrong comes first. Entries with equal probabilities keep the order of
+    The answer lists every observed relation of a kind that the model judges, without those of
+    structure. An object on the floor, or hanging above it, is listed only if it reaches the most
+    sensitive alarm line. The entry that is most probably wrong comes first. Entries with equal probabilities keep the order of
     `Scene.relations`.
 
     Returns:

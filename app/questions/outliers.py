@@ -320,7 +320,7 @@ _EXAMPLE_ANSWER: Final = {
             "object": "nightstand_1",
             "probability": 0.05,
             "is_misplaced": False,
-            "moved": None,
+            "moved": "lamp_1",
         }
     ],
 }

@@ -67,9 +67,9 @@ def with_evidence(p, evidence, opposite):
     """
     if evidence > EXCLUDED:
         return evidence
-    if evidence == EXCLUDED or opposite > EXCLUDED:
-        return min(p, LEAST_LIKELY)
-    return p
+    if opposite > EXCLUDED:
+        return min(p, LEAST_LIKELY, max(np.float32(1.0) - opposite, np.float32(0.0)))
+    return min(p, LEAST_LIKELY) if evidence == EXCLUDED else p
 
 
 @compiled

@@ -82,7 +82,7 @@ async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> Non
         assert (size and tuple(size[axis] for axis in "xyz")) == known.size
     assert words["room_types"] == list(VOCABULARY.room_types)
     assert words["profiles"] == list(PROFILES)
-    assert len(set(words["relations"])) == 8
+    assert len(set(words["relations"])) == 10
     assert words["model"]["version"] == "1.0.0"
     (example,) = words["examples"]
     assert example["name"] == "A bedroom"

@@ -137,7 +137,8 @@ def with_lower_lateral(
         table = np.array([(s.intercept, s.slope, s.log_count) for s in slopes])[:, :, None, None]
         logits = table[:, 0] + table[:, 1] * log_odds + table[:, 2] * (logs[:, None] + logs)
         both = np.concatenate([logits[:, i, j], logits[:, j, i]]).T
-        listed = np.concatenate([evidence.holds[:, i, j], evidence.holds[:, j, i]]).T
+        holds = evidence.holds[: len(slopes)]
+        listed = np.concatenate([holds[:, i, j], holds[:, j, i]]).T
         is_lateral = np.isin(np.arange(both.shape[1]) % len(slopes), LATERAL)
         shifted = both + np.where(is_lateral, np.array(_SHIFTS)[:, None, None], 0.0)
         best = shifted.argmax(2)
