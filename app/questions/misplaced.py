@@ -257,8 +257,8 @@ def misplaced_fields(
 
     The answer lists every observed relation of a kind that the model judges, without those of
     structure. An object on the floor, or hanging above it, is listed only if it reaches the most
-    sensitive alarm line. The entry that is most probably wrong comes first. Entries with equal probabilities keep the order of
-    `Scene.relations`.
+    sensitive alarm line. The entry that is most probably wrong comes first. Entries with equal
+    probabilities keep the order of `Scene.relations`.
 
     Returns:
         The fields of `scene_client.schemas.MisplacedRelation`.
