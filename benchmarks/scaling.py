@@ -23,6 +23,7 @@ from app import questions
 from app.inference.weights import pack_scenes
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.description import Calibration, Description, VocabularyEntry
+from app.scene.relations import CANONICAL
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import ObjectClass, Vocabulary
 from benchmarks.report import Fact, Result
@@ -124,7 +125,16 @@ def _label(number: int) -> str:
 
 
 def _spec(V: int, units: int, states: int, K: int, N: int) -> MachineSpec:
-    sizes = {"V": V, "A": 4, "units": units, "states": states, "C": 33, "K": K, "G": 8, "N": N}
+    sizes = {
+        "V": V,
+        "A": len(CANONICAL),
+        "units": units,
+        "states": states,
+        "C": 33,
+        "K": K,
+        "G": 8,
+        "N": N,
+    }
     return MachineSpec("triway", **sizes, T=_TRIPLES_A_CLASS * V, coupled=True)
 
 

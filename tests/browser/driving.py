@@ -110,8 +110,10 @@ class Board:
 
     @property
     def ghosts(self) -> list[str]:
-        """The suggestions on the board."""
-        return self.page.locator("#board .ghost text").all_text_contents()
+        """The suggestions on the board, also those without room for their name."""
+        every = self.page.locator("#board .ghost").all()
+        spoken = [ghost.get_attribute("aria-label") or "" for ghost in every]
+        return [words.removeprefix("Suggested: ").split(", ")[0] for words in spoken]
 
     @property
     def edges(self) -> list[tuple[str, str]]:

@@ -108,8 +108,9 @@ def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
     assert focus(board).startswith("laptop, ")
     press("Enter")
     assert focus(board) == "What is missing on top of it?"
-    press("ArrowDown")
-    press("ArrowDown")
+    for _ in range(3):
+        press("ArrowDown")
+    assert focus(board) == "What is missing left of it?"
     press("Enter")
     board.settle()
     assert board.body("missing")["at"] == {"relation": "left", "object": "laptop"}
