@@ -10,8 +10,8 @@ An entry is an observed relation, or an object that nothing supports. There are 
 
 "Under" is the opposite of on-top, so both have one unit: "the desk is on top of the bin". The words
 of the request tell them apart. Otherwise the roles of the two classes do (`Places.roles`). People
-also say "under" for "below", so z of such an entry is the larger of the two. An object above
-another object is no sign of a fault if a third object supports it.
+also say "under" for "below", so z of such an entry is the larger of the two. An object may be above
+another object if a third object supports it.
 
 The log-odds that an entry is wrong are a weighted sum of three terms (`app.registry.Judgement`):
 
@@ -32,7 +32,7 @@ object. Without them, only a stated support shows the stand of its subject.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -56,7 +56,7 @@ THE_FLOOR: Final = "floor"
 """Name of the floor in an entry about an object that stands on the floor or hangs above it."""
 
 _LEAST_P: Final = 1e-6  # minimum of p(stand)
-EXPLAINED: Final = 5.0  # z of an object above another object that is no sign of a fault
+EXPLAINED: Final = 5.0  # minimum z of an object above another object if a third object supports it
 _NOWHERE: Final = (math.nan, math.nan, math.nan)
 
 Indices = NDArray[np.int64]
@@ -168,7 +168,7 @@ def _stands(
     supports: Sequence[tuple[int, int]],
     heights: Heights | None,
 ) -> tuple[Indices, Floats]:
-    """Return what holds each of N objects, and log p of it, (N,) each; 0 for an unknown stand.
+    """Return the stand of each of N objects, and its log p, (N,) each; 0 for an unknown stand.
 
     Args:
         supports: pairs of objects (i, j) with i on or in j.
@@ -211,7 +211,7 @@ def _support_shares(artifact: Artifact, posterior: Posterior) -> Floats:
     table = artifact.relation_slopes.relation
     counts = present.log_counts[:, None] + present.log_counts
     odds = np.zeros(counts.shape)
-    for a in (ON_TOP, INSIDE):
+    for a in SUPPORTS:
         if a < artifact.spec.A:
             intercept, slope, weight = table[a].tolist()
             odds += np.exp(intercept + slope * log_odds[a].astype(np.float64) + weight * counts)
@@ -235,15 +235,21 @@ def wrong_relations(artifact: Artifact, scene: Scene) -> dict[Triple, float]:
     """Return the log-odds that each judged relation of a scene is wrong."""
     entries = entries_of(artifact, Posterior(artifact, scene), scene)
     log_odds: dict[Triple, float] = {}
+    for _, rows, values in _judged(artifact, entries):
+        triples = entries.triple[rows].tolist()
+        log_odds |= {
+            (a, i, j): z for (a, i, j), z in zip(triples, values.tolist(), strict=True) if j >= 0
+        }
+    return log_odds
+
+
+def _judged(artifact: Artifact, entries: Entries) -> Iterator[tuple[Judgement, Indices, Floats]]:
+    """Yield the judgement of each kind, its entries, and their log-odds to be wrong."""
     for kind, name in enumerate(KINDS):
         judgement: Judgement | None = getattr(artifact.calibration.misplaced, name)
-        rows = np.flatnonzero((entries.kind == kind) & (entries.triple[:, 2] >= 0))
-        if judgement is None or not len(rows):
-            continue
-        values = wrong_log_odds(judgement, entries.terms[rows]).tolist()
-        triples = entries.triple[rows].tolist()
-        log_odds |= {(a, i, j): z for (a, i, j), z in zip(triples, values, strict=True)}
-    return log_odds
+        rows = np.flatnonzero(entries.kind == kind)
+        if judgement is not None and len(rows):
+            yield judgement, rows, wrong_log_odds(judgement, entries.terms[rows])
 
 
 def misplaced_fields(
@@ -266,15 +272,12 @@ def misplaced_fields(
     entries = entries_of(artifact, posterior, scene, flipped)
     n = len(entries.kind)
     log_odds, is_misplaced, is_listed = np.full(n, -np.inf), np.zeros(n, bool), np.zeros(n, bool)
-    for kind, name in enumerate(KINDS):
-        judgement: Judgement | None = getattr(artifact.calibration.misplaced, name)
-        rows = np.flatnonzero(entries.kind == kind)
-        if judgement is None or not len(rows):
-            continue
-        log_odds[rows] = wrong_log_odds(judgement, entries.terms[rows])
-        p = sigmoid(log_odds[rows])
+    for judgement, rows, values in _judged(artifact, entries):
+        log_odds[rows] = values
+        p = sigmoid(values)
         is_misplaced[rows] = p >= getattr(judgement.lines, sensitivity).threshold(len(rows))
-        is_listed[rows] = kind != STAND or p >= judgement.lines.high.threshold(len(rows))
+        is_alarm = p >= judgement.lines.high.threshold(len(rows))
+        is_listed[rows] = is_alarm | (entries.kind[rows] != STAND)
     is_listed |= is_misplaced
     order = np.argsort(-log_odds, kind="stable")
     order = order[is_listed[order]]

@@ -20,7 +20,7 @@ Floats = NDArray[np.floating[Any]]
 
 EXCLUDED = np.float32(-1.0)
 """Evidence that a relation cannot hold."""
-LEAST_LIKELY = np.float32(0.01)
+MOST_EXCLUDED = np.float32(0.01)
 """Maximum probability of a relation that cannot hold."""
 
 
@@ -68,8 +68,8 @@ def with_evidence(p, evidence, opposite):
     if evidence > EXCLUDED:
         return evidence
     if opposite > EXCLUDED:
-        return min(p, LEAST_LIKELY, max(np.float32(1.0) - opposite, np.float32(0.0)))
-    return min(p, LEAST_LIKELY) if evidence == EXCLUDED else p
+        return min(p, MOST_EXCLUDED, max(np.float32(1.0) - opposite, np.float32(0.0)))
+    return min(p, MOST_EXCLUDED) if evidence == EXCLUDED else p
 
 
 @compiled

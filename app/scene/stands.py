@@ -61,7 +61,7 @@ class Heights(NamedTuple):
 
 
 def stands_of(holds: Flags, observed: Flags, heights: Heights, floor: float) -> NDArray[np.int64]:
-    """Return what holds each of n boxes, (n,).
+    """Return the stand of each of n boxes, (n,).
 
     A low object stands on the floor, also if it is on a rug. The value is `UNKNOWN` if a bottom is
     unknown, if a box reaches into another box and its relation to this box is open, or if a box is
