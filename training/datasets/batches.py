@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.scene import Vocabulary
+from app.scene import RoleCounts, Vocabulary
 from training.datasets import EncodedScene
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges
@@ -168,6 +168,7 @@ class TrainingData:
         digest: digest of the scenes, their vocabulary and split, for the resumption of a run.
         words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
         vocabulary: the object classes and room types; None if the classes have no names.
+        roles: roles of the classes in the training scenes; None without relations.
     """
 
     train: SceneTensors
@@ -179,6 +180,7 @@ class TrainingData:
     digest: str = ""
     words: Tensor | None = None
     vocabulary: Vocabulary | None = None
+    roles: RoleCounts | None = None
 
     @property
     def classes(self) -> Vocabulary:

@@ -209,15 +209,17 @@ def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
     complete = untouched.rows(untouched.complete)
     if len(np.unique(complete.encoded)) >= _LEAST_SCENES:
         untouched = complete
-    varies = cases.terms.std(0) > 0
-    if not varies.any():
-        return None
-    weights = np.zeros(3)
-    *fitted, intercept = logistic(cases.terms[:, varies], cases.wrong, cases.weight, C=RIDGE)
-    weights[varies] = fitted
-    # A likelier relation, and a likelier stand, never make an entry more suspicious.
-    weights = np.minimum(weights, 0.0)
-    if not weights.any():
+    used = cases.terms.std(0) > 0
+    weights, intercept = np.zeros(3), 0.0
+    while used.any():
+        *fitted, intercept = logistic(cases.terms[:, used], cases.wrong, cases.weight, C=RIDGE)
+        weights[:] = 0.0
+        weights[used] = fitted
+        if (weights <= 0).all():
+            break
+        # A likelier relation, and a likelier stand, never make an entry more suspicious.
+        used = weights < 0
+    else:
         return None
     relation, change, stand = weights.tolist()
     silent = AlarmLines(**dict.fromkeys(ALARMS, AlarmLine(intercept=0.0)))

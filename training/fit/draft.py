@@ -8,6 +8,8 @@ import torch
 
 from app.registry import Artifact, Calibration, Places
 from app.scene import Vocabulary
+from training.datasets.batches import TrainingData
+from training.fit.place_statistics import fit_places
 from training.machines import BoltzmannMachine
 from training.machines.arrays import weights_of
 
@@ -38,3 +40,12 @@ def draft_artifact(
         path=Path(),
         places=places,
     )
+
+
+def placed_draft(machine: BoltzmannMachine, data: TrainingData) -> Artifact:
+    """Return a machine in half precision, with the places of the training scenes."""
+    vocabulary = data.classes
+    places = None
+    if data.roles is not None:
+        places = fit_places(data.train.scenes, data.roles, vocabulary)
+    return draft_artifact(as_stored(machine), vocabulary, places=places)

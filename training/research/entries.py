@@ -26,7 +26,7 @@ from training.evaluation.report import Progress, write_whole
 from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, ObjectsConfig
-from training.fit.draft import as_stored, draft_artifact
+from training.fit.draft import draft_artifact, placed_draft
 from training.fit.objects import ObjectScenes
 from training.fit.trainer import Trainer
 from training.machines import BoltzmannMachine
@@ -193,16 +193,15 @@ def _machine_model(
     if not calibrated:
         draft = draft_artifact(machine.requires_grad_(False), data.classes)
         return artifact_model(draft, data.train, seed=seed, calibrated=False)
-    machine = as_stored(machine)
+    draft = placed_draft(machine, data)
     path = run / CALIBRATION
     if path.exists():
         calibration = Calibration.model_validate_json(path.read_text(encoding="utf-8"))
     else:
         say("calibrating")
-        draft = draft_artifact(machine, data.classes)
         calibration = calibrate(draft, data, config.objects, seed)
         write_whole(path, calibration.model_dump_json(indent=1))
-    artifact = draft_artifact(machine, data.classes, calibration)
+    artifact = replace(draft, calibration=calibration)
     profiles = ObjectScenes.of(data.train, data.structure, config.objects).sources
     return artifact_model(artifact, data.train, seed=seed, profiles=profiles)
 

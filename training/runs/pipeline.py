@@ -102,6 +102,7 @@ class SplitScenes:
             digest=self.digest,
             words=self.words,
             vocabulary=self.vocabulary,
+            roles=self.roles,
         )
 
     def complete_data(self) -> TrainingData:

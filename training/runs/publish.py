@@ -29,11 +29,10 @@ from training.fit.calibrate import calibrate
 from training.fit.checkpoint import RunError
 from training.fit.configuration import Config, DataConfig
 from training.fit.count_statistics import fit_counts
-from training.fit.draft import as_stored, draft_artifact
+from training.fit.draft import as_stored, placed_draft
 from training.fit.long_chains import measure_drift
 from training.fit.objects import ObjectScenes
 from training.fit.offset_statistics import fit_offsets
-from training.fit.place_statistics import fit_places
 from training.runs.config_files import load_config, shipped_configs
 from training.runs.example_scenes import known_examples, read_examples
 from training.runs.folder import FinishedRun
@@ -229,16 +228,10 @@ def calibrated_draft(
     run: FinishedRun, scenes: SplitScenes, chosen: Calibration | None = None
 ) -> Artifact:
     """Return the calibrated model of a run in half precision. `chosen`: see `calibrate_objects`."""
-    machine, vocabulary = as_stored(run.machine), scenes.vocabulary
-    places = fit_places(scenes.parts["train"], scenes.roles, vocabulary)
-    calibration = calibrate(
-        draft_artifact(machine, vocabulary, places=places),
-        scenes.training_data(),
-        run.config.objects,
-        run.config.training.seed,
-        chosen,
-    )
-    return draft_artifact(machine, vocabulary, calibration, places)
+    data = scenes.training_data()
+    draft = placed_draft(run.machine, data)
+    calibration = calibrate(draft, data, run.config.objects, run.config.training.seed, chosen)
+    return replace(draft, calibration=calibration)
 
 
 def _measure(
