@@ -9,24 +9,26 @@ An entry is an observed relation, or an object that nothing supports. There are 
     stand     an object that stands on the floor or hangs; it has no relation
 
 "Under" is the opposite of on-top, so both have one unit: "the desk is on top of the bin". The words
-of the request tell them apart. Otherwise the roles of the two classes do (`Places.roles`). People
-also say "under" for "below", so z of such an entry is the larger of the two. An object may be above
+of the request tell them apart, or the boxes. People also say "under" for "below", so z of such an
+entry is the larger of the two. It is at least `Places.under_evidence`. An object may be above
 another object if a third object supports it.
 
-The log-odds that an entry is wrong are a weighted sum of three terms (`app.registry.Judgement`):
+The log-odds that an entry is wrong are a weighted sum of four terms (`app.registry.Judgement`):
 
-    z   log-odds of the relation given the objects
+    z   log-odds of the relation given the objects, at least `LEAST_Z`
     d   change of these log-odds by the other observed relations
     s   log p(stand) of the object that would have moved
+    q   log of the share of its supporter among the supporters of its class (`Places.supporters`)
 
 The stand of an object is what holds it (`app.scene.stands`). `Places.stands` has the shares S of
-the floor, of the wall and of supports for the class of object i. o_ij are the odds that i is on or
-in object j:
+the floor, of the wall and of supports for its class. An object that is neither on the floor nor on
+or in a listed object hangs on a wall, or an unlisted object holds it:
 
-    p(floor) = S_floor    p(hangs) = S_wall    p(on or in j) = S_support · o_ij / (1 + sum_k o_ik)
+    p(floor) = S_floor    p(supported) = S_support    p(neither) = S_wall + S_support · (1 - sum q)
 
-The 1 stands for objects that the scene does not list. Positions and sizes show the stand of every
-object. Without them, only a stated support shows the stand of its subject.
+The sum of the shares q is over the listed classes. Positions and sizes show the stand of every
+object; otherwise s = 0. Classes that belong everywhere, such as pets and bags, have s = q = 0, and
+only their supports are judged.
 """
 
 from __future__ import annotations
@@ -45,16 +47,28 @@ from app.questions.reading import Triple
 from app.registry.artifact import Artifact
 from app.registry.description import KINDS, Judgement, Sensitivity
 from app.scene.relations import ABOVE, CANONICAL, INSIDE, LATERAL, ON_TOP, SUPPORTS, opposite
-from app.scene.roles import ON, UNDER, role_counts
 from app.scene.scene import Scene, extent_of
-from app.scene.stands import FLOOR, HANGS, SUPPORTED, UNKNOWN, Heights, floor_level, stands_of
+from app.scene.stands import (
+    FLOOR,
+    HANGS,
+    SUPPORTED,
+    UNKNOWN,
+    USUAL,
+    Heights,
+    floor_level,
+    stands_of,
+)
 
 BESIDE, SUPPORT, OVER, BELOW, STAND = range(len(KINDS))
 """Indices of the kinds in `KINDS`."""
 
+TERMS: Final = 4
+"""Number of terms of an entry."""
+
 THE_FLOOR: Final = "floor"
 """Name of the floor in an entry about an object that stands on the floor or hangs above it."""
 
+LEAST_Z: Final = -8.0  # below it, log-odds do not tell wrong relations from rare ones
 _LEAST_P: Final = 1e-6  # minimum of p(stand)
 EXPLAINED: Final = 5.0  # minimum z of an object above another object if a third object supports it
 _NOWHERE: Final = (math.nan, math.nan, math.nan)
@@ -69,7 +83,7 @@ class Entries(NamedTuple):
     Attributes:
         triple: (n, 3) relation, subject and object. The object is -1 for the floor.
         kind: (n,) index of the kind in `KINDS`.
-        terms: (n, 3) terms z, d and s; see the module.
+        terms: (n, 4) terms z, d, s and q; see the module.
         mover: (n,) object that would have moved if the entry is wrong.
     """
 
@@ -89,37 +103,36 @@ def entries_of(
     Args:
         flipped: relations of the scene that the request states by their opposite.
     """
-    row, is_structure = posterior.present.row, artifact.vocabulary.structure
-    is_thing = ~is_structure[posterior.present.classes][row]
+    row = posterior.present.row
+    classes = posterior.present.classes[row]
+    is_thing = ~artifact.vocabulary.structure[classes]
     stated = [
         (a, i, j)
         for a, i, j in scene.relations or ()
         if a < artifact.spec.A and is_thing[i] and is_thing[j]
     ]
-    heights = None if scene.poses is None else _heights(artifact, scene)
+    heights = None if scene.poses is None else _heights(artifact, scene, classes)
     if heights is None:
-        unders = {triple for triple in stated if _is_under(artifact, posterior, triple, flipped)}
+        unders = {triple for triple in stated if triple[0] == ON_TOP and triple in flipped}
     else:
         around = heights.around
         unders = {(a, i, j) for a, i, j in stated if a == ON_TOP and around[i, j]}
     supports = [(i, j) for a, i, j in stated if a in SUPPORTS and (a, i, j) not in unders]
-    stands, log_p = _stands(artifact, posterior, scene, supports, heights)
+    stands, log_p, log_q = _stands(artifact, posterior, scene, supports, heights)
     alone, change = posterior.alone_log_odds(), posterior.relation_change()
     rows: list[tuple[int, int, int]] = []
     kinds: list[int] = []
-    terms: list[tuple[float, float, float]] = []
+    terms: list[tuple[float, float, float, float]] = []
     movers: list[int] = []
+    moves = ~artifact.vocabulary.anywhere[classes]
     for a, i, j in stated:
         mover = j if (a, i, j) in flipped and a != INSIDE else i
-        z, d, s = float(alone[a, row[i], row[j]]), float(change[a, row[i], row[j]]), 0.0
+        z, d = float(alone[a, row[i], row[j]]), float(change[a, row[i], row[j]])
+        s = q = 0.0
         if a in LATERAL:
             kind = BESIDE
-        elif (a, i, j) in unders:
-            kind, mover, s = BELOW, j, float(log_p[j]) if stands[j] == FLOOR else 0.0
-            z = max(z, float(alone[ABOVE, row[i], row[j]]))
-        elif a == ABOVE and stands[i] == FLOOR:
-            kind, mover, s = BELOW, j, float(log_p[j]) if stands[j] == FLOOR else 0.0
-            z = max(z, float(alone[ON_TOP, row[i], row[j]]))
+        elif (a, i, j) in unders or (a == ABOVE and stands[i] == FLOOR):
+            kind, mover = BELOW, j
         elif a == ABOVE:
             kind = OVER
             if stands[i] == HANGS:
@@ -127,38 +140,32 @@ def entries_of(
             elif stands[i] == SUPPORTED or heights is not None:
                 z = max(z, EXPLAINED)
         else:
-            kind, mover, s = SUPPORT, i, float(log_p[i])
+            kind, mover, s, q = SUPPORT, i, float(log_p[i]), float(log_q[i])
+        if kind == BELOW:
+            s = float(log_p[j]) if stands[j] == FLOOR else 0.0
+            z = max(float(alone[b, row[i], row[j]]) for b in (ON_TOP, ABOVE))
+            if artifact.places is not None:
+                z = max(z, artifact.places.under_evidence(int(classes[i]), int(classes[j])))
+        if not moves[mover]:
+            if kind == BELOW:
+                continue
+            s = q = 0.0
         rows.append((a, i, j))
         kinds.append(kind)
-        terms.append((z, d, s))
+        terms.append((max(z, LEAST_Z), d, s, q))
         movers.append(mover)
     if heights is not None:
-        for i in np.flatnonzero(is_thing & ((stands == FLOOR) | (stands == HANGS))).tolist():
+        for i in np.flatnonzero(is_thing & moves & np.isin(stands, (FLOOR, HANGS))).tolist():
             rows.append((ON_TOP if stands[i] == FLOOR else ABOVE, i, -1))
             kinds.append(STAND)
-            terms.append((0.0, 0.0, float(log_p[i])))
+            terms.append((0.0, 0.0, float(log_p[i]), 0.0))
             movers.append(i)
     return Entries(
         np.array(rows, np.int64).reshape(-1, 3),
         np.array(kinds, np.int64),
-        np.array(terms, np.float64).reshape(-1, 3),
+        np.array(terms, np.float64).reshape(-1, TERMS),
         np.array(movers, np.int64),
     )
-
-
-def _is_under(
-    artifact: Artifact, posterior: Posterior, triple: Triple, flipped: Collection[Triple]
-) -> bool:
-    """Return whether on-top(i, j) means that j is under i, and not that i stands on j."""
-    a, i, j = triple
-    if a != ON_TOP or triple in flipped:
-        return a == ON_TOP
-    if artifact.places is None:
-        return False
-    classes = posterior.present.classes[posterior.present.row]
-    roles = artifact.places.roles
-    under = role_counts(roles, int(classes[j]), int(classes[i]))[UNDER]
-    return bool(under > role_counts(roles, int(classes[i]), int(classes[j]))[ON])
 
 
 def _stands(
@@ -167,17 +174,19 @@ def _stands(
     scene: Scene,
     supports: Sequence[tuple[int, int]],
     heights: Heights | None,
-) -> tuple[Indices, Floats]:
-    """Return the stand of each of N objects, and its log p, (N,) each; 0 for an unknown stand.
+) -> tuple[Indices, Floats, Floats]:
+    """Return the stand of each of N objects, its log p, and log q of its supporter, (N,) each.
+
+    The values are 0 for an unknown stand, and log p without poses.
 
     Args:
         supports: pairs of objects (i, j) with i on or in j.
         heights: heights of the boxes, or None for a scene without poses.
     """
     present, places = posterior.present, artifact.places
-    stands, log_p = np.full(len(present.row), UNKNOWN), np.zeros(len(present.row))
+    stands, zeros = np.full(len(present.row), UNKNOWN), np.zeros(len(present.row))
     if places is None:
-        return stands, log_p
+        return stands, zeros, zeros
     classes = present.classes[present.row]
     shares = places.stands[classes].astype(np.float64)
     if heights is not None and scene.poses is not None:
@@ -185,48 +194,39 @@ def _stands(
         stands = stands_of(scene.poses.holds, scene.poses.observed, heights, floor)
     else:
         stands[[i for i, _ in supports]] = SUPPORTED
-    is_unsupported = (stands == FLOOR) | (stands == HANGS)
-    held = shares[is_unsupported, stands[is_unsupported]]
-    log_p[is_unsupported] = np.log(np.maximum(held, _LEAST_P))
-    is_supported = stands == SUPPORTED
-    if is_supported.any():
-        p = shares[:, SUPPORTED, None] * _support_shares(artifact, posterior)
-        best = np.zeros(len(stands))
-        for i, j in supports:
-            best[i] = max(best[i], p[i, j])
-        log_p[is_supported] = np.log(np.maximum(best[is_supported], _LEAST_P))
-    log_p[artifact.vocabulary.structure[classes]] = 0.0
-    return stands, log_p
+    if (stands == UNKNOWN).all():
+        return stands, zeros, zeros
+    by_class = places.supporters(classes, present.classes)
+    by_class[:, artifact.vocabulary.structure[present.classes]] = 0.0
+    q = np.where(stands == SUPPORTED, 0.0, 1.0)
+    for i, j in supports:
+        if stands[i] == SUPPORTED:
+            q[i] = max(q[i], by_class[i, present.row[j]])
+    log_q = np.log(np.maximum(q, _LEAST_P))
+    if heights is None:
+        return stands, zeros, log_q
+    shares[:, HANGS] += shares[:, SUPPORTED] * (1 - by_class.sum(1))
+    p = np.where(stands == UNKNOWN, 1.0, shares[np.arange(len(stands)), stands])
+    return stands, np.log(np.maximum(p, _LEAST_P)), log_q
 
 
-def _heights(artifact: Artifact, scene: Scene) -> Heights:
-    sizes = artifact.vocabulary.sizes
+def _heights(artifact: Artifact, scene: Scene, classes: Indices) -> Heights:
+    """Return the heights of the objects. Furniture whose box is only its top reaches down."""
+    sizes, places = artifact.vocabulary.sizes, artifact.places
     centres = np.array([thing.position or _NOWHERE for thing in scene.objects])
-    return Heights.of(centres, np.array([extent_of(thing, sizes) for thing in scene.objects]))
-
-
-def _support_shares(artifact: Artifact, posterior: Posterior) -> Floats:
-    """Return o_ij / (1 + sum_k o_ik) for all pairs of N objects, (N, N); see the module."""
-    present, log_odds = posterior.present, posterior.alone_log_odds()
-    table = artifact.relation_slopes.relation
-    counts = present.log_counts[:, None] + present.log_counts
-    odds = np.zeros(counts.shape)
-    for a in SUPPORTS:
-        if a < artifact.spec.A:
-            intercept, slope, weight = table[a].tolist()
-            odds += np.exp(intercept + slope * log_odds[a].astype(np.float64) + weight * counts)
-    row = present.row
-    by_object: Floats = odds[row[:, None], row]
-    structure = artifact.vocabulary.structure[present.classes][row]
-    by_object[:, structure] = 0.0
-    np.fill_diagonal(by_object, 0.0)
-    shares: Floats = by_object / (1.0 + by_object.sum(1, keepdims=True))
-    return shares
+    extents = np.array([extent_of(thing, sizes) for thing in scene.objects])
+    heights = Heights.of(centres, extents)
+    if places is None:
+        return heights
+    usual = sizes[classes, 2]
+    is_top = (places.stands[classes, FLOOR] >= USUAL) & (extents[:, 2] < usual / 2)
+    lower = np.where(is_top, np.fmin(heights.bottoms, heights.tops - usual), heights.bottoms)
+    return heights._replace(bottoms=lower)
 
 
 def wrong_log_odds(judgement: Judgement, terms: Floats) -> Floats:
-    """Return the log-odds that entries of one kind are wrong, (n,). `terms` is (n, 3)."""
-    weights = np.array([judgement.relation, judgement.change, judgement.stand])
+    """Return the log-odds that entries of one kind are wrong, (n,). `terms` is (n, 4)."""
+    weights = np.array([judgement.relation, judgement.change, judgement.stand, judgement.supporter])
     log_odds: Floats = judgement.intercept + terms @ weights
     return log_odds
 

@@ -249,6 +249,11 @@ def _at(
     if at.relation not in {*canonical, *map(opposite, canonical)}:
         errors.add(InvalidRequestError, ("at", "relation"), "the model does not know this relation")
     anchor = reading.names.find(at.object, ("at", "object"), errors)
+    if anchor is not None:
+        index = reading.scene.objects[anchor].class_index
+        if index is not None and artifact.vocabulary.structure[index]:
+            message = "the model knows no relations to floor, wall and ceiling"
+            errors.add(InvalidRequestError, ("at", "object"), message)
     return None if anchor is None else (at.relation, anchor)
 
 

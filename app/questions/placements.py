@@ -29,11 +29,12 @@ from app.scene.relations import (
     LEFT,
     ON_TOP,
     RELATIONS,
+    SUPPORTS,
     canonicalise,
     opposite,
 )
 from app.scene.scene import Scene, extent_of
-from app.scene.stands import HANGS, SUPPORTED
+from app.scene.stands import HANGS, SUPPORTED, USUAL
 
 PLACES: Final = 3
 """Maximum number of placements in the answer for one class."""
@@ -41,7 +42,6 @@ PLACES: Final = 3
 LEAST_SHARE: Final = 0.75  # least probability of a placement, as a share of the first placement
 LEAST_LIKELY: Final = 0.05  # least probability of a placement
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
-_USUAL: Final = 0.5  # share of a stand that is usual for a class
 _LEAST_STAND: Final = 0.005  # least share of a stand
 _TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 _UNTURNED: Final = np.eye(3)
@@ -107,7 +107,7 @@ def placements(
 
     The candidate is subject or object of the relation. Structural classes (floor, wall) are never
     anchors. If a class has several instances, the first instance is the anchor. If an object stands
-    on top of another object, candidates are never placed under the upper object. A further place
+    on or in another object, no candidate holds it. A further place
     has at least `LEAST_SHARE` of the probability of the first place. Without a place of probability
     `LEAST_LIKELY`, the list is empty. An offset needs an anchor with a position.
 
@@ -128,8 +128,10 @@ def placements(
     A, objects = forward.shape[1], present.first[anchors]
     first = -1  # number of the requested place in `likeliest_places`; -1 without a request
     if A > ON_TOP and scene.relations:
-        upper = [subject for relation, subject, _ in scene.relations if relation == ON_TOP]
-        backward[:, ON_TOP, np.isin(objects, upper)] = NO_UNIT
+        columns = np.flatnonzero(np.isin(objects, held_objects(artifact, posterior, scene)))
+        for a in SUPPORTS:
+            if a < A:
+                backward[:, a, columns] = NO_UNIT
     if at is not None:
         # If the anchor is structural, no column matches it.
         for column in np.flatnonzero(anchors == present.row[at.anchor]).tolist():
@@ -174,6 +176,21 @@ def placements(
     return entries
 
 
+def held_objects(artifact: Artifact, posterior: Posterior, scene: Scene) -> list[int]:
+    """Return the indices of the objects that stand on or in an object, by the scene's relations.
+
+    The list does not contain a desk with a bin under it, although its relation is on-top as well.
+    """
+    places = artifact.places
+    classes = posterior.present.classes[posterior.present.row].tolist()
+    return [
+        i
+        for a, i, j in scene.relations or ()
+        if a == INSIDE
+        or (a == ON_TOP and not (places and places.means_under(classes[i], classes[j])))
+    ]
+
+
 def _lower_unseen(
     artifact: Artifact,
     candidates: NDArray[np.int64],
@@ -184,7 +201,7 @@ def _lower_unseen(
     """Lower the log-odds of stacked relations that training never shows, in place.
 
     The share of a stand is that of the subject's class: objects on a wall for the relation above,
-    and supported objects for on-top and inside. A share below `_USUAL` lowers the odds in
+    and supported objects for on-top and inside. A share below `USUAL` lowers the odds in
     proportion. So a blackboard does not stand on a chair.
 
     Args:
@@ -194,7 +211,7 @@ def _lower_unseen(
     places = artifact.places
     if places is None:
         return
-    change = np.log(np.minimum(np.maximum(places.stands, _LEAST_STAND) / _USUAL, 1.0))
+    change = np.log(np.minimum(np.maximum(places.stands, _LEAST_STAND) / USUAL, 1.0))
     missing, listed = candidates[:, None], anchors[None]
     for relation, stand in ((ON_TOP, SUPPORTED), (ABOVE, HANGS), (INSIDE, SUPPORTED)):
         if relation < forward.shape[1]:

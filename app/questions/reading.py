@@ -19,7 +19,7 @@ from app.errors import ContradictionError, InvalidRequestError, Location
 from app.questions.names import ErrorList, LookUps, Names, Unknown
 from app.questions.scene_warnings import scene_warnings
 from app.scene.geometry import Viewpoint, body_pose, is_optical
-from app.scene.relations import CANONICAL, canonicalise
+from app.scene.relations import CANONICAL, canonicalise, support_cycle
 from app.scene.roles import RoleCounts
 from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
@@ -330,4 +330,8 @@ def _triples(
             message = "this relation contradicts an earlier relation of the same two objects"
             errors.add(ContradictionError, location, message)
         triples.setdefault((index, i, j), i != subject)
+    if circle := support_cycle(triples):
+        ids = [reading.scene.objects[number].id for number in circle]
+        message = f"objects hold each other in a circle: {' on or in '.join(ids)}"
+        errors.add(ContradictionError, ("relations",), message)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])

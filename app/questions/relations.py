@@ -23,12 +23,21 @@ from numpy.typing import NDArray
 from app.errors import InvalidRequestError, Location
 from app.questions.answer import RELATION_BYTES, Fields, SizeLimit, significant
 from app.questions.names import ErrorList
+from app.questions.placements import held_objects
 from app.questions.posterior import Posterior, Present, relations_given
 from app.questions.question import BEDROOM, LABELS, REFUSED, SCENES, Example, Options, Question
 from app.questions.ranking import EXCLUDED, disagreeing, likeliest_relations, observed_pairs
 from app.questions.reading import Reading, Triple
 from app.registry.artifact import Artifact
-from app.scene.relations import CANONICAL, OPPOSITES, canonicalise, opposite
+from app.scene.relations import (
+    CANONICAL,
+    LATERAL,
+    OPPOSITES,
+    STACKED,
+    SUPPORTS,
+    canonicalise,
+    opposite,
+)
 from app.scene.scene import Scene, instance_evidence
 from scene_client.schemas import RelationsAnswer, RelationsRequest
 
@@ -54,8 +63,8 @@ def relations(
 
     An observed relation has the probability of its evidence. Beside it stands the probability that
     the model expects without this observation. A relation that is observed not to hold, or that the
-    boxes exclude, has at most .01. Structural classes (floor, wall) are left out unless `pairs`
-    contains them.
+    boxes or other relations exclude, has at most .01. Structural classes (floor, wall) are left out
+    unless `pairs` contains them.
 
     Args:
         scene: the objects, their observed relations and the room type.
@@ -94,7 +103,7 @@ def relations(
     least = min_probability * (1 - 1e-5)
     table = slopes.relation_given if relations_given(scene) else slopes.relation
     log_odds, log_counts, row = posterior.relation_log_odds(), present.log_counts, present.row
-    evidence = _evidence(scene, artifact.spec.A)
+    evidence = _evidence(artifact, posterior, scene)
     subjects, objects, kinds, p, of_model = likeliest_relations(
         table, log_odds, log_counts, row, judged, evidence, least, include_opposites, top_k
     )
@@ -129,16 +138,20 @@ def relations(
     return {"relations": entries, "disagreements": disagreements}
 
 
-def _evidence(scene: Scene, relations: int) -> NDArray[np.float32]:
+def _evidence(artifact: Artifact, posterior: Posterior, scene: Scene) -> NDArray[np.float32]:
     """Return the evidence about the relations of a scene; see `likeliest_relations`.
 
-    The probability of an observed relation is the product of the confidences of its objects.
+    The probability of an observed relation is the product of the confidences of its objects. An
+    object on or in one object is not on or in another object.
     """
-    n = len(scene.objects)
+    n, relations = len(scene.objects), artifact.spec.A
     if scene.excluded is None and not relations_given(scene):
         return np.zeros((0, 0, 0), np.float32)
     holds, observed = instance_evidence(scene)
-    excluded = observed & ~holds
+    held = np.zeros(n, np.bool_)
+    held[held_objects(artifact, posterior, scene)] = True
+    excluded = (observed | _excluded_by(holds)) & ~holds
+    excluded[[*SUPPORTS]] |= held[:, None] & ~holds[[*SUPPORTS]]
     if scene.excluded is not None:
         excluded = excluded | scene.excluded
     confidence = np.array([thing.confidence for thing in scene.objects], np.float32)
@@ -148,6 +161,22 @@ def _evidence(scene: Scene, relations: int) -> NDArray[np.float32]:
     shown = holds[:relations]
     evidence[shown] = both[shown]
     return evidence
+
+
+def _excluded_by(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the relations of N objects that cannot hold beside others, (A, N, N).
+
+    A stacked relation (on-top, above, inside) excludes all other relations of its two objects. Left
+    and front exclude stacked relations.
+
+    Args:
+        holds: (A, N, N) relations that hold.
+    """
+    lateral, stacked = holds[[*LATERAL]].any(0), holds[[*STACKED]].any(0)
+    excluded = np.zeros_like(holds)
+    excluded[:] = stacked | stacked.T
+    excluded[[*STACKED]] |= lateral | lateral.T
+    return excluded
 
 
 def _judged(

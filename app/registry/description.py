@@ -102,7 +102,8 @@ KINDS: Final = ("lateral", "support", "above", "under", "stand")
 class Judgement(Frozen):
     """The log-odds that an entry of `misplaced` is wrong, and the lines of an alarm.
 
-    The log-odds are intercept + relation·z + change·d + stand·s; see `app.questions.misplaced`.
+    The log-odds are intercept + relation·z + change·d + stand·s + supporter·q; see
+    `app.questions.misplaced`.
     n of the lines is the number of entries of the kind in the scene.
     """
 
@@ -110,6 +111,7 @@ class Judgement(Frozen):
     relation: float
     change: float
     stand: float
+    supporter: float
     lines: AlarmLines
 
 

@@ -23,7 +23,7 @@ from app.registry.fields import Count, Frozen, Many, Sha256, to_json
 from app.registry.offsets import PREFIX as OFFSETS
 from app.registry.places import PREFIX as PLACES
 
-FORMAT: Final = 7
+FORMAT: Final = 8
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -55,7 +55,7 @@ class FileEntry(Frozen):
 class Manifest(Description):
     """The description of a model, its stored tensors and the checksums of its other files."""
 
-    format: Literal[7] = FORMAT
+    format: Literal[8] = FORMAT
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
     files: dict[str, FileEntry]
 

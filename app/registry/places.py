@@ -11,6 +11,7 @@ held is the number of scenes with a relation a from class i to class j, or in th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,14 +22,17 @@ from numpy.typing import NDArray
 
 from app.registry.errors import ArtifactError
 from app.registry.fields import TensorGroup
-from app.scene.relations import CANONICAL
-from app.scene.roles import RoleCounts
+from app.scene.relations import CANONICAL, SUPPORTS
+from app.scene.roles import IN, ON, UNDER, RoleCounts, role_counts
 
 PREFIX: Final = "places."
 """Prefix of the names of these tensors. They are in the same file as the machine's tensors."""
 
 _PLACE: Final = 10.0  # smoothing s, in scenes
 _RELATION: Final = 3.0  # smoothing m, in scenes
+_SUPPORTER: Final = 10.0  # smoothing of the supporters of a class, in scenes
+_SEEN: Final = 0.5  # smoothing of the counts of supporters
+_OTHER_ROLES: Final = 0.5  # smoothing of the counts of other roles
 _SHOWN: Final = 2.0  # minimum number of scenes that show a relation
 
 Floats = NDArray[np.float64]
@@ -116,17 +120,65 @@ class Places(TensorGroup):
         ratio: Floats = np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
         return ratio
 
+    def supporters(self, subject: Indices, other: Indices) -> Floats:
+        """Return the share of each other class among the supporters of each subject, (N, M).
+
+        A supporter is an object on or in which the subject is. The class indices are (N,) and (M,).
+        The counts of a subject are smoothed by `_SUPPORTER` supporters of all classes.
+        """
+        total, share = self._supporters
+        held = np.zeros((len(subject), len(other)))
+        for relation in SUPPORTS:
+            held += self._held(relation, subject[:, None], other)
+        shares: Floats = (held + _SUPPORTER * share[other]) / (total[subject, None] + _SUPPORTER)
+        return shares
+
+    @cached_property
+    def _supporters(self) -> tuple[Floats, Floats]:
+        """Number of supporters of each class, and its share among all supporters, (V,) each."""
+        V = len(self.frequency)
+        is_support = np.isin(self.triple // (V * V), SUPPORTS)
+        keys, held = self.triple[is_support], self.held[is_support]
+        total: Floats = np.bincount(keys // V % V, held, V).astype(np.float64)
+        count = np.bincount(keys % V, held, V) + _SEEN
+        return total, count / count.sum()
+
+    def _held(self, relation: int, subject: Indices, other: Indices) -> Floats:
+        """Return the number of training scenes with a relation; class indices are broadcast."""
+        V = len(self.frequency)
+        keys = (relation * V + subject) * V + other
+        rows = np.minimum(np.searchsorted(self.triple, keys), len(self.triple) - 1)
+        held: Floats = np.where(self.triple[rows] == keys, self.held[rows], 0.0)
+        return held
+
     def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
         """Return whether training shows the relation between pairs of classes.
 
         A single scene may be an error, so two scenes are needed. The class indices of subjects and
         objects are broadcast against each other.
         """
-        V = len(self.frequency)
-        keys = (relation * V + subject) * V + other
-        rows = np.minimum(np.searchsorted(self.triple, keys), len(self.triple) - 1)
-        shown: NDArray[np.bool_] = (self.triple[rows] == keys) & (self.held[rows] >= _SHOWN)
+        shown: NDArray[np.bool_] = self._held(relation, subject, other) >= _SHOWN
         return shown
+
+    def under_evidence(self, upper: int, lower: int) -> float:
+        """Return log(n · n / m), with n scenes that show the lower class under the upper.
+
+        m is the number of scenes that show it on or in the upper class. So the value is large if
+        this role is usual, or if many scenes show it. It is -inf if no scene shows it.
+        """
+        counts = role_counts(self.roles, lower, upper).astype(float)
+        if counts[UNDER] <= 0:
+            return -math.inf
+        return math.log(counts[UNDER] ** 2 / (counts[ON] + counts[IN] + _OTHER_ROLES))
+
+    def means_under(self, upper: int, lower: int) -> bool:
+        """Return whether "upper on top of lower" means that the lower object is under the other.
+
+        A desk is on top of a bin in this sense: it does not stand on the bin. The roles of the two
+        classes decide. At least `_SHOWN` scenes must show the lower class under the upper.
+        """
+        under = role_counts(self.roles, lower, upper)[UNDER]
+        return bool(under >= _SHOWN and under > role_counts(self.roles, upper, lower)[ON])
 
     @cached_property
     def _by_anchor(self) -> tuple[tuple[NDArray[Any], ...], ...]:

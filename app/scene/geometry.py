@@ -5,15 +5,17 @@ radians. Boxes are upright. The footprint of a box is the rectangle of its horiz
 rotated by the yaw.
 
 1. *on-top*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
-   bottom of i is within 5 cm of the top of j. If two thin boxes meet this rule in both directions,
-   only the box with the higher centre is on top. If both centres have the same height, neither box
-   is on top.
+   bottom of i is within 5 cm of the top of j. Box i must not surround box j. If two thin boxes meet
+   this rule in both directions, only the box with the higher centre is on top. If both centres have
+   the same height, neither box is on top. A box surrounds a smaller box if it is more than 10 cm
+   high, and if it reaches both lower and higher than the smaller box.
 2. *above*(i, j) holds if the footprints overlap by at least 30 % of the smaller footprint, and the
    bottom of i is more than 5 cm above the top of j.
 3. Two boxes reach into each other if two conditions hold. The footprints overlap by at least 30 %
-   of the smaller footprint. The bottom of each box is more than 5 cm below the top of the other.
-   The smaller box is the box with the smaller footprint. If the footprints differ by at most 1 %,
-   it is the box with the smaller volume. The smaller box has one of three roles:
+   of the smaller footprint. The bottom of each box is more than 5 cm below the top of the other, or
+   one box surrounds the other. The smaller box is the box with the smaller footprint. If the
+   footprints differ by at most 1 %, it is the box with the smaller volume. The smaller box has one
+   of three roles:
 
    - on the larger box: *on-top*(smaller, larger). The bottom of the smaller box must be at least
      20 % of the larger height above the bottom of the larger box.
@@ -40,6 +42,9 @@ rotated by the yaw.
    are observed not to hold. Left and front are unobserved.
 9. If the size of a box is unknown, its stacked relations are unobserved. A box without height or
    depth is thin, and its size is known.
+
+`excluded_by_centres` excludes further relations at every distance: those with a direction that rule
+4 does not allow, and stacked relations of boxes too far apart to overlap.
 """
 
 from __future__ import annotations
@@ -54,13 +59,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from app.compiling import compiled
 from app.scene.footprints import measure
-from app.scene.relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP
+from app.scene.relations import ABOVE, CANONICAL, FRONT, INSIDE, LEFT, ON_TOP, STACKED
 from app.scene.roles import IN, ON, UNDER, RoleCounts, is_smaller, likely_role, possible_roles
 
 MIN_OVERLAP: Final = 0.30  # minimum overlap as a share of the smaller footprint
 CONTACT: Final = 0.05  # maximum distance in metres between bottom and top for *on-top*
 NEIGHBOUR_GAP: Final = 1.0  # maximum distance in metres between the footprints of neighbours
 NEIGHBOUR_DISTANCE: Final = 1.5  # maximum distance in metres between centres if a size is unknown
+UNKNOWN_REACH: Final = 1.5  # maximum reach in metres of a footprint of unknown size
 MIN_OFFSET: Final = 0.10  # minimum |dx| or |dy| in metres for *front* or *left*
 MOST_DISTANT: Final = 100.0  # longest plausible distance from the viewer in metres; detects mm
 SMALLEST: Final = 1e-3  # shortest plausible longest side of a box in metres
@@ -169,6 +175,29 @@ _NO_ROLES: Final = RoleCounts(
 )
 
 
+def excluded_by_centres(points: Array, sizes: Array, *, horizontal: bool) -> NDArray[np.bool_]:
+    """Return the relations that the centres of n boxes exclude, (A, n, n).
+
+    Unknown centres exclude no relation.
+
+    Args:
+        points: (n, 3) centres in viewer axes, in metres; NaN where unknown.
+        sizes: (n, 3) extents, in metres. A footprint of unknown size, NaN, has a radius of
+            `UNKNOWN_REACH`.
+        horizontal: whether the viewer is known, so that left and front are defined.
+    """
+    dx, dy = (points[:, axis, None] - points[:, axis] for axis in (0, 1))
+    excluded = np.zeros((len(CANONICAL), len(points), len(points)), np.bool_)
+    # A comparison with NaN is False.
+    if horizontal:
+        excluded[LEFT] = (dy < MIN_OFFSET) | (np.abs(dy) < np.abs(dx))
+        excluded[FRONT] = (-dx < MIN_OFFSET) | (np.abs(dx) <= np.abs(dy))
+    radius = np.hypot(sizes[:, 0], sizes[:, 1]) / 2
+    radius[np.isnan(radius)] = UNKNOWN_REACH
+    excluded[[*STACKED]] = np.hypot(dx, dy) > radius[:, None] + radius
+    return excluded
+
+
 @compiled
 def _are_valid(points, extents, turns):
     """Return whether yaws are finite, and positions and extents are finite or NaN (unknown)."""
@@ -237,7 +266,9 @@ def _stack(points, extents, i, j, classes, roles, holds, observed):
         if relation != _NONE:
             holds[relation, subject, anchor] = True
             return True
-    if _lift(points, extents, i, j) >= -CONTACT or _lift(points, extents, j, i) >= -CONTACT:
+    nested = _surrounds(points, extents, i, j) or _surrounds(points, extents, j, i)
+    lowest = max(_lift(points, extents, i, j), _lift(points, extents, j, i))
+    if lowest >= -CONTACT and not nested:
         return False  # two thin boxes at the same height
     for smaller, larger in ((i, j), (j, i)):
         if is_smaller(extents[smaller], extents[larger]):
@@ -274,8 +305,18 @@ def _vertical(points, extents, i, j):
     if lift > CONTACT:
         return ABOVE
     if abs(lift) <= CONTACT and points[i, 2] > points[j, 2]:
-        return ON_TOP
+        return _NONE if _surrounds(points, extents, i, j) else ON_TOP
     return _NONE
+
+
+@compiled
+def _surrounds(points, extents, i, j):
+    """Return whether box i surrounds box j; see rule 1. Their footprints must overlap."""
+    half, half_j = extents[i, 2] / 2, extents[j, 2] / 2
+    is_lower = points[i, 2] - half < points[j, 2] - half_j
+    is_higher = points[i, 2] + half > points[j, 2] + half_j
+    is_high = extents[i, 2] > 2 * CONTACT
+    return is_lower and is_higher and is_high and is_smaller(extents[j], extents[i])
 
 
 @compiled

@@ -7,7 +7,8 @@ into `CANONICAL`. The first argument of a relation is its subject, and the secon
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
+from graphlib import CycleError, TopologicalSorter
 from typing import Final, TypeVar
 
 CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above", "inside")
@@ -39,7 +40,7 @@ _INDEX: Final = {name: index for index, name in enumerate(CANONICAL)}
 _FLIPPED: Final = {OPPOSITES[name]: index for index, name in enumerate(CANONICAL)}
 _OPPOSITE: Final = OPPOSITES | {opposite: name for name, opposite in OPPOSITES.items()}
 
-End = TypeVar("End")
+End = TypeVar("End", bound=Hashable)
 
 
 def _unknown(relation: str) -> ValueError:
@@ -89,4 +90,21 @@ def contradiction(
         if flipped in seen:
             return flipped, (relation, subject, anchor)
         seen.add((relation, subject, anchor))
+    return None
+
+
+def support_cycle(triples: Iterable[tuple[int, End, End]]) -> list[End] | None:
+    """Return objects that support each other in a circle, each on or in the next, or None.
+
+    The last object is the first one again. The triples are canonical.
+    """
+    below: dict[End, list[End]] = {}
+    for relation, subject, anchor in triples:
+        if relation in SUPPORTS:
+            below.setdefault(subject, []).append(anchor)
+    try:
+        TopologicalSorter(below).prepare()
+    except CycleError as error:
+        circle: list[End] = error.args[1]
+        return circle[::-1]
     return None

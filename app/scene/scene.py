@@ -24,6 +24,7 @@ from app.scene.geometry import (
     PoseRelations,
     Viewpoint,
     derive_relations,
+    excluded_by_centres,
     is_world_fixed,
     to_viewer_frame,
 )
@@ -97,7 +98,8 @@ class Scene:
             relations that hold, but the class does not check this condition. None means that no
             relations were derived from poses.
         excluded: (A, n, n) bool, True for relations that the poses of the objects exclude, without
-            the stated relations. None means that no object has a position.
+            the stated relations. Left and front also count if the objects are far apart. None means
+            that no object has a position.
 
     Raises:
         ValueError: two objects have the same id, a triple is invalid, or `relations_complete` is
@@ -199,15 +201,18 @@ def observe(
     objects = scene.objects if viewpoint is None else _in_viewer_frame(scene.objects, viewpoint)
     has_no_viewer = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
     indices = [-1 if thing.class_index is None else thing.class_index for thing in objects]
+    points = np.array([thing.position or _UNKNOWN for thing in objects])
+    sizes = np.array([extent_of(thing, typical_sizes) for thing in objects])
     poses = derive_relations(
-        np.array([thing.position or _UNKNOWN for thing in objects]),
-        np.array([extent_of(thing, typical_sizes) for thing in objects]),
+        points,
+        sizes,
         np.array([thing.yaw for thing in objects]),
         horizontal=not has_no_viewer,
         classes=np.array(indices),
         roles=roles,
     )
     excluded = poses.observed & ~poses.holds
+    excluded |= excluded_by_centres(points, sizes, horizontal=not has_no_viewer)
     if scene.relations is not None:
         for triple in scene.relations:
             excluded[triple] = False

@@ -20,20 +20,25 @@ Flags = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 
+USUAL: Final = 0.5  # share of a stand that is usual for a class
+
+
 def floor_level(bottoms: Floats, weights: Floats) -> float:
-    """Return the height of the floor: the weighted median of the bottoms of objects, in metres.
+    """Return the height of the floor: the lower weighted tertile of bottoms, in metres.
+
+    Only objects that usually stand on the floor count. Without them, the height is NaN.
 
     Args:
         bottoms: (n,) heights in metres; NaN where unknown.
         weights: (n,) shares of the objects of each class that stand on the floor.
     """
-    usable = np.isfinite(bottoms) & (weights > 0)
+    usable = np.isfinite(bottoms) & (weights >= USUAL)
     if not usable.any():
         return float("nan")
     bottoms, weights = bottoms[usable], weights[usable]
     order = np.argsort(bottoms, kind="stable")
     total = np.cumsum(weights[order])
-    return float(bottoms[order][np.searchsorted(total, total[-1] / 2)])
+    return float(bottoms[order][np.searchsorted(total, total[-1] / 3)])
 
 
 class Heights(NamedTuple):
@@ -51,11 +56,11 @@ class Heights(NamedTuple):
 
     @property
     def around(self) -> Flags:
-        """Whether box i reaches below the top of a smaller box j, (n, n).
+        """Whether box i reaches below a smaller box j, or far below its top, (n, n).
 
         "i is on top of j" then means that j is under i, as a bin is under a desk.
         """
-        is_deep = self.bottoms[:, None] < self.tops - CONTACT
+        is_deep = self.bottoms[:, None] < np.maximum(self.bottoms, self.tops - CONTACT)
         around: Flags = is_deep & (self.areas[:, None] >= self.areas)
         return around
 
@@ -63,23 +68,23 @@ class Heights(NamedTuple):
 def stands_of(holds: Flags, observed: Flags, heights: Heights, floor: float) -> NDArray[np.int64]:
     """Return the stand of each of n boxes, (n,).
 
-    A low object stands on the floor, also if it is on a rug. The value is `UNKNOWN` if a bottom is
-    unknown, if a box reaches into another box and its relation to this box is open, or if a box is
-    closely above another box.
+    A low object stands on the floor, also if it is on a rug. The value is `UNKNOWN` if a bottom or
+    the floor is unknown, if a box reaches into another box and its relation to this box is open, or
+    if a box is closely above another box.
 
     Args:
         holds, observed: (A, n, n) relations between the boxes; see `PoseRelations`.
-        floor: height of the floor in metres.
+        floor: height of the floor in metres, or NaN.
     """
     bottoms, tops, _ = heights
     is_known = np.isfinite(bottoms)
     other = ~np.eye(len(bottoms), dtype=np.bool_)
     is_close = (holds[ABOVE] & (bottoms[:, None] - tops <= CLOSE)).any(1)
     is_open = (~observed[[*SUPPORTS]] & is_known & other).any((0, 2))
-    carried = holds[ON_TOP] & ~heights.around & (tops > floor + CLEARANCE)
+    carried = holds[ON_TOP] & ~heights.around & ~(tops <= floor + CLEARANCE)
     stands = np.where(is_close, UNKNOWN, HANGS)
     stands[bottoms <= floor + CLEARANCE] = FLOOR
     stands[is_open] = UNKNOWN
     stands[(carried | holds[INSIDE]).any(1)] = SUPPORTED
-    stands[~is_known] = UNKNOWN
+    stands[~is_known | (np.isnan(floor) & (stands != SUPPORTED))] = UNKNOWN
     return stands

@@ -8,6 +8,7 @@ import re
 import uuid
 from collections.abc import AsyncIterator
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -258,6 +259,26 @@ async def test_contradictions_are_refused(client: httpx.AsyncClient, question: s
         response = await client.post(f"/{question}", json=body)
         document = problem(response, 422, "contradictory-evidence")
         assert [error["pointer"] for error in document["errors"]] == ["#/relations/1"]
+
+
+@pytest.mark.parametrize("question", NAMES)
+async def test_supports_in_a_circle_are_refused(client: httpx.AsyncClient, question: str) -> None:
+    circle = [("bed", "on-top", "lamp"), ("lamp", "inside", "desk"), ("desk", "on-top", "bed")]
+    body = {"objects": ["bed", "lamp", "desk"], "relations": circle}
+    response = await client.post(f"/{question}", json=body)
+    document = problem(response, 422, "contradictory-evidence")
+    (error,) = document["errors"]
+    assert error["pointer"] == "#/relations"
+    names = error["message"].partition(": ")[2].split(" on or in ")
+    assert {*pairwise(names)} == {
+        ("bed", "lamp"), ("lamp", "desk"), ("desk", "bed"),
+    }  # fmt: skip
+
+
+async def test_a_place_on_the_floor_is_refused(client: httpx.AsyncClient) -> None:
+    body = {"objects": ["bed", "floor"], "at": ("on-top", "floor")}
+    document = problem(await client.post("/missing", json=body), 422, "invalid-request")
+    assert [error["pointer"] for error in document["errors"]] == ["#/at/1"]
 
 
 @pytest.mark.parametrize("question", NAMES)

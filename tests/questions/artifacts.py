@@ -56,7 +56,9 @@ NO_ALARM = lines(1e3, 1e3, 1e3)
 
 def judging(lines: AlarmLines = NO_ALARM, stand: float = 0.0, **changes: object) -> Misplaced:
     """The judgement of every kind by the log-odds of the relation. Changes replace judgements."""
-    judgement = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=stand, lines=lines)
+    judgement = Judgement(
+        intercept=0.0, relation=-1.0, change=-1.0, stand=stand, supporter=0.0, lines=lines
+    )
     return Misplaced(**{**dict.fromkeys(KINDS, judgement), **changes})
 
 

@@ -70,7 +70,9 @@ def test_false_relations():
     """Every kind has an entry of its own. The machine has no implications."""
     scene = scene_of([0, 1, 2], [(2, 1, 0), (0, 1, 2)])
     plain = misplaced(larger_artifact("triway"), scene)
-    entry = Judgement(intercept=0.4, relation=-0.5, change=0.0, stand=0.0, lines=NO_ALARM)
+    entry = Judgement(
+        intercept=0.4, relation=-0.5, change=0.0, stand=0.0, supporter=0.0, lines=NO_ALARM
+    )
     scaled = misplaced(larger_artifact("triway", misplaced=judging(lateral=entry)), scene)
     assert len(plain) == len(scaled) == 2
     for one in plain:

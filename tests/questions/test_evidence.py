@@ -56,10 +56,31 @@ def test_the_opposite_of_an_observed_relation_cannot_hold():
     p = plain["left", 1, 0].probability
     assert p > 0.01
     assert answer["left", 1, 0].probability == 0
-    unrelated = {key for key in plain if key[0] != "left"}
-    assert len(unrelated) == 8
-    for key in unrelated:
-        assert answer[key] == plain[key]
+    for i, j in ((0, 1), (1, 0)):
+        assert answer["front", i, j] == plain["front", i, j]
+
+
+def test_stacked_objects_do_not_stand_beside_each_other():
+    """A stacked relation excludes the pair's other relations, and left excludes stacked ones."""
+    plain = entries(scene_of([0, 1, 2]))
+    on_top, left = (entries(scene_of([0, 1, 2], [(a, 1, 0)])) for a in (ON_TOP, LEFT))
+    stacked = {CANONICAL[a] for a in (ON_TOP, ABOVE, INSIDE)}
+    excluded = 0
+    for name in CANONICAL:
+        for i, j in ((0, 1), (1, 0)):
+            excluded += plain[name, i, j].probability > 0.02
+            if (name, i, j) != ("on-top", 1, 0):
+                assert on_top[name, i, j].probability <= 0.0100001
+            if name in stacked:
+                assert left[name, i, j].probability <= 0.0100001
+    assert excluded > 4
+
+
+def test_an_object_is_on_or_in_one_object_only():
+    plain, answer = entries(scene_of([0, 1, 2])), entries(scene_of([0, 1, 2], [(INSIDE, 1, 0)]))
+    assert max(plain[name, 1, 2].probability for name in ("on-top", "inside")) > 0.02
+    assert max(answer[name, 1, 2].probability for name in ("on-top", "inside")) <= 0.0100001
+    assert answer["on-top", 2, 1] == plain["on-top", 2, 1]
 
 
 def test_a_complete_list_excludes_all_other_relations():

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.questions import placements
-from app.questions.placements import offsets_of
+from app.questions.placements import held_objects, offsets_of
+from app.questions.posterior import Posterior
 from app.registry import CountSlope, Offsets
 from app.registry.offsets import UNOBSERVED
 from app.scene import CANONICAL, ObjectClass, Scene, SceneObject, Vocabulary
@@ -75,7 +76,19 @@ def test_no_place_is_under_an_object_on_top_of_another():
 
     assert 0 in under()
     assert 0 not in under((ON_TOP, 0, 1))
+    assert 0 not in under((INSIDE, 0, 1))
     assert 1 in under((ON_TOP, 0, 1))
+
+
+def test_a_desk_with_a_bin_under_it_has_room_for_more():
+    """On-top also means under: class 1 is under class 0 in three scenes."""
+    roles = {
+        "role_pair": np.array([1 * V + 0], np.int32),
+        "role_counts": np.array([(0, 3, 0)], np.float32),
+    }
+    artifact = replace(ARTIFACT, places=places_of(V, {(ON_TOP, 2, 0): 5.0}, **roles))
+    scene = scene_of([0, 1, 2], [(ON_TOP, 0, 1), (ON_TOP, 2, 0)])
+    assert held_objects(artifact, Posterior(artifact, scene), scene) == [2]
 
 
 def offsets_of_every_pair(V: int = V) -> Offsets:

@@ -58,7 +58,13 @@ place_fits = st.builds(
     PlaceFit, relation=weight, counts=weight, intercept=number, slope=st.floats(1e-9, 1e9)
 )
 judgements = st.builds(
-    Judgement, intercept=number, relation=number, change=number, stand=number, lines=alarm_lines
+    Judgement,
+    intercept=number,
+    relation=number,
+    change=number,
+    stand=number,
+    supporter=number,
+    lines=alarm_lines,
 )
 changes = st.fixed_dictionaries(
     {},
@@ -103,10 +109,10 @@ def test_reads_back_as_written(change: dict[str, Any]) -> None:
     read = Manifest.from_bytes(data)
     assert read == written
     assert read.to_bytes() == data
-    assert json.loads(data)["format"] == 7
+    assert json.loads(data)["format"] == 8
 
 
-@pytest.mark.parametrize("value", [6, 8, 7.0, "7", None, True])
+@pytest.mark.parametrize("value", [7, 9, 8.0, "8", None, True])
 def test_refuses_another_format(value: object) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"]
@@ -128,9 +134,9 @@ def test_refuses_another_format(value: object) -> None:
         (b"\xff\xfe", "truncated"),
         (b"[" * 200_000, "truncated"),
         (resign(b"{" + b'"a":[' * 100_000 + b"]" * 100_000 + b"}"), "invalid_manifest"),
-        (resign(b'{"format": 7, nonsense}'), "invalid_manifest"),
-        (b'{"format": 7}', "invalid_manifest"),
-        (resign(b'{"format": 7}'), "invalid_manifest"),
+        (resign(b'{"format": 8, nonsense}'), "invalid_manifest"),
+        (b'{"format": 8}', "invalid_manifest"),
+        (resign(b'{"format": 8}'), "invalid_manifest"),
     ],
 )
 def test_refuses_malformed_manifests(data: bytes, code: str) -> None:

@@ -114,3 +114,26 @@ def test_two_scenes_show_a_relation() -> None:
         shown = places().shows(a, subject, other)
         expected = [[HELD.get((a, i, j), 0) >= 2 for j in range(V)] for i in range(V)]
         assert shown.tolist() == expected
+
+
+def test_supporters_are_smoothed_counts_of_on_top_and_inside() -> None:
+    """A lamp (1) is on a bed (0) and on class 2, and class 2 is in a bed."""
+    table = places(
+        triple=np.array([(2 * V + 1) * V, (2 * V + 1) * V + 2, (4 * V + 2) * V], np.int32),
+        held=np.array([9, 2, 1], np.float32),
+    )
+    prior = np.array([10.5, 0.5, 2.5]) / 13.5
+    held = np.array([(0, 0, 0), (9, 0, 2), (1, 0, 0)])
+    expected = (held + 10 * prior) / (held.sum(1, keepdims=True) + 10)
+    assert table.supporters(np.arange(V), np.arange(V)) == pytest.approx(expected)
+    assert table.supporters(np.array([1]), np.array([2])) == pytest.approx(expected[1:2, 2:])
+
+
+def test_the_roles_tell_under_from_on() -> None:
+    """Class 2 is under class 0 in three scenes; class 1 is on it in seven and under it in one."""
+    assert places().under_evidence(0, 2) == pytest.approx(np.log(9 / 0.5))
+    assert places().under_evidence(0, 1) == pytest.approx(np.log(1 / 7.5))
+    assert places().under_evidence(1, 0) == -np.inf
+    assert places().means_under(0, 2)
+    assert not places().means_under(0, 1)  # one scene may be an error
+    assert not places().means_under(2, 0)

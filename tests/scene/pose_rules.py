@@ -88,9 +88,10 @@ def relate(
         for upper, lower in ((subject, anchor), (anchor, subject)):
             if relation := _vertical(upper, lower):
                 return frozenset([relation] if upper is subject else []), observed
-        if _overlap(subject, anchor) and all(
-            not _above(upper.bottom - lower.top, -0.05)
-            for upper, lower in ((subject, anchor), (anchor, subject))
+        pairs = ((subject, anchor), (anchor, subject))
+        if _overlap(subject, anchor) and (
+            any(_surrounds(*pair) for pair in pairs)
+            or all(not _above(upper.bottom - lower.top, -0.05) for upper, lower in pairs)
         ):
             holds, unobserved = _reaching(subject, anchor, decide)
             return holds, observed - unobserved
@@ -112,8 +113,26 @@ def _vertical(upper: Box, lower: Box) -> str | None:
         return "above"
     # Of two thin things the one with the higher centre lies on the other.
     if _above(gap, -0.05) and upper.position[2] > lower.position[2]:
-        return "on-top"
+        return None if _surrounds(upper, lower) else "on-top"
     return None
+
+
+def _surrounds(outer: Box, inner: Box) -> bool:
+    """Whether a tall box has a smaller one between its bottom and its top."""
+    return (
+        _is_smaller(inner, outer)
+        and _above(outer.top - outer.bottom, 0.1)
+        and _above(inner.bottom, outer.bottom)
+        and _above(outer.top, inner.top)
+    )
+
+
+def _is_smaller(one: Box, other: Box) -> bool:
+    sizes = [(box.footprint, box.footprint * (box.top - box.bottom)) for box in (one, other)]
+    for a, b in zip(*sizes, strict=True):
+        if _above(abs(a - b), 0.01 * max(a, b)):
+            return a < b
+    return False
 
 
 def _overlap(one: Box, other: Box) -> bool:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import get_args
 
 import pytest
@@ -13,6 +14,7 @@ from app.scene.relations import (
     canonicalise,
     contradiction,
     opposite,
+    support_cycle,
 )
 from scene_client.schemas import RelationName
 
@@ -48,3 +50,16 @@ def test_other_names_are_refused_by_name(name: str) -> None:
 def test_contradictions() -> None:
     assert contradiction([(0, 1, 2), (1, 2, 1), (0, 1, 2)]) is None
     assert contradiction([(0, 1, 2), (3, 0, 1), (0, 2, 1)]) == ((0, 1, 2), (0, 2, 1))
+
+
+def test_objects_that_hold_each_other_in_a_circle() -> None:
+    """Only on-top (2) and inside (4) hold an object."""
+    tower = [(2, "box", "book"), (4, "book", "bag"), (2, "bag", "desk")]
+    assert support_cycle(tower) is None
+    assert support_cycle([*tower, (3, "desk", "box"), (0, "desk", "box")]) is None
+    circle = support_cycle([*tower, (2, "desk", "book")])
+    assert circle is not None
+    assert circle[0] == circle[-1]
+    assert {*pairwise(circle)} == {
+        ("book", "bag"), ("bag", "desk"), ("desk", "book"),
+    }  # fmt: skip

@@ -107,7 +107,29 @@ def test_stated_relations_are_not_overruled_but_poses_exclude_others() -> None:
     assert np.argwhere(added).tolist() == [[LEFT, 1, 0], [ON_TOP, 2, 0]]
     assert seen.excluded[[*STACKED], 0, 2].all()
     assert not seen.excluded[ON_TOP, 1, 0]
-    assert not seen.excluded[[LEFT, FRONT], 2, 0].any()
+    # The sofa is behind the desk.
+    assert np.argwhere(~seen.excluded[[LEFT, FRONT], 0, 2]).tolist() == [[FRONT]]
+    assert seen.excluded[[LEFT, FRONT], 2, 0].all()
+
+
+def test_in_a_map_without_a_viewer_no_direction_is_excluded() -> None:
+    sofa = SceneObject("sofa", "sofa", 3, position=(6.0, 0.0, 0.4), size=(0.9, 2.0, 0.8))
+    seen = observe(Scene((DESK, sofa)), frame_id="map")
+    assert seen.excluded is not None
+    assert not seen.excluded[[LEFT, FRONT]].any()
+
+
+@pytest.mark.parametrize(("distance", "is_far"), [(2.9, False), (3.1, True)])
+def test_boxes_of_unknown_size_are_not_stacked_from_far_apart(
+    distance: float, is_far: bool
+) -> None:
+    """A footprint of unknown size reaches at most 1.5 m."""
+    ends = [
+        SceneObject(name, name, 0, position=(x, 0, 0)) for name, x in (("a", 0), ("b", distance))
+    ]
+    seen = observe(Scene(tuple(ends)))
+    assert seen.excluded is not None
+    assert seen.excluded[[*STACKED], 0, 1].all() == is_far
 
 
 def test_scenes_without_poses_stay_as_they_are() -> None:

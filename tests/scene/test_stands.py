@@ -44,7 +44,14 @@ def test_the_floor_is_where_most_objects_on_the_floor_stand() -> None:
 def test_the_floor_is_unknown_without_objects_that_stand_on_it() -> None:
     assert math.isnan(floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.0])))
     assert math.isnan(floor_level(np.zeros(0), np.zeros(0)))
-    assert floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.2])) == 0.5
+    # A cup tells nothing about the floor.
+    assert math.isnan(floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.2])))
+    assert floor_level(np.array([NAN, 0.5]), np.array([1.0, 0.6])) == 0.5
+
+
+def test_objects_on_furniture_do_not_raise_the_floor() -> None:
+    """A chair on a table, and a table: the floor is that of the table."""
+    assert floor_level(np.array([0.74, 0.0]), np.array([0.95, 0.8])) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,9 @@ def uncalibrated(artifact: Artifact) -> Artifact:
     relation into the log-odds that the object or relation is wrong.
     """
     lines = AlarmLines(low=_NO_ALARM, medium=_NO_ALARM, high=_NO_ALARM)
-    plain = Judgement(intercept=0.0, relation=-1.0, change=-1.0, stand=0.0, lines=lines)
+    plain = Judgement(
+        intercept=0.0, relation=-1.0, change=-1.0, stand=0.0, supporter=0.0, lines=lines
+    )
     neutral = Calibration.neutral(artifact.spec.A).model_copy(
         update={
             "outlier": CountSlope(slope=-1.0),

@@ -28,6 +28,7 @@ from app.questions.misplaced import (
     OVER,
     STAND,
     SUPPORT,
+    TERMS,
     Entries,
     entries_of,
     wrong_log_odds,
@@ -140,13 +141,13 @@ def _cases(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int) -> _Ca
                     kind=entries.kind[usable],
                     terms=entries.terms[usable],
                     wrong=is_wrong[usable],
-                    weight=np.full(size, _OF_WORDS if flipped else 1.0),
+                    weight=np.full(size, _OF_WORDS if wrong in flipped else 1.0),
                 )
             )
     if not blocks:
         none = np.zeros(0, np.int64)
         names, no = none.astype(np.str_), none > 0
-        return _Cases(none, none, names, no, no, none, np.zeros((0, 3)), no, np.zeros(0))
+        return _Cases(none, none, names, no, no, none, np.zeros((0, TERMS)), no, np.zeros(0))
     columns: Any = (np.concatenate(column) for column in zip(*blocks, strict=True))
     return _Cases(*columns)
 
@@ -171,10 +172,11 @@ def _questions(
     altered = altered_scene(encoded, structure, triples, rng) if triples else None
     if triples and altered:
         scene, false = altered
-        yield replace(scene, relations=tuple(triples)), (), None
-        yield scene, (), false
+        unders = [triple for triple in triples if _means_under(artifact, encoded, triple)]
+        yield replace(scene, relations=tuple(triples)), unders, None
+        yield scene, unders, false
         if false[0] == ON_TOP:
-            yield scene, (false,), false
+            yield scene, [*unders, false], false
     state = scene_rng(encoded, seed + 1), scene_rng(encoded, seed + 1)
     untouched, moved = untouched_scene(encoded, structure, state[0]), None
     if untouched is not None:
@@ -182,8 +184,29 @@ def _questions(
     if untouched is not None and moved is not None:
         sizes = artifact.vocabulary.sizes
         roles = None if artifact.places is None else artifact.places.roles
+        part = _part_of(untouched, scene_rng(encoded, seed + 2))
         yield observe(untouched, typical_sizes=sizes, roles=roles), (), None
+        yield observe(part, typical_sizes=sizes, roles=roles), (), None
         yield observe(moved[0], typical_sizes=sizes, roles=roles), (), moved[1]
+
+
+def _means_under(artifact: Artifact, encoded: EncodedScene, triple: Triple) -> bool:
+    """Return whether a true on-top relation means that its object is under its subject."""
+    a, i, j = triple
+    classes, places = encoded.instance_classes.tolist(), artifact.places
+    return a == ON_TOP and places is not None and places.means_under(classes[i], classes[j])
+
+
+def _part_of(scene: Scene, rng: Rng) -> Scene:
+    """Return a scene with a random part of the objects. Its supports may be missing, as in a view.
+
+    A scene with stated relations is returned whole.
+    """
+    if scene.relations is not None:
+        return scene
+    count = int(rng.integers(1, len(scene.objects) + 1))
+    kept = np.sort(rng.permutation(len(scene.objects))[:count])
+    return replace(scene, objects=tuple(scene.objects[k] for k in kept))
 
 
 def _truth(entries: Entries, wrong: Triple | int | None) -> tuple[Flags, Flags]:
@@ -210,7 +233,7 @@ def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
     if len(np.unique(complete.encoded)) >= _LEAST_SCENES:
         untouched = complete
     used = cases.terms.std(0) > 0
-    weights, intercept = np.zeros(3), 0.0
+    weights, intercept = np.zeros(TERMS), 0.0
     while used.any():
         *fitted, intercept = logistic(cases.terms[:, used], cases.wrong, cases.weight, C=RIDGE)
         weights[:] = 0.0
@@ -221,10 +244,15 @@ def _fit_kind(cases: _Cases, budget: float) -> Judgement | None:
         used = weights < 0
     else:
         return None
-    relation, change, stand = weights.tolist()
+    relation, change, stand, supporter = weights.tolist()
     silent = AlarmLines(**dict.fromkeys(ALARMS, AlarmLine(intercept=0.0)))
     judgement = Judgement(
-        intercept=intercept, relation=relation, change=change, stand=stand, lines=silent
+        intercept=intercept,
+        relation=relation,
+        change=change,
+        stand=stand,
+        supporter=supporter,
+        lines=silent,
     )
     return judgement.model_copy(update={"lines": _alarm_lines(judgement, untouched, budget)})
 

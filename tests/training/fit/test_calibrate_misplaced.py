@@ -160,13 +160,15 @@ def test_moved_boxes_stand_at_less_likely_places():
 
 
 SILENT = AlarmLines(**dict.fromkeys(ALARMS, AlarmLine(intercept=0.0)))
-BY_RELATION = Judgement(intercept=0.0, relation=-1.0, change=0.0, stand=0.0, lines=SILENT)
+BY_RELATION = Judgement(
+    intercept=0.0, relation=-1.0, change=0.0, stand=0.0, supporter=0.0, lines=SILENT
+)
 
 
 def lists(count: int, size: int, seed: int, scale: float = 0.7):
     """Untouched scenes with entries whose log-odds to be wrong are logistic."""
     rng = np.random.default_rng(seed)
-    terms = np.zeros((count * size, 3))
+    terms = np.zeros((count * size, 4))
     terms[:, 0] = -rng.logistic(0.0, scale, count * size)
     every = np.ones(count * size, dtype=np.bool_)
     return module._Cases(
@@ -249,7 +251,7 @@ def entries_of(*rows):
     kinds, triples, movers = zip(*rows, strict=True)
     n = len(rows)
     return module.Entries(
-        np.array(triples), np.array(kinds), np.zeros((n, 3)), np.array(movers, dtype=np.int64)
+        np.array(triples), np.array(kinds), np.zeros((n, 4)), np.array(movers, dtype=np.int64)
     )
 
 
