@@ -264,7 +264,8 @@ def misplaced_fields(
     The answer lists every observed relation of a kind that the model judges, without those of
     structure. An object on the floor, or hanging above it, is listed only if it reaches the most
     sensitive alarm line. The entry that is most probably wrong comes first. Entries with equal
-    probabilities keep the order of `Scene.relations`.
+    probabilities keep the order of `Scene.relations`. An object under another object is the subject
+    of its entry.
 
     Returns:
         The fields of `scene_client.schemas.MisplacedRelation`.
@@ -281,8 +282,10 @@ def misplaced_fields(
     is_listed |= is_misplaced
     order = np.argsort(-log_odds, kind="stable")
     order = order[is_listed[order]]
+    unders = entries.triple[entries.kind == BELOW].tolist()
+    spelled = {*flipped, *((a, i, j) for a, i, j in unders)}
     return [
-        _spelled(scene, entries.triple[k].tolist(), flipped)
+        _spelled(scene, entries.triple[k].tolist(), spelled)
         | {
             "probability": probability,
             "is_misplaced": bool(is_misplaced[k]),
@@ -295,7 +298,7 @@ def misplaced_fields(
 
 
 def _spelled(scene: Scene, triple: list[int], flipped: Collection[Triple]) -> Fields:
-    """Convert a canonical relation to the name, subject and object that the request uses."""
+    """Convert a canonical relation to a name, subject and object; the opposite if it is flipped."""
     relation, subject, object_ = triple
     name, things = CANONICAL[relation], scene.objects
     if object_ < 0:

@@ -304,7 +304,7 @@ def test_the_answer_names_the_moved_object_of_each_entry():
     # log-odds -0.5 + log 20 and log 20
     expected = [
         ("monitor", "on-top", "floor", 20.0),
-        ("desk", "on-top", "monitor", 20.0 * math.exp(-0.5)),
+        ("monitor", "under", "desk", 20.0 * math.exp(-0.5)),
     ]
     for entry, (subject, relation, object_, odds) in zip(answer, expected, strict=True):
         assert [entry[name] for name in ("subject", "relation", "object")] == [
