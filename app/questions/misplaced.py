@@ -155,7 +155,8 @@ def entries_of(
         terms.append((max(z, LEAST_Z), d, s, q))
         movers.append(mover)
     if heights is not None:
-        for i in np.flatnonzero(is_thing & moves & np.isin(stands, (FLOOR, HANGS))).tolist():
+        is_free = (stands == FLOOR) | (stands == HANGS)
+        for i in np.flatnonzero(is_thing & moves & is_free).tolist():
             rows.append((ON_TOP if stands[i] == FLOOR else ABOVE, i, -1))
             kinds.append(STAND)
             terms.append((0.0, 0.0, float(log_p[i]), 0.0))
