@@ -107,9 +107,9 @@ def placements(
 
     The candidate is subject or object of the relation. Structural classes (floor, wall) are never
     anchors. If a class has several instances, the first instance is the anchor. If an object stands
-    on or in another object, no candidate holds it. A further place
-    has at least `LEAST_SHARE` of the probability of the first place. Without a place of probability
-    `LEAST_LIKELY`, the list is empty. An offset needs an anchor with a position.
+    on or in another object, no candidate holds it. A further place has at least `LEAST_SHARE` of
+    the probability of the first place. Without a place of probability `LEAST_LIKELY`, the list is
+    empty. An offset needs an anchor with a position.
 
     Args:
         candidates: (N,) indices of absent classes.
@@ -211,14 +211,16 @@ def _lower_unseen(
     places = artifact.places
     if places is None:
         return
-    change = np.log(np.minimum(np.maximum(places.stands, _LEAST_STAND) / USUAL, 1.0))
-    missing, listed = candidates[:, None], anchors[None]
+    of_missing, of_listed = (
+        np.log(np.minimum(np.maximum(places.stands[classes], _LEAST_STAND) / USUAL, 1.0))
+        for classes in (candidates, anchors)
+    )
     for relation, stand in ((ON_TOP, SUPPORTED), (ABOVE, HANGS), (INSIDE, SUPPORTED)):
         if relation < forward.shape[1]:
-            shown = places.shows(relation, missing, listed)
-            forward[:, relation] += np.where(shown, 0.0, change[missing, stand])
-            shown = places.shows(relation, listed, missing)
-            backward[:, relation] += np.where(shown, 0.0, change[listed, stand])
+            shown = places.shows(relation, candidates, anchors)
+            forward[:, relation] += np.where(shown, 0.0, of_missing[:, stand, None])
+            shown = places.shows(relation, anchors, candidates).T
+            backward[:, relation] += np.where(shown, 0.0, of_listed[:, stand])
 
 
 def _fits_inside(
@@ -231,12 +233,29 @@ def _fits_inside(
     of their class. A box of unknown size fits everywhere.
     """
     sizes = artifact.vocabulary.sizes
-    inner = np.sort(sizes[candidates], axis=1)[:, None]
+    inner = np.sort(sizes[candidates], axis=1)
     outer = np.sort([extent_of(scene.objects[k], sizes) for k in objects.tolist()], axis=1)
-    # A comparison with NaN is False.
-    too_large = np.any(inner > _TIGHT * outer, axis=2)
-    too_small = np.any(outer > _TIGHT * inner, axis=2)
-    return np.logical_not(too_large), np.logical_not(too_small)
+    fits = _fits(inner, outer)
+    return fits[0], fits[1]
+
+
+@compiled
+def _fits(inner: NDArray[Any], outer: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return whether boxes with sorted extents fit into each other, (2, N, m); see `_fits_inside`.
+
+    The first table tells which inner boxes (N, 3) fit into which outer boxes (m, 3), and the second
+    one which outer boxes fit into which inner boxes.
+    """
+    fits = np.ones((2, len(inner), len(outer)), np.bool_)
+    for i in range(len(inner)):
+        for j in range(len(outer)):
+            for k in range(3):
+                # A comparison with NaN is False.
+                if inner[i, k] > _TIGHT * outer[j, k]:
+                    fits[0, i, j] = False
+                if outer[j, k] > _TIGHT * inner[i, k]:
+                    fits[1, i, j] = False
+    return fits
 
 
 def _offset_fields(

@@ -20,6 +20,7 @@ from typing import Any, ClassVar, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from app.compiling import compiled
 from app.registry.errors import ArtifactError
 from app.registry.fields import TensorGroup
 from app.scene.relations import CANONICAL, SUPPORTS
@@ -37,6 +38,27 @@ _SHOWN: Final = 2.0  # minimum number of scenes that show a relation
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+
+@compiled
+def _counts(
+    triple: NDArray[Any],
+    held: NDArray[Any],
+    V: int,
+    relation: int,
+    subject: NDArray[Any],
+    other: NDArray[Any],
+) -> Floats:
+    """Return the counts of the triples (relation, subject, other), (N, M); 0 without an entry."""
+    counts = np.zeros((len(subject), len(other)))
+    for i in range(len(subject)):
+        start = (relation * V + subject[i]) * V
+        first, last = np.searchsorted(triple, start), np.searchsorted(triple, start + V)
+        for j in range(len(other)):
+            row = first + np.searchsorted(triple[first:last], start + other[j])
+            if row < last and triple[row] == start + other[j]:
+                counts[i, j] = held[row]
+    return counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +151,7 @@ class Places(TensorGroup):
         total, share = self._supporters
         held = np.zeros((len(subject), len(other)))
         for relation in SUPPORTS:
-            held += self._held(relation, subject[:, None], other)
+            held += self._held(relation, subject, other)
         shares: Floats = (held + _SUPPORTER * share[other]) / (total[subject, None] + _SUPPORTER)
         return shares
 
@@ -144,18 +166,16 @@ class Places(TensorGroup):
         return total, count / count.sum()
 
     def _held(self, relation: int, subject: Indices, other: Indices) -> Floats:
-        """Return the number of training scenes with a relation; class indices are broadcast."""
+        """Return the number of training scenes with a relation between classes, (N, M)."""
         V = len(self.frequency)
-        keys = (relation * V + subject) * V + other
-        rows = np.minimum(np.searchsorted(self.triple, keys), len(self.triple) - 1)
-        held: Floats = np.where(self.triple[rows] == keys, self.held[rows], 0.0)
+        held: Floats = _counts(self.triple, self.held, V, relation, subject, other)
         return held
 
     def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
-        """Return whether training shows the relation between pairs of classes.
+        """Return whether training shows the relation from each subject to each other class, (N, M).
 
-        A single scene may be an error, so two scenes are needed. The class indices of subjects and
-        objects are broadcast against each other.
+        A single scene may be an error, so two scenes are needed. The class indices are (N,) and
+        (M,).
         """
         shown: NDArray[np.bool_] = self._held(relation, subject, other) >= _SHOWN
         return shown

@@ -109,9 +109,8 @@ def test_the_ratio_of_a_place_is_that_of_smoothed_counts(
 
 
 def test_two_scenes_show_a_relation() -> None:
-    subject, other = np.arange(V)[:, None], np.arange(V)[None]
     for a in range(A):
-        shown = places().shows(a, subject, other)
+        shown = places().shows(a, np.arange(V), np.arange(V))
         expected = [[HELD.get((a, i, j), 0) >= 2 for j in range(V)] for i in range(V)]
         assert shown.tolist() == expected
 

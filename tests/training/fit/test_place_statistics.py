@@ -45,7 +45,10 @@ def test_each_scene_counts_once_for_each_triple():
     assert places.triple.tolist() == sorted(triples)
     # One more for each class: three, three, none, one and none of the four scenes list it.
     assert places.frequency == pytest.approx(np.array([4, 4, 1, 2, 1]) / 12)
-    assert places.shows(ON_TOP, np.array([LAMP, PICTURE]), np.array(DESK)).tolist() == [True, False]
+    assert places.shows(ON_TOP, np.array([LAMP, PICTURE]), np.array([DESK])).tolist() == [
+        [True],
+        [False],
+    ]
 
 
 def test_structure_and_pairs_of_one_class_do_not_count():
