@@ -93,6 +93,11 @@ class Entries(NamedTuple):
     mover: Indices
 
 
+_NO_ENTRIES: Final = Entries(
+    np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, TERMS)), np.zeros(0, np.int64)
+)
+
+
 def entries_of(
     artifact: Artifact, posterior: Posterior, scene: Scene, flipped: Collection[Triple] = ()
 ) -> Entries:
@@ -111,6 +116,8 @@ def entries_of(
         for a, i, j in scene.relations or ()
         if a < artifact.spec.A and is_thing[i] and is_thing[j]
     ]
+    if not stated and scene.poses is None:
+        return _NO_ENTRIES
     heights = None if scene.poses is None else _heights(artifact, scene, classes)
     if heights is None:
         unders = {triple for triple in stated if triple[0] == ON_TOP and triple in flipped}
