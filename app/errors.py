@@ -342,8 +342,9 @@ class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=
 class ContradictionError(RequestError, slug="contradictory-evidence", status=422, steps=("scene",)):
     """The scene contradicts itself.
 
-    Either an object has a relation to itself, or a pair has both a relation and its opposite (left
-    and right, on-top and under).
+    There are three cases. An object has a relation to itself. A pair has both a relation and its
+    opposite (left and right, on-top and under). Objects hold each other in a circle: a box on a
+    book, the book on a laptop, and the laptop in the box.
     """
 
     example = (

@@ -63,13 +63,8 @@ def test_all_classes_have_the_probability_of_the_formula(monkeypatch, machine, n
     assert [*answer] == sorted(expected, key=expected.__getitem__, reverse=True)
 
 
-@pytest.mark.parametrize("machine", NAMES)
-@pytest.mark.parametrize("name", ["on-top", "under", "left", "contains"])
-@pytest.mark.parametrize("top_k", [1, 2, 4])
-def test_an_early_stop_leaves_the_likeliest_classes_as_they_are(monkeypatch, machine, name, top_k):
-    """With blocks of a single class, the function scores as few classes as possible."""
-    artifact, scene = larger_artifact(machine, at=FITS), scene_of([0, 2], None)
-    every = missing(artifact, scene, at=(name, 1), top_k=9, details=False)
+def count_scored(monkeypatch):
+    """Return a list that gets the classes whose relation is scored, in blocks of a single class."""
     scored = []
 
     def counted(posterior, candidates, place):
@@ -78,6 +73,17 @@ def test_an_early_stop_leaves_the_likeliest_classes_as_they_are(monkeypatch, mac
 
     monkeypatch.setattr(module, "_BLOCK", 1)
     monkeypatch.setattr(module, "place_log_p", counted)
+    return scored
+
+
+@pytest.mark.parametrize("machine", NAMES)
+@pytest.mark.parametrize("name", ["on-top", "under", "left", "contains"])
+@pytest.mark.parametrize("top_k", [1, 2, 4])
+def test_an_early_stop_leaves_the_likeliest_classes_as_they_are(monkeypatch, machine, name, top_k):
+    """With blocks of a single class, the function scores as few classes as possible."""
+    artifact, scene = larger_artifact(machine, at=FITS), scene_of([0, 2], None)
+    every = missing(artifact, scene, at=(name, 1), top_k=9, details=False)
+    scored = count_scored(monkeypatch)
     some = missing(artifact, scene, at=(name, 1), top_k=top_k, details=False)
     assert [entry.label for entry in some] == [entry.label for entry in every[:top_k]]
     for entry, other in zip(some, every, strict=False):
@@ -89,14 +95,7 @@ def test_classes_far_below_the_bound_are_not_scored(monkeypatch):
     """The counts alone decide."""
     fits = (PlaceFit(relation=0.01, counts=100.0),) * 5
     artifact = larger_artifact("triway", at=fits)
-    scored = []
-
-    def counted(posterior, candidates, place):
-        scored.extend(candidates.tolist())
-        return place_log_p(posterior, candidates, place)
-
-    monkeypatch.setattr(module, "_BLOCK", 1)
-    monkeypatch.setattr(module, "place_log_p", counted)
+    scored = count_scored(monkeypatch)
     (entry,) = missing(artifact, scene_of([2]), at=("on-top", 0), top_k=1)
     assert entry.label == "lamp"
     assert scored == [LABELS.index("lamp")]

@@ -26,15 +26,14 @@ def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
 def draft_artifact(
     machine: BoltzmannMachine,
     vocabulary: Vocabulary,
-    calibration: Calibration | None = None,
     places: Places | None = None,
 ) -> Artifact:
-    """Return a model in memory, without files. The default calibration leaves log-odds as is."""
+    """Return a model in memory, without files. Its calibration leaves log-odds as is."""
     return Artifact(
         manifest=None,  # type: ignore[arg-type]  # questions never read it
         weights=weights_of(machine),
         vocabulary=vocabulary,
-        calibration=calibration or Calibration.neutral(machine.spec.A),
+        calibration=Calibration.neutral(machine.spec.A),
         digest="",
         card="",
         path=Path(),

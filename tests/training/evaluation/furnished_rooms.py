@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import torch
@@ -40,4 +41,5 @@ def room_model() -> Artifact:
             "outlier_lines": lines(0.0, 0.0, 0.0),
         }
     )
-    return draft_artifact(machine.eval().requires_grad_(False), VOCABULARY, calibration)
+    draft = draft_artifact(machine.eval().requires_grad_(False), VOCABULARY)
+    return replace(draft, calibration=calibration)

@@ -56,7 +56,7 @@ class MissingRequest(SceneRequest):
         ),
     ] = None
     at: Annotated[Anchor, OrArray()] | None = None
-    """limit the answer to objects missing at this place"""
+    """limit the answer to objects missing at this place; not at floor, wall or ceiling"""
     detail: Detail = "full"
     """`scores` leaves `placements` and `because` out of the answer"""
 
