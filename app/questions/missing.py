@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import InvalidRequestError
+from app.inference.kernels import best
 from app.questions.answer import (
     CAUSE_BYTES,
     EXPLAINED,
@@ -30,7 +31,6 @@ from app.questions.names import ErrorList
 from app.questions.placements import Place, place_log_p, placements
 from app.questions.posterior import LEAST_CHANGE, Posterior, calibrated
 from app.questions.question import LABELS, REFUSED, SCENES, Example, Options, Question
-from app.questions.ranking import likeliest_classes
 from app.questions.reading import Reading
 from app.registry.artifact import Artifact
 from app.scene.geometry import Axes, viewer_axes
@@ -155,7 +155,8 @@ def _ranked(
         logits = calibrated(entry, log_odds, max(1, posterior.listed))
     else:
         logits = _logits_at(artifact, posterior, place, absent, chosen, log_odds, top_k)
-    first, probabilities = likeliest_classes(logits, chosen, top_k)
+    first = best(logits, chosen, top_k)
+    probabilities = 1.0 / (1.0 + np.exp(-logits[first].astype(np.float64)))
     return absent[first], probabilities, log_odds[first]
 
 

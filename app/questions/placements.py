@@ -6,27 +6,22 @@ called the anchor. An offset is the distance vector between the centres of both.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.compiling import compiled
-from app.inference.relations import NO_UNIT
+from app.inference.kernels import NO_UNIT, UNOBSERVED, likeliest_places, rotated_offsets
 from app.questions.answer import Fields, significant
 from app.questions.posterior import Posterior
-from app.questions.ranking import likeliest_places
 from app.registry.artifact import Artifact
-from app.registry.offsets import UNOBSERVED, Offsets, look_up
+from app.registry.offsets import Offsets
 from app.scene.geometry import Axes
 from app.scene.relations import (
     ABOVE,
     CANONICAL,
-    FRONT,
     INSIDE,
-    LEFT,
     ON_TOP,
     RELATIONS,
     SUPPORTS,
@@ -45,7 +40,6 @@ _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
 _LEAST_STAND: Final = 0.005  # least share of a stand
 _TIGHT: Final = 1.2  # ratio of extents up to which a box fits into another box
 _UNTURNED: Final = np.eye(3)
-_PER_METRE: Final = 1000.0  # offsets are rounded to millimetres
 
 
 class Place(NamedTuple):
@@ -235,27 +229,10 @@ def _fits_inside(
     sizes = artifact.vocabulary.sizes
     inner = np.sort(sizes[candidates], axis=1)
     outer = np.sort([extent_of(scene.objects[k], sizes) for k in objects.tolist()], axis=1)
-    fits = _fits(inner, outer)
-    return fits[0], fits[1]
-
-
-@compiled
-def _fits(inner: NDArray[Any], outer: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return whether boxes with sorted extents fit into each other, (2, N, m); see `_fits_inside`.
-
-    The first table tells which inner boxes (N, 3) fit into which outer boxes (m, 3), and the second
-    one which outer boxes fit into which inner boxes.
-    """
-    fits = np.ones((2, len(inner), len(outer)), np.bool_)
-    for i in range(len(inner)):
-        for j in range(len(outer)):
-            for k in range(3):
-                # A comparison with NaN is False.
-                if inner[i, k] > _TIGHT * outer[j, k]:
-                    fits[0, i, j] = False
-                if outer[j, k] > _TIGHT * inner[i, k]:
-                    fits[1, i, j] = False
-    return fits
+    # A comparison with NaN is False.
+    inner_fits = np.logical_not(inner[:, None] > _TIGHT * outer).all(2)
+    outer_fits = np.logical_not(outer > _TIGHT * inner[:, None]).all(2)
+    return np.asarray(inner_fits), np.asarray(outer_fits)
 
 
 def _offset_fields(
@@ -298,51 +275,7 @@ def offsets_of(
         unknown offset.
     """
     rotation = _UNTURNED if axes is None else np.array(axes)
-    mean, std, scenes = _rotated_offsets(
+    mean, std, scenes = rotated_offsets(
         offsets.tables, relation, missing, anchor, outgoing, rotation, axes is not None
     )
-    return mean, std, scenes
-
-
-@compiled
-def _rotated_offsets(
-    tables: tuple[NDArray[Any], ...],
-    relation: NDArray[np.int64],
-    missing: NDArray[np.int64],
-    anchor: NDArray[np.int64],
-    outgoing: NDArray[np.bool_],
-    axes: NDArray[np.float64],
-    has_axes: bool,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Compute the mean (n, 3), standard deviation (n, 3) and number of scenes (n,) of n offsets.
-
-    ``has_axes`` is False if the viewing direction is unknown. For the other arguments, see
-    `offsets_of`.
-    """
-    subject, object_ = np.where(outgoing, missing, anchor), np.where(outgoing, anchor, missing)
-    offset, scenes = look_up(tables, relation, subject, object_)
-    n = len(relation)
-    mean, variance, std = np.zeros((n, 3)), np.zeros((n, 3)), np.empty((n, 3))
-    for k in range(n):
-        if has_axes:
-            for axis in range(3):
-                axis_mean, axis_variance = offset[k, axis], offset[k, 3 + axis] ** 2
-                for to in range(3):
-                    mean[k, to] += axes[axis, to] * axis_mean
-                    variance[k, to] += axes[axis, to] ** 2 * axis_variance
-        else:
-            if relation[k] == LEFT or relation[k] == FRONT:
-                scenes[k] = UNOBSERVED
-            mean[k, 2], variance[k, 2] = offset[k, 2], offset[k, 5] ** 2
-            # Any horizontal direction is equally likely, so x and y share E[x²] + E[y²] equally.
-            for axis in range(2):
-                half = (offset[k, axis] ** 2 + offset[k, 3 + axis] ** 2) / 2
-                variance[k, 0] += half
-                variance[k, 1] += half
-        for axis in range(3):
-            value = mean[k, axis] if outgoing[k] else -mean[k, axis]
-            # Adding 0.0 turns -0.0 into 0.0.
-            mean[k, axis] = np.rint(value * _PER_METRE) / _PER_METRE + 0.0
-            millimetres = np.rint(math.sqrt(variance[k, axis]) * _PER_METRE)
-            std[k, axis] = max(millimetres, 1.0) / _PER_METRE
     return mean, std, scenes
