@@ -389,11 +389,11 @@ class HostRefusedError(ServiceError, slug="host-refused", status=421, steps=("ho
 
 
 class BodiesFullError(ServiceError, slug="bodies-full", status=503, steps=("body",)):
-    """The service holds too many bytes of request bodies.
+    """The service holds too many bytes of request bodies and answers.
 
-    All requests in progress share SCENE_HELD_BODY_BYTES for their bodies. The service always
-    accepts a body of at most 64 KiB that has arrived whole. Send the request again after the time
-    in Retry-After.
+    All requests in progress share SCENE_HELD_BODY_BYTES for their bodies and for large answers. One
+    client holds at most a quarter. The service always accepts a body of at most 16 KiB that has
+    arrived whole. Send the request again after the time in Retry-After.
     """
 
 
@@ -432,10 +432,9 @@ class DrainingError(ServiceError, slug="draining", status=503, steps=("readiness
 class QueueFullError(ServiceError, slug="queue-full", status=429, steps=("admission",)):
     """Too many requests are waiting.
 
-    The queue of requests (SCENE_QUEUE_REQUESTS) or the queue of this model's scenes
-    (SCENE_QUEUE_ROWS) is full. The service also refuses a request that would wait in the queue for
-    too much of its time limit. The service did not start the computation. Send the request again
-    after the time in Retry-After.
+    The queue of requests (SCENE_QUEUE_REQUESTS), of batches and large scenes (SCENE_QUEUE_ROWS) or
+    of drawn scenes is full. One client holds at most a quarter of a queue. The service did not
+    start the computation. Send the request again after the time in Retry-After.
     """
 
 

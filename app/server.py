@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import logging
 import os
+import resource
 import signal
 from socket import SO_ACCEPTCONN, SOL_SOCKET, socket
 from time import monotonic
 from types import FrameType
-from typing import Final
+from typing import ClassVar, Final
 
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
@@ -24,21 +26,70 @@ from app.settings import Settings
 # connections earlier. Otherwise the proxy may send a request while the server closes the
 # connection.
 KEEP_ALIVE: Final = 20
+# The server closes a connection that sends no request in this time in seconds.
+SILENT: Final = 10
+# Number of file descriptors that are not for connections: files of models, logs, event loop.
+_OTHER_FILES: Final = 64
 
 _logger = logging.getLogger("app.server")
 
 
 class Connection(HttpToolsProtocol):
-    """An HTTP connection that ignores the trailers of chunked bodies.
+    """An HTTP connection that ignores the trailers of chunked bodies, and never blocks a new one.
 
     uvicorn appends trailers to the headers of the request, so a trailer could replace a header that
     a proxy has checked or removed.
+
+    If the service has its maximum number of connections, a new connection closes the one that has
+    been idle for the longest time. So idle connections cannot keep health checks out.
+
+    Attributes:
+        idle: connections without a request in progress, the longest idle first, and since when.
+        has_asked: whether the connection has sent a request.
     """
+
+    idle: ClassVar[dict[Connection, float]] = {}
+    has_asked = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Make room for the connection."""
+        super().connection_made(transport)
+        if self.limit_concurrency and len(self.connections) >= self.limit_concurrency:
+            for connection in Connection.idle:
+                connection.close()
+                break
+        Connection.idle[self] = monotonic()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the connection."""
+        Connection.idle.pop(self, None)
+        super().connection_lost(exc)
 
     def on_headers_complete(self) -> None:
         """Start the request with the headers so far. The parser adds trailers to `self.headers`."""
+        Connection.idle.pop(self, None)
+        self.has_asked = True
         super().on_headers_complete()
         self.scope["headers"] = self.headers.copy()
+
+    def on_response_complete(self) -> None:
+        """Start the next pipelined request, or wait for one."""
+        super().on_response_complete()
+        if self.cycle.response_complete:
+            Connection.idle[self] = monotonic()
+
+    def close(self) -> None:
+        """Close the connection, which is idle."""
+        Connection.idle.pop(self, None)
+        self.transport.close()
+
+    @classmethod
+    def close_silent(cls) -> None:
+        """Close connections that have been open for `SILENT` seconds without a request."""
+        began = monotonic() - SILENT
+        for connection, since in list(cls.idle.items()):
+            if since < began and not connection.has_asked:
+                connection.close()
 
 
 class Server(uvicorn.Server):
@@ -107,6 +158,8 @@ class Server(uvicorn.Server):
 
     async def on_tick(self, counter: int) -> bool:
         """Return whether the server must stop. uvicorn calls this method ten times per second."""
+        if counter % 10 == 0:
+            Connection.close_silent()
         if self._closing_at is not None and monotonic() >= self._closing_at:
             self._closing_at = None
             super().handle_exit(signal.SIGTERM, None)
@@ -126,6 +179,18 @@ def _page(host: str, port: int) -> str:
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
+def _most_connections(wanted: int) -> int:
+    """Return the number of connections for which the process may open files."""
+    most = max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] - _OTHER_FILES, _OTHER_FILES)
+    if wanted > most:
+        _logger.warning(
+            "the service accepts %d connections, not SCENE_MAX_CONNECTIONS=%d, because it may open "
+            "only %d files (ulimit -n)",
+            *(most, wanted, most + _OTHER_FILES),
+        )
+    return min(wanted, most)
+
+
 def build(settings: Settings, began: float) -> Server:
     """Return the server, not yet started. Warn if other machines can use it without a key.
 
@@ -139,13 +204,15 @@ def build(settings: Settings, began: float) -> Server:
         root_path=settings.root_path,
         http=Connection,
         ws="none",
-        limit_concurrency=settings.max_connections,
+        # uvicorn refuses requests at this number, so a new connection first closes an idle one.
+        limit_concurrency=_most_connections(settings.max_connections) + 1,
         timeout_keep_alive=KEEP_ALIVE,
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
         access_log=False,
         server_header=False,
-        # X-Forwarded-* headers contain the client's address and scheme. The service uses neither.
-        proxy_headers=False,
+        # Behind a proxy, X-Forwarded-For tells the clients apart that share the queues.
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=list(settings.trusted_proxies),
         timeout_graceful_shutdown=settings.drain_timeout,
     )
     if settings.is_open:

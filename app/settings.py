@@ -174,6 +174,9 @@ class Settings(BaseSettings):
     """Host names and addresses that clients may use for this service, separated by commas, without
     ports; `*` allows all; default: the names of this machine, and SCENE_HOST if it is a single
     address."""
+    trusted_proxies: _Words = ()
+    """Addresses of proxies, separated by commas, whose X-Forwarded-For header names the client; `*`
+    trusts every address; none by default."""
     max_connections: Annotated[int, Field(ge=1, le=2**20)] = 1024
     """Maximum number of connections; the service answers further ones with 503."""
     max_body_bytes: Annotated[int, Field(ge=1024, le=64 * 2**20)] = 2 * 2**20
@@ -181,19 +184,21 @@ class Settings(BaseSettings):
     max_scene_bytes: Annotated[int, Field(ge=1024, le=64 * 2**20)] = 256 * 2**10
     """Maximum size in bytes of the body of a question about one scene."""
     held_body_bytes: Annotated[int, Field(ge=2**20, le=2**36)] = 64 * 2**20
-    """Maximum total size in bytes of the bodies of all requests in progress."""
+    """Maximum total size in bytes of the bodies of all requests and large answers in progress; one
+    client holds at most a quarter."""
     max_objects: Annotated[int, Field(ge=1, le=MAX_OBJECTS)] = MAX_OBJECTS
     """Maximum number of objects in a scene."""
     max_relations: Annotated[int, Field(ge=0, le=MAX_RELATIONS)] = 4096
     """Maximum number of stated relations in a scene."""
-    max_answer_bytes: Annotated[int, Field(ge=2**16, le=2**30)] = 16 * 2**20
+    max_answer_bytes: Annotated[int, Field(ge=2**16, le=2**30)] = 4 * 2**20
     """Maximum size of an answer in bytes."""
     max_weights_bytes: Annotated[int, Field(ge=1024, le=2**40)] = 2**30
     """Maximum size of a weights file in bytes."""
-    queue_rows: Annotated[int, Field(ge=256, le=2**20)] = 4096
-    """Maximum number of scenes per model that wait or are being computed."""
-    queue_requests: Annotated[int, Field(ge=1, le=2**20)] = 256
-    """Maximum number of queued requests."""
+    queue_rows: Annotated[int, Field(ge=1024, le=2**20)] = 4096
+    """Maximum number of scenes of batches and large requests that wait or are being computed; one
+    client holds at most a quarter."""
+    queue_requests: Annotated[int, Field(ge=4, le=2**20)] = 1024
+    """Maximum number of requests that wait for their turn; one client holds at most a quarter."""
     request_timeout_ms: Annotated[int, Field(ge=1, le=600_000)] = 10_000
     """Time limit in milliseconds of a request without X-Request-Timeout-Ms."""
     max_request_timeout_ms: Annotated[int, Field(ge=1, le=600_000)] = 60_000

@@ -55,6 +55,7 @@ async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient
     from app.settings import Settings
 
     app = create_app(Settings(store=store, **{"admin_key": ADMIN_KEY, **NAMED, **settings}))
+    app.state.runtime.metrics.max_age = 0.0
     # `python -m app` also disables the collector; the runtime enables it after the start.
     gc.disable()
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)

@@ -6,7 +6,7 @@ import asyncio
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from email.message import Message
 from functools import cache
 from itertools import islice
@@ -19,8 +19,10 @@ from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
 from app import errors
-from app.api.gateway import ADMIN_KEY, has_key, too_large
-from app.settings import Settings
+from app.api.gateway import ADMIN_KEY, has_key
+from app.serving.admission import in_thread
+from app.serving.bodies import SMALL
+from app.serving.runtime import Runtime
 from scene_client.schemas import FieldError
 from scene_client.schemas import Request as Form
 from scene_client.validation import MAX_ERRORS, PLAIN, field_errors, pointer
@@ -34,81 +36,8 @@ Validation reports each unknown member, and a report takes a hundred times the m
 So the limit on the number of members bounds the memory of the reports.
 """
 
-SMALL: Final = 64 * 1024
-"""The service always accepts a body of at most this size in bytes if it arrives in one piece.
-
-This rule lets small requests through when incomplete bodies of other clients fill the budget. The
-event loop parses small bodies itself, and leaves larger bodies to a thread.
-"""
-
-
-class Bodies:
-    """Reader of request bodies. It limits size and transfer time, and the size of all bodies.
-
-    Attributes:
-        held: total size in bytes of the bodies of all requests in progress.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self.budget = settings.held_body_bytes
-        self.patience = settings.client_timeout
-        self.held = 0
-        self._parser = ThreadPoolExecutor(1, thread_name_prefix="parsing")
-
-    async def read(self, receive: Receive, limit: int) -> bytes:
-        """Read a whole body of at most ``limit`` bytes and add its length to `held`.
-
-        After the answer, the caller must subtract the length of the body from `held`.
-
-        Raises:
-            ServiceError: the body is too large, too slow or incomplete, or the total size of the
-                bodies of all requests in progress exceeds the limit.
-        """
-        body: bytes | bytearray = b""
-        try:
-            async with asyncio.timeout(self.patience):
-                more = True
-                while more:
-                    message = await receive()
-                    if message["type"] != "http.request":
-                        detail = "The connection closed before the body was complete."
-                        raise errors.BadRequestError(detail)
-                    part, more = message.get("body", b""), message.get("more_body", False)
-                    is_whole = not (more or body)
-                    self.held += len(part)
-                    if is_whole:
-                        body = part
-                    else:
-                        body = bytearray(body) if isinstance(body, bytes) else body
-                        body += part
-                    if len(body) > limit:
-                        raise too_large(limit)
-                    if self.held > self.budget and not (is_whole and len(body) <= SMALL):
-                        detail = f"All bodies in progress exceed {self.budget} bytes together."
-                        raise errors.BodiesFullError(detail)
-        except TimeoutError:
-            self.held -= len(body)
-            detail = f"The body did not arrive within {self.patience:g} seconds."
-            raise errors.RequestTimeoutError(detail) from None
-        except BaseException:
-            self.held -= len(body)
-            raise
-        return bytes(body)
-
-    async def parse(self, body: bytes, form: type[FormT]) -> tuple[Any, FormT]:
-        """Return the JSON value of a body, and the same value as a ``form``.
-
-        Raises:
-            NotJSONError, InvalidRequestError: see `parse` and `validated`.
-        """
-
-        def read() -> tuple[Any, FormT]:
-            value = parse(body)
-            return value, validated(value, form)
-
-        if len(body) <= SMALL:
-            return read()
-        return await asyncio.get_running_loop().run_in_executor(self._parser, read)
+# A large answer is sent in parts of this size in bytes, so that a slow client delays the next part.
+_PART: Final = 64 * 1024
 
 
 def validated(value: Any, form: type[FormT], *, at: errors.Location = ()) -> FormT:
@@ -142,6 +71,16 @@ def _most_entries(form: type[Form]) -> dict[str, int]:
         for limit in field.metadata
         if hasattr(limit, "max_length")
     }
+
+
+def read(body: bytes, form: type[FormT]) -> tuple[Any, FormT]:
+    """Return the JSON value of a body, and the same value as a ``form``.
+
+    Raises:
+        NotJSONError, InvalidRequestError: see `parse` and `validated`.
+    """
+    value = parse(body)
+    return value, validated(value, form)
 
 
 def parse(body: bytes) -> Any:
@@ -261,6 +200,12 @@ def _check_media(http: Request) -> None:
         raise errors.UnsupportedMediaTypeError(detail)
 
 
+async def _send_parts(answer: bytes, send: Send) -> None:
+    for start in range(0, len(answer), _PART):
+        part, more = answer[start : start + _PART], start + _PART < len(answer)
+        await send({"type": "http.response.body", "body": part, "more_body": more})
+
+
 class JSONRoute(APIRoute):
     """A route that parses and validates the JSON body without FastAPI.
 
@@ -284,41 +229,39 @@ class JSONRoute(APIRoute):
             detail = "This route has no query parameters. Send all fields in the JSON body."
             raise errors.BadRequestError(detail)
         _check_media(http)
-        bodies: Bodies = scope["app"].state.bodies
-        body = await bodies.read(receive, self.limit(scope["app"].state.settings))
+        body: bytes = scope["state"]["body"]
+        if not body:
+            raise errors.NotJSONError("The body is empty.")
+        runtime: Runtime = scope["app"].state.runtime
+        schema: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
+        if len(body) <= SMALL:
+            value, data = read(body, schema)
+        else:
+            ticket, workers = scope["state"]["ticket"], runtime.admission.workers
+            (value, data), _ = await in_thread(lambda _: read(body, schema), ticket, workers)
         try:
-            if not body:
-                raise errors.NotJSONError("The body is empty.")
-            schema: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
-            value, data = await bodies.parse(body, schema)
-            try:
-                answer: bytes = await self.endpoint(data=data, http=http, **scope["path_params"])
-            except errors.RequestError as error:
-                error.locate(value)
-                raise
-            headers = [
-                (b"content-length", b"%d" % len(answer)),
-                (b"content-type", b"application/json"),
-            ]
-            await send({"type": "http.response.start", "status": 200, "headers": headers})
+            answer: bytes = await self.endpoint(data=data, http=http, **scope["path_params"])
+        except errors.RequestError as error:
+            error.locate(value)
+            raise
+        headers = [
+            (b"content-length", b"%d" % len(answer)),
+            (b"content-type", b"application/json"),
+        ]
+        start = {"type": "http.response.start", "status": 200, "headers": headers}
+        if len(answer) <= _PART:
+            await send(start)
             await send({"type": "http.response.body", "body": answer})
-        finally:
-            bodies.held -= len(body)
+            return
+        with runtime.bodies.hold(scope["state"]["ticket"].client, len(answer)):
+            await send(start)
+            # The server closes the connection of a client that does not read the whole answer.
+            with suppress(TimeoutError):
+                async with asyncio.timeout(runtime.bodies.patience):
+                    await _send_parts(answer, send)
 
     def check(self, http: Request) -> None:
-        """Check a request before its body is read. Subclasses may raise `ServiceError`."""
-
-    def limit(self, settings: Settings) -> int:
-        """Return the maximum size of a body in bytes."""
-        return min(settings.max_scene_bytes, settings.max_body_bytes)
-
-
-class BatchRoute(JSONRoute):
-    """A `JSONRoute` whose bodies contain many scenes."""
-
-    def limit(self, settings: Settings) -> int:
-        """Return the maximum size of a batch in bytes."""
-        return settings.max_body_bytes
+        """Check a request before its body is parsed. Subclasses may raise `ServiceError`."""
 
 
 class AdminJSONRoute(JSONRoute):

@@ -13,11 +13,14 @@ from uuid import uuid4
 from pydantic import SecretStr
 from starlette.datastructures import Headers
 from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app import errors
 from app.api.problems import answer, from_exception, report_defect
+from app.serving.admission import Ticket
+from app.serving.bodies import SMALL, too_large
 from app.serving.models import NO_MODELS
 from app.serving.request import SUCCESS, Record
 from app.serving.runtime import Runtime
@@ -54,6 +57,7 @@ _NOT_QUEUED: Final = (*HEALTH, "/metrics")
 _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
 _TIMEOUT: Final = re.compile(rb"[1-9][0-9]{0,5}")
 _HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{1,5})?")
+_WITH_BODY: Final = frozenset(("POST", "PUT", "PATCH"))
 # HTTP methods of RFC 9110 and RFC 5789. The metrics count all other methods as "-". Otherwise,
 # clients could create any number of series by inventing methods.
 _METHODS: Final = frozenset(
@@ -77,19 +81,19 @@ class Gateway:
        an attacker points the host name of a web page at this machine.
     3. Origin: pages of other origins get an answer only if the settings list the origin.
     4. Key: if the settings contain an API key, the request needs this key or the admin key.
-    5. Admission: the gateway sets the deadline of the request. Then the request waits in the
-       backlog until it may start.
+    5. Admission: the gateway sets the deadline of the request and reads its body. Then the request
+       waits for its turn, which ends when its response starts.
 
     Args:
         app: the ASGI application that answers the requests.
-        runtime: owner of the backlog, the metrics and the models.
+        runtime: owner of the lanes, the metrics and the models.
     """
 
     def __init__(self, app: ASGIApp, settings: Settings, runtime: Runtime) -> None:
         self._app = app
         self._settings = settings
         self._runtime = runtime
-        self._backlog = runtime.backlog
+        self._admission = runtime.admission
         self._metrics = runtime.metrics
         hosts = settings.accepted_hosts
         self._hosts = None if hosts is None else frozenset(name.encode("ascii") for name in hosts)
@@ -116,10 +120,12 @@ class Gateway:
         async def send_completed(message: Message) -> None:
             if message["type"] == "http.response.start":
                 record.begin(message["status"])
+                if (ticket := state.get("ticket")) is not None:
+                    ticket.leave()
                 message["headers"] = _with_defaults(message.get("headers", ()), request_id)
                 # While draining, the client's next request must go to another replica. After a
                 # request to upgrade, the parser would read its body as the next request.
-                if self._backlog.draining or upgrades:
+                if self._runtime.draining or upgrades:
                     message["headers"].append((b"connection", b"close"))
             await send(message)
 
@@ -151,23 +157,57 @@ class Gateway:
             if self._settings.api_key is not None and not self._has_access(scope):
                 detail = "This service needs its API key, or the admin key for administration."
                 raise errors.UnauthorizedError(detail)
-            timeout = size = None
-            for name, value in scope["headers"]:
-                if name == b"x-request-timeout-ms":
-                    timeout = timeout or value
-                elif name == b"content-length":
-                    size = value
-            if not scope["path"].endswith(_NOT_QUEUED):
-                if self._runtime.models is NO_MODELS:
-                    raise errors.NotReadyError("The service is starting.")
-                seconds = self._timeout if timeout is None else self._seconds(timeout)
-                deadline = scope["state"]["deadline"] = monotonic() + seconds
-                await self._backlog.enter(seconds, deadline)
-            if size is not None:
-                self._check_size(size)
-            await self._app(scope, receive, send)
+            if scope["path"].endswith(_NOT_QUEUED):
+                await self._app(scope, receive, send)
+            else:
+                await self._take_turn(scope, receive, send)
         except Exception as error:  # noqa: BLE001 - _fail() answers and logs every error
             await self._fail(error, scope, receive, send)
+
+    async def _take_turn(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Read the body of a request and wait for its turn. Then answer the request."""
+        if self._runtime.models is NO_MODELS:
+            raise errors.NotReadyError("The service is starting.")
+        timeout = size = None
+        for name, value in scope["headers"]:
+            if name == b"x-request-timeout-ms":
+                timeout = timeout or value
+            elif name == b"content-length":
+                size = value
+        seconds = self._timeout if timeout is None else self._seconds(timeout)
+        client = (scope.get("client") or ("",))[0]
+        is_gone = Request(scope, receive).is_disconnected
+        ticket = Ticket(client, monotonic() + seconds, is_gone)
+        body = b""
+        if scope["method"] in _WITH_BODY:
+            limit = self._limit(scope["path"])
+            # int() must not parse very long numbers, so the length is checked first.
+            if size and size.isdigit() and (len(size) > 18 or int(size) > limit):
+                raise too_large(limit)
+            body = await self._runtime.bodies.read(receive, client, limit)
+        scope["state"] |= {"body": body, "ticket": ticket}
+        quick, slow = self._admission.quick, self._admission.slow
+        try:
+            if len(body) > SMALL:
+                await ticket.enter(slow, 1)
+            elif quick.is_full(client, 1):
+                # A refusal takes a turn, too. Otherwise refusals of one client would take the time
+                # of all others.
+                await ticket.enter(quick, 0)
+                raise errors.QueueFullError("Too many requests of this client are waiting.")
+            else:
+                await ticket.enter(quick, 1)
+            await self._app(scope, receive, send)
+        finally:
+            ticket.leave()
+            self._runtime.bodies.release(client, len(body))
+            # The ticket refers to the scope: without this deletion, they form a reference cycle.
+            del scope["state"]["ticket"]
+
+    def _limit(self, path: str) -> int:
+        """Return the maximum size of the body of a request in bytes."""
+        most = self._settings.max_body_bytes
+        return most if path.endswith("/batch") else min(self._settings.max_scene_bytes, most)
 
     async def _fail(self, error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a failure, or close the connection if a response has started already."""
@@ -197,12 +237,6 @@ class Gateway:
             detail = f"{TIMEOUT_HEADER} must be a whole number from 1 to {longest} (milliseconds)."
             raise errors.BadRequestError(detail)
         return int(value) / 1e3
-
-    def _check_size(self, value: bytes) -> None:
-        limit = self._settings.max_body_bytes
-        # int() must not parse very long numbers, so the length is checked first.
-        if value.isdigit() and (len(value) > 18 or int(value) > limit):
-            raise too_large(limit)
 
     def _record(self, scope: Scope, record: Record, seconds: float) -> None:
         """Write the metrics and the access log of a request."""
@@ -234,11 +268,6 @@ def _with_defaults(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) ->
     if b"cache-control" not in names and b"etag" not in names:
         completed.append(_NOT_KEPT)
     return completed
-
-
-def too_large(limit: int) -> errors.BodyTooLargeError:
-    """Return the error for a body of more than ``limit`` bytes."""
-    return errors.BodyTooLargeError(f"The body must not be larger than {limit} bytes.")
 
 
 def has_key(headers: Headers, name: str, expected: SecretStr | None) -> bool:

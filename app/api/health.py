@@ -6,8 +6,6 @@ a question during the warm-up. The module also has the route of the metrics.
 
 from __future__ import annotations
 
-import asyncio
-
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse
 
@@ -110,6 +108,4 @@ async def show_metrics(runtime: RuntimeDep) -> PlainTextResponse:
 
     docs/operations.md explains each metric.
     """
-    # The formatting runs in a thread, because it takes more than 10 ms for many series.
-    text = await asyncio.to_thread(runtime.metrics.exposition)
-    return PlainTextResponse(text, media_type=CONTENT_TYPE)
+    return PlainTextResponse(await runtime.metrics.exposition(), media_type=CONTENT_TYPE)

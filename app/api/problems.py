@@ -15,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
-from app.errors import ERRORS, InternalError, NotFoundError, ServiceError
+from app.errors import ERRORS, BodiesFullError, InternalError, NotFoundError, ServiceError
 
 MEDIA_TYPE: Final = "application/problem+json"
 
@@ -30,6 +30,9 @@ def from_exception(error: Exception) -> ServiceError:
     """Return the error of the service for any exception; an unexpected one is an internal error."""
     if isinstance(error, ServiceError):
         return error
+    if isinstance(error, MemoryError):
+        _logger.error("not enough memory for a request")
+        return BodiesFullError("The service has not enough memory for this request now.")
     if isinstance(error, HTTPException) and error.status_code in _OF_STATUS:
         headers = error.headers or {}
         detail = f"This route accepts only {headers['Allow']}." if "Allow" in headers else ""

@@ -13,14 +13,13 @@ from fastapi import APIRouter
 from pydantic_core import to_json
 from starlette.requests import Request
 
-from app.api.body import BatchRoute, JSONRoute, validated
+from app.api.body import JSONRoute, validated
 from app.api.openapi import error_responses, operation_id
 from app.api.problems import from_exception, report_defect
 from app.errors import RequestError
 from app.questions import QUESTIONS, Question
 from app.questions.answer import written
 from app.serving import request as serving
-from app.serving.models import DEFAULT
 from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
@@ -34,7 +33,7 @@ router = APIRouter(
 )
 batches = APIRouter(
     tags=["batches"],
-    route_class=BatchRoute,
+    route_class=JSONRoute,
     responses=error_responses("admission", "body", "models"),
     generate_unique_id_function=operation_id,
 )
@@ -47,9 +46,9 @@ def serving_request(http: Request) -> serving.Request:
     """Create the serving request of an HTTP request. It uses one snapshot of the models."""
     state, runtime = http.scope["state"], http.scope["app"].state.runtime
     return serving.Request(
-        deadline=state["deadline"],
-        is_gone=http.is_disconnected,
         id=state["request_id"],
+        ticket=state["ticket"],
+        admission=runtime.admission,
         record=state["record"],
         models=runtime.models,
         limits=runtime.limits,
@@ -67,24 +66,23 @@ async def _answer_each(
 
     results: list[bytes] = []
     left = request.limits.answer_bytes
-    with request.for_batch([_reference(scene) for scene in batch.scenes]) as admitted:
-        for number, scene in enumerate(batch.scenes):
-            try:
-                admitted.check()
-                scene_request = admitted.with_answer_bytes(left)
-                # Only this validation may fail because of the client. Any later validation error is
-                # a defect of the service.
-                data = validated(scene, question.request, at=("scenes", number))
-                answer = written(await scene_request.answer(question, data))
-                results.append(b'{"status":200,"result":%b}' % answer)
-                count(serving.SUCCESS)
-            except Exception as error:  # noqa: BLE001 — any error fails only this scene
-                outcome, failed = _failed(error, number, scene, request.id)
-                count(outcome)
-                results.append(failed)
-            left = max(0, left - len(results[-1]))
-            # Let other tasks, such as health checks, run between two scenes.
-            await asyncio.sleep(0)
+    await request.ticket.enter(request.admission.slow, len(batch.scenes))
+    for number, scene in enumerate(batch.scenes):
+        try:
+            request.ticket.check()
+            # Only this validation may fail because of the client. Any later validation error is a
+            # defect of the service.
+            data = validated(scene, question.request, at=("scenes", number))
+            answer = written(await request.with_answer_bytes(left).answer(question, data))
+            results.append(b'{"status":200,"result":%b}' % answer)
+            count(serving.SUCCESS)
+        except Exception as error:  # noqa: BLE001 — any error fails only this scene
+            outcome, failed = _failed(error, number, scene, request.id)
+            count(outcome)
+            results.append(failed)
+        left = max(0, left - len(results[-1]))
+        # Let other tasks, such as quick requests and health checks, run between two scenes.
+        await asyncio.sleep(0)
     return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
 
 
@@ -101,12 +99,6 @@ def _failed(error: Exception, number: int, scene: Any, request_id: str) -> tuple
         report_defect(error, request_id)
     body = failure.describe(request_id).model_dump_json(exclude_none=True).encode()
     return failure.slug, b'{"status":%d,"problem":%b}' % (failure.status, body)
-
-
-def _reference(scene: Any) -> str:
-    """Return the field `model` of a scene that is not validated yet, or the default model."""
-    reference = scene.get("model", DEFAULT) if isinstance(scene, dict) else DEFAULT
-    return reference if isinstance(reference, str) else DEFAULT
 
 
 def _endpoints(question: Question[Any]) -> tuple[_Endpoint, _Endpoint]:

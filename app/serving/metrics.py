@@ -7,9 +7,11 @@ replica of the service is one process and reports its own metrics (docs/decision
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Iterable
 from functools import partial
+from time import monotonic
 from typing import Final, Literal, get_args
 
 from prometheus_client import (
@@ -22,6 +24,7 @@ from prometheus_client import (
     generate_latest,
 )
 
+from app.serving.admission import Admission
 from app.serving.models import DEFAULT, Key, ServedModels
 
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
@@ -45,11 +48,15 @@ disable_created_metrics()  # type: ignore[no-untyped-call]
 class Metrics:
     """The metrics of one application. Call the methods only on the thread of the event loop.
 
+    Args:
+        admission: lanes whose weights are metrics.
+
     Attributes:
         registry: Prometheus registry of this application. A process can have several applications.
+        max_age: maximum age in seconds of the text that `exposition` returns.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, admission: Admission) -> None:
         self.registry = CollectorRegistry()
         counter = partial(Counter, registry=self.registry)
         gauge = partial(Gauge, registry=self.registry)
@@ -85,9 +92,11 @@ class Metrics:
             "scene_serialisation_duration_seconds",
             "Seconds from the last answer of a model to the first byte of the response",
         )
-        self._pending = gauge(
-            "scene_pending_rows", "Scenes that wait for a model or are being computed", _MODEL
+        pending = gauge(
+            "scene_pending", "Weight of the requests that wait or run in each lane", ("lane",)
         )
+        for lane in ("quick", "slow", "draws"):
+            pending.labels(lane).set_function(partial(getattr, getattr(admission, lane), "weight"))
         self._info = gauge(
             "scene_model_info",
             "1 for each served model, with one series per alias",
@@ -104,6 +113,9 @@ class Metrics:
         self._ready = gauge(
             "scene_ready_time_seconds", "Unix time when the default model first answered; 0 before"
         )
+        self.max_age = 1.0
+        self._written_at = 0.0
+        self._text: asyncio.Future[bytes] | None = None
         self._infos: set[Info] = set()
         self._is_ready = False
         # The questions that each served model has answered, for the removal of its series.
@@ -123,11 +135,9 @@ class Metrics:
                 self._compute.remove(*key, question)
                 self._rows.remove(*key, question)
             self._queue.remove(*key)
-            self._pending.remove(*key)
-        for key, model in models.served.items():
+        for key in models.served:
             self._of_model.setdefault(key, set())
             self._queue.labels(*key)
-            self._pending.labels(*key).set_function(partial(getattr, model.queue, "rows"))
         infos = set(_infos(models))
         for info in self._infos - infos:
             self._info.remove(*info)
@@ -182,9 +192,15 @@ class Metrics:
         self._compute.labels(*key, question).observe(seconds)
         self._rows.labels(*key, question).observe(rows)
 
-    def exposition(self) -> bytes:
-        """Return all metrics in the text format of Prometheus."""
-        return generate_latest(self.registry)
+    async def exposition(self) -> bytes:
+        """Return all metrics in the text format of Prometheus, at most `max_age` old.
+
+        The formatting runs in a thread, because it takes more than 10 ms for many series.
+        """
+        if self._text is None or monotonic() - self._written_at >= self.max_age:
+            self._written_at = monotonic()
+            self._text = asyncio.ensure_future(asyncio.to_thread(generate_latest, self.registry))
+        return await asyncio.shield(self._text)
 
 
 def _infos(models: ServedModels) -> Iterable[Info]:

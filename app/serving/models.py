@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,7 +32,6 @@ from app.registry.model_set import EMPTY
 from app.scene.nearest import spelt_alike
 from app.scene.scene import Scene, SceneObject, observe
 from app.scene.vocabulary import Vocabulary
-from app.serving.admission import WorkQueue
 from scene_client.schemas import ContextUnit, Failure, ModelReference
 
 DEFAULT = "default"
@@ -48,11 +47,9 @@ class ServedModel:
 
     Attributes:
         artifact: weights, vocabulary and calibration of the model.
-        queue: queue of the computations of this model.
     """
 
     artifact: Artifact
-    queue: WorkQueue
 
     @cached_property
     def reference(self) -> ModelReference:
@@ -196,13 +193,10 @@ NO_MODELS: Final = ServedModels(EMPTY, MappingProxyType({}))
 """The snapshot before the service has loaded its models."""
 
 
-def prepare(
-    store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels
-) -> ServedModels:
+def prepare(store: ModelSet, previous: ServedModels) -> ServedModels:
     """Warm up every verified model. Return the models that can be served, and all failures.
 
-    If ``previous`` already serves a model from the same artifact, the function skips the warm-up of
-    this model and keeps its queue.
+    If ``previous`` already serves a model from the same artifact, the function skips its warm-up.
     """
     served: dict[Key, ServedModel] = {}
     entries = dict(store.entries)
@@ -222,7 +216,7 @@ def prepare(
                 "warm_up_failed", "the files are valid, but the model could not answer a question"
             )
         else:
-            served[key] = ServedModel(artifact, new_queue())
+            served[key] = ServedModel(artifact)
     return ServedModels(replace(store, entries=MappingProxyType(entries)), MappingProxyType(served))
 
 

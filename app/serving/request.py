@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence, Sized
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from time import perf_counter
-from typing import Any, Final, TypeVar
+from time import monotonic, perf_counter
+from typing import Final, TypeVar
 
-from app.errors import ServiceError
+from app.errors import InvalidRequestError, LocatedError
 from app.questions.answer import Fields, SizeLimit, envelope
+from app.questions.generate import STEPS
 from app.questions.names import LookUps
 from app.questions.question import Question
 from app.questions.reading import Limits, Reading, read_scene
-from app.scene.scene import Scene
-from app.serving.admission import Done, Ticket
+from app.serving.admission import MAX_DRAWS, Admission, Ticket, in_thread
 from app.serving.metrics import Metrics
 from app.serving.models import Key, ServedModel, ServedModels
 from scene_client.schemas import SceneRequest
@@ -24,13 +21,6 @@ from scene_client.schemas import SceneRequest
 RequestT = TypeVar("RequestT", bound=SceneRequest)
 
 SUCCESS: Final = "success"
-
-MANY_OBJECTS: Final = 64
-MANY_RELATIONS: Final = 256
-"""Largest scene that the event loop reads without a look at its expected time.
-
-To read such a scene takes about 1 ms: the service derives the relations from the poses.
-"""
 
 
 @dataclass(slots=True)
@@ -80,26 +70,28 @@ class Record:
 
 
 @dataclass(slots=True)
-class Request(Ticket):
+class Request:
     """One request. It uses the same snapshot of the models from beginning to end.
 
     Attributes:
         id: request id. Every answer contains it.
+        ticket: place of the request in a lane, and its deadline.
+        admission: lanes and threads of the service.
         models: snapshot of the models.
         limits: limits on the scenes and answers of the request.
         metrics: metrics of the service.
         record: values for the log and the metrics.
-        holding: whether the request has already reserved rows (scenes) in the queues of the models.
         look_ups: searches for classes similar to unknown labels, shared by all scenes of the
             request.
     """
 
-    id: str = ""
-    models: ServedModels = field(kw_only=True)
-    limits: Limits = field(kw_only=True)
-    metrics: Metrics = field(kw_only=True)
-    record: Record = field(default_factory=Record)
-    holding: bool = False
+    id: str
+    ticket: Ticket
+    admission: Admission
+    models: ServedModels
+    limits: Limits
+    metrics: Metrics
+    record: Record
     look_ups: LookUps = field(default_factory=LookUps)
 
     async def answer(self, question: Question[RequestT], scene: RequestT) -> Fields:
@@ -111,111 +103,90 @@ class Request(Ticket):
             UnknownModelError: the model does not exist.
             ModelUnavailableError: the service refused to load the model.
             RequestError: the scene is invalid, or the answer would be too large.
-            QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
+            QueueFullError, DeadlinePassedError, DisconnectedError: see `admission`.
         """
         model = self.models.resolve(scene.model)
         self.record.models.add(model.key)
-        reading = await self._read(model, scene, may_be_empty=question.samples)
-        options = question.read(scene, model.artifact, reading)
-        limit = SizeLimit(reading, self.limits.answer_bytes)
-        ask = partial(question.answer, model.artifact, reading.scene, **options, size_limit=limit)
-        rows = options["count"] if question.samples else 1
-        reserved = 0 if self.holding else rows
-        model.queue.take(reserved)
-        try:
-            if question.samples:
-                done = await model.queue.draw(lambda stop: ask(stop=stop), self)
-            else:
-                kind = _kind_of_cost(question.name, reading.scene, options)
-                # The time for relations grows with the number of pairs of objects.
-                size = (1 + len(reading.scene.objects)) ** 2
-                done = await model.queue.run(ask, self, kind=kind, size=size)
-        finally:
-            model.queue.give_back(reserved)
-        self._record(model, question.name, rows, done)
+        artifact, admission, ticket = model.artifact, self.admission, self.ticket
+
+        def read() -> tuple[Reading, partial[Fields]]:
+            reading = read_scene(
+                scene,
+                model.vocabulary,
+                self.limits,
+                self.look_ups,
+                roles=None if artifact.places is None else artifact.places.roles,
+                profiles=artifact.manifest.vocabulary.profiles,
+                may_be_empty=question.samples,
+            )
+            options = question.read(scene, artifact, reading)
+            limit = SizeLimit(reading, self.limits.answer_bytes)
+            call = partial(question.answer, artifact, reading.scene, **options, size_limit=limit)
+            return reading, call
+
+        def compute() -> tuple[Reading, Fields]:
+            reading, call = read()
+            return reading, call()
+
+        rows = 1
+        if question.samples:
+            reading, ask = read()
+            rows, weight = _weight_of_draws(ask)
+            # The models of a client take turns, too.
+            await ticket.enter(admission.draws, weight, line=(ticket.client, model.key))
+            fields, seconds = await in_thread(
+                lambda stop: ask(stop=stop), ticket, admission.drawing
+            )
+        elif is_quick(scene):
+            ticket.check()
+            began = monotonic()
+            reading, fields = compute()
+            seconds = monotonic() - began
+            ticket.check()
+        else:
+            if ticket.lane is not admission.slow:
+                await ticket.enter(admission.slow, 1)
+            answered, seconds = await in_thread(lambda _: compute(), ticket, admission.workers)
+            reading, fields = answered
+        self._record(model, question.name, rows, seconds)
         answer = envelope(scene, self.id, model.reference, reading)
-        warnings = [*reading.warnings, *done.result.pop("warnings", ())]
-        return answer | done.result | {"warnings": warnings}
+        warnings = [*reading.warnings, *fields.pop("warnings", ())]
+        return answer | fields | {"warnings": warnings}
 
-    async def _read(
-        self, model: ServedModel, scene: SceneRequest, *, may_be_empty: bool
-    ) -> Reading:
-        """Return a scene converted for a model. The queue of the model reads large scenes."""
-        arguments = scene, model.vocabulary, self.limits, self.look_ups
-        artifact = model.artifact
-        read = partial(
-            read_scene,
-            *arguments,
-            roles=None if artifact.places is None else artifact.places.roles,
-            profiles=artifact.manifest.vocabulary.profiles,
-            may_be_empty=may_be_empty,
-        )
-        relations = len(scene.relations or ())
-        if len(scene.objects) <= MANY_OBJECTS and relations <= MANY_RELATIONS:
-            return read()
-        posed = sum(
-            not isinstance(thing, str) and thing.position is not None for thing in scene.objects
-        )
-        # The time for the relations from poses grows with the number of pairs of objects.
-        size = len(scene.objects) + relations + posed**2
-        kind = f"read {posed.bit_length()}"
-        return (await model.queue.run(read, self, kind=kind, size=size)).result
-
-    def _record(self, model: ServedModel, name: str, rows: int, done: Done[Any]) -> None:
+    def _record(self, model: ServedModel, name: str, rows: int, seconds: float) -> None:
         """Record the times of a computation, for log and metrics."""
-        record = self.record
-        record.queue_seconds = (record.queue_seconds or 0.0) + done.waited
-        record.compute_seconds = (record.compute_seconds or 0.0) + done.computed
+        record, waited = self.record, self.ticket.waited
+        new = waited - (record.queue_seconds or 0.0)
+        record.queue_seconds = waited
+        record.compute_seconds = (record.compute_seconds or 0.0) + seconds
         record.answered_at = perf_counter()
-        self.metrics.computed(model.key, name, rows, done.waited, done.computed)
+        self.metrics.computed(model.key, name, rows, new, seconds)
 
     def with_answer_bytes(self, left: int) -> Request:
         """Return a copy of the request that limits the next answer to ``left`` bytes."""
         return replace(self, limits=replace(self.limits, answer_bytes=left))
 
-    @contextmanager
-    def for_batch(self, references: Sequence[str]) -> Iterator[Request]:
-        """Reserve one row for each scene of a batch in its model's queue, until the block ends.
 
-        ``references`` are the values of the field `model` of the scenes. An unusable model gets no
-        rows: the answers to its scenes contain the error, and the other scenes are answered.
-
-        Yields:
-            A copy of the request that does not reserve further rows.
-
-        Raises:
-            QueueFullError: the queue of a model is full.
-        """
-        with ExitStack() as reservations:
-            for reference, rows in Counter(references).items():
-                try:
-                    model = self.models.resolve(reference)
-                except ServiceError:
-                    continue
-                model.queue.take(rows)
-                reservations.callback(model.queue.give_back, rows)
-            yield replace(self, holding=True)
+QUICK_OBJECTS: Final = 32
+QUICK_ENTRIES: Final = 256
+"""Largest scene and lists of a question that the event loop computes: it takes about 2 ms."""
 
 
-def _kind_of_cost(name: str, scene: Scene, parameters: Mapping[str, object]) -> str:
-    """Return the kind of a question, which is the key for its expected computation time.
+def is_quick(scene: SceneRequest) -> bool:
+    """Return whether the event loop may compute a question about a scene."""
+    if len(scene.objects) > QUICK_OBJECTS or len(scene.relations or ()) > QUICK_ENTRIES:
+        return False
+    return getattr(scene, "top_k", 0) <= QUICK_ENTRIES
 
-    Questions of the same kind and with the same number of objects take a similar time. The key
-    contains the orders of magnitude of the numbers of classes, related classes and related pairs
-    in the scene, and of the question's options. A string option counts by its length.
+
+def _weight_of_draws(ask: partial[Fields]) -> tuple[int, int]:
+    """Return the number of scenes to draw, and their weight in the lane `draws`.
+
+    Raises:
+        InvalidRequestError: the request draws too much.
     """
-    classes = [thing.class_index for thing in scene.objects]
-    orders = [len(set(classes)).bit_length(), 0, 0]
-    if scene.relations:
-        pairs = {(classes[subject], classes[object_]) for _, subject, object_ in scene.relations}
-        related_classes = {index for pair in pairs for index in pair}
-        orders[1:] = len(related_classes).bit_length(), len(pairs).bit_length()
-    for value in parameters.values():
-        if isinstance(value, int) and not isinstance(value, bool):
-            value = value.bit_length()
-        elif isinstance(value, float):
-            value = round(value, 2)
-        elif isinstance(value, Sized):
-            value = len(value).bit_length()
-        orders.append(value)  # type: ignore[arg-type]
-    return f"{name} {orders}"
+    count, steps = ask.keywords["count"], ask.keywords["steps"] or STEPS
+    if count * steps > MAX_DRAWS:
+        message = f"`count` x `steps` must be at most {MAX_DRAWS}, not {count * steps}"
+        raise InvalidRequestError([LocatedError(("steps",), message)])
+    return count, count * steps

@@ -9,7 +9,6 @@ import logging
 import sys
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
-from functools import partial
 from typing import Literal
 
 from app import errors
@@ -17,7 +16,8 @@ from app.compiling import check_cache, progress
 from app.inference.kernels import KERNELS
 from app.questions.reading import Limits
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
-from app.serving.admission import Backlog, Threads, WorkQueue
+from app.serving.admission import Admission
+from app.serving.bodies import Bodies
 from app.serving.metrics import Change, Metrics
 from app.serving.models import DEFAULT, NO_MODELS, Key, ServedModels, prepare
 from app.settings import Settings
@@ -37,32 +37,29 @@ class Runtime:
     """The runtime of the service. It contains the current snapshot of the models.
 
     Attributes:
-        backlog: queue of requests that wait for admission.
+        admission: lanes of requests, and worker threads.
+        bodies: bodies of the requests and answers in progress.
+        draining: whether the service is shutting down.
         limits: limits on scenes and answers.
         metrics: metrics of the service.
         models: current snapshot of the models; `NO_MODELS` before the start.
     """
 
     def __init__(self, settings: Settings) -> None:
-        self.metrics = Metrics()
-        self.backlog = Backlog(settings.queue_requests)
+        self.admission = Admission(settings.queue_requests, settings.queue_rows)
+        self.bodies = Bodies(settings)
+        self.draining = False
+        self.metrics = Metrics(self.admission)
         limit = settings.max_weights_bytes
         self._store = Store(settings.store, lock_timeout=_LOCK_TIMEOUT, max_weights_bytes=limit)
         self.limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
-        self._threads = Threads()
-        self._new_queue = partial(WorkQueue, settings.queue_rows, self._threads, self.backlog)
         self._poll = settings.store_poll
         self._polling: asyncio.Task[None] | None = None
         self._changing = asyncio.Lock()
         self.models = NO_MODELS
         self._loaded_state: StoreState | None = None
-
-    @property
-    def draining(self) -> bool:
-        """Whether the service is shutting down."""
-        return self.backlog.draining
 
     def check_ready(self) -> None:
         """Check that the service accepts requests and that its default model is usable.
@@ -77,7 +74,7 @@ class Runtime:
 
     def drain(self) -> None:
         """Answer readiness checks with 503, and close connections after answers."""
-        self.backlog.draining = True
+        self.draining = True
 
     async def start(self) -> None:
         """Load, verify and warm up all versions in the store.
@@ -99,7 +96,7 @@ class Runtime:
         """Stop the worker threads and drop the computations that have not started."""
         if self._polling is not None:
             self._polling.cancel()
-        self._threads.stop()
+        self.admission.stop()
 
     async def refresh(self, request_id: str) -> RefreshAnswer:
         """Load the current state of the store and serve it, or keep the served models.
@@ -219,7 +216,7 @@ class Runtime:
         self._loaded_state = self._store.state()
         models = self.models
         with progress(KERNELS):
-            return prepare(load_model_set(self._store, models.store), self._new_queue, models)
+            return prepare(load_model_set(self._store, models.store), models)
 
     def _target(self, reference: str) -> AliasTarget:
         try:

@@ -163,7 +163,7 @@ def environment(scratch: str, token: str) -> dict[str, str]:
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "deploy.ray.middleware.middlewares",
         "RAY_SERVE_HAPROXY_NBTHREAD": "1",
         # A question may be asked twice. So HAProxy repeats it if a replica ends without an answer.
-        "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
+        "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure",
         "RAY_SERVE_HAPROXY_OBSERVE_ERROR_LIMIT": "1",
         # The service's own metrics contain the requests.
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",

@@ -16,58 +16,30 @@ from pydantic import ValidationError
 
 from app.settings import Settings
 from tests.http.stores import VOCABULARY
-from tests.services import Hold, launch, serve
+from tests.http.test_problems import problem
+from tests.services import Hold, Replace, launch, serve
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 DEEP = {"objects": LABELS[:4], "model": "deep"}
 HOME = {"objects": LABELS[:4]}
 
 
-def related(objects: int) -> dict[str, Any]:
-    """A scene in which every two objects are related."""
-    names = LABELS[:objects]
-    relations = [
-        {"subject": one, "relation": "left", "object": other}
-        for place, one in enumerate(names)
-        for other in names[:place]
-    ]
-    return {"objects": names, "relations": relations, "model": "deep"}
-
-
-@pytest.mark.parametrize("cheap", [DEEP, {**DEEP, "objects": [LABELS[0]] * 14}])
-async def test_health_answers_beside_a_first_question(
-    shared_store: Path, hold: Hold, cheap: dict[str, Any]
+async def test_quick_questions_pass_large_scenes_and_batches(
+    shared_store: Path, hold: Hold
 ) -> None:
-    """Neither a cheap question of the same size nor many of them make it look cheap."""
-    async with serve(shared_store) as client:
-        for _ in range(20):
-            assert (await client.post("/outliers", json=cheap)).is_success
-        release = hold("outliers").release
-        costly = asyncio.ensure_future(client.post("/outliers", json=related(14)))
-        began = time.monotonic()
-        while not costly.done() and time.monotonic() - began < 0.5:
-            asked = time.monotonic()
-            assert (await client.get("/health/live")).is_success
-            assert time.monotonic() - asked < 0.4
-            await asyncio.sleep(0.01)
-        assert not costly.done()
-        release.set()
-        assert (await costly).is_success
-
-
-async def test_no_model_waits_for_another(shared_store: Path, hold: Hold) -> None:
     async with serve(shared_store) as client:
         release = hold("outliers").release
-        batch = {"scenes": [related(count) for count in (3, 6, 9, 14)]}
+        large = {"objects": [LABELS[0]] * 33, "model": "deep"}
         costly = [
-            asyncio.ensure_future(client.post("/outliers/batch", json=batch)) for _ in range(8)
+            *(asyncio.ensure_future(client.post("/outliers", json=large)) for _ in range(4)),
+            asyncio.ensure_future(client.post("/outliers/batch", json={"scenes": [large] * 4})),
         ]
         await asyncio.sleep(0.1)
         for size in range(1, 14):
-            # Unmeasured: all of these need a thread.
             body = {"objects": LABELS[:size]}
             assert (await client.post("/missing", json=body)).is_success
             assert (await client.post("/relations", json=body)).is_success
+            assert (await client.get("/health/live")).is_success
         assert not any(job.done() for job in costly)
         release.set()
         assert all(answer.is_success for answer in await asyncio.gather(*costly))
@@ -81,7 +53,7 @@ def test_the_longest_deadline_is_no_shorter_than_the_default(shared_store: Path)
 @pytest.mark.slow
 def test_work_of_a_departed_client_ends(shared_store: Path, tmp_path: Path) -> None:
     with launch(shared_store, tmp_path / "log") as service:
-        body = {**DEEP, "count": 64, "steps": 2000}
+        body = {**DEEP, "count": 64, "steps": 500}
 
         def ask(patience: float) -> None:
             with suppress(httpx.TimeoutException):
@@ -106,3 +78,16 @@ def used(pid: int) -> float:
     """Processor seconds that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+async def test_a_request_without_enough_memory_gets_503(
+    shared_store: Path, replace: Replace, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: Any, **__: Any) -> Any:
+        raise MemoryError
+
+    async with serve(shared_store) as client:
+        replace("outliers", fail)
+        problem(await client.post("/outliers", json=HOME), 503, "bodies-full")
+        assert "not enough memory" in caplog.text
+        assert (await client.post("/missing", json=HOME)).is_success

@@ -261,7 +261,7 @@ async def test_a_request_keeps_the_models_it_started_with(
 ) -> None:
     async with serve(store) as client:
         held = hold("missing", lambda manifest: manifest.version == "1.0.0")
-        batch = {"scenes": [{"objects": ["bed"]}] * 3}
+        batch = {"scenes": [{"objects": ["bed"] * 33}] * 3}  # so many are not for the event loop
         asking = asyncio.create_task(client.post("/missing/batch", json=batch))
         assert await asyncio.to_thread(held.started.wait, 30)
         publish(store, "home", "2.0.0", seed=2, alias="default")

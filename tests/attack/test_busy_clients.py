@@ -1,0 +1,143 @@
+"""One client that asks as fast as it can: others are served, and health answers in time."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import resource
+import socket
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.http.stores import VOCABULARY, make_store
+from tests.services import LiveService, launch, live_service, wait_until
+
+pytestmark = [pytest.mark.system, pytest.mark.slow]
+
+LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
+SCENE = {"objects": LABELS[:8]}
+SECONDS = 3.0
+HEALTH = b"GET /health/live HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+
+service = live_service()
+
+
+def request(path: str, body: Any) -> bytes:
+    content = body if isinstance(body, bytes) else json.dumps(body).encode()
+    head = f"POST /{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
+    return b"%bContent-Length: %d\r\n\r\n%b" % (head.encode(), len(content), content)
+
+
+SINGLE = request("missing", SCENE)
+BATCHES = [request("missing/batch", {"scenes": [{"objects": LABELS[:3]}] * 256})]
+DRAWS = [request("generate", {**SCENE, "count": 16, "steps": 2000})]
+GARBAGE = [
+    request("missing", b'{"objects":[' + b"{}," * 60_000 + b"{}]}"),
+    request("missing", b'{"objects":["bed",'),
+    request("missing", {"objects": [f"nonsuch {k}" for k in range(256)]}),
+    request("relations", {"objects": ["bed"], "relations": [["a", "left", "b"]] * 4096}),
+    request("nowhere", {"a": 1}),
+    b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    b"GET /models/default/contexts HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+]
+
+
+async def ask(
+    port: int, address: str, requests: Iterator[bytes], until: float, pause: float
+) -> Any:
+    """Send requests over one connection. Return the statuses and the seconds of each request."""
+    statuses, seconds = Counter[int](), list[float]()
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(address, 0))
+    while time.monotonic() < until:
+        began = time.monotonic()
+        writer.write(next(requests))
+        head = (await reader.readuntil(b"\r\n\r\n")).lower()
+        length = head.partition(b"content-length:")[2].split(b"\r", 1)[0]
+        await reader.readexactly(int(length))
+        statuses[int(head[9:12])] += 1
+        seconds.append(time.monotonic() - began)
+        await asyncio.sleep(pause)
+    writer.close()
+    return statuses, seconds
+
+
+async def measure(port: int, hostile: list[bytes], attackers: int) -> Any:
+    """Return statuses of 64 connections, of the attacker, and the seconds of health checks."""
+    until = time.monotonic() + SECONDS
+    others = [ask(port, "127.0.0.1", cycle([SINGLE]), until, 0) for _ in range(64)]
+    attack = [ask(port, "127.0.0.2", cycle(hostile), until, 0) for _ in range(attackers)]
+    health = ask(port, "127.0.0.3", cycle([HEALTH]), until, 0.02)
+    (_, seconds), *answers = await asyncio.gather(health, *others, *attack)
+    statuses = [sum((one[0] for one in part), Counter()) for part in (answers[:64], answers[64:])]
+    return *statuses, sorted(seconds)
+
+
+@pytest.mark.parametrize("hostile", [BATCHES, DRAWS, GARBAGE, BATCHES + DRAWS + GARBAGE])
+async def test_others_keep_half_of_their_rate(service: LiveService, hostile: list[bytes]) -> None:
+    alone, _, usual = await measure(service.port, [], 0)
+    beside, attacker, delays = await measure(service.port, hostile, 24)
+    assert set(alone) == set(beside) == {200}  # nobody is refused for the attacker's sake
+    assert not {500, 502} & set(attacker)
+    # Half of the rate is the fair share beside one other client. The margin is for a busy machine.
+    assert beside[200] > 0.4 * alone[200]
+    median = len(delays) // 2
+    assert delays[median] < usual[median] + 0.05
+
+
+def test_memory_stays_bounded_when_answers_are_not_read(service: LiveService) -> None:
+    """Twenty clients ask for the largest batch, and read a byte a second of the answer."""
+    before, answers = service.memory, service.control()
+    batch = request("relations/batch", {"scenes": [{**SCENE, "top_k": 256}] * 256})
+    with ExitStack() as held:
+        for _ in range(20):
+            connection = held.enter_context(socket.socket())
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            connection.connect(("127.0.0.1", service.port))
+            connection.sendall(batch)
+        for _ in range(5):
+            time.sleep(1)
+            assert service.memory - before < 100 * 2**20
+            assert service.control() == answers
+    wait_until(lambda: service.memory - before < 50 * 2**20)
+
+
+def silent(count: int, port: int) -> ExitStack:
+    """Open connections that send nothing."""
+    held = ExitStack()
+    for _ in range(count):
+        held.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
+    return held
+
+
+def test_silent_connections_do_not_keep_health_checks_out(tmp_path: Path) -> None:
+    store = make_store(tmp_path / "store")
+    with (
+        launch(store, tmp_path / "log", SCENE_MAX_CONNECTIONS="64") as service,
+        silent(80, service.port),
+    ):
+        before = service.descriptors
+        for _ in range(20):
+            assert service.client.get("/health/live").status_code == 200
+        # After ten seconds without a request, the service closes them.
+        wait_until(lambda: service.descriptors < before - 50)
+
+
+def test_few_files_limit_the_connections(tmp_path: Path) -> None:
+    """300 connections at `ulimit -n 256`: the service accepts what it has files for."""
+    store, (soft, hard) = make_store(tmp_path / "store"), resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    try:
+        service = launch(store, tmp_path / "log")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    with service, silent(300, service.port):
+        for _ in range(20):
+            assert service.client.get("/health/live").status_code == 200
+        assert "accepts 192 connections" in service.log.read_text()
