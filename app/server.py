@@ -28,7 +28,10 @@ from app.settings import Settings
 KEEP_ALIVE: Final = 20
 # The server closes a connection that sends no request in this time in seconds.
 SILENT: Final = 10
-# Number of file descriptors that are not for connections: files of models, logs, event loop.
+# uvicorn refuses requests above its limit of connections. So this limit leaves room for connections
+# that the service is closing in the same iteration of the event loop.
+_CLOSING: Final = 32
+# Number of file descriptors for other purposes: closing connections, models, logs, event loop.
 _OTHER_FILES: Final = 64
 
 _logger = logging.getLogger("app.server")
@@ -54,7 +57,7 @@ class Connection(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Make room for the connection."""
         super().connection_made(transport)
-        if self.limit_concurrency and len(self.connections) >= self.limit_concurrency:
+        if len(self.connections) > (self.limit_concurrency or 0) - _CLOSING:
             for connection in Connection.idle:
                 connection.close()
                 break
@@ -204,8 +207,7 @@ def build(settings: Settings, began: float) -> Server:
         root_path=settings.root_path,
         http=Connection,
         ws="none",
-        # uvicorn refuses requests at this number, so a new connection first closes an idle one.
-        limit_concurrency=_most_connections(settings.max_connections) + 1,
+        limit_concurrency=_most_connections(settings.max_connections) + _CLOSING,
         timeout_keep_alive=KEEP_ALIVE,
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
         access_log=False,
