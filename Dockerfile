@@ -3,7 +3,8 @@
 #   docker build -t scene-boltzmann-ray --target ray .
 #   docker build -t scene-boltzmann-train --target train .
 
-FROM python:3.11-slim-bookworm AS base
+# The digest names the images of all architectures. `docker buildx imagetools inspect` gives a newer one.
+FROM python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b AS base
 ENV PYTHONUNBUFFERED=1 \
     PYTHONDONTWRITEBYTECODE=1 \
     PATH=/opt/venv/bin:$PATH
@@ -14,15 +15,17 @@ FROM base AS packages
 COPY requirements.lock ./
 RUN python -m venv /opt/venv \
     && /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
-        -r requirements.lock
+        --require-hashes -r requirements.lock
 
 # ---- packages of training, on top
 FROM packages AS training-packages
 # The index for CPU builds of torch; without it the default index may bring a CUDA build.
 ARG TORCH_INDEX_URL=""
-COPY requirements-training.lock ./
+COPY requirements-training.lock requirements-torch.lock ./
 RUN /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
-        ${TORCH_INDEX_URL:+--extra-index-url "$TORCH_INDEX_URL"} -r requirements-training.lock
+        --require-hashes -r requirements-training.lock \
+    && /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
+        ${TORCH_INDEX_URL:+--no-deps --index-url "$TORCH_INDEX_URL"} -r requirements-torch.lock
 
 # ---- training: docker run ... train --help
 FROM base AS train
@@ -42,7 +45,7 @@ CMD ["--help"]
 FROM packages AS ray-packages
 COPY requirements-ray.lock ./
 RUN /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
-        -r requirements-ray.lock
+        --require-hashes -r requirements-ray.lock
 
 FROM base AS ray
 COPY --from=ray-packages /opt/venv /opt/venv

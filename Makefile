@@ -2,7 +2,8 @@
 
 PORT ?= $(or $(SCENE_PORT),8000)
 PYTHON ?= python3
-# Package index with CPU builds of torch. On Linux the default index has CUDA builds. See README.md.
+# Package index for torch alone, with CPU builds. On Linux the default index has CUDA builds, which need
+# further packages. See README.md.
 TORCH_INDEX_URL ?=
 # Further arguments of pytest, image, audit, bench or lock, such as make test ARGS="-k geometry".
 ARGS ?=
@@ -17,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # One worker more than cores, because the tests spend a third of their time waiting.
 WORKERS ?= $$(($$($(BIN)/python -c 'import os; print(os.cpu_count())') + 1))
 PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadscope --no-loadscope-reorder
-INDEX := $(if $(TORCH_INDEX_URL),--extra-index-url $(TORCH_INDEX_URL))
+INDEX := $(if $(TORCH_INDEX_URL),--no-deps --index-url $(TORCH_INDEX_URL))
 
 # A stamp file marks an environment with the packages of its lock file. A newer lock file or
 # pyproject.toml makes the stamp out of date. Both lock files have the same versions, so they share
@@ -25,6 +26,13 @@ INDEX := $(if $(TORCH_INDEX_URL),--extra-index-url $(TORCH_INDEX_URL))
 SERVICE := $(VENV)/.installed-service
 EVERYTHING := $(VENV)/.installed-everything
 RAY := $(RAY_VENV)/.installed
+
+# Lock the packages of some extras with the hashes of all their files. torch has a file of its own.
+define compile
+	$(BIN)/python -m piptools compile --quiet --generate-hashes --strip-extras --no-annotate --no-header \
+		--no-emit-index-url --no-emit-find-links --unsafe-package torch $(3) \
+		$(addprefix --extra ,$(2)) --output-file $(1) $(ARGS) pyproject.toml clients/python/pyproject.toml
+endef
 
 .DEFAULT_GOAL := help
 .PHONY: checks help run ray test test-fast test-slow docs chaos soak image audit setup format bench lock clean
@@ -89,8 +97,11 @@ bench: $(EVERYTHING)  ## run the benchmarks, then load tests of the service, a p
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.load)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.dds)
 
-lock: $(BIN)/python  ## resolve the dependencies of pyproject.toml into requirements*.lock
-	$(BIN)/python scripts/lock.py $(INDEX) $(ARGS)
+lock: $(EVERYTHING)  ## resolve the dependencies of pyproject.toml into requirements*.lock (minutes)
+	$(call compile,requirements-dev.lock,service training telemetry docs dev)
+	$(call compile,requirements-training.lock,service training,--constraint requirements-dev.lock)
+	$(call compile,requirements-ray.lock,service ray,--constraint requirements-dev.lock)
+	$(call compile,requirements.lock,service,--constraint requirements-dev.lock)
 
 clean:  ## remove the environment and all caches
 	rm -rf $(VENV) $(RAY_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .numba_cache
@@ -98,23 +109,25 @@ clean:  ## remove the environment and all caches
 
 $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing the service's packages into $(VENV) ..."
-	@$(PIP) install -r requirements.lock
+	@$(PIP) install --require-hashes -r requirements.lock
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@echo "Installed. Compiling kernels for this machine ..."
 	@$(BIN)/python -m app.compile
 	@echo "Compiled."
 	@touch $@
 
-$(EVERYTHING): requirements-dev.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
+$(EVERYTHING): requirements-dev.lock requirements-torch.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing every package into $(VENV) ..."
-	@$(PIP) install $(INDEX) -r requirements-dev.lock
+	@$(PIP) install --require-hashes -r requirements-dev.lock
+	@$(PIP) install $(INDEX) -r requirements-torch.lock
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@echo "Installed."
 	@touch $(SERVICE) $@
 
 $(RAY): requirements-ray.lock pyproject.toml clients/python/pyproject.toml | $(RAY_VENV)/bin/python
 	@echo "Installing the service and Ray into $(RAY_VENV) ..."
-	@$(RAY_VENV)/bin/python -m pip --disable-pip-version-check install -qq -r requirements-ray.lock
+	@$(RAY_VENV)/bin/python -m pip --disable-pip-version-check install -qq --require-hashes \
+		-r requirements-ray.lock
 	@$(RAY_VENV)/bin/python -m pip --disable-pip-version-check install -qq --no-deps --editable clients/python --editable .
 	@echo "Installed. Compiling kernels for this machine ..."
 	@$(RAY_VENV)/bin/python -m app.compile

@@ -82,7 +82,7 @@ def test_the_manifest_confines_pods_and_asks_for_a_token(
     spec = cluster["rayClusterConfig"]
     assert spec["authOptions"] == {"mode": "token"}
     lock = (repository / "requirements-ray.lock").read_text("utf-8")
-    assert f"ray=={spec['rayVersion']}" in lock.splitlines()
+    assert f"ray=={spec['rayVersion']} \\" in lock.splitlines()
     most = config["applications"][0]["deployments"][0]["autoscaling_config"]["max_replicas"]
     assert spec["workerGroupSpecs"][0]["maxReplicas"] == most
     for pod in pods(cluster):

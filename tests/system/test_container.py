@@ -168,23 +168,34 @@ def test_the_store_is_one_volume_where_the_image_keeps_its_models(
         assert f"models:{store}" in service["volumes"]
 
 
+def pins(repository: Path, lock: str) -> set[str]:
+    text = (repository / f"requirements{lock}.lock").read_text("utf-8")
+    return {line for line in text.splitlines() if "==" in line and not line.startswith("#")}
+
+
 @pytest.mark.parametrize("lock", ["", "-ray", "-training", "-dev"])
-def test_locks_pin_every_package_and_name_no_build_or_index(repository: Path, lock: str) -> None:
-    lines = (repository / f"requirements{lock}.lock").read_text("utf-8").splitlines()
-    pins = [line for line in lines if not line.startswith("#")]
-    assert ("torch==2.13.0" in pins) == (lock in {"-training", "-dev"})
-    for pin in pins:
-        assert re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.]*(; .+)?", pin), pin
+def test_locks_pin_every_package_by_hash_and_name_no_index(repository: Path, lock: str) -> None:
+    """`pip install --require-hashes` refuses a package without a hash."""
+    text = (repository / f"requirements{lock}.lock").read_text("utf-8").replace("\\\n", "")
+    for line in text.splitlines()[1:]:
+        pin = r"[a-z0-9-]+==[0-9][0-9a-z.]*( ; .+?)?"
+        assert re.fullmatch(rf"{pin}(\s+--hash=sha256:[0-9a-f]{{64}})+\s*", line), line
+    assert not any(pin.startswith("torch==") for pin in pins(repository, lock))
+
+
+def test_only_torch_may_come_from_another_index(repository: Path) -> None:
+    assert pins(repository, "-torch") == {"torch==2.13.0"}
+    for file in ("Makefile", "Dockerfile"):
+        text = (repository / file).read_text("utf-8").replace("\\\n", " ")
+        assert "--extra-index-url" not in text
+        for line in text.splitlines():
+            if "install" in line and "--index-url" in line:
+                assert "--no-deps" in line
 
 
 def test_smaller_locks_are_subsets_of_the_larger(repository: Path) -> None:
     service, ray, training, development = (
-        {
-            line
-            for line in (repository / f"requirements{which}.lock").read_text("utf-8").splitlines()
-            if not line.startswith("#")
-        }
-        for which in ("", "-ray", "-training", "-dev")
+        pins(repository, lock) for lock in ("", "-ray", "-training", "-dev")
     )
     assert service < training < development
     assert service < ray
