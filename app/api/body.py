@@ -178,23 +178,27 @@ _DECODER: Final = json.JSONDecoder(object_pairs_hook=_members)
 _LENIENT: Final = json.JSONDecoder(object_pairs_hook=_members, parse_constant=_Constant)
 
 
-def _check_media(http: Request) -> None:
+def _check_media(scope: Scope) -> None:
     """Check that the headers declare plain JSON in UTF-8.
 
     Raises:
         UnsupportedMediaTypeError: the headers declare something else.
     """
-    headers = http.headers
-    content_type, detail = headers.get("content-type", ""), ""
-    if content_type != "application/json":
+    content_type, detail, codings = b"", "", list[bytes]()
+    for name, value in scope["headers"]:
+        if name == b"content-type":
+            content_type = content_type or value
+        elif name == b"content-encoding":
+            codings.append(value)
+    if content_type != b"application/json":
         message = Message()
-        message["content-type"] = content_type
+        message["content-type"] = content_type.decode("latin-1")
         kind, subtype = message.get_content_maintype(), message.get_content_subtype()
         if kind != "application" or not (subtype == "json" or subtype.endswith("+json")):
             detail = "The header Content-Type must be application/json."
         elif message.get_content_charset("utf-8") not in {"utf-8", "utf8"}:
             detail = "The charset in the header Content-Type must be utf-8."
-    if any(coding.lower() != "identity" for coding in headers.getlist("content-encoding")):
+    if any(coding.lower() != b"identity" for coding in codings):
         detail = "The body must not be compressed: leave the header Content-Encoding out."
     if detail:
         raise errors.UnsupportedMediaTypeError(detail)
@@ -228,7 +232,7 @@ class JSONRoute(APIRoute):
         if scope["query_string"]:
             detail = "This route has no query parameters. Send all fields in the JSON body."
             raise errors.BadRequestError(detail)
-        _check_media(http)
+        _check_media(scope)
         body: bytes = scope["state"]["body"]
         if not body:
             raise errors.NotJSONError("The body is empty.")

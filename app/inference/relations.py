@@ -175,7 +175,7 @@ class RelationUnits(ABC):
         self, x: Floats, n: int, observed: ObservedRelations | None
     ) -> tuple[Floats, Floats]:
         """Return `shift` and `apart` of `Between` for n classes; x (H1,) are the logits of h1."""
-        weight = self.implication_weights(x)
+        weight = NO_VALUES if observed is None else self.implication_weights(x)
         if observed is None or not len(weight):
             return NO_VALUES, NO_VALUES
         on = (observed.r > 0) & (observed.i != observed.j)
