@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from scene_client.schemas import (
     GenerateAnswer,
+    GeneratedRelation,
     GeneratedScene,
     ModelReference,
-    Relation,
     RelationName,
 )
 
@@ -28,10 +28,9 @@ NAMES = ["bed", "desk", "lamp", "book", "a rather long name", "x", "chair", "mug
 RELATIONS = get_args(RelationName)
 
 
-def stated(*relations: tuple[str, str, str]) -> list[Relation]:
-    return [
-        Relation.model_validate({"subject": a, "relation": r, "object": b}) for a, r, b in relations
-    ]
+def stated(*relations: tuple[str, str, str]) -> list[GeneratedRelation]:
+    names = ("subject", "relation", "object")
+    return [GeneratedRelation(**dict(zip(names, each, strict=True))) for each in relations]
 
 
 def boxes(objects: list[str], *relations: tuple[str, str, str]) -> dict[str, Box]:

@@ -57,13 +57,17 @@ class GenerateRequest(SceneRequest):
     """states that hidden units keep: maps the name of each layer to pairs [unit, state]"""
 
 
+class GeneratedRelation(Relation):
+    """A relation of a sampled scene. `subject` and `object` are labels."""
+
+
 class GeneratedScene(Reply):
     """A sampled scene: labels, relations between the labels, and the states of hidden units."""
 
     room_type: str | None = None
     """room type of the scene; absent if it has none"""
     objects: list[str]
-    relations: list[Relation]
+    relations: list[GeneratedRelation]
     log_score: Finite
     context: dict[str, list[tuple[int, int]]]
     """states of the hidden units: maps the name of each layer to pairs [unit, state]. Units in
