@@ -228,3 +228,13 @@ def test_one_client_serves_many_threads(peer: Any) -> None:
             thread.join()
     assert found == [True] * 80
     assert started.connections <= 8
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("key", ["secret-key\n", "sécret-key"])
+def test_the_cpp_client_refuses_keys_that_no_header_can_carry(bridge: Path, key: str) -> None:
+    command = [bridge, "http://127.0.0.1:1", "1", "0", key]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert "InvalidRequestError" in done.stderr
+    assert "the API key must be ASCII, without spaces or line breaks" in done.stderr
+    assert "cret" not in done.stderr
