@@ -75,13 +75,13 @@ def integer(field: Any) -> int | None:
     return int(value) if value is not None and value.is_integer() else None
 
 
-def numbers(message: Any, names: str) -> tuple[float, ...] | None:
-    """Return the numbers in the fields with one-letter names, for example "xyz".
+def numbers(message: Any, names: str) -> dict[str, float] | None:
+    """Return the numbers in the fields with one-letter names, for example "xyz", by name.
 
     The result is None if one of the numbers is missing or not finite.
     """
-    values = [number(take(message, name)) for name in names]
-    return None if None in values else tuple(value for value in values if value is not None)
+    values = {name: value for name in names if (value := number(take(message, name))) is not None}
+    return values if len(values) == len(names) else None
 
 
 def text(field: Any) -> str:
