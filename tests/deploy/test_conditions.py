@@ -29,10 +29,9 @@ def program(
     """Ticks one condition as a tree does."""
     here = Path(__file__).parent
     return callers.compiled(
+        require_system_tool,
         here / "conditions.cpp",
         tmp_path_factory.mktemp("conditions") / "conditions",
-        require_system_tool("g++"),
-        require_system_tool("pkg-config"),
         repository / "clients" / "ros2" / "behaviortree_cpp",
         here,
     )
@@ -124,15 +123,13 @@ def test_a_thing_in_the_wrong_place_does_not_belong(
         read_head(connection)
         answer(connection, json.dumps(told).encode())
 
-    peer = Peer(tells)
     ports = [{"scene": '{"objects": ["bed"]}', "object": name} for name in ("pillow_1", "pillow")]
-    try:
-        (by_id,) = tick(program, peer.url, "ObjectBelongs", ports[0])
-        (by_label,) = tick(program, peer.url, "ObjectBelongs", ports[1])
-    finally:
-        peer.close()
-    assert (by_id["status"], by_id["because"]) == (status, because)
-    assert (by_label["status"], by_label["because"]) == (status, because)
+    with Peer(tells) as peer:
+        results = [tick(program, peer.url, "ObjectBelongs", entry) for entry in ports]
+    assert [(result["status"], result["because"]) for (result,) in results] == [
+        (status, because),
+        (status, because),
+    ]
 
 
 @pytest.mark.parametrize(
