@@ -57,6 +57,22 @@ def read_head(connection: socket.socket) -> bytes:
     return head
 
 
+def answering(*arguments: bytes) -> Callable[[socket.socket], None]:
+    """Return a function that answers one request; see `answer`."""
+
+    def behave(connection: socket.socket) -> None:
+        read_head(connection)
+        answer(connection, *arguments)
+
+    return behave
+
+
+def say_nothing(connection: socket.socket) -> None:
+    """Read a request, and wait until the client closes the connection."""
+    read_head(connection)
+    connection.recv(1)
+
+
 def answer(
     connection: socket.socket,
     body: bytes = READY,

@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 from scene_client import Client, __version__, tables
 from scene_client.command import app
 from scene_client.schemas import GenerateAnswer, MissingAnswer, OutliersAnswer, RelationsAnswer
-from tests.client.peers import answer, read_head
+from tests.client.peers import answer, answering, read_head, say_nothing
 from tests.conftest import run_program
 
 ANSWERED: dict[str, Any] = {
@@ -312,31 +312,24 @@ def test_the_exit_status_and_the_reason_of_a_failure(
 def test_exit_status_of_a_busy_and_of_a_defective_service(
     scene: Any, peer: Any, status: bytes, body: bytes, code: int
 ) -> None:
-    started = peer(
-        lambda connection: (read_head(connection), answer(connection, body, status, b"60"))
-    )
-    done = scene("models", "--url", started.url)
+    done = scene("models", "--url", peer(answering(body, status, b"60")).url)
     assert (done.exit_code, done.stdout) == (code, "")
 
 
 def test_markup_in_an_answer_is_text(scene: Any, peer: Any) -> None:
     entry = {"object": "[red]x[/red]", "label": ":bed:", "probability": 0.1, "log_odds": 0.0}
     body = ANSWERED | {"outliers": [entry | {"is_outlier": False}], "misplaced": []}
-    started = peer(lambda stream: (read_head(stream), answer(stream, json.dumps(body).encode())))
-    done = scene("outliers", "bed", "--url", started.url)
+    done = scene("outliers", "bed", "--url", peer(answering(json.dumps(body).encode())).url)
     assert done.stdout.splitlines()[3].split() == ["[red]x[/red]", ":bed:", "0.100", "+0.00"]
 
 
 def test_exit_status_of_ready(scene: Any, peer: Any) -> None:
     assert scene("ready").exit_code == 0
     assert scene("ready", "--url", "http://127.0.0.1:9").exit_code == 3
-    silent = peer(lambda connection: (read_head(connection), connection.recv(1)))
-    assert scene("ready", "--url", silent.url, "--timeout", "0.1").exit_code == 4
-    starting = peer(
-        lambda connection: (read_head(connection), answer(connection, b"{}", b"503 No"))
-    )
+    assert scene("ready", "--url", peer(say_nothing).url, "--timeout", "0.1").exit_code == 4
+    starting = peer(answering(b"{}", b"503 No"))
     assert scene("ready", "--url", starting.url).exit_code == 5
-    # Asked once: whoever waits for a service asks in a loop of their own.
+    # The command does not retry: a script that waits for a service asks in a loop.
     assert starting.connections == 1
 
 

@@ -13,7 +13,7 @@ import pytest
 from scene_client import Client
 from scene_client.vision_msgs import SceneFields
 from tests.client import callers
-from tests.client.peers import Peer, answer, read_head
+from tests.client.peers import Peer, answering
 from tests.conftest import run_program
 from tests.services import LiveService
 
@@ -118,13 +118,8 @@ def test_a_thing_in_the_wrong_place_does_not_belong(
         "outliers": [{"object": "pillow_1", "label": "pillow", "is_outlier": False}],
         "misplaced": [place | {"is_misplaced": moved is not None, "moved": moved}],
     }
-
-    def tells(connection: socket.socket) -> None:
-        read_head(connection)
-        answer(connection, json.dumps(told).encode())
-
     ports = [{"scene": '{"objects": ["bed"]}', "object": name} for name in ("pillow_1", "pillow")]
-    with Peer(tells) as peer:
+    with Peer(answering(json.dumps(told).encode())) as peer:
         results = [tick(program, peer.url, "ObjectBelongs", entry) for entry in ports]
     assert [(result["status"], result["because"]) for (result,) in results] == [
         (status, because),
