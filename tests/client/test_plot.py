@@ -77,8 +77,7 @@ def test_every_object_is_drawn_once_and_only_contents_overlap_their_container(
 def test_a_row_from_left_to_right_is_drawn_as_one(order: list[str]) -> None:
     row = [(a, "left", b) for a, b in pairwise(order)]
     found = boxes(NAMES, *row)
-    for a, _, b in row:
-        assert found[a].x + found[a].width < found[b].x
+    assert all(found[a].x + found[a].width < found[b].x for a, _, b in row)
 
 
 def test_opposite_relations_are_drawn_alike() -> None:
