@@ -57,11 +57,14 @@ def read_head(connection: socket.socket) -> bytes:
     return head
 
 
-def answering(*arguments: bytes) -> Callable[[socket.socket], None]:
-    """Return a function that answers one request; see `answer`."""
+def answering(
+    *arguments: bytes, heads: list[bytes] | None = None
+) -> Callable[[socket.socket], None]:
+    """Return a function that answers one request as `answer` does, and records its head."""
+    heads = [] if heads is None else heads
 
     def behave(connection: socket.socket) -> None:
-        read_head(connection)
+        heads.append(read_head(connection))
         answer(connection, *arguments)
 
     return behave

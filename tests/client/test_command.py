@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 from scene_client import Client, __version__, tables
 from scene_client.command import app
 from scene_client.schemas import GenerateAnswer, MissingAnswer, OutliersAnswer, RelationsAnswer
-from tests.client.peers import answer, answering, read_head, say_nothing
+from tests.client.peers import answering, say_nothing
 from tests.conftest import run_program
 
 ANSWERED: dict[str, Any] = {
@@ -341,15 +341,11 @@ def test_the_version_needs_no_service() -> None:
 def test_the_key_is_taken_from_the_environment(
     scene: Any, peer: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    heads = []
-
-    def listen(connection: Any) -> None:
-        heads.append(read_head(connection).lower())
-        answer(connection, b'{"models":[],"aliases":{}}')
-
+    heads: list[bytes] = []
     monkeypatch.setenv("SCENE_API_KEY", "k" * 16)
-    assert scene("models", "--url", peer(listen).url).exit_code == 0
-    assert b"x-api-key: " + b"k" * 16 in heads[0]
+    started = peer(answering(b'{"models":[],"aliases":{}}', heads=heads))
+    assert scene("models", "--url", started.url).exit_code == 0
+    assert b"x-api-key: " + b"k" * 16 in heads[0].lower()
 
 
 def test_the_package_is_a_program(url: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import threading
-import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +16,7 @@ from scene_client import Client
 from scene_client.schemas import OutliersAnswer
 from scene_client.vision_msgs import SceneFields
 from tests.deploy.ros import load_package
-from tests.services import LiveService
+from tests.services import LiveService, wait_until
 
 
 @pytest.fixture(scope="module")
@@ -36,28 +35,26 @@ Plant = Callable[[Any], Any]
 
 
 @pytest.fixture
-def plant() -> Iterator[Plant]:
-    """Make a tree of one condition, which is taken down at the end."""
-    trees = []
+def plant(request: pytest.FixtureRequest) -> Plant:
+    """Return a function that makes a tree of one condition; the test's end shuts it down."""
 
     def make(condition: Any) -> Any:
         root = py_trees.composites.Sequence("root", memory=True, children=[condition])
-        trees.append(py_trees.trees.BehaviourTree(root))
-        return trees[-1]
+        tree = py_trees.trees.BehaviourTree(root)
+        request.addfinalizer(tree.shutdown)
+        return tree
 
-    yield make
-    for tree in trees:
-        tree.shutdown()
+    return make
 
 
 def settle(tree: Any) -> Status:
     """Tick until the tree has a result."""
-    until = time.monotonic() + 30
-    tree.tick()
-    while tree.root.status is Status.RUNNING:
-        assert time.monotonic() < until
-        time.sleep(0.005)
+
+    def is_settled() -> bool:
         tree.tick()
+        return tree.root.status is not Status.RUNNING
+
+    wait_until(is_settled)
     return tree.root.status
 
 
