@@ -163,11 +163,7 @@ GENERATE: Final = Question("/generate", schemas.GenerateRequest, schemas.Generat
 
 
 def promote(alias: str, fields: Mapping[str, Any]) -> Call[schemas.AliasAnswer]:
-    """Build the call that points the alias ``alias`` at a model or a version.
-
-    Raises:
-        InvalidRequestError: the request is invalid.
-    """
+    """Build the call that points the alias ``alias`` at a model or a version."""
     return Call(
         "PUT",
         model_path("aliases", alias),
@@ -217,12 +213,7 @@ def _json_value(value: Any) -> Any:
 
 
 def validated(kind: type[FormT], fields: dict[str, Any], at: tuple[str | int, ...] = ()) -> FormT:
-    """Return the request, or a part of it, that the dictionary ``fields`` describes.
-
-    Args:
-        kind: class of the request.
-        fields: fields of the request.
-        at: location of ``fields`` in the body.
+    """Return the request, or the part of it at the location ``at``, with these fields.
 
     Raises:
         InvalidRequestError: the request is invalid.

@@ -409,9 +409,9 @@ def _is_unset(pose: Any) -> bool:
 
 def _viewpoint(viewpoint: Viewpoint) -> dict[str, float]:
     values: Any = viewpoint
-    if isinstance(values, list | tuple):
-        values = dict(zip(("x", "y", "yaw"), values, strict=False)) if len(values) == 3 else None
-    x, y, yaw = (number(take(values, name)) for name in ("x", "y", "yaw"))
+    if not isinstance(values, list | tuple):
+        values = [take(values, name) for name in ("x", "y", "yaw")]
+    x, y, yaw = map(number, values) if len(values) == 3 else (None,) * 3
     if x is None or y is None or yaw is None:
         raise MessageError("viewpoint must be three finite numbers: x, y, yaw")
     if max(abs(x), abs(y)) > _MAX_METRES or abs(yaw) > _MAX_YAW:
