@@ -7,6 +7,7 @@ it back, so a message that does not fit its type fails here as in ROS.
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -130,6 +131,23 @@ class Ros:
             "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL=1, VOLATILE=2),
         }
         return {name: SimpleNamespace(**content) for name, content in members.items()}
+
+
+class Slow:
+    """A client that waits for the event `answering` before it gives the answer or the error."""
+
+    def __init__(self, outcome: Any) -> None:
+        self.outcome = outcome
+        self.asked: list[dict[str, Any]] = []
+        self.started, self.answering = threading.Semaphore(0), threading.Event()
+
+    def missing(self, **fields: Any) -> Any:
+        self.asked.append(fields)
+        self.started.release()
+        assert self.answering.wait(30)
+        if isinstance(self.outcome, Exception):
+            raise self.outcome
+        return self.outcome
 
 
 def load_package(monkeypatch: pytest.MonkeyPatch, ros: Ros | None = None) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -16,10 +15,11 @@ from py_trees.common import Status
 from scene_client import Client
 from scene_client.schemas import OutliersAnswer
 from scene_client.vision_msgs import SceneFields
-from tests.deploy.ros import load_package
+from tests.deploy.ros import Slow, load_package
 from tests.services import LiveService, wait_until
 
 BED = {"objects": ["bed"]}
+NOTHING = SimpleNamespace(missing=[])
 Make = Callable[..., Any]
 
 
@@ -128,24 +128,10 @@ def test_a_condition_fails_with_a_reason(make: Make, client: Client, scene: Scen
             assert condition.feedback_message.startswith(reason.rstrip("."))
 
 
-class Slow:
-    """A client that waits for the event `answering`."""
-
-    def __init__(self) -> None:
-        self.answering, self.asked = threading.Event(), threading.Semaphore(0)
-        self.scenes: list[Any] = []
-
-    def missing(self, **fields: Any) -> Any:
-        self.scenes.append(fields["objects"])
-        self.asked.release()
-        assert self.answering.wait(30)
-        return SimpleNamespace(missing=[])
-
-
 def test_a_tick_never_waits_and_a_condition_fails_in_time(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    client, clock = Slow(), SimpleNamespace(now=100.0)
+    client, clock = Slow(NOTHING), SimpleNamespace(now=100.0)
     condition = make("SceneComplete", client, BED, timeout=1.0)
     module = sys.modules[type(condition).__module__]
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock.now))
@@ -160,10 +146,10 @@ def test_a_tick_never_waits_and_a_condition_fails_in_time(
 
 
 def test_an_interrupted_condition_uses_the_next_scene(make: Make) -> None:
-    client, scenes = Slow(), iter([["bed"], ["lamp"], ["sofa"]])
+    client, scenes = Slow(NOTHING), iter([["bed"], ["lamp"], ["sofa"]])
     condition = make("SceneComplete", client, lambda: {"objects": next(scenes)})
     condition.tree.tick()
-    assert client.asked.acquire(timeout=30)
+    assert client.started.acquire(timeout=30)
     # At the second interruption, the condition's question has not started yet.
     for _ in range(2):
         condition.tree.root.stop(Status.INVALID)
@@ -172,4 +158,4 @@ def test_an_interrupted_condition_uses_the_next_scene(make: Make) -> None:
         assert condition.status is Status.RUNNING
     client.answering.set()
     assert settle(condition) is Status.SUCCESS
-    assert client.scenes == [["bed"], ["lamp"]]
+    assert [fields["objects"] for fields in client.asked] == [["bed"], ["lamp"]]
