@@ -73,8 +73,8 @@ def test_missing_objects_are_a_table(scene: Any, url: str, tmp_path: Path) -> No
             {"coverage": 0.0, "unknown_labels": "ignore"},
         ),
         (
-            "rooms bed --candidates office --candidates bedroom --top-k 2 --detail scores",
-            {"candidates": ["office", "bedroom"], "top_k": 2, "detail": "scores"},
+            "rooms bed --candidates office --candidates bedroom --top-k 2 --unknown-labels ignore",
+            {"candidates": ["office", "bedroom"], "top_k": 2, "unknown_labels": "ignore"},
         ),
         (
             "generate bed --count 2 --seed 5 --temperature 0.5 --steps 3",
@@ -180,6 +180,7 @@ def test_scenes_of_the_training_are_read(scene: Any, tmp_path: Path) -> None:
     assert first.stdout == scene("missing", str(tmp_path / "scene.json")).stdout
     second = json.loads(scene("relations", f"{path}:2", "--json").stdout)
     stated = [tuple(one.values()) for one in second["observed_relations"]]
+    assert "frame_id" not in second
     assert ("lamp_1", "on-top", "bed") in stated
     assert not any(one[:2] == ("lamp_2", "on-top") for one in stated)
 
@@ -226,6 +227,12 @@ def test_nan_and_infinity_are_read(scene: Any) -> None:
     found = json.loads(done.stdout)
     assert [entry["object"] for entry in found["outliers"]] == ['"NaN']
     assert found["warnings"] == []
+
+
+def test_a_large_file_is_refused(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scene_client.files.MAX_FILE", 10)
+    done = scene("missing", "-", stdin=" " * 11)
+    assert (done.exit_code, done.stderr) == (2, "- is too large: it has more than 10 bytes\n")
 
 
 FILES = {
