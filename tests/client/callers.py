@@ -1,4 +1,4 @@
-"""Every client, behind one face: a method, a request as in the HTTP contract, an answer in JSON."""
+"""Every client behind one interface: a method and a request as JSON in, the answer as JSON out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import asyncio
 import json
 import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,7 +20,6 @@ from scene_client import (
     Client,
     DeadlineError,
     InvalidRequestError,
-    OfflineClient,
     ProblemError,
     UnreachableError,
 )
@@ -29,136 +28,99 @@ from tests.conftest import REPOSITORY, run_program
 
 
 class Caller(Protocol):
-    """A client. What goes wrong is raised as the Python clients raise it."""
+    """A client. It raises the exceptions of the Python clients."""
 
-    def __call__(self, method: str, request: Any = None, *, timeout: float | None = None) -> Any:
-        """The answer, as it stood in JSON."""
+    def __call__(self, method: str, *request: Any, timeout: float | None = None) -> Any:
+        """Return the answer as JSON."""
 
 
 def _plain(answer: Any) -> Any:
-    if isinstance(answer, BaseModel):
-        return json.loads(answer.model_dump_json(exclude_unset=True))
-    return answer
-
-
-def _arguments(request: Any) -> tuple[Any, ...]:
-    return () if request is None else (request,)
-
-
-def blocking(client: Client) -> Caller:
-    """`Client` and what derives from it."""
-
-    def call(method: str, request: Any = None, *, timeout: float | None = None) -> Any:
-        return _plain(getattr(client, method)(*_arguments(request), timeout=timeout))
-
-    return call
+    is_model = isinstance(answer, BaseModel)
+    return json.loads(answer.model_dump_json(exclude_unset=True)) if is_model else answer
 
 
 @contextmanager
-def sync_caller(url: str, **options: Any) -> Iterator[Caller]:
-    """`Client`."""
-    with Client(url, **options) as client:
-        yield blocking(client)
+def sync_caller(place: Any, kind: type[Client] = Client, **options: Any) -> Iterator[Caller]:
+    """`Client` at a URL, or `OfflineClient` with a store."""
+    with kind(place, **options) as client:
+        yield lambda method, *request, timeout=None: _plain(
+            getattr(client, method)(*request, timeout=timeout)
+        )
 
 
 @contextmanager
 def async_caller(url: str, **options: Any) -> Iterator[Caller]:
-    """`AsyncClient`, on a loop that runs while it is asked."""
+    """`AsyncClient`, on an event loop that runs during each call."""
     with asyncio.Runner() as runner:
         client = AsyncClient(url, **options)
-
-        def call(method: str, request: Any = None, *, timeout: float | None = None) -> Any:
-            asked = getattr(client, method)(*_arguments(request), timeout=timeout)
-            return _plain(runner.run(asked))
-
         try:
-            yield call
+            yield lambda method, *request, timeout=None: _plain(
+                runner.run(getattr(client, method)(*request, timeout=timeout))
+            )
         finally:
             runner.run(client.close())
 
 
-@contextmanager
-def offline_caller(store: Path, **options: Any) -> Iterator[Caller]:
-    """`OfflineClient`."""
-    with OfflineClient(store, **options) as client:
-        yield blocking(client)
-
-
 def compiled(
-    source: Path, program: Path, compiler: Path, pkg_config: Path, *headers_in: Path
+    find_tool: Callable[[str], Path], source: Path, program: Path, *headers_in: Path
 ) -> Path:
-    """A C++ program over ``scene_client.hpp``, and headers in further folders.
+    """Compile a C++ program with ``scene_client.hpp``, and headers in further folders.
 
-    Where its libraries are missing the test is skipped, or fails under REQUIRE_SYSTEM=1.
+    Without its libraries, the test is skipped, or fails with REQUIRE_SYSTEM=1.
     """
-    found = subprocess.run(
-        [pkg_config, "--cflags", "--libs", "cpp-httplib"], capture_output=True, text=True
-    )
-    headers = "#include <httplib.h>\n#include <nlohmann/json.hpp>\n"
-    probe = subprocess.run(
-        [compiler, "-std=c++17", "-fsyntax-only", "-x", "c++", "-"],
-        input=headers,
-        capture_output=True,
-        text=True,
-    )
-    if found.returncode or probe.returncode:
-        message = "cpp-httplib or nlohmann-json is not installed"
-        if os.environ.get("REQUIRE_SYSTEM") == "1":
-            pytest.fail(message, pytrace=False)
-        pytest.skip(message)
-    command = [
-        compiler,
-        *("-std=c++17", "-Wall", "-Wextra", "-Werror", "-pthread"),
+    libraries = [find_tool("pkg-config"), "--cflags", "--libs", "cpp-httplib", "nlohmann_json"]
+    flags = subprocess.run(libraries, capture_output=True, text=True)
+    if flags.returncode:
+        refuse = pytest.fail if os.environ.get("REQUIRE_SYSTEM") == "1" else pytest.skip
+        refuse("cpp-httplib or nlohmann-json is not installed")
+    run_program(
+        *(find_tool("g++"), "-std=c++17", "-Wall", "-Wextra", "-Werror", "-pthread"),
         *(f"-I{folder}" for folder in (REPOSITORY / "clients" / "cpp", *headers_in)),
-        *(source, "-o", program),
-        *found.stdout.split(),
-    ]
-    run_program(*command)
+        *(source, "-o", program, *flags.stdout.split()),
+    )
     return program
+
+
+_ERRORS = {
+    "deadline": DeadlineError,
+    "unreachable": UnreachableError,
+    "unreadable": AnswerError,
+    "invalid": InvalidRequestError.about,
+}
 
 
 @contextmanager
 def cpp_caller(
     program: Path, url: str, *, timeout: float = 10.0, retries: int = 5, api_key: str = ""
 ) -> Iterator[Caller]:
-    """`scene::Client`, in a process of its own."""
+    """`scene::Client`, in a separate process."""
     process = subprocess.Popen(
         [program, url, str(timeout), str(retries), api_key],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
     )
-    to, of = process.stdin, process.stdout
-    assert to is not None
-    assert of is not None
+    assert process.stdin
+    assert process.stdout
 
-    def call(method: str, request: Any = None, *, timeout: float | None = None) -> Any:
-        to.write(json.dumps({"method": method, "request": request, "timeout": timeout}) + "\n")
-        to.flush()
-        said = json.loads(of.readline())
-        match said.pop("outcome"):
-            case "answer":
-                return said["answer"]
-            case "problem":
-                errors = [FieldError.model_validate(error) for error in said.pop("errors")]
-                text, problem = said.pop("text"), ProblemError(**said, errors=errors)
-                assert text == str(problem)
-                raise problem
-            case "deadline":
-                raise DeadlineError(said["message"])
-            case "unreachable":
-                raise UnreachableError(said["message"])
-            case "unreadable":
-                raise AnswerError(said["message"])
-            case "invalid":
-                raise InvalidRequestError([FieldError(pointer="#", message=said["message"])])
-            case other:
-                raise AssertionError(other)
+    def call(method: str, *request: Any, timeout: float | None = None) -> Any:
+        line = {"method": method, "request": request[0] if request else None, "timeout": timeout}
+        print(json.dumps(line), file=process.stdin, flush=True)
+        result = json.loads(process.stdout.readline())
+        outcome = result.pop("outcome")
+        if outcome == "answer":
+            return result["answer"]
+        if outcome != "problem":
+            raise _ERRORS[outcome](result["message"])
+        result["errors"] = [FieldError.model_validate(error) for error in result["errors"]]
+        text, problem = result.pop("text"), ProblemError(**result)
+        assert text == str(problem)
+        raise problem
 
     try:
         yield call
     finally:
-        to.close()
+        process.stdin.close()
         status = process.wait(timeout=10)
-        of.close()
+        process.stdout.close()
     assert status == 0

@@ -1,4 +1,4 @@
-"""A live service over a store of small machines, and every client of it."""
+"""Every client of a live service with small machines."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from scene_client import OfflineClient
 from tests.client import callers
 from tests.client.callers import Caller
 from tests.client.peers import Peer
@@ -18,7 +19,7 @@ from tests.services import LiveService
 
 @pytest.fixture(scope="session")
 def url(live: LiveService) -> str:
-    """Where the service is."""
+    """The URL of the service."""
     return live.url
 
 
@@ -26,47 +27,42 @@ def url(live: LiveService) -> str:
 def bridge(
     tmp_path_factory: pytest.TempPathFactory, require_system_tool: Callable[[str], Path]
 ) -> Path:
-    """The program that puts calls to the C++ client."""
+    """The program that calls the C++ client."""
     source = Path(__file__).parent / "bridge.cpp"
     program = tmp_path_factory.mktemp("bridge") / "bridge"
-    compiler, pkg_config = require_system_tool("g++"), require_system_tool("pkg-config")
-    return callers.compiled(source, program, compiler, pkg_config)
+    return callers.compiled(require_system_tool, source, program)
 
 
 @pytest.fixture
 def peer() -> Iterator[Callable[[Callable[[socket.socket], None]], Peer]]:
-    """Starts services that do with each connection what they are told; see `peers`."""
+    """Return a function that starts a server, which calls a function for each connection."""
     with ExitStack() as stack:
-
-        def start(behave: Callable[[socket.socket], None]) -> Peer:
-            started = Peer(behave)
-            stack.callback(started.close)
-            return started
-
-        yield start
+        yield lambda behave: stack.enter_context(Peer(behave))
 
 
-# Every client there is: whoever adds one adds it here, and the contract is asked of it too.
+# The contract tests ask every client of these lists.
 OVER_HTTP = ("sync", "async", pytest.param("cpp", marks=pytest.mark.system))
 EVERY = (*OVER_HTTP, "offline")
 
 
 @pytest.fixture
 def open_caller(request: pytest.FixtureRequest) -> Callable[..., AbstractContextManager[Caller]]:
-    """Opens a client of the kind that the test is parametrised with, at a URL."""
+    """Return a function that opens a client at a URL; the parameter of the test is its kind."""
     return opener(request)
 
 
 def opener(request: pytest.FixtureRequest) -> Callable[..., AbstractContextManager[Caller]]:
     if request.param == "cpp":
         return partial(callers.cpp_caller, request.getfixturevalue("bridge"))
-    return {"sync": callers.sync_caller, "async": callers.async_caller}[request.param]
+    return callers.async_caller if request.param == "async" else callers.sync_caller
 
 
 @pytest.fixture(scope="session")
 def caller(request: pytest.FixtureRequest, url: str, shared_store: Path) -> Iterator[Caller]:
-    """A client of the kind that the test is parametrised with, of the live service."""
-    is_offline = request.param == "offline"
-    opened = callers.offline_caller(shared_store) if is_offline else opener(request)(url)
+    """A client of the live service; the parameter of the test is its kind."""
+    if request.param == "offline":
+        opened = callers.sync_caller(shared_store, OfflineClient)
+    else:
+        opened = opener(request)(url)
     with opened as caller:
         yield caller

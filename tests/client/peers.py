@@ -1,4 +1,4 @@
-"""Services that behave badly, over real sockets."""
+"""Servers that misbehave, over real sockets."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import socket
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Self
 
 READY = b'{"status":"ready"}'
 
 
 class Peer:
-    """Accepts connections, and does with each what ``behave`` does."""
+    """A server that calls the function ``behave`` for each connection, in a thread."""
 
     def __init__(self, behave: Callable[[socket.socket], None]) -> None:
         self.connections = 0
@@ -28,21 +29,21 @@ class Peer:
                 connection, _ = self._socket.accept()
                 self.connections += 1
                 self._accepted.append(connection)
-                thread = threading.Thread(target=self._serve, args=(connection,))
-                self._threads.append(thread)
-                thread.start()
+                self._threads.append(threading.Thread(target=self._serve, args=(connection,)))
+                self._threads[-1].start()
 
     def _serve(self, connection: socket.socket) -> None:
         with suppress(OSError), connection:
             self._behave(connection)
 
-    def close(self) -> None:
-        with suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
-        for connection in self._accepted:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for connection in (self._socket, *self._accepted):
             with suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
         for thread in self._threads:
             thread.join()
 
@@ -51,9 +52,28 @@ def read_head(connection: socket.socket) -> bytes:
     head = b""
     while b"\r\n\r\n" not in head:
         if not (part := connection.recv(65536)):
-            raise OSError("the client has gone")
+            raise OSError("the client has closed the connection")
         head += part
     return head
+
+
+def answering(
+    *arguments: bytes, heads: list[bytes] | None = None
+) -> Callable[[socket.socket], None]:
+    """Return a function that answers one request as `answer` does, and records its head."""
+    heads = [] if heads is None else heads
+
+    def behave(connection: socket.socket) -> None:
+        heads.append(read_head(connection))
+        answer(connection, *arguments)
+
+    return behave
+
+
+def say_nothing(connection: socket.socket) -> None:
+    """Read a request, and wait until the client closes the connection."""
+    read_head(connection)
+    connection.recv(1)
 
 
 def answer(
@@ -62,10 +82,5 @@ def answer(
     status: bytes = b"200 OK",
     retry_after: bytes = b"0",
 ) -> None:
-    lines = (
-        b"HTTP/1.1 " + status,
-        b"Content-Type: application/json",
-        b"Content-Length: %d" % len(body),
-        b"Retry-After: " + retry_after,
-    )
-    connection.sendall(b"\r\n".join(lines) + b"\r\n\r\n" + body)
+    head = b"HTTP/1.1 %s\r\nContent-Type: application/json\r\nContent-Length: %d\r\n"
+    connection.sendall(head % (status, len(body)) + b"Retry-After: %s\r\n\r\n" % retry_after + body)

@@ -1,4 +1,4 @@
-"""``scene``, as people type it and scripts branch on it."""
+"""The command ``scene``: its output, its errors and its exit statuses."""
 
 from __future__ import annotations
 
@@ -15,17 +15,8 @@ from typer.testing import CliRunner, Result
 
 from scene_client import Client, __version__, tables
 from scene_client.command import app
-from scene_client.schemas import (
-    Disagreement,
-    ExpectedRelation,
-    GenerateAnswer,
-    MisplacedRelation,
-    MissingAnswer,
-    Outlier,
-    OutliersAnswer,
-    RelationsAnswer,
-)
-from tests.client.peers import answer, read_head
+from scene_client.schemas import GenerateAnswer, MissingAnswer, OutliersAnswer, RelationsAnswer
+from tests.client.peers import answering, say_nothing
 from tests.conftest import run_program
 
 ANSWERED: dict[str, Any] = {
@@ -47,16 +38,9 @@ def scene(url: str, monkeypatch: pytest.MonkeyPatch) -> Any:
     return run
 
 
-def test_at_in_a_file_equals_the_option_at(scene: Any, tmp_path: Path) -> None:
-    body = {"objects": ["bed"], "at": ["on-top", "bed"], "candidates": ["lamp"]}
-    (tmp_path / "scene.json").write_text(json.dumps(body))
-    by_option = scene("missing", "bed", "--at", "on-top bed", "--candidates", "lamp")
-    assert "on-top bed" in by_option.stdout
-    assert scene("missing", str(tmp_path / "scene.json")).stdout == by_option.stdout
-
-
-def test_missing_objects_are_a_table(scene: Any, url: str) -> None:
-    done = scene("missing", "bed", "nightstand", "--at", "on-top nightstand", "--top-k", "2")
+def test_missing_objects_are_a_table(scene: Any, url: str, tmp_path: Path) -> None:
+    line = ("missing", "bed, nightstand,", "--at", "on-top nightstand", "--top-k", "2")
+    done = scene(*line)
     assert done.exit_code == 0
     with Client(url) as client:
         found = client.missing(["bed", "nightstand"], at=("on-top", "nightstand"), top_k=2).missing
@@ -66,8 +50,10 @@ def test_missing_objects_are_a_table(scene: Any, url: str) -> None:
         assert f"{entry.probability:.3f}" in done.stdout
         place = entry.placements[0]
         assert f"{place.relation} {place.object} {place.probability:.3f}" in done.stdout
-    # No colours where nobody looks.
-    assert "\x1b" not in done.stdout
+    assert "\x1b" not in done.stdout  # colours are only for terminals
+    body = {"objects": ["bed", "nightstand"], "at": ["on-top", "nightstand"], "top_k": 2}
+    (tmp_path / "scene.json").write_text(json.dumps(body))
+    assert scene("missing", str(tmp_path / "scene.json")).stdout == done.stdout
 
 
 @pytest.mark.parametrize(
@@ -83,8 +69,12 @@ def test_missing_objects_are_a_table(scene: Any, url: str) -> None:
         ("outliers bed --room-type office", {"room_type": "office"}),
         ("outliers bed --threshold 0.2", {"threshold": 0.2}),
         (
-            "rooms bed --candidates office --candidates bedroom --top-k 2 --detail scores",
-            {"candidates": ["office", "bedroom"], "top_k": 2, "detail": "scores"},
+            "missing bed --coverage 0 --unknown-labels ignore",
+            {"coverage": 0.0, "unknown_labels": "ignore"},
+        ),
+        (
+            "rooms bed --candidates office --candidates bedroom --top-k 2 --unknown-labels ignore",
+            {"candidates": ["office", "bedroom"], "top_k": 2, "unknown_labels": "ignore"},
         ),
         (
             "generate bed --count 2 --seed 5 --temperature 0.5 --steps 3",
@@ -108,7 +98,7 @@ def test_json_is_the_service_s_answer(
     }
 
 
-def test_a_scene_may_come_from_a_file_or_a_pipe_and_options_go_before_it(
+def test_a_scene_may_come_from_a_file_or_a_pipe_and_options_override_it(
     scene: Any, tmp_path: Path
 ) -> None:
     # A path is known by its slashes, whatever the file is called.
@@ -190,6 +180,7 @@ def test_scenes_of_the_training_are_read(scene: Any, tmp_path: Path) -> None:
     assert first.stdout == scene("missing", str(tmp_path / "scene.json")).stdout
     second = json.loads(scene("relations", f"{path}:2", "--json").stdout)
     stated = [tuple(one.values()) for one in second["observed_relations"]]
+    assert "frame_id" not in second
     assert ("lamp_1", "on-top", "bed") in stated
     assert not any(one[:2] == ("lamp_2", "on-top") for one in stated)
 
@@ -238,20 +229,10 @@ def test_nan_and_infinity_are_read(scene: Any) -> None:
     assert found["warnings"] == []
 
 
-def test_long_lists_of_sampled_relations_are_cut() -> None:
-    objects = ["bed", *(f"lamp {number}" for number in range(20))]
-    sides = [{"subject": name, "relation": "left", "object": "bed"} for name in objects[1:]]
-    on = {"subject": "lamp 7", "relation": "on-top", "object": "bed"}
-    drawn = {"objects": objects, "relations": [*sides, on], "log_score": 0.0, "context": {}}
-    found = GenerateAnswer.model_validate(ANSWERED | {"seed": 1, "scenes": [drawn]})
-    table = shown(tables.generate(found))
-    assert table.count("left bed") == tables.MOST_RELATIONS - 1
-    assert "lamp 7 on-top bed" in table
-    assert "… and 9 more" in table
-
-
-def test_commas_separate_labels(scene: Any) -> None:
-    assert scene("missing", "bed, lamp,").stdout == scene("missing", "bed", "lamp").stdout
+def test_a_large_file_is_refused(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scene_client.files.MAX_FILE", 10)
+    done = scene("missing", "-", stdin=" " * 11)
+    assert (done.exit_code, done.stderr) == (2, "- is too large: it has more than 10 bytes\n")
 
 
 FILES = {
@@ -331,10 +312,6 @@ def test_the_exit_status_and_the_reason_of_a_failure(
     assert code == 1 or "#" not in done.stderr
 
 
-def test_unknown_labels_can_be_ignored(scene: Any) -> None:
-    assert scene("missing", "bed", "nightstnad", "--unknown-labels", "ignore").exit_code == 0
-
-
 @pytest.mark.parametrize(
     ("status", "body", "code"),
     [(b"503 No", b"{}", 5), (b"429 No", b"{}", 5), (b"500 No", b"{}", 6), (b"200 OK", b"{}", 6)],
@@ -342,43 +319,40 @@ def test_unknown_labels_can_be_ignored(scene: Any) -> None:
 def test_exit_status_of_a_busy_and_of_a_defective_service(
     scene: Any, peer: Any, status: bytes, body: bytes, code: int
 ) -> None:
-    started = peer(
-        lambda connection: (read_head(connection), answer(connection, body, status, b"60"))
-    )
-    done = scene("models", "--url", started.url)
+    done = scene("models", "--url", peer(answering(body, status, b"60")).url)
     assert (done.exit_code, done.stdout) == (code, "")
+
+
+def test_markup_in_an_answer_is_text(scene: Any, peer: Any) -> None:
+    entry = {"object": "[red]x[/red]", "label": ":bed:", "probability": 0.1, "log_odds": 0.0}
+    body = ANSWERED | {"outliers": [entry | {"is_outlier": False}], "misplaced": []}
+    done = scene("outliers", "bed", "--url", peer(answering(json.dumps(body).encode())).url)
+    assert done.stdout.splitlines()[3].split() == ["[red]x[/red]", ":bed:", "0.100", "+0.00"]
 
 
 def test_exit_status_of_ready(scene: Any, peer: Any) -> None:
     assert scene("ready").exit_code == 0
     assert scene("ready", "--url", "http://127.0.0.1:9").exit_code == 3
-    silent = peer(lambda connection: (read_head(connection), connection.recv(1)))
-    assert scene("ready", "--url", silent.url, "--timeout", "0.1").exit_code == 4
-    starting = peer(
-        lambda connection: (read_head(connection), answer(connection, b"{}", b"503 No"))
-    )
+    assert scene("ready", "--url", peer(say_nothing).url, "--timeout", "0.1").exit_code == 4
+    starting = peer(answering(b"{}", b"503 No"))
     assert scene("ready", "--url", starting.url).exit_code == 5
-    # Asked once: whoever waits for a service asks in a loop of their own.
+    # The command does not retry: a script that waits for a service asks in a loop.
     assert starting.connections == 1
 
 
-def test_the_version_needs_no_service(scene: Any) -> None:
-    done = scene("--version")
+def test_the_version_needs_no_service() -> None:
+    done = CliRunner().invoke(app, ["--version"])
     assert (done.exit_code, done.stdout) == (0, f"scene {__version__}\n")
 
 
 def test_the_key_is_taken_from_the_environment(
     scene: Any, peer: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    heads = []
-
-    def listen(connection: Any) -> None:
-        heads.append(read_head(connection).lower())
-        answer(connection, b'{"models":[],"aliases":{}}')
-
+    heads: list[bytes] = []
     monkeypatch.setenv("SCENE_API_KEY", "k" * 16)
-    assert scene("models", "--url", peer(listen).url).exit_code == 0
-    assert b"x-api-key: " + b"k" * 16 in heads[0]
+    started = peer(answering(b'{"models":[],"aliases":{}}', heads=heads))
+    assert scene("models", "--url", started.url).exit_code == 0
+    assert b"x-api-key: " + b"k" * 16 in heads[0].lower()
 
 
 def test_the_package_is_a_program(url: str) -> None:
@@ -386,89 +360,77 @@ def test_the_package_is_a_program(url: str) -> None:
     assert "log-odds" in run_program(*command, env={**os.environ, "SCENE_URL": url}).stdout
 
 
-def shown(renderable: Any) -> str:
+# ------------------------------------------------------------------------------------- tables
+
+
+def shown(table: Any) -> str:
     console = Console(width=200, markup=False)
     with console.capture() as capture:
-        console.print(renderable)
+        console.print(table)
     return capture.get()
 
 
-def test_offsets_reasons_and_disagreements_are_shown_where_an_answer_has_them() -> None:
-    placement = {
-        "relation": "on-top",
-        "object": "desk",
-        "probability": 0.5,
-        "offset": {
-            "mean": {"x": 0.1, "y": -0.2, "z": 0.3},
-            "std": {"x": 0.01, "y": 0.02, "z": 0.03},
-            "scenes": 9,
-        },
-    }
-    lamp = {
-        "label": "lamp",
-        "probability": 0.25,
-        "log_odds": -1.0,
-        "placements": [placement, {**placement, "offset": None}],
-        "because": [{"object": "bed", "log_odds_change": 1.5}],
-    }
-    text = shown(tables.missing(MissingAnswer(**ANSWERED, missing=[lamp])))
+def rows(table: Any) -> list[list[str]]:
+    return [line.split() for line in shown(table).splitlines()]
+
+
+def test_places_offsets_and_reasons_of_a_missing_object() -> None:
+    vectors = {"mean": {"x": 0.1, "y": -0.2, "z": 0.3}, "std": {"x": 0.01, "y": 0.02, "z": 0.03}}
+    place = {"relation": "on-top", "object": "desk"}
+
+    def table(probability: float, asked_place: bool = False, **offset: Any) -> str:
+        places = [place | {"probability": probability, **offset}]
+        because = [{"object": "bed", "log_odds_change": 1.5}]
+        lamp = {"label": "lamp", "probability": 0.25, "log_odds": -1.0}
+        lamp |= {"placements": places, "because": because}
+        found = MissingAnswer(**ANSWERED, missing=[lamp])
+        return shown(tables.missing(found, asked_place=asked_place))
+
+    text = table(0.5, offset={**vectors, "scenes": 9})
     assert "on-top desk 0.500 (x +0.10±0.01, y -0.20±0.02, z +0.30±0.03 m)" in text
-    lamp["placements"] = [{**placement, "probability": 0.24}]
-    unlikely = MissingAnswer(**ANSWERED, missing=[lamp])
-    assert "on-top desk" not in shown(tables.missing(unlikely))
-    assert "on-top desk 0.240" in shown(tables.missing(unlikely, asked_place=True))
     assert "bed +1.50" in text
-    doubt = Disagreement("lamp", "desk", ["left", "above"], "on-top", 0.9, 0.05)
-    answer = RelationsAnswer(**ANSWERED, relations=[], disagreements=[doubt])
-    text = shown(tables.relations(answer))
-    assert "disagreements" in text
-    assert "left, above" in text
-    assert "on-top 0.900" in text
+    assert "on-top desk" not in table(0.24)
+    assert "on-top desk 0.240" in table(0.24, asked_place=True)
 
 
-def test_an_observed_relation_has_a_given_and_an_expected_probability() -> None:
+def test_observed_and_expected_relations() -> None:
     given = {"subject": "milk", "relation": "inside", "object": "fridge", "probability": 0.81}
-    seen = ExpectedRelation(**given, observed=True, expected=0.123)
-    unseen = ExpectedRelation(**given | {"relation": "on-top"})
-    answer = RelationsAnswer(**ANSWERED, relations=[seen, unseen], disagreements=[])
-    lines = shown(tables.relations(answer))
-    rows = [line.split() for line in lines.splitlines()]
-    assert ["subject", "relation", "object", "probability", "expected"] in rows
-    assert ["milk", "inside", "fridge", "0.810", "observed", "0.123"] in rows
-    assert ["milk", "on-top", "fridge", "0.810"] in rows
-
-
-def test_the_moved_object_of_a_misplaced_relation_is_named() -> None:
-    place = {"subject": "pillow", "relation": "on-top", "object": "floor", "probability": 0.9}
-    moved = MisplacedRelation(**place, is_misplaced=True, moved="pillow")
-    fine = MisplacedRelation(**place | {"relation": "left", "object": "bed", "probability": 0.1})
-    lines = shown(tables.outliers(OutliersAnswer(**ANSWERED, outliers=[], misplaced=[moved, fine])))
-    rows = [line.split() for line in lines.splitlines()]
-    assert ["pillow", "on-top", "floor", "0.900", "misplaced", "pillow"] in rows
-    assert ["pillow", "left", "bed", "0.100"] in rows
-
-
-def test_markup_of_a_service_is_not_rendered() -> None:
-    hostile = Outlier(
-        object="[red]x[/red]",
-        label=":bed:",
-        probability=0.1,
-        log_odds=0.0,
-        is_outlier=False,
-        because=[],
+    doubt = {"subject": "lamp", "object": "desk", "observed": ["left", "above"]}
+    doubt |= {"expected": "on-top", "probability": 0.9, "observed_probability": 0.05}
+    found = RelationsAnswer(
+        **ANSWERED,
+        relations=[given | {"observed": True, "expected": 0.123}, given | {"relation": "on-top"}],
+        disagreements=[doubt],
     )
-    text = shown(tables.outliers(OutliersAnswer(**ANSWERED, outliers=[hostile], misplaced=[])))
-    assert "[red]x[/red]" in text
+    lines = rows(tables.relations(found))
+    assert ["subject", "relation", "object", "probability", "expected"] in lines
+    assert ["milk", "inside", "fridge", "0.810", "observed", "0.123"] in lines
+    assert ["milk", "on-top", "fridge", "0.810"] in lines
+    assert ["disagreements"] in lines
+    assert ["lamp", "left,", "above", "desk", "0.050", "on-top", "0.900"] in lines
 
 
-def test_the_likeliest_misplaced_relations_are_shown() -> None:
-    given = [
-        MisplacedRelation(subject=f"a_{i}", relation="left", object="b", probability=1 - i / 40)
+def test_misplaced_relations_and_the_moved_object() -> None:
+    relations: list[Any] = [
+        {"subject": f"a_{i}", "relation": "left", "object": "b", "probability": 1 - i / 40}
         for i in range(12)
     ]
-    text = shown(tables.outliers(OutliersAnswer(**ANSWERED, outliers=[], misplaced=given)))
-    assert "the 10 likeliest to be wrong of 12" in text
-    assert "a_9" in text
-    assert "a_10" not in text
-    few = OutliersAnswer(**ANSWERED, outliers=[], misplaced=given[:10])
+    relations[0] |= {"is_misplaced": True, "moved": "b"}
+    table = tables.outliers(OutliersAnswer(**ANSWERED, outliers=[], misplaced=relations))
+    assert "the 10 likeliest to be wrong of 12" in shown(table)
+    assert ["a_0", "left", "b", "1.000", "misplaced", "b"] in rows(table)
+    assert ["a_9", "left", "b", "0.775"] in rows(table)
+    assert "a_10" not in shown(table)
+    few = OutliersAnswer(**ANSWERED, outliers=[], misplaced=relations[:10])
     assert "likeliest" not in shown(tables.outliers(few))
+
+
+def test_long_lists_of_sampled_relations_are_cut() -> None:
+    objects = ["bed", *(f"lamp {number}" for number in range(20))]
+    sides = [{"subject": name, "relation": "left", "object": "bed"} for name in objects[1:]]
+    on = {"subject": "lamp 7", "relation": "on-top", "object": "bed"}
+    drawn = {"objects": objects, "relations": [*sides, on], "log_score": 0.0, "context": {}}
+    table = shown(tables.generate(GenerateAnswer(**ANSWERED, seed=1, scenes=[drawn])))
+    assert table.count("left bed") == tables.MOST_RELATIONS - 1
+    assert "lamp 7 on-top bed" in table
+    assert "… and 9 more" in table

@@ -31,17 +31,8 @@ def test_the_wheel_holds_the_client_alone(repository: Path, tmp_path: Path):
 
 
 HEAVY = (
-    "fastapi",
-    "matplotlib",
-    "numba",
-    "numpy",
-    "prometheus_client",
-    "pydantic_settings",
-    "rapidfuzz",
-    "safetensors",
-    "starlette",
-    "torch",
-    "uvicorn",
+    *("fastapi", "matplotlib", "numba", "numpy", "prometheus_client", "pydantic_settings"),
+    *("rapidfuzz", "safetensors", "starlette", "torch", "uvicorn"),
 )
 
 PROGRAM = f"""
@@ -64,5 +55,5 @@ except ImportError as error:
 
 def test_the_client_works_where_nothing_of_the_service_is_installed() -> None:
     done = run_program(sys.executable, "-W", "error", "-c", PROGRAM)
-    # Whoever wants answers without a service is told what that takes.
+    # An offline client says which packages it needs.
     assert "pip install '.[service]' in the repository" in done.stdout

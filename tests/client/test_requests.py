@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from typer.testing import CliRunner
 
 from scene_client import AsyncClient, Client, InvalidRequestError, ProblemError
-from scene_client.command import app
 from scene_client.schemas import (
     Anchor,
     Detection,
@@ -23,19 +19,19 @@ from scene_client.schemas import (
     SceneRequest,
 )
 
-MODEL = {"name": "a", "version": "1.0.0", "variant": "rbm", "digest": "0"}
 EVERYTHING: dict[str, Any] = {
-    "model": MODEL,
+    "model": {"name": "a", "version": "1.0.0", "variant": "rbm", "digest": "0"},
     "request_id": "r",
+    "seed": 1,
     "relations": [],
     "disagreements": [],
     "missing": [],
     "outliers": [],
     "misplaced": [],
-    "seed": 1,
     "scenes": [],
     "results": [],
 }
+"""An answer to every question."""
 
 
 class Recorder:
@@ -67,17 +63,16 @@ def scene(recorder: Recorder) -> Client:
 def test_short_and_long_forms_are_sent_alike(scene: Client, recorder: Recorder) -> None:
     lamp = Detection(label="lamp", id="l", position=Position(x=1.0, y=0.0, z=0.5))
     plain = {"label": "lamp", "id": "l", "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
-    stated = {"subject": "l", "relation": "on-top", "object": "desk"}
-    bodies = []
-    for detection, relation, at in (
-        (lamp, Relation(**stated), Anchor(relation="left", object="desk")),  # type: ignore[arg-type]
-        (plain, stated, {"relation": "left", "object": "desk"}),
+    stated: Any = {"subject": "l", "relation": "on-top", "object": "desk"}
+    place: Any = {"relation": "left", "object": "desk"}
+    forms: Any = (
+        (lamp, Relation(**stated), Anchor(**place)),
+        (plain, stated, place),
         (plain, ("l", "on-top", "desk"), ("left", "desk")),
-    ):
-        scene.missing(("desk", detection), relations=[relation], at=at)  # type: ignore[list-item, arg-type]
-        bodies.append(recorder.body)
-    assert bodies[0] == bodies[1] == bodies[2]
-    assert bodies[0]["objects"] == ["desk", plain]
+    )
+    for detection, relation, at in forms:
+        scene.missing(("desk", detection), relations=[relation], at=at)
+        assert recorder.body == {"objects": ["desk", plain], "relations": [stated], "at": place}
 
 
 LAMPS = {"objects": ["bed"], "candidates": ["lamp"]}
@@ -155,37 +150,9 @@ def test_invalid_requests_are_not_sent(
 
 @pytest.mark.parametrize("url", ["", "robot:8000", "ftp://robot", "http://", "http://robot?a=b"])
 def test_invalid_urls_are_refused(url: str) -> None:
-    with pytest.raises(InvalidRequestError, match="URL"):
-        Client(url)
-    with pytest.raises(InvalidRequestError, match="URL"):
-        AsyncClient(url)
-
-
-@pytest.mark.parametrize("key", ["secret-key\n", "secret-\rkey", "sécret-key", "secret key"])
-def test_keys_that_no_header_can_carry_are_refused_without_being_repeated(
-    monkeypatch: pytest.MonkeyPatch, key: str
-) -> None:
     for kind in (Client, AsyncClient):
-        for keys in ({"api_key": key}, {"admin_key": key}):
-            with pytest.raises(InvalidRequestError, match="ASCII") as raised:
-                kind("http://robot", **keys)
-            assert "cret" not in str(raised.value)
-    monkeypatch.setenv("SCENE_API_KEY", key)
-    result = CliRunner().invoke(app, ["missing", "bed"])
-    assert result.exit_code == 2
-    assert "ASCII" in result.output
-    assert "cret" not in result.output
-
-
-@pytest.mark.system
-@pytest.mark.parametrize("key", ["secret-key\n", "sécret-key"])
-def test_the_cpp_client_refuses_the_same_keys(bridge: Path, key: str) -> None:
-    run = subprocess.run(
-        [bridge, "http://127.0.0.1:1", "1", "0", key], capture_output=True, text=True
-    )
-    assert "InvalidRequestError" in run.stderr
-    assert "ASCII" in run.stderr
-    assert "cret" not in run.stderr
+        with pytest.raises(InvalidRequestError, match="URL"):
+            kind(url)
 
 
 def test_keys_go_where_they_are_needed_and_nowhere_else(recorder: Recorder) -> None:
@@ -204,23 +171,17 @@ def test_expected_is_sent_only_if_set() -> None:
     scene.promote("default", "home")
     scene.promote("default", "home", expected=None)
     scene.promote("default", "home", expected="home@1.0.0")
-    assert [json.loads(request.content) for request in recorder.requests] == [
-        {"model": "home"},
-        {"model": "home", "expected": None},
-        {"model": "home", "expected": "home@1.0.0"},
-    ]
+    bodies = [json.loads(request.content) for request in recorder.requests]
+    expected = [{}, {"expected": None}, {"expected": "home@1.0.0"}]
+    assert bodies == [{"model": "home"} | fields for fields in expected]
     assert {request.headers["x-admin-key"] for request in recorder.requests} == {"b" * 16}
 
 
 def test_names_are_quoted_in_addresses() -> None:
     recorder = Recorder(status=404)
     scene = Client("http://robot", transport=httpx.MockTransport(recorder))
-    for name in ("a/b", "ä b", "home@1.0.0", "../x"):
+    quoted = {"a/b": b"a%2Fb", "ä b": b"%C3%A4%20b", "x@1.0": b"x%401.0", "../x": b"..%2Fx"}
+    for name, text in quoted.items():
         with pytest.raises(ProblemError):
             scene.vocabulary(name)
-    assert [request.url.raw_path for request in recorder.requests] == [
-        b"/models/a%2Fb/vocabulary",
-        b"/models/%C3%A4%20b/vocabulary",
-        b"/models/home%401.0.0/vocabulary",
-        b"/models/..%2Fx/vocabulary",
-    ]
+        assert recorder.requests[-1].url.raw_path == b"/models/%b/vocabulary" % text

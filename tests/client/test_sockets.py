@@ -5,8 +5,9 @@ from __future__ import annotations
 import socket
 import ssl
 import subprocess
-import threading
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +27,7 @@ from scene_client import (
     sync,
 )
 from tests.client.conftest import OVER_HTTP
-from tests.client.peers import answer, read_head
+from tests.client.peers import answer, answering, read_head, say_nothing
 
 
 def serve(connection: socket.socket, heads: list[bytes] | None = None) -> None:
@@ -39,31 +40,24 @@ def serve(connection: socket.socket, heads: list[bytes] | None = None) -> None:
 
 
 def drip(connection: socket.socket) -> None:
-    """Send something every 20 ms, for ever: no single wait is long."""
+    """Send a byte of the body every 20 ms, without end: no single wait is long."""
     read_head(connection)
     connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 1000000\r\n\r\n")
-    pause = threading.Event()
     while True:
         connection.sendall(b" ")
-        pause.wait(0.02)
+        time.sleep(0.02)
 
 
 def drip_head(connection: socket.socket) -> None:
     read_head(connection)
     connection.sendall(b"HTTP/1.1 200 OK\r\n")
-    pause = threading.Event()
     for number in range(10**6):
         connection.sendall(b"X-%d: y\r\n" % number)
-        pause.wait(0.02)
-
-
-def say_nothing(connection: socket.socket) -> None:
-    read_head(connection)
-    connection.recv(1)
+        time.sleep(0.02)
 
 
 def flood(connection: socket.socket) -> None:
-    """Send as fast as it is read: no wait is one at all."""
+    """Send as fast as the client reads: the client never waits."""
     read_head(connection)
     connection.sendall(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n")
     while True:
@@ -97,7 +91,7 @@ def test_no_service_holds_a_call_beyond_the_deadline(
 ) -> None:
     monkeypatch.setattr(sync, "MAX_ANSWER", 2**50)
     monkeypatch.setattr(asynchronous, "MAX_ANSWER", 2**50)
-    # Nothing here is timed: were a wait longer than the deadline, it would never end.
+    # The test measures no time: a wait beyond the deadline would never end.
     started = peer(behave)
     with open_caller(started.url, timeout=0.2) as call:
         for _ in range(2):
@@ -150,16 +144,15 @@ def test_a_refused_connection_is_unreachable_and_not_ready(open_caller: Any) -> 
 @every_client
 def test_the_key_and_the_time_left_are_sent(peer: Any, open_caller: Any) -> None:
     heads: list[bytes] = []
-    with open_caller(
-        peer(partial(serve, heads=heads)).url + "/robot/", api_key="k" * 16, timeout=5.0
-    ) as call:
+    url = peer(partial(serve, heads=heads)).url + "/robot/"
+    with open_caller(url, api_key="k" * 16, timeout=5.0) as call:
         call("is_ready")
     (head,) = heads
     assert head.startswith(b"GET /robot/health/ready HTTP/1.1\r\n")
     lines = dict(line.lower().split(b": ", 1) for line in head.split(b"\r\n")[1:] if line)
     assert lines[b"x-api-key"] == b"k" * 16
     assert 2000 < int(lines[b"x-request-timeout-ms"]) <= 5000
-    # What is unpacked could be of any size.
+    # A compressed answer could decompress to any size.
     assert lines[b"accept-encoding"] == b"identity"
 
 
@@ -205,7 +198,7 @@ async def test_an_answer_without_end_is_not_kept(
 ) -> None:
     monkeypatch.setattr(sync, "MAX_ANSWER", 1000)
     monkeypatch.setattr(asynchronous, "MAX_ANSWER", 1000)
-    started = peer(lambda connection: (read_head(connection), answer(connection, b" " * 2000)))
+    started = peer(answering(b" " * 2000))
     with Client(started.url) as scene, pytest.raises(AnswerError, match="more than"):
         scene.models()
     async with AsyncClient(started.url) as scene_async:
@@ -215,16 +208,16 @@ async def test_an_answer_without_end_is_not_kept(
 
 def test_one_client_serves_many_threads(peer: Any) -> None:
     started = peer(serve)
-    found: list[bool] = []
-    with Client(started.url) as scene:
-
-        def ask() -> None:
-            found.extend(scene.is_ready() for _ in range(10))
-
-        threads = [threading.Thread(target=ask) for _ in range(8)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    assert found == [True] * 80
+    with Client(started.url) as scene, ThreadPoolExecutor(8) as threads:
+        assert all(threads.map(lambda _: scene.is_ready(), range(80)))
     assert started.connections <= 8
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("key", ["secret-key\n", "sécret-key"])
+def test_the_cpp_client_refuses_keys_that_no_header_can_carry(bridge: Path, key: str) -> None:
+    command = [bridge, "http://127.0.0.1:1", "1", "0", key]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert "InvalidRequestError" in done.stderr
+    assert "the API key must be ASCII, without spaces or line breaks" in done.stderr
+    assert "cret" not in done.stderr

@@ -1,16 +1,17 @@
-"""As much of ROS 2 as the example node needs: rclpy's surface, and the published message types.
+"""A stand-in for rclpy with the published message types, as far as the example node needs them.
 
-Messages are those of the parser that reads bags. Every one that is published is written in CDR and
-read back, so one that does not fit its type fails here as it would in ROS.
+Messages are those of the parser that reads bags. A publisher writes each message in CDR and reads
+it back, so a message that does not fit its type fails here as in ROS.
 """
 
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ def message_type(name: str) -> Any:
 
 @dataclass
 class Publisher:
-    """What was published, each message as it came over the wire."""
+    """A publisher that keeps its messages as they arrive over the wire."""
 
     kind: Any
     sent: list[Any] = field(default_factory=list)
@@ -56,10 +57,11 @@ class Ros:
 
     Attributes:
         given: parameters, as from a file.
-        declared: those that the node asked for.
-        subscriptions: topic to (message type, callback).
-        publishers: topic to what was published there.
+        declared: parameters that the node declares.
+        subscriptions: (message type, callback) of each topic.
+        publishers: publisher of each topic.
         timers: (period in seconds, callback).
+        spun: nodes that the program has run.
     """
 
     given: dict[str, Any]
@@ -71,25 +73,19 @@ class Ros:
     destroyed: bool = False
 
     def node_type(self) -> type:
-        """The base class of nodes, bound to this process."""
+        """Return the base class of nodes, bound to this process."""
         ros = self
 
         class Node:
             def __init__(self, name: str) -> None:
-                self.name = name
-
-            def get_name(self) -> str:
-                return self.name
+                self.get_name = lambda: name
 
             def declare_parameter(self, name: str, default: Any) -> Any:
-                value = ros.given.get(name, default)
+                value = ros.declared[name] = ros.given.get(name, default)
                 assert type(value) is type(default), f"{name} changed its type"
-                ros.declared[name] = value
                 return SimpleNamespace(value=value)
 
-            def create_subscription(
-                self, kind: Any, topic: str, callback: Callable[[Any], None], qos: Any
-            ) -> None:
+            def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
                 ros.subscriptions[topic] = kind, callback
 
             def create_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
@@ -107,50 +103,55 @@ class Ros:
 
         return Node
 
-    def modules(self) -> dict[str, ModuleType]:
-        """What the node imports, by name."""
-        found: dict[str, ModuleType] = {}
-
-        def module(name: str, **content: Any) -> None:
-            found[name] = ModuleType(name)
-            vars(found[name]).update(content)
-
-        module(
-            "rclpy",
-            init=lambda: None,
-            try_shutdown=lambda: None,
-            spin=self.spun.append,
-            __path__=[],
-        )
-        module("rclpy.node", Node=self.node_type())
-        module(
-            "rclpy.executors",
-            ExternalShutdownException=type("ExternalShutdownException", (Exception,), {}),
-        )
-        module(
-            "rclpy.qos",
-            qos_profile_sensor_data=object(),
-            QoSProfile=lambda **settings: settings,
-            DurabilityPolicy=SimpleNamespace(TRANSIENT_LOCAL=1, VOLATILE=2),
-        )
-        types: dict[str, list[str]] = {
+    def modules(self) -> dict[str, Any]:
+        """Return the modules that the node imports, by name."""
+        names = {
             "std_msgs": ["String"],
             "geometry_msgs": ["PoseWithCovarianceStamped"],
             "vision_msgs": ["Detection3DArray", "Detection2DArray", "LabelInfo"],
             "visualization_msgs": ["Marker", "MarkerArray"],
             "diagnostic_msgs": ["DiagnosticArray", "DiagnosticStatus", "KeyValue"],
         }
-        for package, names in types.items():
-            module(package, __path__=[])
-            module(
-                f"{package}.msg",
-                **{name: message_type(f"{package}/msg/{name}") for name in names},
-            )
-        return found
+        members: dict[str, dict[str, Any]] = {
+            f"{package}.msg": {name: message_type(f"{package}/msg/{name}") for name in types}
+            for package, types in names.items()
+        }
+        members |= {package: {} for package in names}
+
+        def nothing() -> None:
+            """Do nothing."""
+
+        members["rclpy"] = {"init": nothing, "try_shutdown": nothing, "spin": self.spun.append}
+        members["rclpy.node"] = {"Node": self.node_type()}
+        shutdown = type("ExternalShutdownException", (Exception,), {})
+        members["rclpy.executors"] = {"ExternalShutdownException": shutdown}
+        members["rclpy.qos"] = {
+            "qos_profile_sensor_data": object(),
+            "QoSProfile": lambda **settings: settings,
+            "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL=1, VOLATILE=2),
+        }
+        return {name: SimpleNamespace(**content) for name, content in members.items()}
+
+
+class Slow:
+    """A client that waits for the event `answering` before it gives the answer or the error."""
+
+    def __init__(self, outcome: Any) -> None:
+        self.outcome = outcome
+        self.asked: list[dict[str, Any]] = []
+        self.started, self.answering = threading.Semaphore(0), threading.Event()
+
+    def missing(self, **fields: Any) -> Any:
+        self.asked.append(fields)
+        self.started.release()
+        assert self.answering.wait(30)
+        if isinstance(self.outcome, Exception):
+            raise self.outcome
+        return self.outcome
 
 
 def load_package(monkeypatch: pytest.MonkeyPatch, ros: Ros | None = None) -> None:
-    """Make the example package importable, anew, and this ROS with it."""
+    """Make a new copy of the example package importable, with this ROS."""
     monkeypatch.syspath_prepend(str(PACKAGE))
     for name in [name for name in sys.modules if name.split(".")[0] == "scene_reasoning"]:
         monkeypatch.delitem(sys.modules, name)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import threading
-import time
+import sys
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -16,194 +15,147 @@ from py_trees.common import Status
 from scene_client import Client
 from scene_client.schemas import OutliersAnswer
 from scene_client.vision_msgs import SceneFields
-from tests.deploy.ros import load_package
-from tests.services import LiveService
+from tests.deploy.ros import Slow, load_package
+from tests.services import LiveService, wait_until
+
+BED = {"objects": ["bed"]}
+NOTHING = SimpleNamespace(missing=[])
+Make = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
 def client(live: LiveService) -> Iterator[Client]:
-    with Client(f"http://127.0.0.1:{live.port}", timeout=20.0) as client:
+    with Client(live.url, timeout=20.0) as client:
         yield client
 
 
 @pytest.fixture
-def behaviours(monkeypatch: pytest.MonkeyPatch) -> Any:
+def make(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Make:
+    """Return a function that makes a condition and its tree; the test's end shuts the tree down."""
     load_package(monkeypatch)
-    return importlib.import_module("scene_reasoning.behaviours")
+    behaviours = importlib.import_module("scene_reasoning.behaviours")
 
-
-Plant = Callable[[Any], Any]
-
-
-@pytest.fixture
-def plant() -> Iterator[Plant]:
-    """Make a tree of one condition, which is taken down at the end."""
-    trees = []
-
-    def make(condition: Any) -> Any:
+    def make(kind: str, client: Any, scene: Any, *arguments: Any, **options: Any) -> Any:
+        source = scene if callable(scene) else lambda: scene
+        condition = getattr(behaviours, kind)(
+            "condition", client, source, *arguments, **{"timeout": 30.0, **options}
+        )
         root = py_trees.composites.Sequence("root", memory=True, children=[condition])
-        trees.append(py_trees.trees.BehaviourTree(root))
-        return trees[-1]
+        condition.tree = py_trees.trees.BehaviourTree(root)
+        request.addfinalizer(condition.tree.shutdown)
+        return condition
 
-    yield make
-    for tree in trees:
-        tree.shutdown()
+    return make
 
 
-def settle(tree: Any) -> Status:
+def settle(condition: Any) -> Status:
     """Tick until the tree has a result."""
-    until = time.monotonic() + 30
-    tree.tick()
-    while tree.root.status is Status.RUNNING:
-        assert time.monotonic() < until
-        time.sleep(0.005)
-        tree.tick()
-    return tree.root.status
+
+    def is_settled() -> bool:
+        condition.tree.tick()
+        return condition.tree.root.status is not Status.RUNNING
+
+    wait_until(is_settled)
+    return condition.tree.root.status
 
 
-def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
-    behaviours: Any, client: Client, scene: SceneFields, plant: Plant
+def test_a_scene_is_complete_if_no_missing_object_reaches_the_log_odds(
+    make: Make, client: Client, scene: SceneFields
 ) -> None:
     best = client.missing(**scene).missing
     highest = max(best, key=lambda thing: thing.log_odds)
     for margin, expected in ((0.01, Status.SUCCESS), (-0.01, Status.FAILURE)):
-        condition = behaviours.SceneComplete(
-            "complete", client, lambda: scene, timeout=30.0, log_odds=highest.log_odds + margin
-        )
-        assert settle(plant(condition)) is expected
+        condition = make("SceneComplete", client, scene, log_odds=highest.log_odds + margin)
+        assert settle(condition) is expected
         assert condition.answer.missing == best
         assert (highest.label in condition.feedback_message) is (expected is Status.FAILURE)
 
 
 @pytest.mark.parametrize("thing", ["toilet_1", "toilet"])
-def test_a_thing_belongs_unless_it_is_an_outlier(
-    behaviours: Any, client: Client, scene: SceneFields, plant: Plant, thing: str
+def test_an_object_belongs_unless_it_is_an_outlier(
+    make: Make, client: Client, scene: SceneFields, thing: str
 ) -> None:
     (toilet,) = (entry for entry in client.outliers(**scene).outliers if entry.object == "toilet_1")
     for margin, expected in ((0.001, Status.SUCCESS), (-0.001, Status.FAILURE)):
-        condition = behaviours.ObjectBelongs(
-            "belongs",
-            client,
-            lambda: scene,
-            thing,
-            timeout=30.0,
-            threshold=toilet.probability + margin,
-        )
-        assert settle(plant(condition)) is expected
+        threshold = toilet.probability + margin
+        condition = make("ObjectBelongs", client, scene, thing, threshold=threshold)
+        assert settle(condition) is expected
         assert condition.feedback_message.startswith("toilet_1: an outlier with probability 0.")
 
 
 @pytest.mark.parametrize(
-    ("thing", "moved", "is_misplaced", "message"),
+    ("thing", "moved", "is_misplaced", "is_wrong"),
     [
-        ("pillow_1", "pillow_1", True, "pillow_1: in the wrong place, pillow_1 on-top floor"),
-        ("pillow", "pillow_1", True, "pillow_1: in the wrong place, pillow_1 on-top floor"),
-        ("pillow_1", "bed", True, None),
-        ("pillow_1", None, False, None),
+        ("pillow_1", "pillow_1", True, True),
+        ("pillow", "pillow_1", True, True),
+        ("pillow_1", "bed", True, False),
+        ("pillow_1", None, False, False),
     ],
 )
-def test_a_thing_in_the_wrong_place_does_not_belong(
-    behaviours: Any, plant: Plant, thing: str, moved: str | None, is_misplaced: bool, message: Any
+def test_an_object_in_the_wrong_place_does_not_belong(
+    make: Make, thing: str, moved: str | None, is_misplaced: bool, is_wrong: bool
 ) -> None:
-    outlier = {"probability": 0.01, "log_odds": 2.0, "is_outlier": False}
+    outlier = {"object": "pillow_1", "label": "pillow", "probability": 0.01, "log_odds": 2.0}
     place = {"subject": "pillow_1", "relation": "on-top", "object": "floor", "probability": 0.9}
-    answer = OutliersAnswer.model_validate(
-        {
-            "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
-            "request_id": "r",
-            "outliers": [outlier | {"object": "pillow_1", "label": "pillow"}],
-            "misplaced": [place | {"is_misplaced": is_misplaced, "moved": moved}],
-        }
+    answer = OutliersAnswer(
+        model={"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
+        request_id="r",
+        outliers=[outlier | {"is_outlier": False}],
+        misplaced=[place | {"is_misplaced": is_misplaced, "moved": moved}],
     )
     client = SimpleNamespace(outliers=lambda **fields: answer)
-    condition = behaviours.ObjectBelongs("belongs", client, lambda: {"objects": ["bed"]}, thing)
-    assert settle(plant(condition)) is (Status.FAILURE if message else Status.SUCCESS)
+    condition = make("ObjectBelongs", client, BED, thing)
+    assert settle(condition) is (Status.FAILURE if is_wrong else Status.SUCCESS)
+    wrong = "pillow_1: in the wrong place, pillow_1 on-top floor"
     likely = "pillow_1: an outlier with probability 0.01"
-    assert condition.feedback_message == (message or likely)
+    assert condition.feedback_message == (wrong if is_wrong else likely)
 
 
 LAMP = {"candidates": ["lamp"], "at": {"relation": "on-top", "object": "desk"}, "log_odds": -1e3}
 
 
-@pytest.mark.parametrize(
-    ("kind", "arguments", "options", "message"),
-    [
-        ("SceneComplete", [lambda: None], {}, "nothing was seen"),
-        ("SceneComplete", [lambda: {"objects": []}], {}, "nothing was seen"),
-        ("SceneComplete", [], LAMP, "missing: lamp"),
-        ("ObjectBelongs", [None, "sofa"], {}, "no sofa was seen"),
-    ],
-)
-def test_a_condition_fails_with_a_reason(
-    behaviours: Any,
-    client: Client,
-    scene: SceneFields,
-    plant: Plant,
-    kind: str,
-    arguments: list[Any],
-    options: dict[str, Any],
-    message: str,
+def test_a_condition_fails_with_a_reason(make: Make, client: Client, scene: SceneFields) -> None:
+    with Client("http://127.0.0.1:9") as unreachable:
+        conditions = {
+            "nothing was seen": make("SceneComplete", client, None),
+            "nothing was seen.": make("SceneComplete", client, {"objects": []}),
+            "missing: lamp": make("SceneComplete", client, scene, **LAMP),
+            "no sofa was seen": make("ObjectBelongs", client, scene, "sofa"),
+            "UnreachableError: ": make("SceneComplete", unreachable, BED),
+        }
+        for reason, condition in conditions.items():
+            assert settle(condition) is Status.FAILURE
+            assert condition.feedback_message.startswith(reason.rstrip("."))
+
+
+def test_a_tick_never_waits_and_a_condition_fails_in_time(
+    make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source, *others = arguments or [None]
-    condition = getattr(behaviours, kind)(
-        "condition", client, source or (lambda: scene), *others, timeout=30.0, **options
-    )
-    assert settle(plant(condition)) is Status.FAILURE
-    assert condition.feedback_message == message
-
-
-def test_a_service_that_is_not_there_fails_the_condition(behaviours: Any, plant: Plant) -> None:
-    with Client("http://127.0.0.1:9") as client:
-        condition = behaviours.SceneComplete(
-            "complete", client, lambda: {"objects": ["bed"]}, timeout=30.0
-        )
-        assert settle(plant(condition)) is Status.FAILURE
-    assert condition.feedback_message.startswith("UnreachableError: ")
-
-
-class Slow:
-    """A client that answers when it is told to."""
-
-    def __init__(self) -> None:
-        self.answering, self.asked = threading.Event(), threading.Semaphore(0)
-        self.scenes: list[Any] = []
-
-    def missing(self, **fields: Any) -> Any:
-        self.scenes.append(fields["objects"])
-        self.asked.release()
-        assert self.answering.wait(30)
-        return SimpleNamespace(missing=[])
-
-
-def test_a_tick_never_waits_and_a_condition_fails_in_time(behaviours: Any, plant: Plant) -> None:
-    client, clock = Slow(), SimpleNamespace(now=100.0)
-    condition = behaviours.SceneComplete("complete", client, lambda: {"objects": ["bed"]})
-    behaviours.time = SimpleNamespace(monotonic=lambda: clock.now)
-    tree = plant(condition)
+    client, clock = Slow(NOTHING), SimpleNamespace(now=100.0)
+    condition = make("SceneComplete", client, BED, timeout=1.0)
+    module = sys.modules[type(condition).__module__]
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock.now))
     for clock.now in (100.0, 100.5, 100.99):
-        tree.tick()
-        assert tree.root.status is Status.RUNNING
+        condition.tree.tick()
+        assert condition.status is Status.RUNNING
     clock.now = 101.01
-    tree.tick()
-    assert tree.root.status is Status.FAILURE
+    condition.tree.tick()
+    assert condition.status is Status.FAILURE
     assert condition.feedback_message == "no answer in time"
     client.answering.set()
 
 
-def test_an_interrupted_condition_uses_the_next_scene(behaviours: Any, plant: Plant) -> None:
-    client, scenes = Slow(), iter([["bed"], ["lamp"], ["sofa"]])
-    condition = behaviours.SceneComplete(
-        "complete", client, lambda: {"objects": next(scenes)}, timeout=30.0
-    )
-    tree = plant(condition)
-    tree.tick()
-    assert client.asked.acquire(timeout=30)
-    # Interrupted twice: the second time its question had not even begun.
+def test_an_interrupted_condition_uses_the_next_scene(make: Make) -> None:
+    client, scenes = Slow(NOTHING), iter([["bed"], ["lamp"], ["sofa"]])
+    condition = make("SceneComplete", client, lambda: {"objects": next(scenes)})
+    condition.tree.tick()
+    assert client.started.acquire(timeout=30)
+    # At the second interruption, the condition's question has not started yet.
     for _ in range(2):
-        tree.root.stop(Status.INVALID)
+        condition.tree.root.stop(Status.INVALID)
         assert condition.status is Status.INVALID
-        tree.tick()
+        condition.tree.tick()
         assert condition.status is Status.RUNNING
     client.answering.set()
-    assert settle(tree) is Status.SUCCESS
-    assert client.scenes == [["bed"], ["lamp"]]
+    assert settle(condition) is Status.SUCCESS
+    assert [fields["objects"] for fields in client.asked] == [["bed"], ["lamp"]]

@@ -13,7 +13,7 @@ import pytest
 from scene_client import Client
 from scene_client.vision_msgs import SceneFields
 from tests.client import callers
-from tests.client.peers import Peer, answer, read_head
+from tests.client.peers import Peer, answering
 from tests.conftest import run_program
 from tests.services import LiveService
 
@@ -29,10 +29,9 @@ def program(
     """Ticks one condition as a tree does."""
     here = Path(__file__).parent
     return callers.compiled(
+        require_system_tool,
         here / "conditions.cpp",
         tmp_path_factory.mktemp("conditions") / "conditions",
-        require_system_tool("g++"),
-        require_system_tool("pkg-config"),
         repository / "clients" / "ros2" / "behaviortree_cpp",
         here,
     )
@@ -47,7 +46,7 @@ def tick(program: Path, url: str, kind: str, *ports: Any, timeout: float = 20.0)
 
 @pytest.fixture
 def url(live: LiveService) -> str:
-    return f"http://127.0.0.1:{live.port}"
+    return live.url
 
 
 def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
@@ -56,20 +55,12 @@ def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
     with Client(url, timeout=20.0) as client:
         missing = client.missing(**scene).missing
     highest = max(missing, key=lambda thing: thing.log_odds)
-    above, below, default = tick(
-        program,
-        url,
-        "SceneComplete",
-        {"scene": json.dumps(scene), "log_odds": str(highest.log_odds + 0.01)},
-        {"scene": json.dumps(scene), "log_odds": str(highest.log_odds - 0.01)},
-        {"scene": json.dumps(scene)},
-    )
-    assert above == {
-        "status": "SUCCESS",
-        "because": "nothing is missing",
-        "waited": True,
-        "woken": 1,
-    }
+    ports = {"scene": json.dumps(scene)}
+    limits = [{"log_odds": str(highest.log_odds + margin)} for margin in (0.01, -0.01)]
+    lists = [ports | limits[0], ports | limits[1], ports]
+    above, below, default = tick(program, url, "SceneComplete", *lists)
+    because = "nothing is missing"
+    assert above == {"status": "SUCCESS", "because": because, "waited": True, "woken": 1}
     assert (below["status"], below["because"]) == ("FAILURE", f"missing: {highest.label}")
     absent = [thing.label for thing in missing if thing.log_odds >= 0]
     assert (default["status"] == "FAILURE") is bool(absent)
@@ -82,18 +73,11 @@ def test_a_thing_belongs_unless_it_is_an_outlier(
     with Client(url, timeout=20.0) as client:
         outliers = client.outliers(**scene).outliers
     (toilet,) = (thing for thing in outliers if thing.label == "toilet")
-    strict = json.dumps({**scene, "threshold": toilet.probability - 0.001})
-    mild = json.dumps({**scene, "threshold": toilet.probability + 0.001})
-    found = tick(
-        program,
-        url,
-        "ObjectBelongs",
-        {"scene": mild, "object": "toilet_1"},
-        {"scene": strict, "object": "toilet_1"},
-        {"scene": strict, "object": "toilet"},
-        {"scene": strict, "object": "sofa"},
-        {"scene": strict},
-    )
+    strict = {"scene": json.dumps({**scene, "threshold": toilet.probability - 0.001})}
+    mild = {"scene": json.dumps({**scene, "threshold": toilet.probability + 0.001})}
+    objects = ({"object": name} for name in ("toilet_1", "toilet", "sofa"))
+    ports = [mild | {"object": "toilet_1"}, *(strict | name for name in objects), strict]
+    found = tick(program, url, "ObjectBelongs", *ports)
     assert [(entry["status"], entry["because"]) for entry in found] == [
         ("SUCCESS", "toilet_1 belongs"),
         ("FAILURE", "toilet_1 is an outlier"),
@@ -119,20 +103,13 @@ def test_a_thing_in_the_wrong_place_does_not_belong(
         "outliers": [{"object": "pillow_1", "label": "pillow", "is_outlier": False}],
         "misplaced": [place | {"is_misplaced": moved is not None, "moved": moved}],
     }
-
-    def tells(connection: socket.socket) -> None:
-        read_head(connection)
-        answer(connection, json.dumps(told).encode())
-
-    peer = Peer(tells)
     ports = [{"scene": '{"objects": ["bed"]}', "object": name} for name in ("pillow_1", "pillow")]
-    try:
-        (by_id,) = tick(program, peer.url, "ObjectBelongs", ports[0])
-        (by_label,) = tick(program, peer.url, "ObjectBelongs", ports[1])
-    finally:
-        peer.close()
-    assert (by_id["status"], by_id["because"]) == (status, because)
-    assert (by_label["status"], by_label["because"]) == (status, because)
+    with Peer(answering(json.dumps(told).encode())) as peer:
+        results = [tick(program, peer.url, "ObjectBelongs", entry) for entry in ports]
+    assert [(result["status"], result["because"]) for (result,) in results] == [
+        (status, because),
+        (status, because),
+    ]
 
 
 @pytest.mark.parametrize(

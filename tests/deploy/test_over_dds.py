@@ -83,10 +83,7 @@ def test_every_field_has_the_bytes_of_ros(length: int) -> None:
     ],
 )
 def test_invalid_options_end_the_program_with_status_2(
-    options: list[str],
-    error: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    options: list[str], error: str, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     monkeypatch.setattr("sys.argv", ["over_dds.py", *options])
     with pytest.raises(SystemExit, match="2"):
@@ -94,9 +91,7 @@ def test_invalid_options_end_the_program_with_status_2(
     assert error in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_a_service_that_does_not_answer_is_one_line_for_each_message(
-    recorded: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unreachable_service_is_one_line_of_error(recorded: Any, capsys: Any) -> None:
     with Client("http://127.0.0.1:9") as client:
         assert over_dds.bridge.answer(over_dds.bridge.Advisor(client), recorded) is None
     (line,) = capsys.readouterr().err.splitlines()
@@ -105,7 +100,7 @@ def test_a_service_that_does_not_answer_is_one_line_for_each_message(
 
 @pytest.fixture(scope="module")
 def errors(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the bridge writes to standard error."""
+    """The standard error of the bridge."""
     return tmp_path_factory.mktemp("bridge") / "errors"
 
 

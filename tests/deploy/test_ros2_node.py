@@ -6,7 +6,6 @@ import copy
 import importlib
 import json
 import math
-import threading
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
@@ -18,13 +17,19 @@ import yaml
 
 from scene_client import Client, UnreachableError
 from scene_client.vision_msgs import SceneFields
+from tests.client.peers import Peer, answering
 from tests.client.ros_messages import blank
-from tests.deploy.ros import PACKAGE, STORE, Ros, load_package
-from tests.services import LiveService, launch, wait_until
+from tests.deploy.ros import PACKAGE, STORE, Ros, Slow, load_package
+from tests.services import LiveService, wait_until
+
+
+def new(name: str, **fields: Any) -> Any:
+    """Return a message of vision_msgs."""
+    return blank(STORE, f"vision_msgs/msg/{name}", **fields)
 
 
 class Running:
-    """The node in a process of its own making: what it hears, and what it publishes."""
+    """The running node: its subscriptions and publications."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **parameters: Any) -> None:
         self.ros = Ros(parameters)
@@ -106,37 +111,24 @@ def test_detections_become_answers_markers_and_a_diagnosis(
 
 
 def test_the_api_key_comes_from_a_file(
-    run: Callable[..., Running], recorded: Any, shared_store: Path, tmp_path: Path
+    run: Callable[..., Running], recorded: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "key").write_text("incorrect-zebra-capacitor-nail\n")
-    key = {"SCENE_API_KEY": "incorrect-zebra-capacitor-nail"}
-    with launch(shared_store, tmp_path / "log", **key) as service:
-        for file, topic in ((str(tmp_path / "key"), "~/answers"), ("", "/diagnostics")):
-            running = run(url=service.url, timeout=20.0, api_key_file=file)
+    for file in (str(tmp_path / "key"), ""):
+        heads: list[bytes] = []
+        with Peer(answering(heads=heads)) as peer:
+            running = run(url=peer.url, api_key_file=file)
             running.hear("detections", recorded)
-            running.wait_for(topic)
-            assert bool(running.published("~/answers")) is bool(file)
-
-
-class Slow:
-    """A client that does not answer before it is told to, and then fails."""
-
-    def __init__(self) -> None:
-        self.asked: list[int] = []
-        self.started, self.answering = threading.Semaphore(0), threading.Event()
-
-    def missing(self, **fields: Any) -> Any:
-        self.asked.append(fields["stamp"]["sec"])
-        self.started.release()
-        assert self.answering.wait(30)
-        raise UnreachableError("gone")
+            running.wait_for("/diagnostics")
+        key = b"x-api-key: incorrect-zebra-capacitor-nail\r\n"
+        assert (key in heads[0].lower()) is bool(file)
 
 
 def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
     run: Callable[..., Running], recorded: Any
 ) -> None:
     running = run()
-    client = running.node.advisor.client = Slow()
+    client = running.node.advisor.client = Slow(UnreachableError("gone"))
     for second in range(4):
         message = copy.deepcopy(recorded)
         message.header.stamp.sec = second
@@ -147,7 +139,7 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
     assert running.published("/diagnostics") == []
     client.answering.set()
     running.wait_for("/diagnostics", 2)
-    assert client.asked == [0, 3]
+    assert [fields["stamp"]["sec"] for fields in client.asked] == [0, 3]
     first, second_one = (report.status[0] for report in running.published("/diagnostics"))
     assert first.level == second_one.level == 2
     assert first.message == "UnreachableError: gone"
@@ -171,7 +163,7 @@ def test_an_unreachable_service_is_diagnosed_until_it_returns(
 
 def test_empty_detections_send_no_request(run: Callable[..., Running]) -> None:
     running = run(url="http://127.0.0.1:9")
-    assert running.answer(blank(STORE, "vision_msgs/msg/Detection3DArray"))["notes"] == []
+    assert running.answer(new("Detection3DArray"))["notes"] == []
     assert (running.status().level, running.status().message) == (1, "nothing was seen")
 
 
@@ -188,10 +180,10 @@ def test_numbers_wait_for_their_labels(
     running.wait_for("/diagnostics")
     assert running.status().message.startswith("MessageError: the class ids are numbers")
     classes = [
-        blank(STORE, "vision_msgs/msg/VisionClass", class_id=int(number), class_name=name)
+        new("VisionClass", class_id=int(number), class_name=name)
         for name, number in numbers.items()
     ]
-    running.hear("label_info", blank(STORE, "vision_msgs/msg/LabelInfo", class_map=classes))
+    running.hear("label_info", new("LabelInfo", class_map=classes))
     answer = running.answer(recorded)
     assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}
 
@@ -233,24 +225,18 @@ def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
 def test_images_are_heard_where_the_parameters_say_so(
     run: Callable[..., Running], live: LiveService
 ) -> None:
+    def detection(name: str, x: float) -> Any:
+        hypothesis = new("ObjectHypothesis", class_id=name, score=0.9)
+        found = new("Detection2D", results=[new("ObjectHypothesisWithPose", hypothesis=hypothesis)])
+        found.bbox.center.position.x = x
+        found.bbox.size_x = found.bbox.size_y = 50.0
+        return found
+
     running = run(url=live.url, timeout=20.0, kind="2d", questions=["outliers"])
-    names, places = ("bed", "lamp"), (100.0, 160.0)
-    detections = []
-    for name, place in zip(names, places, strict=True):
-        hypothesis = blank(STORE, "vision_msgs/msg/ObjectHypothesis", class_id=name, score=0.9)
-        detection = blank(STORE, "vision_msgs/msg/Detection2D")
-        detection.results = [
-            blank(STORE, "vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis)
-        ]
-        detection.bbox.center.position.x = place
-        detection.bbox.size_x = detection.bbox.size_y = 50.0
-        detections.append(detection)
-    array = blank(STORE, "vision_msgs/msg/Detection2DArray", detections=detections)
-    answer = running.answer(array)
-    assert [
-        (entry["subject"], entry["relation"], entry["object"])
-        for entry in answer["outliers"]["misplaced"]
-    ] == [("bed_1", "left", "lamp_1")]
+    detections = [detection("bed", 100.0), detection("lamp", 160.0)]
+    answer = running.answer(new("Detection2DArray", detections=detections))
+    (entry,) = answer["outliers"]["misplaced"]
+    assert [*entry.values()][:3] == ["bed_1", "left", "lamp_1"]
 
 
 def test_the_program_spins_one_node_and_takes_it_down(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,26 +254,21 @@ def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyP
     load_package(monkeypatch)
     advisor = importlib.import_module("scene_reasoning.advisor")
     ghosts = importlib.import_module("scene_reasoning.ghosts").ghosts
-    fields = SceneFields(
-        {
-            "objects": [
-                {"id": "d", "label": "desk", "position": {"x": 1.0, "y": 2.0, "z": 0.4}},
-                {"id": "c", "label": "chair"},
-            ]
-        }
-    )
+    desk = {"id": "d", "label": "desk", "position": {"x": 1.0, "y": 2.0, "z": 0.4}}
+    fields = SceneFields({"objects": [desk, {"id": "c", "label": "chair"}]})
     offset = {"mean": {"x": 0.1, "y": -0.2, "z": 0.5}, "std": {"x": 0.2, "y": 0.0, "z": 9.0}}
     nowhere = {"relation": "front", "object": "c"}
     there = {"relation": "on-top", "object": "d"}
     inside = {"relation": "inside", "object": "d", "offset": None}
-    missing = [
-        {"label": "milk", "placements": []},
-        {"label": "lamp", "placements": [nowhere, there | {"offset": offset}]},
-        {"label": "bed", "placements": [nowhere]},
-        {"label": "cup", "placements": [there]},
-        {"label": "pen", "placements": [inside]},
-        {"label": "book", "placements": [there]},
-    ]
+    placements: dict[str, list[Any]] = {
+        "milk": [],
+        "lamp": [nowhere, there | {"offset": offset}],
+        "bed": [nowhere],
+        "cup": [there],
+        "pen": [inside],
+        "book": [there],
+    }
+    missing = [{"label": label, "placements": places} for label, places in placements.items()]
     lamp, cup, pen = ghosts(advisor.Advice(fields, {"missing": {"missing": missing}}), 3)
     assert lamp.text == "lamp? on-top desk"
     assert lamp.position == pytest.approx((1.1, 1.8, 0.9))

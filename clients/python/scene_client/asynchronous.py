@@ -10,7 +10,7 @@ import anyio
 import httpx
 
 from scene_client import calls, schemas
-from scene_client.calls import Call, Scene, T, segment
+from scene_client.calls import Call, Scene, T
 from scene_client.connection import MAX_ANSWER, RETRIES, Options, async_deadline, async_transport
 from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
 
@@ -70,8 +70,7 @@ class AsyncClient:
         **fields: Unpack[schemas.RelationsFields],
     ) -> schemas.RelationsAnswer:
         """Return the likely spatial relations between the objects."""
-        forms = schemas.RelationsRequest, schemas.RelationsAnswer
-        call = calls.ask("/relations", *forms, objects, fields, self.options.model)
+        call = calls.RELATIONS.call(objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def missing(
@@ -82,8 +81,7 @@ class AsyncClient:
         **fields: Unpack[schemas.MissingFields],
     ) -> schemas.MissingAnswer:
         """Return classes that are probably missing from the scene, and their likely places."""
-        forms = schemas.MissingRequest, schemas.MissingAnswer
-        call = calls.ask("/missing", *forms, objects, fields, self.options.model)
+        call = calls.MISSING.call(objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def outliers(
@@ -94,8 +92,7 @@ class AsyncClient:
         **fields: Unpack[schemas.OutliersFields],
     ) -> schemas.OutliersAnswer:
         """Return how well each object fits the scene, and the relations that are probably false."""
-        forms = schemas.OutliersRequest, schemas.OutliersAnswer
-        call = calls.ask("/outliers", *forms, objects, fields, self.options.model)
+        call = calls.OUTLIERS.call(objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def rooms(
@@ -106,8 +103,7 @@ class AsyncClient:
         **fields: Unpack[schemas.RoomsFields],
     ) -> schemas.RoomsAnswer:
         """Return the likely types of the room, or where one object usually is."""
-        forms = schemas.RoomsRequest, schemas.RoomsAnswer
-        call = calls.ask("/rooms", *forms, objects, fields, self.options.model)
+        call = calls.ROOMS.call(objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     async def generate(
@@ -118,8 +114,7 @@ class AsyncClient:
         **fields: Unpack[schemas.GenerateFields],
     ) -> schemas.GenerateAnswer:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
-        forms = schemas.GenerateRequest, schemas.GenerateAnswer
-        call = calls.ask("/generate", *forms, objects, fields, self.options.model)
+        call = calls.GENERATE.call(objects, fields, self.options.model)
         return await self._call(call, timeout)
 
     # -------------------------------------------------------------------------------- batches
@@ -128,33 +123,25 @@ class AsyncClient:
         self, scenes: Iterable[Scene[schemas.RelationsRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.RelationsAnswer]:
         """Ask `relations` about up to 256 scenes. Each scene has its own answer or problem."""
-        forms = schemas.RelationsRequest, schemas.RelationsAnswer
-        call = calls.ask_each("/relations", *forms, scenes, self.options.model)
-        return await self._call(call, timeout)
+        return await self._call(calls.RELATIONS.batch(scenes, self.options.model), timeout)
 
     async def missing_batch(
         self, scenes: Iterable[Scene[schemas.MissingRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.MissingAnswer]:
         """Ask `missing` about up to 256 scenes. Each scene has its own answer or problem."""
-        forms = schemas.MissingRequest, schemas.MissingAnswer
-        call = calls.ask_each("/missing", *forms, scenes, self.options.model)
-        return await self._call(call, timeout)
+        return await self._call(calls.MISSING.batch(scenes, self.options.model), timeout)
 
     async def outliers_batch(
         self, scenes: Iterable[Scene[schemas.OutliersRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.OutliersAnswer]:
         """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
-        forms = schemas.OutliersRequest, schemas.OutliersAnswer
-        call = calls.ask_each("/outliers", *forms, scenes, self.options.model)
-        return await self._call(call, timeout)
+        return await self._call(calls.OUTLIERS.batch(scenes, self.options.model), timeout)
 
     async def rooms_batch(
         self, scenes: Iterable[Scene[schemas.RoomsRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.RoomsAnswer]:
         """Ask `rooms` about up to 256 scenes. Each scene has its own answer or problem."""
-        forms = schemas.RoomsRequest, schemas.RoomsAnswer
-        call = calls.ask_each("/rooms", *forms, scenes, self.options.model)
-        return await self._call(call, timeout)
+        return await self._call(calls.ROOMS.batch(scenes, self.options.model), timeout)
 
     # --------------------------------------------------------------------------------- models
 
@@ -174,31 +161,31 @@ class AsyncClient:
         self, name: str, version: str | None = None, *, timeout: float | None = None
     ) -> schemas.ModelSummary | schemas.VersionDetails:
         """Return the versions of a model, or the details of one version."""
-        path = f"/models/{segment(name)}"
         if version is None:
-            return await self._call(Call("GET", path, schemas.ModelSummary), timeout)
-        path += f"/versions/{segment(version)}"
+            call = Call("GET", calls.model_path(name), schemas.ModelSummary)
+            return await self._call(call, timeout)
+        path = calls.model_path(name, "versions", version)
         return await self._call(Call("GET", path, schemas.VersionDetails), timeout)
 
     async def vocabulary(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> schemas.VocabularyAnswer:
         """Return the object classes, relations and room types of a model."""
-        path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
+        path = calls.model_path(name or self.options.model or "default", "vocabulary")
         return await self._call(Call("GET", path, schemas.VocabularyAnswer), timeout)
 
     async def word(
         self, word: str, name: str | None = None, *, timeout: float | None = None
     ) -> schemas.WordAnswer:
         """Return the class that a label becomes in a model, and by which rule."""
-        path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
-        return await self._call(Call("GET", f"{path}/{segment(word)}", schemas.WordAnswer), timeout)
+        path = calls.model_path(name or self.options.model or "default", "vocabulary", word)
+        return await self._call(Call("GET", path, schemas.WordAnswer), timeout)
 
     async def contexts(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> schemas.ContextsAnswer:
         """Return each hidden unit of a model with the classes of its largest weights."""
-        path = f"/models/{segment(name or self.options.model or 'default')}/contexts"
+        path = calls.model_path(name or self.options.model or "default", "contexts")
         return await self._call(Call("GET", path, schemas.ContextsAnswer), timeout)
 
     async def refresh(self, *, timeout: float | None = None) -> schemas.RefreshAnswer:

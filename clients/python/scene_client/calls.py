@@ -101,77 +101,72 @@ class Call(Generic[T]):
         return pause if self.repeatable or not may_have_arrived else None
 
 
-def segment(name: str) -> str:
-    """Return a name as one URL-encoded segment of a path.
+def model_path(*names: str) -> str:
+    """Return the path ``/models/...`` with these names as URL-encoded segments.
 
     Raises:
-        InvalidRequestError: the name is empty or contains only dots.
+        InvalidRequestError: a name is empty or contains only dots.
     """
     # In a URL, the segments "." and ".." refer to folders, so they cannot be names.
-    if not name or set(name) <= {"."}:
+    if any(not name or set(name) <= {"."} for name in names):
         raise InvalidRequestError.about("a name must not be empty, and must not contain only dots")
-    return quote(name, safe="")
+    return "/".join(["/models", *(quote(name, safe="") for name in names)])
 
 
 # -------------------------------------------------------------------------------------- questions
 
 
-def ask(
-    path: str,
-    form: type[RequestT],
-    answer: type[AnswerT],
-    scene: Any,
-    fields: Mapping[str, Any],
-    model: str | None = None,
-) -> Call[AnswerT]:
-    """Build one question about one scene.
+@dataclass(frozen=True, slots=True)
+class Question(Generic[RequestT, AnswerT]):
+    """The route of a question, with the classes of its request and its answer."""
 
-    Args:
-        path: path of the question's route.
-        form, answer: classes of request and answer.
-        scene: list of objects, or a whole request as a ``form`` or a dictionary.
-        fields: other fields of the request, if ``scene`` is a list of objects.
-        model: model for requests without the field ``model``.
+    path: str
+    form: type[RequestT]
+    answer: type[AnswerT]
 
-    Raises:
-        InvalidRequestError: the request is invalid.
-    """
-    return Call("POST", path, answer, _json(_request(form, scene, fields, model)))
+    def call(self, scene: Any, fields: Mapping[str, Any], model: str | None) -> Call[AnswerT]:
+        """Build the question about one scene.
+
+        Args:
+            scene: list of objects, or a whole request as a ``form`` or a dictionary.
+            fields: other fields of the request, if ``scene`` is a list of objects.
+            model: model for requests without the field ``model``.
+
+        Raises:
+            InvalidRequestError: the request is invalid.
+        """
+        body = _json(_request(self.form, scene, fields, model))
+        return Call("POST", self.path, self.answer, body)
+
+    def batch(self, scenes: Iterable[Any], model: str | None) -> Call[schemas.BatchAnswer[AnswerT]]:
+        """Build the question about many scenes. `call` describes the arguments.
+
+        Raises:
+            InvalidRequestError: the batch or the request about one of its scenes is invalid.
+        """
+        requests = [
+            _json(_request(self.form, scene, {}, model, ("scenes", index)))
+            for index, scene in enumerate(scenes)
+        ]
+        if not 1 <= len(requests) <= schemas.MAX_BATCH:
+            message = f"a batch must contain from 1 to {schemas.MAX_BATCH} scenes"
+            raise InvalidRequestError.about(message, "#/scenes")
+        answers = schemas.BatchAnswer[self.answer]  # type: ignore[name-defined]
+        return Call("POST", f"{self.path}/batch", answers, f'{{"scenes":[{",".join(requests)}]}}')
 
 
-def ask_each(
-    path: str,
-    form: type[RequestT],
-    answer: type[AnswerT],
-    scenes: Iterable[Any],
-    model: str | None = None,
-) -> Call[schemas.BatchAnswer[AnswerT]]:
-    """Build a batch request: one question about many scenes. `ask` describes the arguments.
-
-    Raises:
-        InvalidRequestError: the batch or the request about one of its scenes is invalid.
-    """
-    requests = [
-        _json(_request(form, scene, {}, model, ("scenes", index)))
-        for index, scene in enumerate(scenes)
-    ]
-    if not 1 <= len(requests) <= schemas.MAX_BATCH:
-        message = f"a batch must contain from 1 to {schemas.MAX_BATCH} scenes"
-        raise InvalidRequestError.about(message, "#/scenes")
-    body = f'{{"scenes":[{",".join(requests)}]}}'
-    answers = schemas.BatchAnswer[answer]  # type: ignore[valid-type]
-    return Call("POST", f"{path}/batch", answers, body)
+RELATIONS: Final = Question("/relations", schemas.RelationsRequest, schemas.RelationsAnswer)
+MISSING: Final = Question("/missing", schemas.MissingRequest, schemas.MissingAnswer)
+OUTLIERS: Final = Question("/outliers", schemas.OutliersRequest, schemas.OutliersAnswer)
+ROOMS: Final = Question("/rooms", schemas.RoomsRequest, schemas.RoomsAnswer)
+GENERATE: Final = Question("/generate", schemas.GenerateRequest, schemas.GenerateAnswer)
 
 
 def promote(alias: str, fields: Mapping[str, Any]) -> Call[schemas.AliasAnswer]:
-    """Build the call that points the alias ``alias`` at a model or a version.
-
-    Raises:
-        InvalidRequestError: the request is invalid.
-    """
+    """Build the call that points the alias ``alias`` at a model or a version."""
     return Call(
         "PUT",
-        f"/models/aliases/{segment(alias)}",
+        model_path("aliases", alias),
         schemas.AliasAnswer,
         _json(validated(schemas.AliasRequest, dict(fields))),
         administers=True,
@@ -192,7 +187,7 @@ def _request(
     model: str | None,
     at: tuple[str | int, ...] = (),
 ) -> RequestT:
-    """Return the validated request of a question; see `ask`. ``at`` is its location in the body."""
+    """Return the validated request; see `Question.call`. ``at`` is its location in the body."""
     if isinstance(scene, schemas.SceneRequest | Mapping):
         if fields:
             names = ", ".join(fields)
@@ -203,30 +198,22 @@ def _request(
         members = {"objects": scene, **fields}
     if model is not None:
         members.setdefault("model", model)
-    return validated(kind, {name: _field_value(value) for name, value in members.items()}, at)
-
-
-def _field_value(value: Any) -> Any:
-    """Return the value of a field as a dictionary, a list or a single value."""
-    if isinstance(value, str | BaseModel | Mapping) or not isinstance(value, Iterable):
-        return _json_value(value)
-    return [_json_value(entry) for entry in value]
+    return validated(kind, {name: _json_value(value) for name, value in members.items()}, at)
 
 
 def _json_value(value: Any) -> Any:
-    """Return a schema object without its unset fields, or a mapping, as a dictionary."""
+    """Return a schema object without its unset fields, a mapping or an iterable as JSON has it."""
     if isinstance(value, BaseModel):
         return value.model_dump(exclude_unset=True)
-    return dict(value) if isinstance(value, Mapping) else value
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        return [_json_value(entry) for entry in value]
+    return value
 
 
 def validated(kind: type[FormT], fields: dict[str, Any], at: tuple[str | int, ...] = ()) -> FormT:
-    """Return the request, or a part of it, that the dictionary ``fields`` describes.
-
-    Args:
-        kind: class of the request.
-        fields: fields of the request.
-        at: location of ``fields`` in the body.
+    """Return the request, or the part of it at the location ``at``, with these fields.
 
     Raises:
         InvalidRequestError: the request is invalid.

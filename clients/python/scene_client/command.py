@@ -5,9 +5,7 @@ The command writes errors to standard error. The help text of `app` lists the ex
 
 from __future__ import annotations
 
-import json
 import os
-import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -25,7 +23,6 @@ from rich.console import Console, RenderableType
 from typer.core import TyperGroup
 
 from scene_client import __version__, tables
-from scene_client.annotated import from_annotated, is_annotated
 from scene_client.errors import (
     ClientError,
     DeadlineError,
@@ -33,22 +30,17 @@ from scene_client.errors import (
     ProblemError,
     UnreachableError,
 )
+from scene_client.files import is_file, label_map_of, read_scene, with_labels
 from scene_client.offline import OfflineClient
-from scene_client.ros_fields import WELL_KNOWN, MessageError, read_label_map
+from scene_client.ros_fields import MessageError
 from scene_client.schemas import Detail, FieldError, RelationName, Sensitivity, UnknownLabels
 from scene_client.sync import Client
-from scene_client.vision_msgs import from_message, is_message
 
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
-
-MAX_FILE: Final = 64 * 2**20
-"""Maximum size of a scene file in bytes. The service has the same upper limit for a body."""
 
 _FLAGS: Final = ("--json",)
 _VALUED: Final = ("--url", "--model", "--offline", "--timeout")
 _RELATIONS: Final = get_args(RelationName)
-# A file with one scene per line, and the number of a line.
-_LINES: Final = re.compile(r"(?P<file>.+\.jsonl)(:(?P<line>[0-9]{1,9}))?$")
 
 
 class _Group(TyperGroup):
@@ -231,10 +223,9 @@ def relations(
     label_map: LabelMap = None,
 ) -> None:
     """List the likely spatial relations between the objects."""
-    scene = _scene(things, relations, room_type, unknown_labels, label_map)
-    opposites = include_opposites or None
+    scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
     request = scene | _named(
-        top_k=top_k, min_probability=min_probability, include_opposites=opposites
+        top_k=top_k, min_probability=min_probability, include_opposites=include_opposites or None
     )
     _show(context, lambda client: client.relations(request), tables.relations, request)
 
@@ -261,13 +252,10 @@ def missing(
     detail: HowMuch = None,
 ) -> None:
     """List objects that the scene probably lacks, and their likely places."""
-    scene = _scene(things, relations, room_type, unknown_labels, label_map)
+    scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
+    place = None if at is None else _anchor(at)
     request = scene | _named(
-        top_k=top_k,
-        coverage=coverage,
-        at=None if at is None else _anchor(at),
-        candidates=candidates or None,
-        detail=detail,
+        top_k=top_k, coverage=coverage, at=place, candidates=candidates or None, detail=detail
     )
     shown = partial(tables.missing, asked_place=request.get("at") is not None)
     _show(context, lambda client: client.missing(request), shown, request)
@@ -290,7 +278,7 @@ def outliers(
     detail: HowMuch = None,
 ) -> None:
     """List objects that do not fit the scene, and relations that are probably false."""
-    scene = _scene(things, relations, room_type, unknown_labels, label_map)
+    scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
     request = scene | _named(sensitivity=sensitivity, threshold=threshold, detail=detail)
     _show(context, lambda client: client.outliers(request), tables.outliers, request)
 
@@ -308,7 +296,7 @@ def rooms(
     detail: HowMuch = None,
 ) -> None:
     """List the likely types of the room, or where one object usually is."""
-    scene = _scene(things, None, None, unknown_labels, label_map)
+    scene = _scene(things, label_map, unknown_labels=unknown_labels)
     request = scene | _named(top_k=top_k, candidates=candidates or None, detail=detail)
     _show(context, lambda client: client.rooms(request), tables.rooms, request)
 
@@ -339,8 +327,9 @@ def generate(
 ) -> None:
     """Sample scenes that contain the given objects."""
     if plot is not None and find_spec("matplotlib") is None:
-        _fail("the option --plot needs matplotlib: run pip install matplotlib", MEANINGLESS)
-    scene = _scene(things or [], relations, room_type, unknown_labels, label_map)
+        _fail("the option --plot needs matplotlib: run pip install matplotlib")
+    things = things or []
+    scene = _scene(things, label_map, relations, room_type=room_type, unknown_labels=unknown_labels)
     request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
     answer = _show(context, lambda client: client.generate(request), tables.generate, request)
     if plot is not None:
@@ -349,7 +338,7 @@ def generate(
         try:
             draw(answer, plot)
         except (OSError, ValueError) as error:
-            _fail(f"the command cannot draw the picture: {error}", MEANINGLESS)
+            _fail(f"the command cannot draw the picture: {error}")
 
 
 # ------------------------------------------------------------------------------------- models
@@ -381,33 +370,29 @@ def ready(context: typer.Context) -> None:
         client.check_ready()
 
 
-# ------------------------------------------------------------------------------------ reading
+# ------------------------------------------------------------------------------------ the scene
 
 
 def _scene(
     things: list[str] | None,
-    stated: list[str] | None,
-    room_type: str | None,
-    unknown_labels: UnknownLabels | None,
     label_map: str | None,
+    stated: list[str] | None = None,
+    **options: str | None,
 ) -> dict[str, Any]:
     """Return the fields of the request from files and options. Options override files."""
     if things is None:
-        _fail(
-            "the objects are missing: give labels, a file that ends in .json, or - for stdin",
-            MEANINGLESS,
-        )
+        _fail("the objects are missing: give labels, a file that ends in .json, or - for stdin")
     things = [part for thing in things for part in _labels(thing)]
-    files = [thing for thing in things if _is_file(thing)]
+    files = [thing for thing in things if is_file(thing)]
     if files and things != files[:1]:
-        _fail(f"{files[0]} is a whole scene: remove the labels and other files", MEANINGLESS)
-    labels = {} if label_map is None else _label_map(label_map)
-    scene = _read(files[0], labels) if files else {"objects": things}
-    return _with_labels(scene, labels) | _named(
-        relations=[_relation(text) for text in stated] if stated else None,
-        room_type=room_type,
-        unknown_labels=unknown_labels,
-    )
+        _fail(f"{files[0]} is a whole scene: remove the labels and other files")
+    try:
+        labels = {} if label_map is None else label_map_of(label_map)
+        scene = with_labels(read_scene(files[0], labels) if files else {"objects": things}, labels)
+    except MessageError as error:
+        _fail(str(error))
+    relations = [_relation(text) for text in stated] if stated else None
+    return scene | _named(relations=relations, **options)
 
 
 def _named(**options: Any) -> dict[str, Any]:
@@ -417,141 +402,26 @@ def _named(**options: Any) -> dict[str, Any]:
 
 def _labels(thing: str) -> list[str]:
     """Return the labels of an argument, which commas may separate; a file stays one argument."""
-    if _is_file(thing):
+    if is_file(thing):
         return [thing]
     return [label.strip() for label in thing.split(",") if label.strip()]
-
-
-def _is_file(thing: str) -> bool:
-    """Return whether an argument is a file. Labels do not end in .json or contain a slash."""
-    return thing == "-" or thing.endswith(".json") or bool(_LINES.match(thing)) or os.sep in thing
-
-
-def _label_map(option: str) -> dict[str, str | None]:
-    """Return the labels of the class ids that the option `--label-map` names."""
-    names: Any = option
-    try:
-        if option not in WELL_KNOWN:
-            text = _bytes(option).decode()
-            try:
-                names = json.loads(text)
-            except ValueError:
-                names = text.splitlines()
-            names = names.get("categories", names) if isinstance(names, dict) else names
-            if isinstance(names, list) and isinstance(names[0], dict):
-                names = {entry["id"]: entry["name"] for entry in names}
-        return read_label_map(names)
-    except (LookupError, TypeError, ValueError):
-        _fail(f"--label-map: {option} does not contain labels", MEANINGLESS)
-
-
-def _with_labels(scene: dict[str, Any], labels: dict[str, str | None]) -> dict[str, Any]:
-    """Replace the labels of objects that are class ids."""
-    if not isinstance(scene.get("objects"), list):
-        return scene
-    objects = []
-    for thing in scene["objects"]:
-        label = thing.get("label") if isinstance(thing, dict) else thing
-        if str(label).isdecimal():
-            label = labels.get(str(label))
-            if label is None:
-                remedy = "set --label-map to coco80, coco91 or a file with the labels of the ids"
-                _fail(f"an object has a class id instead of a label: {remedy}", MEANINGLESS)
-            thing = {**thing, "label": label} if isinstance(thing, dict) else label
-        objects.append(thing)
-    return scene | {"objects": objects}
-
-
-def _bytes(name: str) -> bytes:
-    """Return the contents of a file, or of standard input for the name ``-``."""
-    try:
-        if name == "-":
-            text = sys.stdin.buffer.read(MAX_FILE + 1)
-        else:
-            with Path(name).open("rb") as file:
-                text = file.read(MAX_FILE + 1)
-    except OSError as error:
-        _fail(f"cannot read {name}: {error.strerror}", MEANINGLESS)
-    if len(text) > MAX_FILE:
-        _fail(f"{name} is too large: it has more than {MAX_FILE} bytes", MEANINGLESS)
-    return text
-
-
-def _read(argument: str, labels: dict[str, str | None]) -> dict[str, Any]:
-    """Return the request fields of a file: a request, a ROS message, or a scene of the training."""
-    lines = _LINES.match(argument)
-    name = lines["file"] if lines else argument
-    text = _bytes(name)
-    if lines:
-        text = _line(name, text, lines["line"])
-    try:
-        scene = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        _fail(f"{argument} is not JSON: {error}", MEANINGLESS)
-    if is_message(scene):
-        return _of_message(name, scene, labels)
-    if is_annotated(scene):
-        try:
-            return from_annotated(scene)
-        except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError):
-            _fail(f"{argument} is not a scene of the training format", MEANINGLESS)
-    if isinstance(scene, list):
-        return {"objects": _of_coco(name, scene)}
-    if not isinstance(scene, dict):
-        _fail(f"{name} must contain a request or a list of objects", MEANINGLESS)
-    return scene
-
-
-def _of_coco(name: str, entries: list[Any]) -> list[Any]:
-    """Return the objects of a list, which may be a file of COCO's results for one image."""
-    if not all(isinstance(entry, dict) and "category_id" in entry for entry in entries):
-        return entries
-    if len({str(entry.get("image_id")) for entry in entries}) > 1:
-        _fail(f"{name} has several images: keep the results of one image_id", MEANINGLESS)
-    return [
-        {"label": entry["category_id"], "confidence": entry.get("score", 1.0)} for entry in entries
-    ]
-
-
-def _line(name: str, text: bytes, line: str | None) -> bytes:
-    """Return one line of a file with one scene per line."""
-    lines = text.splitlines()
-    if line is None and len(lines) != 1:
-        _fail(f"{name} has {len(lines)} lines: choose one, such as {name}:1", MEANINGLESS)
-    number = int(line or 1)
-    if not 1 <= number <= len(lines):
-        _fail(f"{name} has {len(lines)} lines; it has no line {number}", MEANINGLESS)
-    return lines[number - 1]
-
-
-def _of_message(name: str, message: Any, labels: dict[str, str | None]) -> dict[str, Any]:
-    """Return the request fields for a ROS message with detections, as JSON from rosbridge."""
-    try:
-        fields = from_message(message, labels or None)
-    except MessageError as error:
-        _fail(f"{name}: {error}", MEANINGLESS)
-    for note in fields.notes:
-        which = "" if note.detection is None else f"detection {note.detection}: "
-        print(f"{name}: {which}{note.detail}", file=sys.stderr)
-    return fields
 
 
 def _anchor(text: str) -> dict[str, str]:
     relation, _, object = text.strip().partition(" ")
     if relation not in _RELATIONS or not object:
         rule = '--at must be a relation and an object, such as "on-top desk"'
-        _fail(f"{rule}; {_relations_for([relation])}", MEANINGLESS)
+        _fail(f"{rule}; {_relations_for([relation])}")
     return {"relation": relation, "object": object.strip()}
 
 
 def _relation(text: str) -> dict[str, str]:
     # Labels may contain spaces. The first name of a relation separates the two labels.
     words = text.split()
-    positions = [n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS]
-    if not positions:
+    middle = next((n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS), None)
+    if middle is None:
         rule = '--relations must be a subject, a relation and an object, as in "lamp on-top desk"'
-        _fail(f"{rule}; {_relations_for(words[1:-1])}", MEANINGLESS)
-    middle = positions[0]
+        _fail(f"{rule}; {_relations_for(words[1:-1])}")
     subject, object = " ".join(words[:middle]), " ".join(words[middle + 1 :])
     return {"subject": subject, "relation": words[middle], "object": object}
 
@@ -571,8 +441,6 @@ def _exit_on_error(request: Any) -> Iterator[None]:
     """End the program with a message and an exit status if the block raises an error."""
     try:
         yield
-    except InvalidRequestError as error:
-        _fail(str(error), MEANINGLESS)
     except ProblemError as problem:
         errors = [_quoted(error, request) for error in problem.errors]
         parts = (problem.type, problem.status, problem.title, problem.detail)
@@ -581,10 +449,10 @@ def _exit_on_error(request: Any) -> Iterator[None]:
         _fail(f"the service cannot be reached: {error}", UNREACHABLE)
     except DeadlineError as error:
         _fail(str(error), LATE)
+    except (InvalidRequestError, ImportError) as error:
+        _fail(str(error))
     except ClientError as error:
         _fail(str(error), FAILED)
-    except ImportError as error:
-        _fail(str(error), MEANINGLESS)
 
 
 def _quoted(error: FieldError, request: Any) -> FieldError:
@@ -606,7 +474,7 @@ def _status(problem: ProblemError) -> int:
     return REFUSED if 400 <= problem.status < 500 else FAILED
 
 
-def _fail(message: str, status: int) -> NoReturn:
+def _fail(message: str, status: int = MEANINGLESS) -> NoReturn:
     Console(stderr=True, markup=False, highlight=False, emoji=False, soft_wrap=True).print(
         message, style="red"
     )

@@ -9,9 +9,9 @@ Only the name resolution of blocking calls has no time limit.
 from __future__ import annotations
 
 import ssl
-import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any, Final
@@ -41,7 +41,6 @@ KEEP_ALIVE: Final = 4.0
 
 By default, uvicorn closes an idle connection after five seconds, and a request sent at that moment
 would be lost."""
-
 
 _refused: Final = InvalidRequestError.about
 
@@ -137,23 +136,18 @@ def async_transport(ssl_context: ssl.SSLContext) -> httpx.AsyncHTTPTransport:
 # ------------------------------------------------------------------------------ blocking calls
 
 
-class _Deadline(threading.local):
-    """The deadline of each thread's current call, as a value of `time.monotonic`."""
-
-    ends = float("inf")
-
-
-_DEADLINE: Final = _Deadline()
+# The deadline of the current call as a value of `time.monotonic`. Each thread has its own context.
+_ENDS: Final = ContextVar("ends", default=float("inf"))
 
 
 @contextmanager
 def deadline(seconds: float) -> Iterator[None]:
     """Limit the total time for which this thread waits on connections of `DeadlineTransport`."""
-    _DEADLINE.ends = monotonic() + seconds
+    token = _ENDS.set(monotonic() + seconds)
     try:
         yield
     finally:
-        _DEADLINE.ends = float("inf")
+        _ENDS.reset(token)
 
 
 def _seconds_left(timeout: float | None) -> float:
@@ -163,7 +157,7 @@ def _seconds_left(timeout: float | None) -> float:
         httpcore.TimeoutException: the deadline has passed. Without this exception, a read of data
             that have already arrived would succeed after the deadline.
     """
-    seconds = _DEADLINE.ends - monotonic()
+    seconds = _ENDS.get() - monotonic()
     if seconds <= 0:
         raise httpcore.TimeoutException("the timeout of the call has expired")
     return seconds if timeout is None else min(timeout, seconds)
@@ -250,17 +244,18 @@ class DeadlineTransport(httpx.BaseTransport):
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Send one request and return the response."""
         url = request.url
-        core_request = httpcore.Request(
+        target = httpcore.URL(
+            scheme=url.raw_scheme, host=url.raw_host, port=url.port, target=url.raw_path
+        )
+        call = httpcore.Request(
             request.method,
-            httpcore.URL(
-                scheme=url.raw_scheme, host=url.raw_host, port=url.port, target=url.raw_path
-            ),
+            target,
             headers=request.headers.raw,
             content=request.stream,
             extensions=request.extensions,
         )
         with _as_httpx():
-            response = self._pool.handle_request(core_request)
+            response = self._pool.handle_request(call)
         return httpx.Response(response.status, headers=response.headers, stream=_Body(response))
 
     def close(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -18,9 +19,8 @@ class ClientError(Exception):
     """Base class of the exceptions. A call of the client failed."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Process pools pickle exceptions. `_restore` restores the attributes of the exception
-        # without a call of the constructor.
-        return _restore, (type(self), self.args, self.__dict__)
+        # Process pools pickle exceptions. Pickle must not call the constructors of subclasses.
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
 class InvalidRequestError(ClientError, ValueError):
@@ -153,13 +153,6 @@ def _seconds(retry_after: str) -> float | None:
             moment = moment.replace(tzinfo=UTC)
         return max(0.0, (moment - datetime.now(UTC)).total_seconds())
     return None
-
-
-def _restore(kind: type[ClientError], args: tuple[Any, ...], state: dict[str, Any]) -> ClientError:
-    """Return an exception with these attributes, for pickle. The constructor does not run."""
-    error = kind.__new__(kind, *args)
-    error.__dict__.update(state)
-    return error
 
 
 def _located_message(error: FieldError) -> str:

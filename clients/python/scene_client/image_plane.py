@@ -57,13 +57,9 @@ def left_pairs(boxes: Sequence[Box | None], order: Sequence[int]) -> list[tuple[
     for rank, i in enumerate(order):
         for j in order[:rank]:
             first, second = boxes[i], boxes[j]
-            if first is None or second is None or not are_neighbours(first, second):
-                continue
-            relation = relation_between(first, second)
-            if relation == "left":
-                pairs.append((i, j))
-            elif relation == "right":
-                pairs.append((j, i))
+            if first is not None and second is not None and are_neighbours(first, second):
+                relation = relation_between(first, second)
+                pairs += {"left": [(i, j)], "right": [(j, i)]}.get(relation or "", [])
     return pairs
 
 

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from math import ceil, sqrt
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -28,10 +29,13 @@ _WALL: Final = 0.2  # gap between a container and its contents
 
 # Colour and line style of each relation. The relations on-top and inside have no lines, because
 # their boxes touch.
-_STYLES: Final = {
-    "left": ("#1f5fa8", "-"),
-    "front": ("#b34700", "--"),
-    "above": ("#2d7a2d", ":"),
+_STYLES: Final = {"above": ("#2d7a2d", ":"), "front": ("#b34700", "--"), "left": ("#1f5fa8", "-")}
+_BOX: Final[dict[str, Any]] = {
+    "boxstyle": "round,pad=0,rounding_size=0.15",
+    "facecolor": "#f2f2f2",
+    "edgecolor": "#333333",
+    "linewidth": 0.8,
+    "zorder": 2,
 }
 # Inches per unit of length (the height of a box). With this scale, a label fits into its box.
 _UNIT: Final = 0.32
@@ -71,53 +75,30 @@ def _draw(axes: Axes, scene: GeneratedScene, boxes: list[Box]) -> None:
     axes.set_axis_off()
     axes.set_aspect("equal")
     for box in boxes:
-        axes.add_patch(
-            FancyBboxPatch(
-                (box.x, box.y),
-                box.width,
-                box.height,
-                boxstyle="round,pad=0,rounding_size=0.15",
-                facecolor="#f2f2f2",
-                edgecolor="#333333",
-                linewidth=0.8,
-                zorder=2,
-            )
-        )
+        axes.add_patch(FancyBboxPatch((box.x, box.y), box.width, box.height, **_BOX))
         # The label of a container is above its contents.
         middle = (box.x + box.width / 2, box.y + box.height - HEIGHT / 2)
         # In matplotlib, an unescaped dollar sign starts a formula.
         text = box.label.replace("$", r"\$")
         axes.text(*middle, text, ha="center", va="center", fontsize=_POINTS, zorder=3)
-    box_of = {box.label: box for box in boxes}
-    drawn_relations = set()
-    for relation in scene.relations:
-        subject, object = box_of.get(relation.subject), box_of.get(relation.object)
-        if subject is not None and object is not None and relation.relation in _STYLES:
-            drawn_relations.add(relation.relation)
-            _draw_line(axes, subject, object, relation.relation)
-    for name in sorted(drawn_relations):
-        color, dashes = _STYLES[name]
-        axes.plot([], [], color=color, linestyle=dashes, label=name)
-    if drawn_relations:
+    centres = {box.label: (box.x + box.width / 2, box.y + box.height / 2) for box in boxes}
+    for name, (color, dashes) in _STYLES.items():
+        lines = [
+            zip(centres[one.subject], centres[one.object], strict=True)
+            for one in scene.relations
+            if one.relation == name and {one.subject, one.object} <= centres.keys()
+        ]
+        for ends in lines:
+            axes.plot(*ends, color=color, linestyle=dashes, linewidth=0.7, alpha=0.5, zorder=1)
+        if lines:
+            axes.plot([], [], color=color, linestyle=dashes, label=name)
+    if axes.get_legend_handles_labels()[1]:
         axes.legend(
             loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3, fontsize=_POINTS, frameon=False
         )
     width, height = extent(boxes)
     axes.set_xlim(-GAP, width + GAP)
     axes.set_ylim(-GAP, height + GAP)
-
-
-def _draw_line(axes: Axes, subject: Box, object: Box, relation: str) -> None:
-    color, dashes = _STYLES[relation]
-    axes.plot(
-        [subject.x + subject.width / 2, object.x + object.width / 2],
-        [subject.y + subject.height / 2, object.y + object.height / 2],
-        color=color,
-        linestyle=dashes,
-        linewidth=0.7,
-        alpha=0.5,
-        zorder=1,
-    )
 
 
 # ------------------------------------------------------------------------------------ layout
@@ -198,24 +179,26 @@ def arrange(objects: Sequence[str], relations: Iterable[Relation]) -> list[Box]:
     for name in roots:
         cells.setdefault((column[name], row[name]), []).append(piles[name])
     boxes_of = {cell: _in_shelves(members) for cell, members in cells.items()}
-    widths: dict[int, float] = {}
-    heights: dict[int, float] = {}
-    for (column_rank, row_rank), boxes in boxes_of.items():
-        width, height = extent(boxes)
-        widths[column_rank] = max(width, widths.get(column_rank, 0.0))
-        heights[row_rank] = max(height, heights.get(row_rank, 0.0))
-    x_of, y_of = _starts(widths), _starts(heights)
+    extents = {cell: extent(boxes) for cell, boxes in boxes_of.items()}
+    starts = [
+        _starts(
+            {
+                rank: max(extents[cell][axis] for cell in cells if cell[axis] == rank)
+                for rank in {cell[axis] for cell in cells}
+            }
+        )
+        for axis in (0, 1)
+    ]
     return [
         box
-        for (column_rank, row_rank), boxes in boxes_of.items()
-        for box in _shifted(boxes, x_of[column_rank], y_of[row_rank])
+        for (across, up), boxes in boxes_of.items()
+        for box in _shifted(boxes, starts[0][across], starts[1][up])
     ]
 
 
 def _canonical(relation: Relation) -> tuple[str, str, str]:
     """Return a relation as (subject, relation, object), without the relations in `_OPPOSITES`."""
-    opposite = _OPPOSITES.get(relation.relation)
-    if opposite is not None:
+    if opposite := _OPPOSITES.get(relation.relation):
         return relation.object, opposite, relation.subject
     return relation.subject, relation.relation, relation.object
 
@@ -282,9 +265,5 @@ def _shifted(boxes: Iterable[Box], x: float, y: float) -> list[Box]:
 
 def _starts(extents: dict[int, float]) -> dict[int, float]:
     """Return the start of each column (x) or row (y) from the extents of the columns or rows."""
-    starts: dict[int, float] = {}
-    start = 0.0
-    for rank in sorted(extents):
-        starts[rank] = start
-        start += extents[rank] + 2 * GAP
-    return starts
+    ends = accumulate((extents[rank] + 2 * GAP for rank in sorted(extents)), initial=0.0)
+    return dict(zip(sorted(extents), ends, strict=False))

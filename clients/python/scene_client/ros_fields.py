@@ -21,12 +21,7 @@ class MessageError(ValueError):
 
 
 def take(message: Any, *path: str) -> Any:
-    """Return a nested field, or None if a part of its path is missing.
-
-    Args:
-        message: message or field that contains the path.
-        *path: names of the fields from the message to the nested field.
-    """
+    """Return the nested field at a path of names, or None if a part of the path is missing."""
     for name in path:
         if message is None:
             return None
@@ -75,20 +70,14 @@ def integer(field: Any) -> int | None:
     return int(value) if value is not None and value.is_integer() else None
 
 
-def numbers(message: Any, names: str) -> tuple[float, ...] | None:
-    """Return the numbers in the fields with one-letter names, for example "xyz".
-
-    The result is None if one of the numbers is missing or not finite.
-    """
-    values = [number(take(message, name)) for name in names]
-    return None if None in values else tuple(value for value in values if value is not None)
+def numbers(message: Any, names: str) -> dict[str, float] | None:
+    """Return the numbers in fields with one-letter names ("xyz"), or None if one is not finite."""
+    values = {name: value for name in names if (value := number(take(message, name))) is not None}
+    return values if len(values) == len(names) else None
 
 
 def text(field: Any) -> str:
-    """Return a field with a text or a whole number as text without surrounding blanks.
-
-    The result is "" for a field of another type.
-    """
+    """Return a text or a whole number as text without surrounding blanks, or "" for other types."""
     if isinstance(field, str):
         return field.strip()
     whole = integer(field)
@@ -109,15 +98,12 @@ def frame_of(header: Any) -> str:
 
 def time_of(stamp: Any) -> dict[str, int] | None:
     """Convert a time of ROS 1 or ROS 2 to the field `stamp`. Return None for an invalid time."""
-    seconds = integer(take(stamp, "sec"))
-    seconds = integer(take(stamp, "secs")) if seconds is None else seconds
-    nanoseconds = integer(take(stamp, "nanosec"))
-    nanoseconds = integer(take(stamp, "nsecs")) if nanoseconds is None else nanoseconds
-    if seconds is None or nanoseconds is None:
-        return None
-    if not (-(2**31) <= seconds < 2**31 and 0 <= nanoseconds < 1_000_000_000):
-        return None
-    return {"sec": seconds, "nanosec": nanoseconds}
+    for names in (("sec", "nanosec"), ("secs", "nsecs")):
+        seconds, nanoseconds = (integer(take(stamp, name)) for name in names)
+        if seconds is not None and nanoseconds is not None:
+            is_valid = -(2**31) <= seconds < 2**31 and 0 <= nanoseconds < 1_000_000_000
+            return {"sec": seconds, "nanosec": nanoseconds} if is_valid else None
+    return None
 
 
 # -------------------------------------------------------------------------------- class ids
@@ -182,9 +168,6 @@ def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
             "label_map must be a mapping, a list of labels, a vision_msgs/LabelInfo or the name of "
             "a known list"
         )
-    labels: dict[str, str | None] = {}
-    for class_id, label in pairs:
-        if not (label is None or isinstance(label, str)):
-            raise MessageError("every entry of label_map must be a label or None")
-        labels[str(class_id).strip()] = label
-    return labels
+    if not all(label is None or isinstance(label, str) for _, label in pairs):
+        raise MessageError("every entry of label_map must be a label or None")
+    return {str(class_id).strip(): label for class_id, label in pairs}

@@ -11,7 +11,7 @@ from typing import Self, Unpack, overload
 import httpx
 
 from scene_client import calls, schemas
-from scene_client.calls import Call, Scene, T, segment
+from scene_client.calls import Call, Scene, T
 from scene_client.connection import MAX_ANSWER, RETRIES, DeadlineTransport, Options, deadline
 from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
 
@@ -71,8 +71,7 @@ class Client:
         **fields: Unpack[schemas.RelationsFields],
     ) -> schemas.RelationsAnswer:
         """Return the likely spatial relations between the objects."""
-        forms = schemas.RelationsRequest, schemas.RelationsAnswer
-        call = calls.ask("/relations", *forms, objects, fields, self.options.model)
+        call = calls.RELATIONS.call(objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def missing(
@@ -83,8 +82,7 @@ class Client:
         **fields: Unpack[schemas.MissingFields],
     ) -> schemas.MissingAnswer:
         """Return classes that are probably missing from the scene, and their likely places."""
-        forms = schemas.MissingRequest, schemas.MissingAnswer
-        call = calls.ask("/missing", *forms, objects, fields, self.options.model)
+        call = calls.MISSING.call(objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def outliers(
@@ -95,8 +93,7 @@ class Client:
         **fields: Unpack[schemas.OutliersFields],
     ) -> schemas.OutliersAnswer:
         """Return how well each object fits the scene, and the relations that are probably false."""
-        forms = schemas.OutliersRequest, schemas.OutliersAnswer
-        call = calls.ask("/outliers", *forms, objects, fields, self.options.model)
+        call = calls.OUTLIERS.call(objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def rooms(
@@ -107,8 +104,7 @@ class Client:
         **fields: Unpack[schemas.RoomsFields],
     ) -> schemas.RoomsAnswer:
         """Return the likely types of the room, or where one object usually is."""
-        forms = schemas.RoomsRequest, schemas.RoomsAnswer
-        call = calls.ask("/rooms", *forms, objects, fields, self.options.model)
+        call = calls.ROOMS.call(objects, fields, self.options.model)
         return self._call(call, timeout)
 
     def generate(
@@ -119,8 +115,7 @@ class Client:
         **fields: Unpack[schemas.GenerateFields],
     ) -> schemas.GenerateAnswer:
         """Sample scenes from the model. Each sampled scene contains the given objects."""
-        forms = schemas.GenerateRequest, schemas.GenerateAnswer
-        call = calls.ask("/generate", *forms, objects, fields, self.options.model)
+        call = calls.GENERATE.call(objects, fields, self.options.model)
         return self._call(call, timeout)
 
     # -------------------------------------------------------------------------------- batches
@@ -129,33 +124,25 @@ class Client:
         self, scenes: Iterable[Scene[schemas.RelationsRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.RelationsAnswer]:
         """Ask `relations` about up to 256 scenes. Each scene has its own answer or problem."""
-        forms = schemas.RelationsRequest, schemas.RelationsAnswer
-        call = calls.ask_each("/relations", *forms, scenes, self.options.model)
-        return self._call(call, timeout)
+        return self._call(calls.RELATIONS.batch(scenes, self.options.model), timeout)
 
     def missing_batch(
         self, scenes: Iterable[Scene[schemas.MissingRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.MissingAnswer]:
         """Ask `missing` about up to 256 scenes. Each scene has its own answer or problem."""
-        forms = schemas.MissingRequest, schemas.MissingAnswer
-        call = calls.ask_each("/missing", *forms, scenes, self.options.model)
-        return self._call(call, timeout)
+        return self._call(calls.MISSING.batch(scenes, self.options.model), timeout)
 
     def outliers_batch(
         self, scenes: Iterable[Scene[schemas.OutliersRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.OutliersAnswer]:
         """Ask `outliers` about up to 256 scenes. Each scene has its own answer or problem."""
-        forms = schemas.OutliersRequest, schemas.OutliersAnswer
-        call = calls.ask_each("/outliers", *forms, scenes, self.options.model)
-        return self._call(call, timeout)
+        return self._call(calls.OUTLIERS.batch(scenes, self.options.model), timeout)
 
     def rooms_batch(
         self, scenes: Iterable[Scene[schemas.RoomsRequest]], *, timeout: float | None = None
     ) -> schemas.BatchAnswer[schemas.RoomsAnswer]:
         """Ask `rooms` about up to 256 scenes. Each scene has its own answer or problem."""
-        forms = schemas.RoomsRequest, schemas.RoomsAnswer
-        call = calls.ask_each("/rooms", *forms, scenes, self.options.model)
-        return self._call(call, timeout)
+        return self._call(calls.ROOMS.batch(scenes, self.options.model), timeout)
 
     # --------------------------------------------------------------------------------- models
 
@@ -175,31 +162,31 @@ class Client:
         self, name: str, version: str | None = None, *, timeout: float | None = None
     ) -> schemas.ModelSummary | schemas.VersionDetails:
         """Return the versions of a model, or the details of one version."""
-        path = f"/models/{segment(name)}"
         if version is None:
-            return self._call(Call("GET", path, schemas.ModelSummary), timeout)
-        path += f"/versions/{segment(version)}"
+            call = Call("GET", calls.model_path(name), schemas.ModelSummary)
+            return self._call(call, timeout)
+        path = calls.model_path(name, "versions", version)
         return self._call(Call("GET", path, schemas.VersionDetails), timeout)
 
     def vocabulary(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> schemas.VocabularyAnswer:
         """Return the object classes, relations and room types of a model."""
-        path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
+        path = calls.model_path(name or self.options.model or "default", "vocabulary")
         return self._call(Call("GET", path, schemas.VocabularyAnswer), timeout)
 
     def word(
         self, word: str, name: str | None = None, *, timeout: float | None = None
     ) -> schemas.WordAnswer:
         """Return the class that a label becomes in a model, and by which rule."""
-        path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
-        return self._call(Call("GET", f"{path}/{segment(word)}", schemas.WordAnswer), timeout)
+        path = calls.model_path(name or self.options.model or "default", "vocabulary", word)
+        return self._call(Call("GET", path, schemas.WordAnswer), timeout)
 
     def contexts(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> schemas.ContextsAnswer:
         """Return each hidden unit of a model with the classes of its largest weights."""
-        path = f"/models/{segment(name or self.options.model or 'default')}/contexts"
+        path = calls.model_path(name or self.options.model or "default", "contexts")
         return self._call(Call("GET", path, schemas.ContextsAnswer), timeout)
 
     def refresh(self, *, timeout: float | None = None) -> schemas.RefreshAnswer:

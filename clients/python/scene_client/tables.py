@@ -34,25 +34,26 @@ def relations(answer: schemas.RelationsAnswer) -> RenderableType:
         (
             *_relation(entry),
             "observed" if entry.observed else "",
-            "" if entry.expected is None else _probability_text(entry.expected),
+            "" if entry.expected is None else f"{entry.expected:.3f}",
         )
         for entry in answer.relations
     ]
-    table = _table("subject", "relation", "object", "probability", "", "expected", rows=rows)
     disagreements = [
         (
-            entry.subject,
-            ", ".join(entry.observed),
-            entry.object,
-            _probability_text(entry.observed_probability),
-            f"{entry.expected} {_probability_text(entry.probability)}",
+            *(entry.subject, ", ".join(entry.observed), entry.object),
+            f"{entry.observed_probability:.3f}",
+            f"{entry.expected} {entry.probability:.3f}",
         )
         for entry in answer.disagreements
     ]
-    if not disagreements:
-        return table
-    columns = ("subject", "observed", "object", "probability", "expected")
-    return Group(table, _table(*columns, rows=disagreements, title="disagreements"))
+    return _tables(
+        _table("subject", "relation", "object", "probability", "", "expected", rows=rows),
+        _table(
+            *("subject", "observed", "object", "probability", "expected"),
+            rows=disagreements,
+            title="disagreements",
+        ),
+    )
 
 
 def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> RenderableType:
@@ -64,38 +65,32 @@ def missing(answer: schemas.MissingAnswer, *, asked_place: bool = False) -> Rend
     least = 0.0 if asked_place else LIKELY_PLACE
     rows = [
         (
-            entry.label,
-            _probability_text(entry.probability),
-            f"{entry.log_odds:+.2f}",
+            *(entry.label, f"{entry.probability:.3f}", f"{entry.log_odds:+.2f}"),
             "\n".join(_placement(p) for p in entry.placements if p.probability >= least),
             _reasons(entry.because),
         )
         for entry in answer.missing
     ]
-    table = _table("missing", "probability", "log-odds", "where", "because", rows=rows)
-    if not answer.more:
-        return table if rows else "No object is missing."
-    count_rows = [
+    counts = [
         (
-            entry.label,
-            str(entry.listed_count),
+            *(entry.label, str(entry.listed_count)),
             f"{entry.expected_count:.1f} ({entry.low} to {entry.high})",
-            _probability_text(entry.probability),
+            f"{entry.probability:.3f}",
         )
         for entry in answer.more
     ]
-    counts = _table("more of", "listed", "expected", "probability", rows=count_rows)
-    return Group(table, counts) if rows else counts
+    table = _table("missing", "probability", "log-odds", "where", "because", rows=rows)
+    more = _table("more of", "listed", "expected", "probability", rows=counts)
+    if not rows:
+        return more if counts else "No object is missing."
+    return _tables(table, more)
 
 
 def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
     """Return a table of objects, most probable outlier first, and a table of false relations."""
     rows = [
         (
-            entry.object,
-            entry.label,
-            _probability_text(entry.probability),
-            f"{entry.log_odds:+.2f}",
+            *(entry.object, entry.label, f"{entry.probability:.3f}", f"{entry.log_odds:+.2f}"),
             "outlier" if entry.is_outlier else "",
             _reasons(entry.because),
             ", ".join(entry.usually_with),
@@ -103,43 +98,24 @@ def outliers(answer: schemas.OutliersAnswer) -> RenderableType:
         for entry in answer.outliers
     ]
     heads = ("object", "label", "probability", "log-odds", "", "because", "usually with")
-    table = _table(*heads, rows=rows)
-    if not answer.misplaced:
-        return table
-    misplaced_rows = [
+    misplaced = [
         (*_relation(entry), *(("misplaced", entry.moved or "") if entry.is_misplaced else ("", "")))
         for entry in answer.misplaced[:MOST_MISPLACED]
     ]
     columns = ("subject", "relation", "object", "probability of being wrong", "", "moved")
     title = "relations as given"
-    if len(misplaced_rows) < len(answer.misplaced):
-        title += f": the {len(misplaced_rows)} likeliest to be wrong of {len(answer.misplaced)}"
-    return Group(table, _table(*columns, rows=misplaced_rows, title=title))
+    if len(misplaced) < len(answer.misplaced):
+        title += f": the {len(misplaced)} likeliest to be wrong of {len(answer.misplaced)}"
+    return _tables(_table(*heads, rows=rows), _table(*columns, rows=misplaced, title=title))
 
 
 def rooms(answer: schemas.RoomsAnswer) -> RenderableType:
     """Return a table of room types, most probable first."""
     rows = [
-        (entry.room_type, _probability_text(entry.probability), _reasons(entry.because))
+        (entry.room_type, f"{entry.probability:.3f}", _reasons(entry.because))
         for entry in answer.room_types
     ]
     return _table("room type", "probability", "because", rows=rows)
-
-
-def notes(answer: BaseModel) -> list[str]:
-    """Return one line for each mapped label and each warning of the answer."""
-    if not isinstance(answer, schemas.Answer):
-        return []
-    mapped = [
-        f"{entry.label}: read as {entry.class_} "
-        f"(rule {entry.rule}, similarity {entry.similarity:.2f})"
-        for entry in answer.mapped
-    ]
-    warnings = [
-        ": ".join(filter(None, (entry.code, ", ".join(entry.objects), entry.message)))
-        for entry in answer.warnings
-    ]
-    return mapped + warnings
 
 
 def generate(answer: schemas.GenerateAnswer) -> RenderableType:
@@ -152,41 +128,27 @@ def generate(answer: schemas.GenerateAnswer) -> RenderableType:
     return _table("scene", "objects", "relations", "log score", rows=rows, title=title)
 
 
-def _relations(relations: Sequence[schemas.Relation]) -> str:
-    """Return the first `MOST_RELATIONS` relations as lines of text, vertical relations first."""
-    ranked = sorted(relations, key=lambda entry: entry.relation in {"left", "front"})
-    lines = [f"{r.subject} {r.relation} {r.object}" for r in ranked[:MOST_RELATIONS]]
-    if len(ranked) > MOST_RELATIONS:
-        lines.append(f"… and {len(ranked) - MOST_RELATIONS} more")
-    return "\n".join(lines)
-
-
 def models(answer: schemas.ModelList) -> RenderableType:
     """Return a table of versions with their aliases, and the unusable entries of the store."""
     rows = [
         (
-            f"{model.name}@{version.version}",
-            version.variant or "",
-            ", ".join(version.aliases),
-            version.status if version.reason is None else f"{version.status}: {version.reason}",
+            *(f"{model.name}@{version.version}", version.variant or "", ", ".join(version.aliases)),
+            ": ".join(filter(None, (version.status, version.reason))),
         )
         for model in answer.models
         for version in model.versions
     ]
-    table = _table("model", "variant", "aliases", "status", rows=rows)
     failures = [(failure.subject, failure.reason, failure.detail) for failure in answer.failures]
-    if not failures:
-        return table
-    return Group(table, _table("failed", "reason", "detail", rows=failures))
+    return _tables(
+        _table("model", "variant", "aliases", "status", rows=rows),
+        _table("failed", "reason", "detail", rows=failures),
+    )
 
 
 def contexts(answer: schemas.ContextsAnswer) -> RenderableType:
     """Return a table of the states of hidden units with the classes of their largest weights."""
     rows = [
-        (
-            *(layer, str(unit.unit), str(unit.state)),
-            *(_weighted(unit.objects), _weighted(unit.room_types)),
-        )
+        (layer, str(unit.unit), str(unit.state), *map(_weighted, (unit.objects, unit.room_types)))
         for layer, units in answer.layers.items()
         for unit in units
     ]
@@ -203,6 +165,22 @@ def vocabulary(answer: schemas.VocabularyAnswer) -> RenderableType:
     if answer.profiles:
         title += f"\nprofiles: {', '.join(answer.profiles)}"
     return _table("object", "also", "", rows=rows, title=title)
+
+
+def notes(answer: BaseModel) -> list[str]:
+    """Return one line for each mapped label and each warning of the answer."""
+    if not isinstance(answer, schemas.Answer):
+        return []
+    mapped = [
+        f"{entry.label}: read as {entry.class_} "
+        f"(rule {entry.rule}, similarity {entry.similarity:.2f})"
+        for entry in answer.mapped
+    ]
+    warnings = [
+        ": ".join(filter(None, (entry.code, ", ".join(entry.objects), entry.message)))
+        for entry in answer.warnings
+    ]
+    return mapped + warnings
 
 
 def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = None) -> Table:
@@ -222,24 +200,31 @@ def _table(*columns: str, rows: Sequence[Sequence[str]], title: str | None = Non
     return table
 
 
+def _tables(first: Table, second: Table) -> RenderableType:
+    """Return both tables, or only the first one if the second one has no rows."""
+    return Group(first, second) if second.row_count else first
+
+
 def _relation(entry: schemas.ScoredRelation) -> tuple[str, str, str, str]:
-    return entry.subject, entry.relation, entry.object, _probability_text(entry.probability)
+    return entry.subject, entry.relation, entry.object, f"{entry.probability:.3f}"
 
 
-def _probability_text(probability: float) -> str:
-    return f"{probability:.3f}"
+def _relations(relations: Sequence[schemas.Relation]) -> str:
+    """Return the first `MOST_RELATIONS` relations as lines of text, vertical relations first."""
+    ranked = sorted(relations, key=lambda entry: entry.relation in {"left", "front"})
+    lines = [f"{r.subject} {r.relation} {r.object}" for r in ranked[:MOST_RELATIONS]]
+    if len(ranked) > MOST_RELATIONS:
+        lines.append(f"… and {len(ranked) - MOST_RELATIONS} more")
+    return "\n".join(lines)
 
 
 def _placement(placement: schemas.Placement) -> str:
-    text = f"{placement.relation} {placement.object} {_probability_text(placement.probability)}"
+    text = f"{placement.relation} {placement.object} {placement.probability:.3f}"
     # A model has no offsets if its training scenes have no positions.
     offset = placement.offset
     if offset is None:
         return text
-    axes = (
-        f"{axis} {getattr(offset.mean, axis):+.2f}±{getattr(offset.std, axis):.2f}"
-        for axis in ("x", "y", "z")
-    )
+    axes = (f"{n} {getattr(offset.mean, n):+.2f}±{getattr(offset.std, n):.2f}" for n in "xyz")
     return f"{text} ({', '.join(axes)} m)"
 
 

@@ -66,9 +66,6 @@ def field_errors(
 ) -> list[FieldError]:
     """Return the errors of a request, at most `MAX_ERRORS`.
 
-    Validation stops at the first invalid object. So the function replaces this object by a valid
-    one and validates the request again, until it has enough errors.
-
     Args:
         error: the validation error of pydantic.
         body: the value that pydantic has validated.
@@ -76,23 +73,26 @@ def field_errors(
         at: location of ``body`` in the request.
     """
     errors = []
-    for details in _first_errors(error, body, form):
+    for details in _all_errors(error, body, form)[:MAX_ERRORS]:
         message, suggestions = _message(details, form)
         location = pointer(at) + pointer(details["loc"], body)[1:]
         errors.append(FieldError(pointer=location, message=message, suggestions=suggestions))
     return errors
 
 
-def _first_errors(error: ValidationError, body: Any, form: type[Request]) -> list[ErrorDetails]:
-    """Return pydantic's errors of a request, at most `MAX_ERRORS`; see `field_errors`."""
+def _all_errors(error: ValidationError, body: Any, form: type[Request]) -> list[ErrorDetails]:
+    """Return pydantic's errors of a request, those of objects first, as in the schema.
+
+    Validation stops at the first invalid object. So the function replaces this object by a valid
+    one and validates the request again, until it has enough errors.
+    """
     errors = newest_errors = error.errors(include_url=False)
     while len(errors) < MAX_ERRORS:
-        object_errors = filter(_is_of_objects, newest_errors)
         # An error of the whole list has the location ("objects",), without an index.
-        indices: list[Any] = [details["loc"][1] for details in object_errors if details["loc"][1:]]
-        if not indices:
+        locations = (details["loc"] for details in newest_errors if _is_of_objects(details))
+        index: Any = next((location[1] for location in locations if location[1:]), None)
+        if index is None:
             break
-        index = indices[0]
         objects = [*body["objects"]]
         objects[index] = "valid"
         body = {**body, "objects": objects}
@@ -102,8 +102,7 @@ def _first_errors(error: ValidationError, body: Any, form: type[Request]) -> lis
         except ValidationError as next_error:
             newest_errors = list(filter(_is_of_objects, next_error.errors(include_url=False)))
             errors += newest_errors
-    # Errors of objects come first, as in the schema.
-    return sorted(errors, key=_is_of_objects, reverse=True)[:MAX_ERRORS]
+    return sorted(errors, key=_is_of_objects, reverse=True)
 
 
 def _is_of_objects(details: ErrorDetails) -> bool:

@@ -13,6 +13,7 @@ or bags). The message may have the layout of ROS Galactic and later (fields
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple, get_args
@@ -136,14 +137,8 @@ def from_detection2d_array(
     """Convert objects without poses. The relation left comes from neighbouring boxes in the image.
 
     An image does not show depth or support, so the relations front, on-top, above and inside stay
-    unobserved.
-
-    Args:
-        message: a vision_msgs/Detection2DArray.
-        label_map, min_score, unknown_labels: arguments of `from_detection3d_array`.
-
-    Raises:
-        MessageError: the message does not contain a valid scene, or an argument is invalid.
+    unobserved. ``message`` is a vision_msgs/Detection2DArray. `from_detection3d_array` describes
+    the other arguments and the errors.
     """
     reader = _Reader(message, label_map, min_score)
     fields = {"objects": [reader.object(sighting) for sighting in reader.sightings]}
@@ -160,13 +155,9 @@ def from_message(
     viewpoint: Viewpoint | None = None,
     unknown_labels: UnknownLabels = "nearest-or-ignore",
 ) -> SceneFields:
-    """Convert a Detection3DArray or a Detection2DArray.
+    """Convert a Detection3DArray or a Detection2DArray. The fields of the boxes show the type.
 
-    The fields of the boxes show the type of the message.
-
-    Raises:
-        MessageError: the message has another type, does not contain a valid scene, or an argument
-            is invalid.
+    `from_detection3d_array` describes the arguments and the errors.
     """
     options: Any = {"min_score": min_score, "unknown_labels": unknown_labels}
     if _is_flat(message):
@@ -268,8 +259,8 @@ class _Reader:
         if len(sightings) <= MAX_OBJECTS:
             return sightings
         ranked = sorted(sightings, key=lambda sighting: -sighting.confidence)
+        detail = f"{MAX_OBJECTS} other detections have equal or higher scores"
         for sighting in ranked[MAX_OBJECTS:]:
-            detail = f"{MAX_OBJECTS} other detections have equal or higher scores"
             self.note(sighting.index, "too-many", detail)
         return sorted(ranked[:MAX_OBJECTS], key=lambda sighting: sighting.index)
 
@@ -279,24 +270,21 @@ class _Reader:
         A unique id of the detector stays. Otherwise the id is the label with a number.
         """
         index_of_id: dict[str, int] = {}
-        ids: dict[int, str] = {}
         for sighting in self.sightings:
             detection = sighting.detection
             name = text(take(detection, "id")) or text(take(detection, "tracking_id"))
-            if not name:
-                continue
-            if not is_plain(name, _MAX_ID):
+            if name and not is_plain(name, _MAX_ID):
                 self.note(sighting.index, "renamed", "the id is not plain text")
             elif name in index_of_id:
                 detail = f"detection {index_of_id[name]} has the same id"
                 self.note(sighting.index, "renamed", detail)
-            else:
+            elif name:
                 index_of_id[name] = sighting.index
-                ids[sighting.index] = name
-        last_number: dict[str, int] = {}
+        ids = {index: name for name, index in index_of_id.items()}
+        last_number: Counter[str] = Counter()
         for sighting in self.sightings:
             while sighting.index not in ids:
-                last_number[sighting.label] = last_number.get(sighting.label, 0) + 1
+                last_number[sighting.label] += 1
                 name = f"{sighting.label}_{last_number[sighting.label]}"
                 if name not in index_of_id:
                     ids[sighting.index] = name
@@ -316,8 +304,11 @@ class _Reader:
         return frame_of(take(sighting.detection, "header")) not in ("", self.frame)
 
     def object(self, sighting: _Sighting) -> dict[str, Any]:
-        name, label = self.ids[sighting.index], sighting.label
-        return {"id": name, "label": label, "confidence": sighting.confidence}
+        return {
+            "id": self.ids[sighting.index],
+            "label": sighting.label,
+            "confidence": sighting.confidence,
+        }
 
     def pose(self, sighting: _Sighting, boxes: bool) -> dict[str, Any]:
         """Return the fields position, size and orientation of a detection, as far as known."""
@@ -327,26 +318,23 @@ class _Reader:
             return {}
         box = take(sighting.detection, "bbox") if boxes else None
         pose, size = take(box, "center"), numbers(take(box, "size"), "xyz")
-        has_size = size is not None and any(size) and all(0 <= s <= _MAX_EXTENT for s in size)
-        if not has_size and _is_unset(pose):
+        if size and not (any(size.values()) and all(0 <= s <= _MAX_EXTENT for s in size.values())):
+            size = None
+        if size is None and _is_unset(pose):
             pose = sighting.pose
             if _is_unset(pose):
                 self.note(sighting.index, "no-position", "the box and the pose are unset")
                 return {}
         position = numbers(take(pose, "position"), "xyz")
-        if position is None or any(abs(value) > _MAX_METRES for value in position):
+        if position is None or any(abs(value) > _MAX_METRES for value in position.values()):
             self.note(sighting.index, "no-position", "the position is not finite or out of range")
             return {}
-        pose_fields: dict[str, Any] = {"position": dict(zip("xyz", position, strict=True))}
-        if size is not None and has_size:
-            pose_fields["size"] = dict(zip("xyz", size, strict=True))
-        turn = numbers(take(pose, "orientation"), "xyzw")
-        length = math.hypot(*turn) if turn else 0.0
-        if turn and _MIN_NORM < length < math.inf:
-            pose_fields["orientation"] = dict(
-                zip("xyzw", (side / length for side in turn), strict=True)
-            )
-        return pose_fields
+        fields = {"position": position} | ({"size": size} if size else {})
+        turn = numbers(take(pose, "orientation"), "xyzw") or {}
+        length = math.hypot(*turn.values())
+        if _MIN_NORM < length < math.inf:
+            fields["orientation"] = {axis: value / length for axis, value in turn.items()}
+        return fields
 
     def image_relations(self, ids: list[str]) -> list[dict[str, str]]:
         """Return the relations left between neighbouring boxes in the image."""
@@ -377,7 +365,7 @@ class _Reader:
         if not (width > 0 and height > 0):
             self.note(sighting.index, "no-box", "the box must have a positive width and height")
             return None
-        return upright_box((middle[0], middle[1]), (width, height), theta or 0.0)
+        return upright_box((middle["x"], middle["y"]), (width, height), theta or 0.0)
 
     def finish(self, fields: dict[str, Any], unknown_labels: str) -> SceneFields:
         """Add the frame and the time of the message to the fields. Return them with the notes."""
@@ -392,10 +380,8 @@ class _Reader:
             fields["stamp"] = time
         elif stamp is not None:
             self.note(None, "no-stamp", "the stamp of the message is not a valid time")
-        order = sorted(
-            self.notes, key=lambda note: -1 if note.detection is None else note.detection
-        )
-        return SceneFields(fields, tuple(order))
+        self.notes.sort(key=lambda note: -1 if note.detection is None else note.detection)
+        return SceneFields(fields, tuple(self.notes))
 
 
 def _unwrapped(message: Any) -> Any:
@@ -418,14 +404,14 @@ def _is_number(label: str) -> bool:
 def _is_unset(pose: Any) -> bool:
     """Return whether a pose is missing or unset."""
     position = take(pose, "position")
-    return position is None or numbers(position, "xyz") == (0.0, 0.0, 0.0)
+    return position is None or numbers(position, "xyz") == {"x": 0.0, "y": 0.0, "z": 0.0}
 
 
 def _viewpoint(viewpoint: Viewpoint) -> dict[str, float]:
     values: Any = viewpoint
-    if isinstance(values, list | tuple):
-        values = dict(zip(("x", "y", "yaw"), values, strict=False)) if len(values) == 3 else None
-    x, y, yaw = (number(take(values, name)) for name in ("x", "y", "yaw"))
+    if not isinstance(values, list | tuple):
+        values = [take(values, name) for name in ("x", "y", "yaw")]
+    x, y, yaw = map(number, values) if len(values) == 3 else (None,) * 3
     if x is None or y is None or yaw is None:
         raise MessageError("viewpoint must be three finite numbers: x, y, yaw")
     if max(abs(x), abs(y)) > _MAX_METRES or abs(yaw) > _MAX_YAW:

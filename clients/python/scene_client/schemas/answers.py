@@ -96,43 +96,33 @@ class Mapped(Reply):
     """canonical label of the class"""
     similarity: Annotated[float, Field(ge=0, le=1)]
     """similarity of the label and the class. 1 means that the rule is certain"""
-    rule: Annotated[
-        Rule,
-        Field(
-            description="how the service read the label. Certain rules: qualifier "
-            "(`mouse_(computer_equipment)`), alternative (`sofa/couch`), article (`a chair`), "
-            "instance (`chair_12`), prompt (`a photo of a chair`). Guesses: spelling "
-            "(`nigthstand`), head (`office table`)"
-        ),
-    ]
+    rule: Rule
+    """how the service read the label. Certain rules: qualifier (`mouse_(computer_equipment)`),
+    alternative (`sofa/couch`), article (`a chair`), instance (`chair_12`), prompt (`a photo of a
+    chair`). Guesses: spelling (`nigthstand`), head (`office table`)"""
 
 
 class SceneWarning(Reply):
     """A probable mistake in the scene, or a limit of the model. The service still answers."""
 
-    code: Annotated[
-        Literal[
-            "implausible-position",
-            "implausible-size",
-            "implausible-scale",
-            "y-axis-up",
-            "rolled-objects",
-            "flat-scene",
-            "unknown-sizes",
-            "not-judged",
-        ],
-        Field(
-            description="implausible-position: an object is more than 100 m from the viewer. "
-            "implausible-size: all sides of an object are below 1 mm, or one is above 20 m. "
-            "implausible-scale: the sizes of the objects differ from the typical sizes of their "
-            "classes by a common factor. y-axis-up: the sizes fit only if the y axis points up. "
-            "rolled-objects: furniture lies on its side, but its size fits an upright object. "
-            "flat-scene: all objects have the same depth in an optical frame. unknown-sizes: "
-            "vertical relations of an object are unobserved, because its size is unknown. "
-            "not-judged: the model has too few training scenes to judge objects or relations, and "
-            "the list is empty"
-        ),
+    code: Literal[
+        "implausible-position",
+        "implausible-size",
+        "implausible-scale",
+        "y-axis-up",
+        "rolled-objects",
+        "flat-scene",
+        "unknown-sizes",
+        "not-judged",
     ]
+    """implausible-position: an object is more than 100 m from the viewer. implausible-size: all
+    sides of an object are below 1 mm, or one is above 20 m. implausible-scale: the sizes of the
+    objects differ from the typical sizes of their classes by a common factor. y-axis-up: the sizes
+    fit only if the y axis points up. rolled-objects: furniture lies on its side, but its size fits
+    an upright object. flat-scene: all objects have the same depth in an optical frame.
+    unknown-sizes: vertical relations of an object are unobserved, because its size is unknown.
+    not-judged: the model has too few training scenes to judge objects or relations, and the list is
+    empty"""
     message: str
     objects: list[str]
     """ids of the objects that the warning concerns; empty for the whole scene"""
@@ -148,21 +138,12 @@ class Answer(Reply):
     """`frame_id` of the request"""
     stamp: Stamp | None = None
     """`stamp` of the request"""
-    ignored: Annotated[
-        list[str],
-        Field(
-            description="with `ignore` or `nearest-or-ignore` as `unknown_labels`: ids of the "
-            "objects, candidates and room type that the model does not know. The answer ignores "
-            "them"
-        ),
-    ] = []
-    mapped: Annotated[
-        list[Mapped],
-        Field(
-            description="each label that the vocabulary does not list, with the class that "
-            "replaces it. Guesses need `nearest` or `nearest-or-ignore` as `unknown_labels`"
-        ),
-    ] = []
+    ignored: list[str] = []
+    """with `ignore` or `nearest-or-ignore` as `unknown_labels`: ids of the objects, candidates and
+    room type that the model does not know. The answer ignores them"""
+    mapped: list[Mapped] = []
+    """each label that the vocabulary does not list, with the class that replaces it. Guesses need
+    `nearest` or `nearest-or-ignore` as `unknown_labels`"""
     warnings: list[SceneWarning] = []
     """probable mistakes in the scene"""
     observed_relations: list[ObservedRelation] | None = None

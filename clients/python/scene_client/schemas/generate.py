@@ -40,21 +40,17 @@ class GenerateRequest(SceneRequest):
     """number of scenes to sample"""
     steps: Annotated[int | None, Field(ge=1, le=2000)] = None
     """number of Gibbs sweeps; default: the model's value"""
-    temperature: Annotated[
-        float,
-        Field(
-            ge=0.05,
-            # At 2, a scene has 70 objects and 1,000 relations, and 64 scenes take up to 46 s.
-            le=1.5,
-            allow_inf_nan=False,
-            description="sampling temperature, from 0.05 to 1.5; values above 1 give more varied "
-            "scenes",
-        ),
-    ] = 1.0
+    # At 2, a scene has 70 objects and 1,000 relations, and 64 scenes take up to 46 s.
+    temperature: Annotated[float, Field(ge=0.05, le=1.5, allow_inf_nan=False)] = 1.0
+    """sampling temperature, from 0.05 to 1.5; values above 1 give more varied scenes"""
     context: Annotated[
         dict[Name, Annotated[list[UnitState], Field(max_length=4096)]] | None, Field(max_length=8)
     ] = None
     """states that hidden units keep: maps the name of each layer to pairs [unit, state]"""
+
+
+class GeneratedRelation(Relation):
+    """A relation of a sampled scene. `subject` and `object` are labels."""
 
 
 class GeneratedScene(Reply):
@@ -63,7 +59,7 @@ class GeneratedScene(Reply):
     room_type: str | None = None
     """room type of the scene; absent if it has none"""
     objects: list[str]
-    relations: list[Relation]
+    relations: list[GeneratedRelation]
     log_score: Finite
     context: dict[str, list[tuple[int, int]]]
     """states of the hidden units: maps the name of each layer to pairs [unit, state]. Units in

@@ -36,25 +36,15 @@ class MissingRequest(SceneRequest):
     """What else should be here, and where?"""
 
     objects: SomeObjects
-    coverage: Annotated[
-        Probability | None,
-        Field(
-            description="share of the real scene's classes that the request lists. With 1, at most "
-            "one class is missing. Values below 0.15 mean 0.15. Default: the value of the model, "
-            "which gave validation scenes the best answers",
-        ),
-    ] = None
+    coverage: Probability | None = None
+    """share of the real scene's classes that the request lists. With 1, at most one class is
+    missing. Values below 0.15 mean 0.15. Default: the value of the model, which gave validation
+    scenes the best answers"""
     top_k: Annotated[int, Field(ge=1)] = 10
     """maximum number of classes in the answer"""
-    candidates: Annotated[
-        list[Label] | None,
-        Field(
-            min_length=1,
-            max_length=4096,
-            description="limit the answer to classes with these labels. The list `more` then "
-            "contains them at any probability",
-        ),
-    ] = None
+    candidates: Annotated[list[Label] | None, Field(min_length=1, max_length=4096)] = None
+    """limit the answer to classes with these labels. The list `more` then contains them at any
+    probability"""
     at: Annotated[Anchor, OrArray()] | None = None
     """limit the answer to objects missing at this place; not at floor, wall or ceiling"""
     detail: Detail = "full"
@@ -93,14 +83,10 @@ class Placement(Reply):
     relation: RelationName
     object: str
     probability: Probability
-    offset: Annotated[
-        Offset | None,
-        Field(
-            description="offset from `object` in metres. The offset is absent if `object` has no "
-            "position, or if the training scenes have no poses. It is also absent for left, right, "
-            "front and behind in a map, odom or world frame without a viewpoint"
-        ),
-    ] = None
+    offset: Offset | None = None
+    """offset from `object` in metres. The offset is absent if `object` has no position, or if the
+    training scenes have no poses. It is also absent for left, right, front and behind in a map,
+    odom or world frame without a viewpoint"""
 
 
 class MissingObject(Reply):
@@ -113,20 +99,12 @@ class MissingObject(Reply):
     label: str
     probability: Probability
     log_odds: Finite
-    placements: Annotated[
-        list[Placement],
-        Field(
-            description="the likeliest place, and at most 2 further places that are at least 3/4 "
-            "as probable. With `at`, this place comes first"
-        ),
-    ] = []
-    because: Annotated[
-        list[Because],
-        Field(
-            description="objects that change the odds by a factor of at least 3, largest change "
-            "first, at most 3. Only the first 32 classes of the answer have reasons"
-        ),
-    ] = []
+    placements: list[Placement] = []
+    """the likeliest place, and at most 2 further places that are at least 3/4 as probable. With
+    `at`, this place comes first"""
+    because: list[Because] = []
+    """objects that change the odds by a factor of at least 3, largest change first, at most 3. Only
+    the first 32 classes of the answer have reasons"""
 
 
 class MoreInstances(Reply):
@@ -156,15 +134,11 @@ class MissingAnswer(Answer):
     coverage: Probability | None = None
     """value of `coverage` that the service has used"""
     missing: list[MissingObject]
-    more: Annotated[
-        list[MoreInstances],
-        Field(
-            description="listed classes with probably more instances than listed, most probable "
-            "first. Without `candidates`, their probability is at least 0.5. The list is empty "
-            "with `at`, and for models without statistics of counts. Classes and numbers of "
-            "objects with too little data are left out"
-        ),
-    ] = []
+    more: list[MoreInstances] = []
+    """listed classes with probably more instances than listed, most probable first. Without
+    `candidates`, their probability is at least 0.5. The list is empty with `at`, and for models
+    without statistics of counts. Classes and numbers of objects with too little data are left
+    out"""
 
 
 class MissingFields(SceneFields, total=False):

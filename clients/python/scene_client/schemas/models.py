@@ -130,13 +130,9 @@ class WordAnswer(Reply):
     model: ModelReference
     word: str
     class_: Annotated[VocabularyEntry | None, Field(alias="class")] = None
-    rule: Annotated[
-        Literal["label", "alias", "phrase"] | Rule | None,
-        Field(
-            description="how the service reads the label: label, alias or phrase "
-            "(`bottle of milk`) of the vocabulary, or a rule of `mapped`"
-        ),
-    ] = None
+    rule: Literal["label", "alias", "phrase"] | Rule | None = None
+    """how the service reads the label: label, alias or phrase (`bottle of milk`) of the vocabulary,
+    or a rule of `mapped`"""
     certain: bool = False
     """true if every request accepts the label; false if it needs `unknown_labels: nearest`"""
     suggestions: list[str] = []
@@ -168,13 +164,9 @@ class ContextUnit(Reply):
     name: str
     """name made of the objects and the relation with the largest weights"""
     objects: list[WeightedLabel]
-    relations: Annotated[
-        list[WeightedRelation],
-        Field(
-            description="relations of the training scenes. Each weight is the difference from "
-            "the mean weight of the layer"
-        ),
-    ]
+    relations: list[WeightedRelation]
+    """relations of the training scenes. Each weight is the difference from the mean weight of the
+    layer"""
     room_types: list[WeightedLabel]
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
-
-from pydantic import Field
+from typing import Literal
 
 from scene_client.schemas.answers import Answer, Because, Reply, ScoredRelation
 from scene_client.schemas.requests import (
@@ -23,14 +21,10 @@ class OutliersRequest(SceneRequest):
     """Which objects do not belong here, or are in the wrong place?"""
 
     objects: SomeObjects
-    sensitivity: Annotated[
-        Sensitivity,
-        Field(
-            description="rate of alarms in unchanged scenes: at most about 2, 10 and 20 % of the "
-            "scenes with low, medium and high. The rates apply to the large data source with the "
-            "most alarms, and also to short lists of objects"
-        ),
-    ] = "medium"
+    sensitivity: Sensitivity = "medium"
+    """rate of alarms in unchanged scenes: at most about 2, 10 and 20 % of the scenes with low,
+    medium and high. The rates apply to the large data source with the most alarms, and also to
+    short lists of objects"""
     threshold: Probability | None = None
     """minimum probability of an outlier; default: threshold of the model for `sensitivity`"""
     detail: Detail = "full"
@@ -50,13 +44,9 @@ class Outlier(Reply):
     probability: Probability
     log_odds: Finite
     is_outlier: bool
-    because: Annotated[
-        list[Because],
-        Field(
-            description="other objects that explain `is_outlier`, largest effect first, at most "
-            "3. For an outlier, they lower its log-odds. Otherwise, they raise its log-odds"
-        ),
-    ] = []
+    because: list[Because] = []
+    """other objects that explain `is_outlier`, largest effect first, at most 3. For an outlier,
+    they lower its log-odds. Otherwise, they raise its log-odds"""
     usually_with: list[str] = []
     """for an outlier: absent classes that would make it likely, at most 3"""
 

@@ -86,15 +86,10 @@ class RelationsAnswer(Answer):
     """
 
     relations: list[ExpectedRelation]
-    disagreements: Annotated[
-        list[Disagreement],
-        Field(
-            description="pairs whose observed relation differs from the expected relation, at most "
-            "`top_k`. Given the rest of the scene, the expected relation has a probability of at "
-            "least one half. The first pair has the largest ratio of the probabilities of the "
-            "expected and the observed relation"
-        ),
-    ]
+    disagreements: list[Disagreement]
+    """pairs whose observed relation differs from the expected relation, at most `top_k`. Given the
+    rest of the scene, the expected relation has a probability of at least one half. The first pair
+    has the largest ratio of the probabilities of the expected and the observed relation"""
 
 
 class RelationsFields(SceneFields, total=False):

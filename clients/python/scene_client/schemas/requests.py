@@ -40,16 +40,7 @@ The validation of a million invalid relations would take seconds.
 UnknownLabels = Literal["error", "ignore", "nearest", "nearest-or-ignore"]
 Detail = Literal["scores", "full"]
 RelationName = Literal[
-    "left",
-    "right",
-    "front",
-    "behind",
-    "on-top",
-    "under",
-    "above",
-    "below",
-    "inside",
-    "contains",
+    "left", "right", "front", "behind", "on-top", "under", "above", "below", "inside", "contains"
 ]
 
 
@@ -80,10 +71,7 @@ Id = Annotated[
     ),
 ]
 """An id or a label. A whole number is the id with its digits, as in training scenes."""
-Unused = Annotated[
-    str | None,
-    Field(max_length=256, description="field of a training scene; unused by the service"),
-]
+Unused = Annotated[str | None, Field(max_length=256)]
 ModelSpec = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_plain_text)]
 
 
@@ -197,13 +185,9 @@ class Stamp(Request):
 class Detection(Request):
     """One detected object."""
 
-    id: Annotated[
-        Id | None,
-        Field(
-            description="id of the object in this scene; default: its label, followed by a number "
-            "if several objects have this label"
-        ),
-    ] = None
+    id: Id | None = None
+    """id of the object in this scene; default: its label, followed by a number if several objects
+    have this label"""
     label: Label
     """label in any spelling that the vocabulary accepts"""
     confidence: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 1.0
@@ -216,13 +200,9 @@ class Detection(Request):
     """rotation of the object's box"""
     yaw: Angle | None = None
     """rotation about the z axis in radians, instead of `orientation`"""
-    supported_by: Annotated[
-        Id | None,
-        Field(
-            description="id of the object under this object: the relation on-top. Unused if the "
-            "service derives relations from the positions of all objects"
-        ),
-    ] = None
+    supported_by: Id | None = None
+    """id of the object under this object: the relation on-top. Unused if the service derives
+    relations from the positions of all objects"""
 
     @model_validator(mode="after")
     def _one_rotation(self) -> Self:
@@ -265,42 +245,28 @@ class Relation(Request):
 class SceneRequest(Request):
     """A request: the scene that the robot observes, and the model that answers."""
 
-    objects: Annotated[
-        list[SceneObject],
-        # Validation stops at the first invalid object. `validation.field_errors` then repeats it.
-        Field(max_length=256, fail_fast=True, description="labels or detections, at most 256"),
-    ]
+    # Validation stops at the first invalid object. `validation.field_errors` then repeats it.
+    objects: Annotated[list[SceneObject], Field(max_length=256, fail_fast=True)]
+    """labels or detections, at most 256"""
     relations: Annotated[
         list[Annotated[Relation, OrArray()]] | None,
-        Field(
-            max_length=MAX_RELATIONS,
-            # Validation stops at the first invalid relation. A list of all errors would need a
-            # hundred times the memory of the request.
-            fail_fast=True,
-            description="relations that hold in the scene. Unlisted relations are unobserved, "
-            "unless `relations_complete` is true. Without this field, the service derives "
-            "relations from positions. An empty list turns this derivation off",
-        ),
+        # Validation stops at the first invalid relation. A list of all errors would need a hundred
+        # times the memory of the request.
+        Field(max_length=MAX_RELATIONS, fail_fast=True),
     ] = None
+    """relations that hold in the scene. Unlisted relations are unobserved, unless
+    `relations_complete` is true. Without this field, the service derives relations from positions.
+    An empty list turns this derivation off"""
     relations_complete: bool = False
     """whether every relation that `relations` does not list is false"""
     room_type: Label | None = None
     """one of the model's room types"""
-    profile: Annotated[
-        Name | None,
-        Field(
-            description="name of a data source of the model. Its base rates of the classes apply. "
-            "Without it, the model infers the source from the listed objects"
-        ),
-    ] = None
-    frame_id: Annotated[
-        str | None,
-        Field(
-            max_length=256,
-            description="name of the frame of all positions, as in std_msgs/Header. The answer "
-            "contains the same name",
-        ),
-    ] = None
+    profile: Name | None = None
+    """name of a data source of the model. Its base rates of the classes apply. Without it, the
+    model infers the source from the listed objects"""
+    frame_id: Annotated[str | None, Field(max_length=256)] = None
+    """name of the frame of all positions, as in std_msgs/Header. The answer contains the same
+    name"""
     stamp: Stamp | None = None
     """time of the scene, as in std_msgs/Header; copied to the answer"""
     viewpoint: Viewpoint | None = None
@@ -309,25 +275,19 @@ class SceneRequest(Request):
     """an alias, `name` or `name@version`"""
     seed: Annotated[int | None, Field(ge=0, le=MAX_SEED)] = None
     """random seed of `/generate`; unused by other questions"""
-    unknown_labels: Annotated[
-        UnknownLabels,
-        Field(
-            description="treatment of labels that the model does not know. `error` refuses the "
-            "request. `ignore` leaves these objects out of the scene. `nearest` corrects misspelt "
-            "words and reads phrases by their last words (see `mapped`); it refuses a label that "
-            "could be several classes. `nearest-or-ignore` leaves such a label out"
-        ),
-    ] = "error"
+    unknown_labels: UnknownLabels = "error"
+    """treatment of labels that the model does not know. `error` refuses the request. `ignore`
+    leaves these objects out of the scene. `nearest` corrects misspelt words and reads phrases by
+    their last words (see `mapped`); it refuses a label that could be several classes.
+    `nearest-or-ignore` leaves such a label out"""
 
-    scene_id: Annotated[
-        Unused,
-        Field(
-            description="id of a training scene. Without `frame_id` and `viewer_frame`, its "
-            "positions are in the frame `map`"
-        ),
-    ] = None
+    scene_id: Unused = None
+    """id of a training scene. Without `frame_id` and `viewer_frame`, its positions are in the frame
+    `map`"""
     source: Unused = None
+    """field of a training scene; unused by the service"""
     group: Unused = None
+    """field of a training scene; unused by the service"""
     viewer_frame: bool = False
     """whether the axes of a training scene are those of the viewer"""
 
@@ -363,13 +323,9 @@ class AliasRequest(Request):
 
     model: ModelSpec
     """`name@version`, or `name` for the newest usable version"""
-    expected: Annotated[
-        ModelSpec | None,
-        Field(
-            description="required current target of the alias, as in GET /models. null means that "
-            "the alias must not exist yet. By default, the service does not check the target"
-        ),
-    ] = None
+    expected: ModelSpec | None = None
+    """required current target of the alias, as in GET /models. null means that the alias must not
+    exist yet. By default, the service does not check the target"""
 
 
 class AliasFields(TypedDict, total=False):

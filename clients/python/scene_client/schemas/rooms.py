@@ -24,15 +24,8 @@ class RoomsRequest(SceneRequest):
     objects: SomeObjects
     top_k: Annotated[int, Field(ge=1, le=4096)] = 5
     """maximum number of room types in the answer"""
-    candidates: Annotated[
-        list[Label] | None,
-        Field(
-            min_length=1,
-            max_length=4096,
-            description="the possible room types, such as the rooms of a flat. Their "
-            "probabilities sum to one",
-        ),
-    ] = None
+    candidates: Annotated[list[Label] | None, Field(min_length=1, max_length=4096)] = None
+    """the possible room types, such as the rooms of a flat. Their probabilities sum to one"""
     detail: Detail = "full"
     """`scores` leaves `because` out of the answer"""
 
@@ -42,13 +35,9 @@ class RoomType(Reply):
 
     room_type: str
     probability: Probability
-    because: Annotated[
-        list[Because],
-        Field(
-            description="objects that change the odds of the room type by a factor of at least 3, "
-            "largest change first, at most 3"
-        ),
-    ] = []
+    because: list[Because] = []
+    """objects that change the odds of the room type by a factor of at least 3, largest change
+    first, at most 3"""
 
 
 class RoomsAnswer(Answer):
