@@ -13,7 +13,6 @@ from app.registry import (
     AliasTarget,
     Artifact,
     ArtifactError,
-    ArtifactFailure,
     ModelSet,
     Store,
     StoreError,
@@ -116,9 +115,10 @@ def test_loaded_versions_are_verified_again(file: str, store: Store) -> None:
     good = path.read_bytes()
     path.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
     broken = load_model_set(store, first)
-    assert broken.entries["tiny", "2.0.0"] == ArtifactFailure(
-        "checksum_mismatch", f"{file} does not match its checksum: the file was altered"
-    )
+    failure = broken.failures["tiny", "2.0.0"]
+    assert failure.code == "checksum_mismatch"
+    assert failure.reason == f"{file} does not match its checksum: the file was altered"
+    assert failure.__traceback__ is failure.__context__ is None
     path.write_bytes(good)
     assert load_model_set(store, broken).resolve("tiny").digest == first.resolve("tiny").digest
 
