@@ -358,11 +358,9 @@ class Description(Frozen):
             if self.spec.get(name, 0) != length:
                 given = f"{name} = {self.spec.get(name)}"
                 raise ValueError(f"the description has {length} {what}, but the spec has {given}")
-        number = len(words.room_types)
-        if (rooms := self.spec.get("C", 0)) not in (0, number):
-            raise ValueError(
-                f"the vocabulary has {number} room types, but the spec has C = {rooms}"
-            )
+        rooms, types = self.spec.get("C", 0), len(words.room_types)
+        if rooms not in (0, types):
+            raise ValueError(f"the vocabulary has {types} room types, but the spec has C = {rooms}")
         if any(t >= rooms for t in self.calibration.rare_rooms):
             raise ValueError(f"calibration.rare_rooms must be below C = {rooms}")
         for example in self.examples:
