@@ -24,8 +24,6 @@ from typing import Any
 import httpx
 import pytest
 
-CHAOS = os.environ.get("CHAOS") == "1"
-"""Whether `make chaos` runs the tests: all attacks, for minutes."""
 ADMIN_KEY = "correct-horse-battery-staple"
 CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed": 11}
 NAMED = {"allowed_hosts": ["service"]}

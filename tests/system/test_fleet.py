@@ -85,7 +85,7 @@ def port(fleet: Fleet, haproxy: StartProxy, configuration: Path) -> Iterator[int
 @pytest.fixture
 def load(fleet: Fleet, port: int) -> ConstantLoad:
     """Requests whose answers must be exactly those of the version that they name."""
-    judge = Judge(fleet.store, ("1.0.0", "1.1.0"))
+    judge = Judge(fleet.replicas[1].client, ("1.0.0", "1.1.0"))
     return ConstantLoad(port, REQUESTS, judge, connections=4)
 
 
