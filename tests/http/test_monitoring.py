@@ -1,4 +1,4 @@
-"""``GET /metrics`` and the access log: what the service tells of itself, and what it keeps."""
+"""``GET /metrics`` and the access log."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import json
 import re
 import shutil
-import time
 import uuid
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.conftest import REPOSITORY
 from tests.http.stores import corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import Hold, LiveService, Replace, defect, serve
+from tests.services import Hold, LiveService, Replace, defect, serve, wait_until
 
 SCENE = {"objects": ["bed", "lamp"]}
+QUESTIONS = ("relations", "missing", "outliers", "rooms", "generate")
 OPERATIONS = (REPOSITORY / "docs" / "operations.md").read_text("utf-8")
 
 
@@ -63,7 +63,7 @@ async def test_the_documented_example_is_of_this_service(shared_store: Path) -> 
         await client.post("/missing", json=SCENE)
         await client.post("/missing", json={"objects": ["nosuchthing"]})
         text = (await client.get("/metrics")).text
-    # Line by line the same, but for the counts.
+    # The lines are the same, except the counts.
     for line in ok["example"].splitlines():
         assert line.rpartition(" ")[0] in text if line[0] != "#" else line in text
 
@@ -107,14 +107,10 @@ async def test_requests_are_counted_by_route_method_and_outcome(
     assert found["scene_request_duration_seconds_count", "/missing"] == 5
 
 
-async def test_unknown_paths_and_methods_add_no_metrics(
-    client: httpx.AsyncClient,
-) -> None:
+async def test_unknown_paths_and_methods_add_no_metrics(client: httpx.AsyncClient) -> None:
     async def ask(number: int) -> None:
-        await client.get(f"/nowhere/{number}")
-        await client.get(f"/models/m{number}")
-        await client.get(f"/problems/p{number}")
-        await client.get(f"/static/s{number}")
+        for folder in ("nowhere", "models", "problems", "static"):
+            await client.get(f"/{folder}/m{number}")
         await client.request(f"METHOD{number}", f"/models/m{number}")
         await client.post("/missing", json={**SCENE, "model": f"m{number}"})
 
@@ -128,15 +124,14 @@ async def test_unknown_paths_and_methods_add_no_metrics(
 
 async def test_work_is_measured_by_model_and_question(shared_store: Path) -> None:
     async with serve(shared_store) as client:
-        for path in ("relations", "missing", "outliers", "rooms", "generate"):
-            body = {**SCENE, "model": "plain", "seed": 1} | (
-                {"steps": 1} if path == "generate" else {}
-            )
+        for path in QUESTIONS:
+            body = {**SCENE, "model": "plain", "seed": 1}
+            body |= {"steps": 1} if path == "generate" else {}
             assert (await client.post(f"/{path}", json=body)).status_code == 200
         batch = {"scenes": [SCENE, {"objects": ["nosuchthing"]}, SCENE]}
         assert (await client.post("/missing/batch", json=batch)).status_code == 200
         found = await samples(client)
-    for question in ("relations", "missing", "outliers", "rooms", "generate"):
+    for question in QUESTIONS:
         label = ("plain", question, "1.0.0")
         assert found["scene_compute_duration_seconds_count", *label] == 1
         assert found["scene_compute_duration_seconds_sum", *label] > 0
@@ -167,16 +162,11 @@ async def test_reloads_are_counted_by_outcome(store: Path, admin: dict[str, str]
         found = await samples(client)
         led = [key[5] for key in found if key[:2] == ("scene_model_info", "default")]
     assert led == ["1.1.0"]
-    assert {key[1:]: n for key, n in found.items() if key[0] == "scene_reloads_total"} == {
-        ("poll", "success"): 0,
-        ("poll", "refused"): 0,
-        ("poll", "failed"): 0,
-        ("refresh", "success"): 1,
-        ("refresh", "refused"): 1,
-        ("refresh", "failed"): 0,
-        ("alias", "success"): 1,
-        ("alias", "refused"): 1,
-        ("alias", "failed"): 0,
+    reloads = {key[1:]: n for key, n in found.items() if key[0] == "scene_reloads_total"}
+    assert reloads == {
+        (change, outcome): float(change != "poll" and outcome != "failed")
+        for change in ("poll", "refresh", "alias")
+        for outcome in ("success", "refused", "failed")
     }
     assert found["scene_ready_time_seconds",] >= found["scene_start_time_seconds",] > 0
 
@@ -277,17 +267,14 @@ def test_the_documentation_lists_every_metric(live: LiveService) -> None:
 
 
 def line(service: LiveService, method: str, path: str, **arguments: Any) -> dict[str, Any]:
-    """What the log tells of one request, in one line."""
+    """Send a request, and return its line of the log."""
     identity = uuid.uuid4().hex
     headers = {"X-Request-Id": identity}
     service.client.request(method, path, headers=headers, **arguments)
-    # It is written after the answer.
-    for _ in range(500):
-        lines = map(json.loads, service.log.read_text().splitlines())
-        if found := [entry for entry in lines if entry.get("request_id") == identity]:
-            break
-        time.sleep(0.01)
-    (entry,) = found
+    # The service writes the line after the answer.
+    wait_until(lambda: f'"{identity}"' in service.log.read_text(), service.log)
+    lines = map(json.loads, service.log.read_text().splitlines())
+    (entry,) = (entry for entry in lines if entry.get("request_id") == identity)
     assert entry.pop("process") == service.process.pid
     for name in ("time", "message", "request_id"):
         assert entry.pop(name)
@@ -300,26 +287,13 @@ def test_a_request_is_one_line(live: LiveService) -> None:
     answered = line(live, "POST", "/missing", json=SCENE)
     assert answered.pop("latency_ms") >= answered.pop("compute_ms") > 0
     assert answered.pop("queue_ms") >= 0
-    assert answered == {
-        "level": "info",
-        "logger": "app.access",
-        "method": "POST",
-        "route": "/missing",
-        "status": 200,
-        "outcome": "success",
-        "model": "home",
-        "version": "1.0.0",
-    }
+    common = {"level": "info", "logger": "app.access"}
+    expected = {"method": "POST", "route": "/missing", "status": 200, "outcome": "success"}
+    assert answered == common | expected | {"model": "home", "version": "1.0.0"}
     refused = line(live, "GET", "/nowhere?key=secret")
     assert refused.pop("latency_ms") > 0
-    assert refused == {
-        "level": "info",
-        "logger": "app.access",
-        "method": "GET",
-        "route": "-",
-        "status": 404,
-        "outcome": "not-found",
-    }
+    expected = {"method": "GET", "route": "-", "status": 404, "outcome": "not-found"}
+    assert refused == common | expected
 
 
 @pytest.mark.system
