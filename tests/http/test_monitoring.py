@@ -143,24 +143,23 @@ async def test_work_is_measured_by_model_and_question(shared_store: Path) -> Non
     assert found["scene_serialisation_duration_seconds_sum",] > 0
 
 
-async def test_reloads_are_counted_by_outcome(store: Path, admin: dict[str, str]) -> None:
-    async with serve(store) as client:
+async def test_reloads_are_counted_by_outcome(own: httpx.AsyncClient, store: Path) -> None:
 
-        async def refresh() -> int:
-            return (await client.post("/models/refresh", headers=admin)).status_code
+    async def refresh() -> int:
+        return (await own.post("/models/refresh")).status_code
 
-        async def move(model: str) -> int:
-            url = "/models/aliases/default"
-            return (await client.put(url, json={"model": model}, headers=admin)).status_code
+    async def move(model: str) -> int:
+        url = "/models/aliases/default"
+        return (await own.put(url, json={"model": model})).status_code
 
-        assert await refresh() == 200
-        assert await move("home@1.1.0") == 200
-        assert await move("home@7.0.0") == 404
-        publish(store, "home", "2.0.0", seed=2)
-        corrupt(store, "home", "2.0.0")
-        assert await refresh() == 409
-        found = await samples(client)
-        led = [key[5] for key in found if key[:2] == ("scene_model_info", "default")]
+    assert await refresh() == 200
+    assert await move("home@1.1.0") == 200
+    assert await move("home@7.0.0") == 404
+    publish(store, "home", "2.0.0", seed=2)
+    corrupt(store, "home", "2.0.0")
+    assert await refresh() == 409
+    found = await samples(own)
+    led = [key[5] for key in found if key[:2] == ("scene_model_info", "default")]
     assert led == ["1.1.0"]
     reloads = {key[1:]: n for key, n in found.items() if key[0] == "scene_reloads_total"}
     assert reloads == {
@@ -181,54 +180,52 @@ async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
 # ------------------------------------------------------------------------------- the models
 
 
-async def test_model_info_has_every_alias(store: Path, admin: dict[str, str]) -> None:
-    async with serve(store) as client:
-        await client.put("/models/aliases/night", json={"model": "home"}, headers=admin)
-        infos = {key[1:] for key in await samples(client) if key[0] == "scene_model_info"}
-        expected = set()
-        for alias, name, variant, version in (
-            ("default", "home", "triway", "1.0.0"),
-            ("candidate", "home", "triway", "1.1.0"),
-            ("night", "home", "triway", "1.1.0"),
-            ("", "plain", "rbm", "1.0.0"),
-            ("", "deep", "gbm", "0.1.0"),
-        ):
-            listed = (await client.get(f"/models/{name}/versions/{version}")).json()
-            expected.add((alias, listed["digest"], name, variant, version))
+async def test_model_info_has_every_alias(own: httpx.AsyncClient) -> None:
+    await own.put("/models/aliases/night", json={"model": "home"})
+    infos = {key[1:] for key in await samples(own) if key[0] == "scene_model_info"}
+    expected = set()
+    for alias, name, variant, version in (
+        ("default", "home", "triway", "1.0.0"),
+        ("candidate", "home", "triway", "1.1.0"),
+        ("night", "home", "triway", "1.1.0"),
+        ("", "plain", "rbm", "1.0.0"),
+        ("", "deep", "gbm", "0.1.0"),
+    ):
+        listed = (await own.get(f"/models/{name}/versions/{version}")).json()
+        expected.add((alias, listed["digest"], name, variant, version))
     assert infos == expected
 
 
 async def test_metrics_of_a_removed_model_disappear(
-    store: Path, admin: dict[str, str], hold: Hold
+    own: httpx.AsyncClient, store: Path, hold: Hold
 ) -> None:
-    async with serve(store) as client:
 
-        async def names(of: str) -> set[str]:
-            return {key[0] for key in await samples(client) if of in key}
+    async def names(of: str) -> set[str]:
+        return {key[0] for key in await samples(own) if of in key}
 
-        async def ask(model: str, objects: int = 2) -> int:
-            body = {"objects": ["bed"] * objects, "model": model}
-            return (await client.post("/missing", json=body)).status_code
+    async def ask(model: str, objects: int = 2) -> int:
+        body = {"objects": ["bed"] * objects, "model": model}
+        return (await own.post("/missing", json=body)).status_code
 
-        assert await ask("plain") == await ask("home@1.0.0") == 200
-        everything = await names("home")
-        assert {"scene_pending_rows", "scene_batch_rows_sum", "scene_model_info"} <= everything
-        assert await names("plain") == everything
-        # A request that still holds the old snapshot reports late.
-        held = hold("missing", lambda manifest: manifest.name == "plain")
-        late = asyncio.ensure_future(ask("plain", 9))  # unmeasured, so on a thread
-        assert await asyncio.to_thread(held.started.wait, 30)
-        shutil.rmtree(store / "plain")
-        await client.post("/models/refresh", headers=admin)
-        assert await names("plain") == set()
-        assert await names("home") == everything
-        held.release.set()
-        assert await late == 200
-        assert await names("plain") == set()
-        publish(store, "plain", "1.0.0", variant="rbm")
-        await client.post("/models/refresh", headers=admin)
-        assert await ask("plain") == 200
-        assert (await samples(client))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
+    assert await ask("plain") == await ask("home@1.0.0") == 200
+    everything = await names("home")
+    assert {"scene_pending_rows", "scene_batch_rows_sum", "scene_model_info"} <= everything
+    assert await names("plain") == everything
+    # A request that still holds the old snapshot reports late.
+    held = hold("missing", lambda manifest: manifest.name == "plain")
+    late = asyncio.ensure_future(ask("plain", 9))  # unmeasured, so on a thread
+    assert await asyncio.to_thread(held.started.wait, 30)
+    shutil.rmtree(store / "plain")
+    await own.post("/models/refresh")
+    assert await names("plain") == set()
+    assert await names("home") == everything
+    held.release.set()
+    assert await late == 200
+    assert await names("plain") == set()
+    publish(store, "plain", "1.0.0", variant="rbm")
+    await own.post("/models/refresh")
+    assert await ask("plain") == 200
+    assert (await samples(own))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
 
 
 async def test_a_process_without_a_default_is_not_ready(
