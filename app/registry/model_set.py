@@ -99,11 +99,11 @@ def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
         aliases, failure = {}, StoreError(error.code, error.reason)
     keys: list[tuple[str, str]] = []
     try:
-        for name in store.names():
-            try:
-                keys += [(name, version) for version in store.versions(name)]
-            except StoreError as error:  # only this model's folder is unreadable
-                failure = StoreError(error.code, error.reason)
+        for name, versions in store.published().items():
+            if isinstance(versions, StoreError):  # only this model's folder is unreadable
+                failure = versions
+            else:
+                keys += [(name, version) for version in versions]
     except StoreError as error:
         failure = StoreError(error.code, error.reason)
     entries = {key: _load(store, *key, previous.entries.get(key)) for key in keys}

@@ -68,20 +68,21 @@ class Store:
         self._lock_timeout = lock_timeout
         self._max_weights_bytes = max_weights_bytes
 
-    def names(self) -> tuple[str, ...]:
-        """Return the sorted names of models that have a version or an unreadable folder.
+    def published(self) -> dict[str, tuple[str, ...] | StoreError]:
+        """Return the versions of each model, or the error of an unreadable folder, by sorted name.
 
         Raises:
             StoreError: `unreadable` if the root is not a readable directory.
         """
-
-        def may_hold_versions(name: str) -> bool:
+        models: dict[str, tuple[str, ...] | StoreError] = {}
+        for name in self._folders():
             try:
-                return bool(self.versions(name))
-            except StoreError:
-                return True
-
-        return tuple(filter(may_hold_versions, self._folders()))
+                versions = self.versions(name)
+            except StoreError as error:
+                models[name] = StoreError(error.code, error.reason)
+            else:
+                models |= {name: versions} if versions else {}
+        return models
 
     def versions(self, name: str) -> tuple[str, ...]:
         """Return the published versions of a model in ascending order. The result may be empty.
@@ -146,8 +147,8 @@ class Store:
         """
         files = [self.root / ALIASES]
         with suppress(StoreError):
-            for name in self.names():
-                for version in self.versions(name):
+            for name, versions in self.published().items():
+                for version in () if isinstance(versions, StoreError) else versions:
                     folder = self.root / name / version
                     files += [folder / file for file in (MANIFEST, WEIGHTS, CARD)]
         return tuple((str(file), *_file_state(file)) for file in files)

@@ -61,8 +61,10 @@ def test_lists_names_and_versions_in_order(store: Store) -> None:
     for version in ("1.10.0", "1.9.0", "0.2.0"):
         publish(store, version)
     publish(store, name="another")
-    assert store.names() == ("another", "tiny")
-    assert store.versions("tiny") == ("0.2.0", "1.9.0", "1.10.0")
+    assert [*store.published().items()] == [
+        ("another", ("1.0.0",)),
+        ("tiny", ("0.2.0", "1.9.0", "1.10.0")),
+    ]
     assert store.resolve("tiny") == ("tiny", "1.10.0")
     assert store.resolve("tiny@0.2.0") == ("tiny", "0.2.0")
     assert store.versions("nothing") == ()
@@ -122,9 +124,9 @@ def test_waits_for_another_writer_but_not_for_ever(tmp_path: Path) -> None:
         thread.start()
         thread.join(0.1)
         assert thread.is_alive()
-        assert store.names() == (), "readers do not wait"
+        assert store.published() == {}, "readers do not wait"
     thread.join(30)
-    assert store.names() == ("tiny",)
+    assert store.published() == {"tiny": ("1.0.0",)}
 
 
 def test_everything_is_on_disk_before_it_is_pointed_at(
@@ -214,7 +216,7 @@ def test_an_alias_needs_a_target_and_a_name_of_its_own(store: Store) -> None:
     ):
         with refused(code):
             store.publish(description(name, "2.0.0"), state(), alias=alias)
-    assert (store.names(), store.versions("tiny")) == (("tiny",), ("1.0.0",))
+    assert store.published() == {"tiny": ("1.0.0",)}
 
 
 def test_the_writer_of_aliases_applies_the_limits_of_the_reader(store: Store) -> None:
@@ -288,10 +290,10 @@ def test_readers_see_no_leftovers_and_the_next_writer_clears_them(store: Store) 
     (store.root / "plain").write_text("a file")
     (store.root / "lost+found").mkdir()
     (store.root / "tiny" / "notes").mkdir()
-    assert (store.names(), store.versions("tiny")) == (("tiny",), ("1.0.0",))
+    assert store.published() == {"tiny": ("1.0.0",)}
     publish(store, "2.0.0")
     assert not any(leftover.exists() for leftover in (half, only, table))
-    assert (store.names(), store.versions("tiny")) == (("tiny",), ("1.0.0", "2.0.0"))
+    assert store.published() == {"tiny": ("1.0.0", "2.0.0")}
     assert (store.root / "README.md").read_text() == "about"
 
 
@@ -337,7 +339,7 @@ def test_a_model_outside_the_root_is_no_model(store: Store, tmp_path: Path) -> N
     outside = Store(tmp_path / "outside")
     publish(outside, name="foreign")
     (store.root / "foreign").symlink_to(outside.root / "foreign")
-    assert store.names() == ("tiny",)
+    assert store.published() == {"tiny": ("1.0.0",)}
     with refused("unknown_model"):
         store.resolve("foreign")
     with refused("unsafe_path"):
@@ -358,9 +360,9 @@ def test_no_name_leads_out_of_the_root(name: str, store: Store) -> None:
 
 def test_a_missing_store_is_an_error_and_an_empty_one_is_not(store: Store) -> None:
     with refused("unreadable"):
-        store.names()
+        store.published()
     store.root.mkdir()
-    assert (store.names(), dict(store.aliases())) == ((), {})
+    assert store.published() == store.aliases() == {}
 
 
 # -- the command --------------------------------------------------------------------------------
