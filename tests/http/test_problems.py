@@ -169,6 +169,10 @@ INVALID: dict[str, list[tuple[Any, ...]]] = {
     ],
     "missing": [
         ({"top_k": 17}, "top_k"),
+        *(({"coverage": value}, "coverage") for value in (-0.1, 1.5, "0.5", True)),
+        ({"detail": "all"}, "detail", "must be `scores` or `full`"),
+        # This model has no profiles.
+        ({"model": "plain", "profile": "homes"}, "profile", "does not have"),
         ({"top_k": 2.0}, "top_k", "a whole number, not a decimal number"),
         ({"topk": 3}, "topk", "unknown field", "top_k"),
         ({"x": 1.0}, "x", "unknown field"),  # a field of another part is no suggestion
@@ -190,8 +194,16 @@ INVALID: dict[str, list[tuple[Any, ...]]] = {
         ({"relations": [["lamp", "left"]]}, "relations/0", "or an array of these 3 values"),
         ({"relations": [["lamp", "left", "sofa"]]}, "relations/0/2", "no entry of `objects`"),
     ],
-    "outliers": [({"threshold": -0.1}, "threshold")],
-    "rooms": [({"top_k": 0}, "top_k"), ({"candidates": []}, "candidates")],
+    "outliers": [
+        ({"threshold": -0.1}, "threshold"),
+        ({"sensitivity": "utmost"}, "sensitivity"),
+        ({"detail": "all"}, "detail", "must be `scores` or `full`"),
+    ],
+    "rooms": [
+        ({"top_k": 0}, "top_k"),
+        ({"candidates": []}, "candidates"),
+        ({"detail": "all"}, "detail", "must be `scores` or `full`"),
+    ],
     "generate": [
         ({"count": 0}, "count"),
         ({"count": 65}, "count"),
@@ -330,11 +342,11 @@ async def test_unknown_models_are_not_found(client: httpx.AsyncClient, model: st
 @pytest.mark.parametrize(
     "path",
     [
-        f"/{MARKER}", "/relations/", "/relations/batch/", "/relations/x", "/models/", "/v3",
-        "/static/nothing.js", "/static/../settings.py", "/static/%2e%2e/settings.py",
-        "/docs/nothing", "/redoc/%00", "/problems/nothing", "/%F0%9F%98%80", "/%ff%fe",
+        *(f"/{MARKER}", "/relations/", "/relations/batch/", "/relations/x", "/models/", "/v3"),
+        *("/static/nothing.js", "/static/../settings.py", "/static/%2e%2e/settings.py"),
+        *("/docs/nothing", "/redoc/%00", "/problems/nothing", "/%F0%9F%98%80", "/%ff%fe"),
     ],
-)  # fmt: skip
+)
 async def test_unknown_routes_are_not_found(client: httpx.AsyncClient, path: str) -> None:
     problem(await client.get(path), 404, "not-found")
 
@@ -347,10 +359,8 @@ async def test_misspelt_ids_are_answered_with_similar_ids(client: httpx.AsyncCli
     # Only plain ids are repeated.
     body["at"]["object"] = f"{MARKER}>"
     (fault,) = problem(await client.post("/missing", json=body), 422, "invalid-request")["errors"]
-    assert "suggestions" not in fault or not fault["suggestions"]
-
-
-async def test_only_the_first_faults_have_similar_ids(client: httpx.AsyncClient) -> None:
+    assert not fault.get("suggestions")
+    # Only the first errors have similar ids.
     things = [{"id": f"{n}_{'ab' * 30}", "label": "bed"} for n in range(256)]
     ends = [f"{n}-{'ba' * 30}" for n in range(60)]
     body = {"objects": things, "pairs": [[end, "bed"] for end in ends]}
@@ -358,12 +368,9 @@ async def test_only_the_first_faults_have_similar_ids(client: httpx.AsyncClient)
     assert sum(bool(fault.get("suggestions")) for fault in errors) <= 32
 
 
-async def test_query_parameters_are_refused(client: httpx.AsyncClient) -> None:
+async def test_query_parameters_and_misspelt_paths_are_refused(client: httpx.AsyncClient) -> None:
     response = await client.post("/missing?model=home", json={"objects": ["bed"]})
     assert "JSON body" in problem(response, 400, "bad-request")["detail"]
-
-
-async def test_a_misspelt_path_is_answered_with_similar_paths(client: httpx.AsyncClient) -> None:
     for path in ("/mising", "/Missing", "/missing/", "/api/missing"):
         document = problem(await client.post(path, json={"objects": ["bed"]}), 404, "not-found")
         assert "/missing, /missing/batch" in document["detail"]

@@ -259,11 +259,10 @@ def test_the_writer_of_aliases_applies_the_limits_of_the_reader(store: Store) ->
 def test_an_invalid_alias_table_is_refused_and_kept(text: str, store: Store) -> None:
     publish(store)
     (store.root / "aliases.json").write_text(text)
-    target = AliasTarget(name="tiny")
     for use in (
         store.aliases,
         lambda: store.resolve("default"),
-        lambda: store.set_alias("default", target),
+        lambda: store.set_alias("default", AliasTarget(name="tiny")),
         lambda: store.remove_alias("default"),
         lambda: store.publish(description(version="2.0.0"), state(), alias="default"),
     ):
