@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import sys
 from collections.abc import Callable
@@ -334,34 +333,21 @@ def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> No
     expect(bedroom.column("missing", 1)).to_be_hidden()
 
 
-def test_the_curl_shown_gives_the_answer_shown(
-    bedroom: Board, api: httpx.Client, require_system_tool: Callable[[str], Path]
+def test_the_calls_shown_give_the_answer_shown_and_can_be_copied(
+    open_board: OpenBoard, api: httpx.Client, require_system_tool: Callable[[str], Path]
 ) -> None:
     require_system_tool("curl")
-    question = "relations"
-    bedroom.tab("Relations")
-    command = bedroom.curl(question)
-    done = run_program("sh", "-c", command)
-    answer, body = json.loads(done.stdout), bedroom.body(question)
-    asked = ask(api, question, body)
-    assert {**answer, "request_id": ""} == {**asked, "request_id": ""}
-    first = bedroom.rows(question)[0]
-    assert percent(answer[question][0]["probability"]) in first
-
-
-def test_the_python_call_shown_gives_the_same_answer(
-    bedroom: Board, api: httpx.Client, repository: Path
-) -> None:
-    pytest.importorskip("scene_client")
-    environment = {**os.environ, "PYTHONPATH": str(repository)}
-    done = run_program(sys.executable, "-c", bedroom.python("missing"), env=environment)
-    answer = ask(api, "missing", bedroom.body("missing"))
-    shown = [(one["label"], one["probability"]) for one in json.loads(done.stdout)["missing"]]
-    assert shown == [(one["label"], one["probability"]) for one in answer["missing"]]
-
-
-def test_calls_can_be_copied(open_board: OpenBoard) -> None:
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
+    programs = ("sh", board.curl("missing")), (sys.executable, board.python("missing"))
+    curl, python = (json.loads(run_program(name, "-c", text).stdout) for name, text in programs)
+    asked = ask(api, "missing", board.body("missing"))
+    assert curl | {"request_id": ""} == asked | {"request_id": ""}
+    one, other = (
+        [(entry["label"], entry["probability"]) for entry in answer["missing"]]
+        for answer in (python, asked)
+    )
+    assert one == other
+    assert percent(asked["missing"][0]["probability"]) in board.rows("missing")[0]
     board.column("missing").get_by_text("Send this request from a program").click()
     board.column("missing").get_by_role("button", name="Copy the curl call").click()
     expect(board.column("missing").get_by_text("copied")).to_be_visible()
