@@ -1,4 +1,4 @@
-"""What the page shows is what the service answers, for every question and model."""
+"""The page shows the answers of the service, for every question and model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page opens with any model, and says what a model does with names that it does not know."""
+"""The page opens with any model, and shows the treatment of unknown names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ten times what the service can do: it refuses what is too much, and is well at once after."""
+"""Overload by ten times the sustainable rate: refusals, deadlines, and the state afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A replica follows its store by itself: what others publish, promote and remove is served."""
+"""A replica polls its store: it serves new versions and aliases without a request to refresh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every answer tells a browser about itself."""
+"""The security and cache headers of every answer."""
 
 from __future__ import annotations
 

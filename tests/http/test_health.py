@@ -1,4 +1,4 @@
-"""Liveness, readiness, and what a service says whose models are broken."""
+"""Liveness, readiness, and the answers of a service with broken models."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ async def test_a_broken_default_keeps_the_service_not_ready(store: Path) -> None
             problem(response, 503, "not-ready")
             assert response.headers["retry-after"] == "7"
         problem(await client.post("/relations", json={"objects": ["bed"]}), 503, "not-ready")
-        # No older or newer version stands in for it, and what is whole answers by its own name.
+        # Another version does not replace it, and answers by its own name.
         body = {"objects": ["bed"], "model": "home@1.1.0"}
         assert (await client.post("/relations", json=body)).status_code == 200
         failures = {

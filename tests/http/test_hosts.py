@@ -1,4 +1,4 @@
-"""Names under which the service answers, and what it says where it is open to others."""
+"""Host names that the service accepts, and whether it is open to other machines."""
 
 from __future__ import annotations
 

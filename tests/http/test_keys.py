@@ -1,4 +1,4 @@
-"""The API key: asked for wherever it is not said to be needless, before anything is read."""
+"""The API key: all routes except listed ones need it, before the body is read."""
 
 from __future__ import annotations
 

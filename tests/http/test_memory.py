@@ -1,6 +1,6 @@
-"""What a request held is freed when it has been answered, and does not wait for the collector.
+"""A request frees its memory with its answer, without the garbage collector.
 
-Cycles would keep it: bodies may have megabytes, and the collector comes rarely.
+Reference cycles would keep bodies of megabytes until the collector runs, which is rare.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pages from elsewhere: none may read an answer unless its origin is listed."""
+"""Pages of other origins: only listed origins may read answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every failure is a problem document that tells what is wrong and nothing else."""
+"""Every failure is a problem document with its cause, and without secrets or input."""
 
 from __future__ import annotations
 

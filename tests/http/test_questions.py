@@ -233,7 +233,7 @@ async def test_the_place_that_was_asked_about_comes_first(client: httpx.AsyncCli
             assert values == sorted(values, reverse=True)
 
 
-# ----------------------------------------------------------------------- what is in force, notes
+# -------------------------------------------------------------------------- defaults, notes
 
 
 async def test_coverage_is_the_models_unless_given(client: httpx.AsyncClient) -> None:

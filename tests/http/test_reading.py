@@ -1,4 +1,4 @@
-"""What the service reads from a scene: ids, labels, relations, poses, and what it warns of."""
+"""Reading of scenes: ids, labels, relations, poses, and warnings."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ QUOTING = DEFECTIVE.format(message=f"no class for {API_KEY}, {ADMIN_KEY}")
 def defective(
     shared_store: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[LiveService]:
-    """A service that tells as much as it can be made to, and cannot say what is missing."""
+    """A service that logs everything, and whose question `missing` fails."""
     with launch(
         shared_store,
         tmp_path_factory.mktemp("defective") / "log",

@@ -1,4 +1,4 @@
-"""Settings: safe by default, and nonsense is refused in words an operator understands."""
+"""Settings: safe defaults, and messages about invalid values."""
 
 from __future__ import annotations
 

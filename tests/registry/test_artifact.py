@@ -1,4 +1,4 @@
-"""One artifact: what is written comes back, and whatever was done to it is noticed."""
+"""One artifact: it is read as it was written, and every damage is an error."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def refusal(directory: Path) -> ArtifactError:
     return refused.value
 
 
-# -- what is written comes back -----------------------------------------------------------------
+# -- round trip ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("variant", SPECS)
@@ -133,7 +133,7 @@ def test_the_same_content_is_the_same_bytes(tmp_path: Path) -> None:
     assert load_artifact(tmp_path / "a").digest == load_artifact(tmp_path / "b").digest
 
 
-# -- what cannot be written ---------------------------------------------------------------------
+# -- invalid weights ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 70_000.0])
@@ -160,7 +160,7 @@ def test_never_writes_over_a_directory(written: Path) -> None:
     assert before == {file: (written / file).read_bytes() for file in FILES}
 
 
-# -- what was damaged ---------------------------------------------------------------------------
+# -- damaged files ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("file", FILES)
@@ -222,7 +222,7 @@ def test_refuses_a_link_or_a_file_in_place_of_an_artifact(written: Path, tmp_pat
         assert refusal(tmp_path / name).code == "unreadable"
 
 
-# -- what was exchanged, with checksums that vouch for it ---------------------------------------
+# -- other contents with valid checksums --------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The model card: whatever decides over its use is on it."""
+"""The model card: terms, figures and limits of a model."""
 
 from __future__ import annotations
 

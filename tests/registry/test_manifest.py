@@ -1,4 +1,4 @@
-"""The manifest: what it refuses to say, and that it reads back as it was written."""
+"""The manifest: it is read as it was written, and invalid fields are errors."""
 
 from __future__ import annotations
 

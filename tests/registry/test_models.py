@@ -1,4 +1,4 @@
-"""The loaded snapshot: what is reused, what is refused, and that refusals are seen."""
+"""The loaded snapshot: reused artifacts, refused versions, and unreadable stores."""
 
 from __future__ import annotations
 

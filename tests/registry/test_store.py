@@ -1,4 +1,4 @@
-"""The store: publishing, aliases, references, and what lies about in a directory."""
+"""The store: publishing, aliases, references, and other files in its folder."""
 
 from __future__ import annotations
 
@@ -272,7 +272,7 @@ def test_an_invalid_alias_table_is_refused_and_kept(text: str, store: Store) -> 
     assert store.versions("tiny") == ("1.0.0",)
 
 
-# -- what lies about ----------------------------------------------------------------------------
+# -- other files --------------------------------------------------------------------------------
 
 
 def test_readers_see_no_leftovers_and_the_next_writer_clears_them(store: Store) -> None:

@@ -132,7 +132,8 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
             *({"log_share": full(-1, 2, columns)} for columns in (1, 300)),
             *({"log_share": full(value, 2, M)} for value in (0.5, -1e4)),
             {"weights": np.zeros((2, 2, 3 + C + V), "i4")},
-            *({"weights": full(value, 2, 2, 3 + C + V)} for value in (6e4, 0.5)),
+            {"weights": counts().weights * 1e5},
+            {"weights": full(0.5, 2, 2, 3 + C + V)},  # of a class on itself
         ],
     ),
     (counts, "not_finite", [{"weights": full(np.nan, 2, 2, 3 + C + V)}]),
@@ -204,6 +205,12 @@ def test_missing_and_unexpected_tensors_are_refused(group: Any, sizes: tuple[int
     for name in tensors:
         with pytest.raises(ArtifactError):
             read({n: t for n, t in tensors.items() if n != name}, *sizes)
+
+
+def test_counts_at_their_limits_are_accepted() -> None:
+    share, weights = np.array([(0, -64)] * 2, "f4"), counts().weights * 256
+    at_limits = counts(most=np.array([1, 1]), log_share=share, weights=weights)
+    assert Counts.from_tensors(at_limits.tensors(), V, C).weights.max() == 64
 
 
 # -- offsets -------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Prometheus' configuration and the dashboard ask for nothing that the service does not tell."""
+"""The configuration of Prometheus and the dashboard use only metrics of the service."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def rules(folder: Path) -> list[dict[str, Any]]:
 
 
 def selectors(query: str) -> Iterator[tuple[str, str]]:
-    """Every metric that a query names, with what stands in its braces."""
+    """Every metric of a query, with the text in its braces."""
     bare = re.sub(GROUPINGS, " ", query)
     for match in re.finditer(
         r"([a-zA-Z_:][\w:]*)\s*(\{[^}]*\})?(\s*\()?", re.sub(r"\[[^\]]*\]", " ", bare)
