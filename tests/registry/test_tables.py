@@ -106,6 +106,13 @@ def full(value: float, *shape: int) -> Any:
     return np.full(shape, value, "f4")
 
 
+def with_zero(array: Any) -> Any:
+    """A copy whose first variance or standard deviation is 0."""
+    array = array.copy()
+    array[0, 3] = 0
+    return array
+
+
 EMPTY = np.zeros(0, "i4")
 NO_CLASS = {"classes": EMPTY, "most": EMPTY, "log_share": full(-1, 0, M)}
 INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
@@ -147,7 +154,11 @@ INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
             {"pair": np.array([3, 21], "f4")},
             {"pair_scenes": np.array([0, 12], "i4")},
             {"relation_scenes": np.array([-1, 0, 0, 0, 0], "i4")},
-            {"pair_offset": full(0, 2, 6)},
+            {"pair_offset": with_zero(offsets().pair_offset)},
+            {
+                "relation": with_zero(offsets().relation),
+                "relation_scenes": np.array([1, 0, 9, 0, 0]),
+            },
             {"relation": full(0, A, 6)},
             {"subject": full(-1, A, V, 6)},
         ],
