@@ -310,3 +310,7 @@ def test_the_roles_tell_under_from_on() -> None:
     assert table.means_under(0, 2)
     assert not table.means_under(0, 1)  # one scene may be an error
     assert not table.means_under(2, 0)
+    # Two scenes suffice, unless as many show the upper class on the lower.
+    two, pairs = np.array([(2, 0, 0), (7, 1, 0), (0, 2, 0)], "f4"), np.array([2, 3, 6], "i4")
+    assert places(role_counts=two[1:], role_pair=pairs[1:]).means_under(0, 2)
+    assert not places(role_counts=two, role_pair=pairs).means_under(0, 2)
