@@ -75,7 +75,7 @@ audit: $(EVERYTHING)  ## report known vulnerabilities and risky code, write bill
 
 chaos: $(EVERYTHING)  ## attack a running service: hostile requests, overload, model changes (minutes)
 	$(BIN)/python -m app.compile
-	CHAOS=1 $(BIN)/python -m pytest tests/chaos tests/http/test_contract.py tests/http/test_hostile.py $(ARGS)
+	$(BIN)/python -m pytest tests/chaos tests/http/test_contract.py tests/http/test_hostile.py $(ARGS)
 
 soak: $(EVERYTHING)  ## check that memory does not grow in ten minutes of mixed use (MINUTES=10)
 	@# Compile in another process, so that the compiler's memory does not count.

@@ -75,24 +75,15 @@ class ServiceError(HTTPException):
         errors: the errors in the request. The first `MAX_ERRORS` are kept.
         failures: unusable versions and aliases, with the reasons.
         headers: further headers of the response.
-
-    Attributes:
-        slug: stable name and last path segment of the ``type`` member. Clients can compare it.
-        status: HTTP status code.
-        title: short summary. All problems of this type have the same title.
-        explanation: cause and remedy. The page of the problem type shows this text.
-        uri: the ``type`` member of the problem document (RFC 9457, section 3.1.1).
-        steps: the steps that may raise the error.
-        example: errors in the example of the OpenAPI document.
     """
 
-    slug: ClassVar[str]
+    slug: ClassVar[str]  # stable name, which clients can compare
     status: ClassVar[int]
     title: ClassVar[str]
-    explanation: ClassVar[str]
-    uri: ClassVar[str]
-    steps: ClassVar[tuple[Step, ...]]
-    example: ClassVar[tuple[FieldError, ...]] = ()
+    explanation: ClassVar[str]  # cause and remedy, for the page
+    uri: ClassVar[str]  # the member `type` of the problem document (RFC 9457, section 3.1.1)
+    steps: ClassVar[tuple[Step, ...]]  # the steps that may raise the error
+    example: ClassVar[tuple[FieldError, ...]] = ()  # for the OpenAPI document
 
     def __init_subclass__(
         cls, *, slug: str = "", status: int = 500, steps: tuple[Step, ...] = ()
@@ -173,6 +164,10 @@ class RequestError(ServiceError):
             for error in self.located
         ]
         self.located = ()
+
+
+def _example(place: str, message: str, *suggestions: str) -> tuple[FieldError, ...]:
+    return (FieldError(pointer=place, message=message, suggestions=list(suggestions)),)
 
 
 class NotJSONError(ServiceError, slug="not-json", status=400, steps=("body",)):
@@ -313,7 +308,7 @@ class InvalidRequestError(RequestError, slug="invalid-request", status=422, step
     names.
     """
 
-    example = (FieldError(pointer="#/objects/1/confidence", message="must be greater than 0"),)
+    example = _example("#/objects/1/confidence", "must be greater than 0")
 
 
 class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=("scene",)):
@@ -326,13 +321,7 @@ class UnknownLabelsError(RequestError, slug="unknown-labels", status=422, steps=
     /models/{name}/vocabulary lists every known label.
     """
 
-    example = (
-        FieldError(
-            pointer="#/objects/1",
-            message="the model does not know this label",
-            suggestions=["nightstand"],
-        ),
-    )
+    example = _example("#/objects/1", "the model does not know this label", "nightstand")
     _hint = (
         " GET /models/{name}/vocabulary lists the known names. With `unknown_labels` set to "
         "`ignore`, the service leaves unknown names out."
@@ -347,11 +336,8 @@ class ContradictionError(RequestError, slug="contradictory-evidence", status=422
     book, the book on a laptop, and the laptop in the box.
     """
 
-    example = (
-        FieldError(
-            pointer="#/relations/1",
-            message="this relation contradicts an earlier relation of the same two objects",
-        ),
+    example = _example(
+        "#/relations/1", "this relation contradicts an earlier relation of the same two objects"
     )
 
 
@@ -362,11 +348,9 @@ class RareRoomTypeError(RequestError, slug="rare-room-type", status=422, steps=(
     questions accept them. Leave the room type out, or choose another one.
     """
 
-    example = (
-        FieldError(
-            pointer="#/room_type",
-            message="the model has too few training scenes of this room type to sample such a room",
-        ),
+    example = _example(
+        "#/room_type",
+        "the model has too few training scenes of this room type to sample such a room",
     )
 
 

@@ -61,10 +61,6 @@ def _lower(value: object) -> object:
     return value.strip().lower() if isinstance(value, str) else value
 
 
-def _format_of_stderr() -> Literal["json", "plain"]:
-    return "plain" if sys.stderr.isatty() else "json"
-
-
 def _words(value: object) -> object:
     return tuple(value.replace(",", " ").split()) if isinstance(value, str) else value
 
@@ -223,9 +219,9 @@ class Settings(BaseSettings):
     log_level: Annotated[
         Literal["debug", "info", "warning", "error", "critical"], BeforeValidator(_lower)
     ] = "info"
-    log_format: Annotated[
-        Literal["json", "plain"], BeforeValidator(_lower), Field(default_factory=_format_of_stderr)
-    ]
+    log_format: Annotated[Literal["json", "plain"], BeforeValidator(_lower)] = Field(
+        default_factory=lambda: "plain" if sys.stderr.isatty() else "json"
+    )
     """By default, `plain` on a terminal, else `json`."""
     access_log: bool = True
     """Log one line per request, without payload."""
@@ -297,9 +293,8 @@ class Settings(BaseSettings):
     @classmethod
     def _covers_the_default(cls, value: int, info: ValidationInfo) -> int:
         if value < info.data.get("request_timeout_ms", 0):
-            raise ValueError(
-                "SCENE_MAX_REQUEST_TIMEOUT_MS must be at least SCENE_REQUEST_TIMEOUT_MS"
-            )
+            limits = "SCENE_MAX_REQUEST_TIMEOUT_MS must be at least SCENE_REQUEST_TIMEOUT_MS"
+            raise ValueError(limits)
         return value
 
     @field_validator("opentelemetry")
@@ -308,15 +303,12 @@ class Settings(BaseSettings):
         if not value:
             return value
         if not all(map(_is_installed, _EXPORTER)):
-            raise ValueError(
-                "SCENE_OPENTELEMETRY needs the packages of the dependency group telemetry "
-                "(pip install '.[telemetry]')"
-            )
+            packages = "the packages of the dependency group telemetry (pip install '.[telemetry]')"
+            raise ValueError(f"SCENE_OPENTELEMETRY needs {packages}")
         # Without the URL of a collector, the service would start but never send a trace.
         if not any(map(os.environ.get, _ENDPOINTS)):
-            raise ValueError(
-                f"SCENE_OPENTELEMETRY needs the URL of a collector: set {_ENDPOINTS[0]}"
-            )
+            url = f"the URL of a collector: set {_ENDPOINTS[0]}"
+            raise ValueError(f"SCENE_OPENTELEMETRY needs {url}")
         return value
 
     @field_validator("admin_key", "api_key")

@@ -24,14 +24,20 @@ from typing import Any
 import httpx
 import pytest
 
-CHAOS = os.environ.get("CHAOS") == "1"
-"""Whether `make chaos` runs the tests: all attacks, for minutes."""
 ADMIN_KEY = "correct-horse-battery-staple"
 CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed": 11}
 NAMED = {"allowed_hosts": ["service"]}
 """Settings of a service in process; its clients use the URL http://service."""
 
 Replace = Callable[[str, Callable[..., Any]], None]
+
+WITHOUT_TRAINING = """
+import runpy, sys
+for name in ("torch", "training", "opentelemetry.sdk"):
+    sys.modules[name] = None  # importing them fails
+runpy.run_module("app", run_name="__main__")
+"""
+"""A program for `launch`: the service as it is installed for serving."""
 
 DEFECTIVE = """
 import sys
@@ -286,8 +292,9 @@ def wait_until(
 
 @pytest.fixture(scope="session")
 def live(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    """The service as a separate process, shared by all tests."""
-    with launch(shared_store, tmp_path_factory.mktemp("live") / "log") as service:
+    """The service as a separate process without torch and training, shared by all tests."""
+    log, program = tmp_path_factory.mktemp("live") / "log", ("-c", WITHOUT_TRAINING)
+    with launch(shared_store, log, program=program) as service:
         yield service
 
 

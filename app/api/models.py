@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Sequence
 from typing import Annotated, Final, cast
 
 from fastapi import APIRouter, Depends, Path, Security
@@ -14,7 +13,6 @@ from starlette.requests import Request
 from app.api.body import AdminJSONRoute, check_admin
 from app.api.gateway import ADMIN_KEY
 from app.api.openapi import error_responses
-from app.registry import AliasTarget
 from app.scene.relations import opposite
 from app.scene.vocabulary import ObjectClass
 from app.serving.models import ServedModels
@@ -217,52 +215,38 @@ async def move_alias(
 
 
 def _class(entry: ObjectClass) -> schemas.VocabularyEntry:
+    size = entry.size and schemas.Size(**dict(zip("xyz", entry.size, strict=True)))
     return schemas.VocabularyEntry(
         label=entry.label,
         aliases=list(entry.aliases),
         structure=entry.structure,
-        size=_size(entry.size),
+        size=size,
         parent=entry.parent,
         anywhere=entry.anywhere,
     )
 
 
-def _size(extents: Sequence[float] | None) -> schemas.Size | None:
-    return None if extents is None else schemas.Size(**dict(zip("xyz", extents, strict=True)))
-
-
 def _name(models: ServedModels, reference: str) -> str:
     """Return the model name of a reference, even if the service refused the version."""
     name = reference.partition("@")[0]
-    target: AliasTarget | None = models.store.aliases.get(name)
-    if target is not None:
-        name = target.name
+    name = models.store.aliases[name].name if name in models.store.aliases else name
     if name not in models.store.versions:
         raise models.unknown(reference)
     return name
 
 
 def _summary(models: ServedModels, name: str) -> schemas.ModelSummary:
-    return schemas.ModelSummary(
-        name=name,
-        versions=[
-            _version_summary(models, name, number)
-            for number in reversed(models.store.versions[name])
-        ],
-    )
+    versions = reversed(models.store.versions[name])
+    entries = [_version_summary(models, name, version) for version in versions]
+    return schemas.ModelSummary(name=name, versions=entries)
 
 
 def _version_summary(models: ServedModels, name: str, number: str) -> schemas.VersionSummary:
     served = models.served.get((name, number))
     if served is None:
         failure = models.failures[f"{name}@{number}"]
-        return schemas.VersionSummary(
-            version=number,
-            status="refused",
-            aliases=[],
-            reason=failure.reason,
-            detail=failure.detail,
-        )
+        cause = {"reason": failure.reason, "detail": failure.detail}
+        return schemas.VersionSummary(version=number, status="refused", aliases=[], **cause)
     return schemas.VersionSummary(
         version=number,
         status="ready",

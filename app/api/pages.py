@@ -21,21 +21,18 @@ from app.errors import ERRORS, NotFoundError
 
 STATIC: Final = Path(__file__).parents[1] / "static"
 
-_NO_FRAMES: Final = "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-# Policy of the API documentation. Swagger UI and Redoc need inline styles. Redoc searches in a web
-# worker, which Redoc creates from a blob. The policy forbids inline scripts.
-_POLICY: Final = (
-    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data:; font-src 'self' data:; connect-src 'self'; worker-src blob:; "
-    + _NO_FRAMES
-)
-_HEADERS: Final = {"Content-Security-Policy": _POLICY}
-
-# Policy of the scene editor (board.html), which needs no inline styles.
+# Policy of the scene editor (board.html).
 _STRICT_POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-    "connect-src 'self'; " + _NO_FRAMES
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+# Policy of the API documentation. Swagger UI and Redoc need inline styles. Redoc searches in a web
+# worker, which Redoc creates from a blob. Both policies forbid inline scripts.
+_POLICY: Final = (
+    _STRICT_POLICY.replace("style-src 'self'", "style-src 'self' 'unsafe-inline'")
+    + "; font-src 'self' data:; worker-src blob:"
+)
+_HEADERS: Final = {"Content-Security-Policy": _POLICY}
 
 _PAGE: Final = """<!doctype html>
 <html lang="en">
@@ -123,7 +120,6 @@ def install(app: FastAPI, *, docs: bool) -> None:
 
 
 def _serve_document(app: FastAPI, path: str, html: str) -> None:
+    @app.get(path, include_in_schema=False)
     async def document() -> HTMLResponse:
         return HTMLResponse(html, headers=_HEADERS)
-
-    app.add_api_route(path, document, include_in_schema=False)

@@ -20,41 +20,16 @@ from app.registry.description import (
 from app.registry.errors import ArtifactError, RegistryError, StoreError
 from app.registry.examples import Example
 from app.registry.manifest import Manifest
-from app.registry.model_set import ArtifactFailure, ModelSet, load_model_set
+from app.registry.model_set import ModelSet, load_model_set
 from app.registry.offsets import Offsets
 from app.registry.places import Places
 from app.registry.references import AliasTarget
 from app.registry.store import Store, StoreState
 
 __all__ = [
-    "AlarmLine",
-    "AlarmLines",
-    "AliasTarget",
-    "Artifact",
-    "ArtifactError",
-    "ArtifactFailure",
-    "Calibration",
-    "CountSlope",
-    "Counts",
-    "DataSource",
-    "Description",
-    "Example",
-    "Judgement",
-    "Manifest",
-    "Metric",
-    "Misplaced",
-    "ModelSet",
-    "Offsets",
-    "PlaceFit",
-    "Places",
-    "RegistryError",
-    "Sensitivity",
-    "Sharpness",
-    "Store",
-    "StoreError",
-    "StoreState",
-    "VocabularyEntry",
-    "load_artifact",
-    "load_model_set",
-    "write_artifact",
-]
+    "AlarmLine", "AlarmLines", "AliasTarget", "Artifact", "ArtifactError", "Calibration",
+    "CountSlope", "Counts", "DataSource", "Description", "Example", "Judgement", "Manifest",
+    "Metric", "Misplaced", "ModelSet", "Offsets", "PlaceFit", "Places", "RegistryError",
+    "Sensitivity", "Sharpness", "Store", "StoreError", "StoreState", "VocabularyEntry",
+    "load_artifact", "load_model_set", "write_artifact",
+]  # fmt: skip

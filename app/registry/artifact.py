@@ -24,15 +24,12 @@ from app.inference.objects import LARGEST_WEIGHT, ObjectScorer
 from app.inference.relations import RelationUnits, relation_units
 from app.inference.weights import layout
 from app.registry.card import render_card
-from app.registry.counts import PREFIX as COUNTS
 from app.registry.counts import Counts
 from app.registry.description import Calibration, Description, RelationSlopes
 from app.registry.durable import sync_directory, write_file
 from app.registry.errors import ArtifactError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
-from app.registry.offsets import PREFIX as OFFSETS
 from app.registry.offsets import Offsets
-from app.registry.places import PREFIX as PLACES
 from app.registry.places import Places
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
 from app.scene.vocabulary import Vocabulary
@@ -45,10 +42,6 @@ MAX_WEIGHTS_BYTES: Final = 2**30
 SCENE_MAX_WEIGHTS_BYTES sets another maximum."""
 
 _DTYPES: Final = {float: "float32", int: "int32"}
-_UNSUPPORTED: Final = (
-    "the service does not support this machine: its weights W and Q must be between "
-    f"-{LARGEST_WEIGHT:g} and {LARGEST_WEIGHT:g}"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +135,9 @@ def write_artifact(
     *,
     storage_dtype: StorageDtype = "float32",
 ) -> Manifest:
-    """Write an artifact into a new directory and sync it to disk.
+    """Write an artifact into a new directory, whose parent exists, and sync it to disk.
 
     Args:
-        directory: the new directory. Its parent must exist.
-        description: contents of the manifest without the entries about files.
         state: maps names to arrays. It contains the arrays of `layout`, and optionally those of
             `Offsets.tensors()`, `Counts.tensors()` and `Places.tensors()`.
         storage_dtype: dtype of floating-point tensors with two or more axes; see `pack`.
@@ -179,10 +170,9 @@ def load_artifact(
 
     Args:
         directory: directory with exactly the three files of an artifact.
-        previous: an artifact that was loaded earlier, or None. If the verified files have the same
-            digest, the function returns `previous` instead of a second copy.
-        max_weights_bytes: maximum size of the weights file. The function checks the size before it
-            reads the file.
+        previous: an artifact that was loaded earlier. The function returns it instead of a second
+            copy if the verified files have the same digest.
+        max_weights_bytes: maximum size of the weights file, checked before the file is read.
 
     Raises:
         ArtifactError: the artifact is invalid. The exception describes the first error found.
@@ -191,8 +181,12 @@ def load_artifact(
     if previous is not None and previous.digest == digest:
         return previous
     tensors = unpack(stored, manifest.tensors)
-    offsets, counts, places = (_pop_group(tensors, name) for name in (OFFSETS, COUNTS, PLACES))
+    offsets, counts, places = (
+        {name: tensors.pop(name) for name in list(tensors) if name.startswith(group.prefix)}
+        for group in (Offsets, Counts, Places)
+    )
     weights = _weights(manifest, tensors)
+    A, V, C = weights.spec.A, weights.spec.V, len(manifest.vocabulary.room_types)
     return Artifact(
         manifest=manifest,
         weights=weights,
@@ -201,17 +195,10 @@ def load_artifact(
         digest=digest,
         card=card,
         path=directory,
-        offsets=Offsets.from_tensors(offsets, weights.spec.A, weights.spec.V) if offsets else None,
-        counts=Counts.from_tensors(counts, weights.spec.V, len(manifest.vocabulary.room_types))
-        if counts
-        else None,
-        places=Places.from_tensors(places, weights.spec.A, weights.spec.V) if places else None,
+        offsets=Offsets.from_tensors(offsets, A, V) if offsets else None,
+        counts=Counts.from_tensors(counts, V, C) if counts else None,
+        places=Places.from_tensors(places, A, V) if places else None,
     )
-
-
-def _pop_group(tensors: dict[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
-    """Remove the tensors with a prefix from a dictionary, and return them."""
-    return {name: tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
 
 
 def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights:
@@ -219,9 +206,8 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
         spec = MachineSpec.from_dict(dict(manifest.spec))
         expected = layout(spec)
     except (ValueError, TypeError) as error:
-        raise ArtifactError(
-            "invalid_manifest", f"the manifest has an invalid spec: {error}"
-        ) from None
+        reason = f"the manifest has an invalid spec: {error}"
+        raise ArtifactError("invalid_manifest", reason) from None
     require_equal(
         {name: (array.dtype.name, array.shape) for name, array in tensors.items()},
         {name: (_DTYPES[kind], shape) for name, (kind, shape) in expected.items()},
@@ -236,7 +222,9 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
         raise ArtifactError("invalid_tensor", "L must be symmetric with a diagonal of 0")
     largest = max(np.abs(weights[name]).max(initial=0) for name in ("W", "Q"))
     if not largest <= LARGEST_WEIGHT:
-        raise ArtifactError("unsupported", _UNSUPPORTED)
+        limits = f"-{LARGEST_WEIGHT:g} and {LARGEST_WEIGHT:g}"
+        reason = "the service does not support this machine: its weights W and Q must be between "
+        raise ArtifactError("unsupported", reason + limits)
     return weights
 
 
@@ -281,9 +269,8 @@ def _require_no_other_file(folder: int) -> None:
         raise _unreadable("the artifact's directory", error) from None
     if extra:
         names = ", ".join(sorted(ascii(name) for name in extra)[:8])
-        raise ArtifactError(
-            "unexpected_file", f"the artifact's directory has unexpected files: {names}"
-        )
+        reason = f"the artifact's directory has unexpected files: {names}"
+        raise ArtifactError("unexpected_file", reason)
 
 
 def _require_size(name: str, size: int, limit: int) -> None:
@@ -293,26 +280,23 @@ def _require_size(name: str, size: int, limit: int) -> None:
 
 def _read(folder: int, name: str, limit: int) -> bytes:
     """Read at most limit + 1 bytes of a file. The extra byte shows that the file is too long."""
-    # Without O_NONBLOCK, opening a FIFO in place of the file would block forever.
-    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+
+    def opener(path: str, flags: int) -> int:
+        # Without O_NONBLOCK, opening a FIFO in place of the file would block forever.
+        return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
+
     try:
-        descriptor = os.open(name, flags, dir_fd=folder)
+        with open(name, "rb", opener=opener) as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise ArtifactError("unreadable", f"{name} is not a regular file")
+            # read() first allocates a buffer for all requested bytes. The argument is at most the
+            # size of the file plus 1, so that the buffer is not larger than needed.
+            return file.read(min(status.st_size, limit) + 1)
     except FileNotFoundError:
         raise ArtifactError("missing_file", f"the artifact has no file {name}") from None
     except OSError as error:
         raise _unreadable(name, error) from None
-    try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise ArtifactError("unreadable", f"{name} is not a regular file")
-        with os.fdopen(descriptor, "rb", closefd=False) as file:
-            # read() first allocates a buffer for all requested bytes. The argument is at most the
-            # size of the file plus 1, so that the buffer is not larger than needed.
-            return file.read(min(status.st_size, limit) + 1)
-    except OSError as error:
-        raise _unreadable(name, error) from None
-    finally:
-        os.close(descriptor)
 
 
 def _unreadable(what: str, error: OSError) -> ArtifactError:
@@ -325,7 +309,6 @@ def _read_checked(folder: int, name: str, entry: FileEntry, limit: int) -> bytes
     if len(data) < entry.bytes:
         raise ArtifactError("truncated", f"{name} has only {len(data)} of {entry.bytes} bytes")
     if hashlib.sha256(data).hexdigest() != entry.sha256:
-        raise ArtifactError(
-            "checksum_mismatch", f"{name} does not match its checksum: the file was altered"
-        )
+        reason = f"{name} does not match its checksum: the file was altered"
+        raise ArtifactError("checksum_mismatch", reason)
     return data

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import prod
 
 from app.inference import MachineSpec
-from app.registry.counts import PREFIX as COUNTS
-from app.registry.description import DataSource, Description
+from app.registry.counts import Counts
+from app.registry.description import Description
 from app.registry.manifest import TensorEntry, of_machine
-from app.registry.offsets import PREFIX as OFFSETS
+from app.registry.offsets import Offsets
 
 _RESEARCH_WARNING = """\
 > **Research use.** These weights were trained on {sources}, whose terms allow research use. Ask
@@ -77,21 +77,25 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
     Args:
         tensors: maps the name of each stored tensor to its dtype and shape.
     """
-    words, spec = description.vocabulary, description.spec
+    words = description.vocabulary
+    bound = [_cell(source.source) for source in description.data if source.research_only]
     proposed = sum(not entry.structure for entry in words.objects)
     machine = of_machine(tensors)
     weights = sum(prod(e.shape) for e in machine.values() if e.dtype.startswith("float"))
     stored = ", ".join(sorted({entry.dtype for entry in machine.values()}))
-    pairs, counted = _size(tensors, f"{OFFSETS}pair"), _size(tensors, f"{COUNTS}classes")
+    pairs, counted = (
+        prod(tensors[name].shape) if name in tensors else 0
+        for name in (f"{Offsets.prefix}pair", f"{Counts.prefix}classes")
+    )
     sections = [
         f"# {description.name} {description.version}",
-        *_warning(description.data),
+        *([_RESEARCH_WARNING.format(sources=", ".join(bound))] if bound else []),
         "## Model",
         _table(
             ("", ""),
             [
                 ("Kind", f"{description.variant}, a Boltzmann machine over objects and relations"),
-                *_machine(MachineSpec.from_dict(dict(spec))),
+                *_machine(MachineSpec.from_dict(dict(description.spec))),
                 ("Profiles", ", ".join(words.profiles) or "none"),
                 ("Weights", f"{weights:,} (stored as {stored})"),
                 ("Object classes", f"{len(words.objects)}, of which {proposed} may be proposed"),
@@ -144,15 +148,6 @@ def _units(units: int, states: int) -> str:
     return f"{units} binary units" if states == 2 else f"{units} units of {states} states"
 
 
-def _size(tensors: Mapping[str, TensorEntry], name: str) -> int:
-    return prod(tensors[name].shape) if name in tensors else 0
-
-
-def _warning(data: Sequence[DataSource]) -> Iterable[str]:
-    if sources := [source.source for source in data if source.research_only]:
-        yield _RESEARCH_WARNING.format(sources=", ".join(map(_cell, sources)))
-
-
 def _metrics(description: Description) -> str:
     if not description.metrics:
         return "No metrics are recorded, so the quality of the answers is unknown."
@@ -160,23 +155,20 @@ def _metrics(description: Description) -> str:
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for m in description.metrics:
         cell = f"{m.value:.3f} [{m.low:.3f}, {m.high:.3f}]"
-        rows.setdefault((m.task, m.metric), {})[m.source] = cell
-    table = _table(
-        ("Task", "Metric", *sources),
-        [(*name, *(cells.get(source, "") for source in sources)) for name, cells in rows.items()],
-    )
-    note = f"\n\n{_OFFSETS}" if any(m.task == "Offsets" for m in description.metrics) else ""
-    calibration = description.calibration
+        rows.setdefault((m.task, m.metric), dict.fromkeys(sources, ""))[m.source] = cell
+    table = [(*name, *cells.values()) for name, cells in rows.items()]
+    judged = {
+        "objects": description.calibration.outlier is not None,
+        "relations": description.calibration.misplaced.judges_relations,
+    }
     unjudged = [
         f"`/outliers` judges no {part}, because the calibration had too few scenes."
-        for part, is_judged in (
-            ("objects", calibration.outlier is not None),
-            ("relations", calibration.misplaced.judges_relations),
-        )
+        for part, is_judged in judged.items()
         if not is_judged
     ]
-    parts = [_MEASURED, table, _PROBABILITIES, *unjudged]
-    return "\n\n".join(parts) + note
+    note = [_OFFSETS] if any(m.task == "Offsets" for m in description.metrics) else []
+    parts = [_MEASURED, _table(("Task", "Metric", *sources), table), _PROBABILITIES]
+    return "\n\n".join([*parts, *unjudged, *note])
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -13,13 +13,10 @@ from app.inference.kernels import INTERCEPT as INTERCEPT
 from app.inference.kernels import ROOM as ROOM
 from app.inference.kernels import SEVERAL as SEVERAL
 from app.inference.kernels import SINGLE as SINGLE
-from app.registry.errors import ArtifactError
 from app.registry.fields import TensorGroup
 
 Table = NDArray[np.float32]
 
-PREFIX: Final = "counts."
-"""Prefix of the names of count tensors. They are in the same file as the machine's tensors."""
 
 EXPONENTS: Final = 2
 """Exponents of the formula: the first raises large numbers, and the second numbers between 1 and M.
@@ -43,7 +40,7 @@ class Counts(TensorGroup):
             on itself.
     """
 
-    prefix: ClassVar[str] = PREFIX
+    prefix: ClassVar[str] = "counts."
 
     classes: NDArray[np.integer[Any]]
     most: NDArray[np.integer[Any]]
@@ -55,42 +52,26 @@ class Counts(TensorGroup):
         """Build the counts of a model with V classes and C room types from stored tensors.
 
         Raises:
-            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
-                `invalid_tensor` if a value is invalid.
+            ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
         """
-        K = len(np.atleast_1d(tensors.get(f"{PREFIX}classes", ())))
-        M = np.atleast_1d(tensors.get(f"{PREFIX}log_share", ())).shape[-1]
+        K = cls.length(tensors, "classes")
+        M = np.atleast_1d(tensors.get(f"{cls.prefix}log_share", ())).shape[-1]
         shapes = {
             "classes": (K,),
             "most": (K,),
             "log_share": (K, M),
             "weights": (K, EXPONENTS, ROOM + C + V),
         }
-        counts = cls.read(tensors, shapes)
-        if complaint := counts._complaint(V, C):
-            raise ArtifactError("invalid_tensor", f"the count tensors are invalid: {complaint}")
+        counts = cls.read(tensors, shapes, ("classes", "most"))
+        counts.require(K, "there must be at least one class")
+        counts.require_keys("classes", V)
+        counts.require(2 <= M <= _MOST, f"log_share must have 2 to {_MOST} columns")
+        is_right = ((counts.most >= 1) & (counts.most < M)).all()
+        counts.require(is_right, "most must be from 1 to the columns of log_share minus 1")
+        is_right = ((counts.log_share <= 0) & (counts.log_share >= -_LARGEST)).all()
+        counts.require(is_right, f"log_share must be between -{_LARGEST:g} and 0")
+        is_right = (np.abs(counts.weights) <= _LARGEST).all()
+        counts.require(is_right, f"weights must be between -{_LARGEST:g} and {_LARGEST:g}")
+        on_itself = counts.weights[np.arange(K), :, ROOM + C + counts.classes]
+        counts.require(not on_itself.any(), "the weight of a class on itself must be 0")
         return counts
-
-    def _complaint(self, V: int, C: int) -> str | None:
-        for name in ("classes", "most"):
-            if not np.issubdtype(getattr(self, name).dtype, np.integer):
-                return f"{name} must be integers"
-        for name in ("log_share", "weights"):
-            if not np.issubdtype(getattr(self, name).dtype, np.floating):
-                return f"{name} must be floating-point numbers"
-        ascending = (self.classes[1:] > self.classes[:-1]).all()
-        if not len(self.classes) or self.classes[0] < 0 or not ascending:
-            return "classes must be non-negative, in ascending order, and at least one"
-        if (self.classes[-1:] >= V).any():
-            return "the tensor 'classes' has a class that the model does not have"
-        if not 2 <= self.log_share.shape[1] <= _MOST:
-            return f"log_share must have 2 to {_MOST} columns"
-        if (self.most < 1).any() or (self.most >= self.log_share.shape[1]).any():
-            return "most must be from 1 to the number of columns of log_share minus 1"
-        if (self.log_share > 0).any() or (self.log_share < -_LARGEST).any():
-            return f"log_share must be between -{_LARGEST:g} and 0"
-        if (np.abs(self.weights) > _LARGEST).any():
-            return f"weights must be between -{_LARGEST:g} and {_LARGEST:g}"
-        if self.weights[np.arange(len(self.classes)), :, ROOM + C + self.classes].any():
-            return "the weight of a class on itself must be 0"
-        return None

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, Self
+from collections.abc import Sequence
+from typing import Annotated, Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,13 +195,11 @@ class Calibration(Frozen):
     @classmethod
     def neutral(cls, relations: int) -> Self:
         """Return the calibration with default values for A = ``relations`` canonical relations."""
-        neutral = (CountSlope(),) * relations
-        at = (PlaceFit(),) * relations
-        return cls(relation=neutral, relation_given=neutral, placement=neutral, at=at)
+        neutral = dict.fromkeys(PAIR_CALIBRATIONS, (CountSlope(),) * relations)
+        return cls.model_validate({**neutral, "at": (PlaceFit(),) * relations})
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RelationSlopes:
+class RelationSlopes(NamedTuple):
     """Calibration tables of the A canonical relations, each (A, 3).
 
     Each row of a table is the `CountSlope` of one relation: intercept, slope, log_count. The tables
@@ -215,12 +213,9 @@ class RelationSlopes:
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
         """Build the tables of a calibration."""
-        return cls(*(_table(getattr(calibration, name)) for name in PAIR_CALIBRATIONS))
-
-
-def _table(entries: tuple[CountSlope, ...]) -> Floats:
-    rows = [(entry.intercept, entry.slope, entry.log_count) for entry in entries]
-    return np.array(rows, np.float32).reshape(-1, 3)
+        entries = (getattr(calibration, name) for name in PAIR_CALIBRATIONS)
+        rows = ([(e.intercept, e.slope, e.log_count) for e in part] for part in entries)
+        return cls(*(np.array(part, np.float32).reshape(-1, 3) for part in rows))
 
 
 class ClassEntry(Frozen):
@@ -254,19 +249,14 @@ class VocabularyEntry(Frozen):
     @model_validator(mode="after")
     def _is_a_vocabulary(self) -> Self:
         if self.relations != CANONICAL[: len(self.relations)]:
-            raise ValueError(
-                f"relations must be the first entries of {CANONICAL}, in the same order"
-            )
+            raise ValueError(f"relations must be the first of {CANONICAL}, in the same order")
         words = self.model_dump(mode="json", exclude={"relations", "profiles"})
         self._words = Vocabulary.from_dict(words)
         return self
 
     @classmethod
     def of(
-        cls,
-        vocabulary: Vocabulary,
-        relations: int = len(CANONICAL),
-        profiles: tuple[str, ...] = (),
+        cls, vocabulary: Vocabulary, relations: int = len(CANONICAL), profiles: Sequence[str] = ()
     ) -> Self:
         """Return the manifest entry of a vocabulary for a machine with A = ``relations``."""
         names = {"relations": CANONICAL[:relations], "profiles": profiles}
@@ -366,15 +356,11 @@ class Description(Frozen):
             ),
         ):
             if self.spec.get(name, 0) != length:
-                raise ValueError(
-                    f"the description has {length} {what}, but the spec has "
-                    f"{name} = {self.spec.get(name)}"
-                )
-        if (rooms := self.spec.get("C", 0)) not in (0, len(words.room_types)):
-            raise ValueError(
-                f"the vocabulary has {len(words.room_types)} room types, but the spec has "
-                f"C = {rooms}"
-            )
+                given = f"{name} = {self.spec.get(name)}"
+                raise ValueError(f"the description has {length} {what}, but the spec has {given}")
+        rooms, types = self.spec.get("C", 0), len(words.room_types)
+        if rooms not in (0, types):
+            raise ValueError(f"the vocabulary has {types} room types, but the spec has C = {rooms}")
         if any(t >= rooms for t in self.calibration.rare_rooms):
             raise ValueError(f"calibration.rare_rooms must be below C = {rooms}")
         for example in self.examples:

@@ -1,9 +1,7 @@
 """Writing files so that a crash leaves either the old state or the new state.
 
-A rename is atomic for readers. To survive a power failure, the bytes of a file must be on disk
-before the rename. The directory entry must be on disk after the rename. The calls of fsync write
-the bytes and the directory entry to disk. A lock between processes lets only one process at a time
-write to a store.
+A rename is atomic for readers. To survive a power failure, fsync writes the bytes of a file to disk
+before the rename, and the directory entry after it. A lock lets only one process at a time write.
 """
 
 from __future__ import annotations
@@ -82,24 +80,19 @@ def exclusive(path: Path, timeout: float) -> Iterator[None]:
     Raises:
         StoreError: `locked`, if another process still holds the lock after ``timeout`` seconds.
     """
+    deadline = time.monotonic() + timeout
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
     try:
-        _wait(descriptor, timeout)
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() >= deadline:
+                    holder = "another process still holds the lock of the store"
+                    reason = f"{holder} after {timeout:g} s; try again later"
+                    raise StoreError("locked", reason) from None
+                time.sleep(0.01)
         yield
     finally:
         os.close(descriptor)
-
-
-def _wait(descriptor: int, timeout: float) -> None:
-    deadline = time.monotonic() + timeout
-    while True:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() >= deadline:
-                holder = "another process still holds the lock of the store"
-                detail = f"{holder} after {timeout:g} s; try again later"
-                raise StoreError("locked", detail) from None
-            time.sleep(0.01)
-        else:
-            return

@@ -4,45 +4,20 @@ from __future__ import annotations
 
 import errno
 import os
-from typing import Generic, Literal, TypeVar
+from typing import Literal
 
-ArtifactCode = Literal[
-    "missing_file",
-    "unexpected_file",
-    "unreadable",
-    "too_large",
-    "truncated",
-    "checksum_mismatch",
-    "unknown_format",
-    "invalid_manifest",
-    "not_safetensors",
-    "wrong_shape",
-    "not_finite",
-    "invalid_tensor",
-    "unsupported",
-    "wrong_place",
-    "unexpected_error",
-    "warm_up_failed",
-]
-StoreCode = Literal[
-    "invalid_reference",
-    "unknown_model",
-    "unknown_version",
-    "dangling_alias",
-    "invalid_aliases",
-    "version_exists",
-    "name_conflict",
-    "alias_conflict",
-    "unsafe_path",
-    "unreadable",
-    "not_writable",
-    "locked",
-]
-
-CodeT = TypeVar("CodeT", bound=str)
+Code = Literal[
+    # of an artifact
+    "missing_file", "unexpected_file", "unreadable", "too_large", "truncated", "checksum_mismatch",
+    "unknown_format", "invalid_manifest", "not_safetensors", "wrong_shape", "not_finite",
+    "invalid_tensor", "unsupported", "wrong_place", "unexpected_error", "warm_up_failed",
+    # of a store; its folders may be "unreadable" too
+    "invalid_reference", "unknown_model", "unknown_version", "dangling_alias", "invalid_aliases",
+    "version_exists", "name_conflict", "alias_conflict", "unsafe_path", "not_writable", "locked",
+]  # fmt: skip
 
 
-class RegistryError(Exception, Generic[CodeT]):
+class RegistryError(Exception):
     """Base class of the registry's errors. The code and the reason never contain absolute paths.
 
     Attributes:
@@ -50,20 +25,20 @@ class RegistryError(Exception, Generic[CodeT]):
         reason: description of the failure. It may name a file or a tensor, but not the folder.
     """
 
-    def __init__(self, code: CodeT, reason: str) -> None:
+    def __init__(self, code: Code, reason: str) -> None:
         super().__init__(code, reason)
-        self.code: CodeT = code
+        self.code: Code = code
         self.reason = reason
 
     def __str__(self) -> str:
         return f"{self.code}: {self.reason}"
 
 
-class ArtifactError(RegistryError[ArtifactCode]):
+class ArtifactError(RegistryError):
     """An artifact (the files of one model version) is invalid or cannot be read."""
 
 
-class StoreError(RegistryError[StoreCode]):
+class StoreError(RegistryError):
     """A reference (alias, name or name@version) does not resolve, or the store refused a change."""
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
+import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
@@ -17,6 +18,7 @@ from pydantic import (
     FailFast,
     Field,
     StringConstraints,
+    ValidationError,
 )
 
 from app.registry.errors import ArtifactError
@@ -46,6 +48,12 @@ def to_json(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 
+def first_error(error: ValidationError) -> str:
+    """Return the location and message of the first validation error, without the invalid value."""
+    detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
+    return ": ".join(filter(None, (".".join(map(str, detail["loc"])), detail["msg"])))
+
+
 class Frozen(BaseModel):
     """Base class of immutable pydantic models. They refuse unknown fields, NaN and infinity."""
 
@@ -67,13 +75,26 @@ class TensorGroup:
         return {f"{self.prefix}{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
+    def length(cls, tensors: Mapping[str, NDArray[Any]], name: str) -> int:
+        """Return the length of a stored tensor's first axis, 0 if the tensor does not exist."""
+        return len(np.atleast_1d(tensors.get(f"{cls.prefix}{name}", ())))
+
+    @classmethod
     def read(
-        cls, tensors: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]
+        cls,
+        tensors: Mapping[str, NDArray[Any]],
+        shapes: Mapping[str, tuple[int, ...]],
+        integers: Collection[str],
     ) -> Self:
-        """Build the group from stored tensors. ``shapes`` has the required shape of each field.
+        """Build the group from stored tensors.
+
+        Args:
+            shapes: the required shape of each field.
+            integers: the fields with integers. All others have floating-point numbers.
 
         Raises:
-            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape.
+            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
+                `invalid_tensor` if a tensor has a wrong dtype.
         """
         for name in sorted(tensors.keys() | {f"{cls.prefix}{name}" for name in shapes}):
             required = shapes.get(name.removeprefix(cls.prefix))
@@ -84,4 +105,22 @@ class TensorGroup:
                     f"tensor '{name}' has the shape {shape}, but the shape must be {required} "
                     "(None means that the tensor does not exist)",
                 )
-        return cls(**{name: tensors[f"{cls.prefix}{name}"] for name in shapes})
+        group = cls(**{name: tensors[f"{cls.prefix}{name}"] for name in shapes})
+        for name in shapes:
+            kind = np.integer if name in integers else np.floating
+            words = "integers" if name in integers else "floating-point numbers"
+            is_right = np.issubdtype(getattr(group, name).dtype, kind)
+            group.require(is_right, f"{name} must be {words}")
+        return group
+
+    def require(self, condition: object, complaint: str) -> None:
+        """Raise ArtifactError `invalid_tensor` with the complaint if the condition is false."""
+        if not condition:
+            subject = self.prefix.removesuffix("s.")
+            raise ArtifactError("invalid_tensor", f"the {subject} tensors are invalid: {complaint}")
+
+    def require_keys(self, name: str, limit: int) -> None:
+        """Require that a field has ascending numbers from 0 to ``limit`` - 1."""
+        keys = getattr(self, name)
+        is_right = ((keys >= 0) & (keys < limit)).all() and (keys[1:] > keys[:-1]).all()
+        self.require(is_right, f"the keys in {name} must be ascending, from 0 to {limit - 1}")

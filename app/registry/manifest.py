@@ -12,16 +12,16 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator
 
-from app.registry.counts import PREFIX as COUNTS
+from app.registry.counts import Counts
 from app.registry.description import Description
-from app.registry.errors import ArtifactError
-from app.registry.fields import Count, Frozen, Many, Sha256, to_json
-from app.registry.offsets import PREFIX as OFFSETS
-from app.registry.places import PREFIX as PLACES
+from app.registry.errors import ArtifactError, Code
+from app.registry.fields import Count, Frozen, Many, Sha256, first_error, to_json
+from app.registry.offsets import Offsets
+from app.registry.places import Places
 
 FORMAT: Final = 8
 MAX_TENSORS: Final = 10_000
@@ -41,7 +41,7 @@ class TensorEntry(Frozen):
 
 def of_machine(tensors: Mapping[str, TensorEntry]) -> dict[str, TensorEntry]:
     """Return the tensors of the machine, without offsets, counts and places."""
-    statistics = (OFFSETS, COUNTS, PLACES)
+    statistics = tuple(group.prefix for group in (Offsets, Counts, Places))
     return {name: entry for name, entry in tensors.items() if not name.startswith(statistics)}
 
 
@@ -89,43 +89,27 @@ class Manifest(Description):
         """
         trailer = _TRAILER.search(data)
         if trailer and hashlib.sha256(data[: trailer.start()]).hexdigest().encode() != trailer[1]:
-            raise ArtifactError(
-                "checksum_mismatch", f"{MANIFEST} does not match its own checksum: it was altered"
-            )
-        members = _parse(data, complete=trailer is not None)
+            raise _refused("checksum_mismatch", "does not match its own checksum: it was altered")
+        try:
+            members = json.loads(data)
+        except (ValueError, RecursionError):
+            if trailer:
+                raise _refused("invalid_manifest", "is not JSON") from None
+            raise _refused("truncated", "is truncated or not JSON") from None
+        if not isinstance(members, dict):
+            raise _refused("invalid_manifest", "is not a JSON object")
         if type(version := members.get("format")) is not int or version != FORMAT:
-            raise ArtifactError(
-                "unknown_format",
-                f"{MANIFEST} does not have format {FORMAT}, the only format of this release; "
-                "train or publish the model again",
-            )
+            advice = "the only format of this release; train or publish the model again"
+            raise _refused("unknown_format", f"does not have format {FORMAT}, {advice}")
         if not trailer:
-            raise ArtifactError(
-                "invalid_manifest", f"{MANIFEST} does not end with its checksum in the last line"
-            )
+            raise _refused("invalid_manifest", "does not end with its checksum in the last line")
         del members["checksum"]
         try:
             return cls.model_validate(members)
         except ValidationError as error:
-            raise ArtifactError(
-                "invalid_manifest", f"{MANIFEST} has an invalid field: {_first_error(error)}"
-            ) from None
+            reason = f"has an invalid field: {first_error(error)}"
+            raise _refused("invalid_manifest", reason) from None
 
 
-def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
-    try:
-        members = json.loads(data)
-    except (ValueError, RecursionError):
-        if complete:
-            raise ArtifactError("invalid_manifest", f"{MANIFEST} is not JSON") from None
-        raise ArtifactError("truncated", f"{MANIFEST} is truncated or not JSON") from None
-    if not isinstance(members, dict):
-        raise ArtifactError("invalid_manifest", f"{MANIFEST} is not a JSON object")
-    return members
-
-
-def _first_error(error: ValidationError) -> str:
-    """Return the location and message of the first validation error, without the invalid value."""
-    detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
-    location = ".".join(str(part) for part in detail["loc"])
-    return f"{location}: {detail['msg']}" if location else str(detail["msg"])
+def _refused(code: Code, reason: str) -> ArtifactError:
+    return ArtifactError(code, f"{MANIFEST} {reason}")

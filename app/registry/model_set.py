@@ -12,22 +12,11 @@ from types import MappingProxyType
 from typing import Final
 
 from app.registry.artifact import Artifact
-from app.registry.errors import ArtifactCode, ArtifactError, StoreError
+from app.registry.errors import ArtifactError, StoreError
 from app.registry.references import AliasTarget, resolve_reference, version_key
 from app.registry.store import Store
 
 _logger = logging.getLogger("app.registry")
-
-
-@dataclass(frozen=True, slots=True)
-class ArtifactFailure:
-    """The reason why a version of a model is not usable.
-
-    Unlike an exception, this object does not keep stack frames or weights in memory.
-    """
-
-    code: ArtifactCode
-    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +24,16 @@ class ModelSet:
     """The state of a store at one moment.
 
     Attributes:
-        entries: maps each published (name, version) to its artifact, or to the reason why the
-            version is not usable.
+        entries: maps each published (name, version) to its artifact, or to the error that makes
+            the version unusable.
         aliases: maps each alias to its target.
-        failure: reason why the store or its aliases could not be read, without stack frames. None
-            means that they could be read.
+        failure: reason why the store or its aliases could not be read. None means that they could
+            be read.
+
+    The errors were never raised, so they keep no stack frames or weights in memory.
     """
 
-    entries: Mapping[tuple[str, str], Artifact | ArtifactFailure]
+    entries: Mapping[tuple[str, str], Artifact | ArtifactError]
     aliases: Mapping[str, AliasTarget]
     failure: StoreError | None = None
 
@@ -55,10 +46,10 @@ class ModelSet:
         )
 
     @cached_property
-    def failures(self) -> Mapping[tuple[str, str], ArtifactFailure]:
+    def failures(self) -> Mapping[tuple[str, str], ArtifactError]:
         """Maps each unusable (name, version) to the reason."""
         return MappingProxyType(
-            {key: e for key, e in self.entries.items() if isinstance(e, ArtifactFailure)}
+            {key: e for key, e in self.entries.items() if isinstance(e, ArtifactError)}
         )
 
     def resolve(self, reference: str) -> Artifact:
@@ -79,9 +70,8 @@ class ModelSet:
                 raise StoreError(self.failure.code, self.failure.reason) from None
             raise
         entry = self.entries[key]
-        if isinstance(entry, ArtifactFailure):
-            name, version = key
-            raise ArtifactError(entry.code, f"{name}@{version}: {entry.reason}")
+        if isinstance(entry, ArtifactError):
+            raise ArtifactError(entry.code, f"{'@'.join(key)}: {entry.reason}")
         return entry
 
     def _by_preference(self, name: str) -> list[str]:
@@ -96,11 +86,8 @@ EMPTY: Final = ModelSet({}, {})
 def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
     """Load and verify every version of a store.
 
-    The function raises no exception for errors in the store, such as invalid versions, unreadable
-    aliases or a missing store. The result contains these errors.
-
-    The function verifies all files, but reuses artifacts of the previous snapshot whose digest is
-    unchanged.
+    The result contains all errors, such as invalid versions, unreadable aliases or a missing store.
+    An artifact of the previous snapshot is verified again, and reused if its digest is unchanged.
     """
     failure: StoreError | None = None
     aliases: Mapping[str, AliasTarget]
@@ -112,11 +99,11 @@ def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
         aliases, failure = {}, StoreError(error.code, error.reason)
     keys: list[tuple[str, str]] = []
     try:
-        for name in store.names():
-            try:
-                keys += [(name, version) for version in store.versions(name)]
-            except StoreError as error:  # only this model's folder is unreadable
-                failure = StoreError(error.code, error.reason)
+        for name, versions in store.published().items():
+            if isinstance(versions, StoreError):  # only this model's folder is unreadable
+                failure = versions
+            else:
+                keys += [(name, version) for version in versions]
     except StoreError as error:
         failure = StoreError(error.code, error.reason)
     entries = {key: _load(store, *key, previous.entries.get(key)) for key in keys}
@@ -124,18 +111,18 @@ def load_model_set(store: Store, previous: ModelSet = EMPTY) -> ModelSet:
 
 
 def _load(
-    store: Store, name: str, version: str, previous: Artifact | ArtifactFailure | None
-) -> Artifact | ArtifactFailure:
+    store: Store, name: str, version: str, previous: Artifact | ArtifactError | None
+) -> Artifact | ArtifactError:
     try:
         return store.load(name, version, previous if isinstance(previous, Artifact) else None)
     except ArtifactError as error:
-        return ArtifactFailure(error.code, error.reason)
+        return ArtifactError(error.code, error.reason)
     except StoreError as error:  # for example, the version was removed after it was listed
-        return ArtifactFailure("missing_file", error.reason)
+        return ArtifactError("missing_file", error.reason)
     except Exception as error:
         # This includes MemoryError, because other versions may need less memory.
         _logger.exception("%s@%s could not be loaded", name, version)
-        return ArtifactFailure(
+        return ArtifactError(
             "unexpected_error",
             f"loading failed with {type(error).__name__}; see the traceback in the service's log",
         )

@@ -10,21 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Final, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.kernels import UNOBSERVED as UNOBSERVED
 from app.inference.kernels import look_up_offsets
-from app.registry.errors import ArtifactError
 from app.registry.fields import TensorGroup
 
 Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
-
-PREFIX: Final = "offsets."
-"""Prefix of the names of offset tensors. They are in the same file as the machine's tensors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +39,7 @@ class Offsets(TensorGroup):
         pair_scenes: (P,) number of training scenes with each pair in its relation.
     """
 
-    prefix: ClassVar[str] = PREFIX
+    prefix: ClassVar[str] = "offsets."
 
     relation: Table
     relation_scenes: Ints
@@ -58,10 +54,9 @@ class Offsets(TensorGroup):
         """Build the offsets of a machine with A relations and V classes from stored tensors.
 
         Raises:
-            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
-                `invalid_tensor` if a value is invalid.
+            ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
         """
-        P = len(np.atleast_1d(tensors.get(f"{PREFIX}pair", ())))
+        P = cls.length(tensors, "pair")
         shapes = {
             "relation": (A, 6),
             "relation_scenes": (A,),
@@ -71,25 +66,15 @@ class Offsets(TensorGroup):
             "pair_offset": (P, 6),
             "pair_scenes": (P,),
         }
-        offsets = cls.read(tensors, shapes)
-        if complaint := offsets._complaint(A * V * V):
-            raise ArtifactError("invalid_tensor", f"the offset tensors are invalid: {complaint}")
+        offsets = cls.read(tensors, shapes, ("relation_scenes", "pair", "pair_scenes"))
+        offsets.require_keys("pair", A * V * V)
+        is_right = (offsets.relation_scenes >= 0).all() and (offsets.pair_scenes >= 1).all()
+        offsets.require(is_right, "relation_scenes must be at least 0 and pair_scenes at least 1")
+        least = offsets.relation + offsets.subject.min(axis=1) + offsets.object.min(axis=1)
+        variances = least[offsets.relation_scenes > 0, 3:]
+        is_right = (variances > 0).all() and (offsets.pair_offset[:, 3:] > 0).all()
+        offsets.require(is_right, "variances and standard deviations must be positive")
         return offsets
-
-    def _complaint(self, most: int) -> str | None:
-        counted = (self.relation_scenes, self.pair, self.pair_scenes)
-        if not all(np.issubdtype(array.dtype, np.integer) for array in counted):
-            return "pair, pair_scenes and relation_scenes must be integers"
-        if (self.pair[1:] <= self.pair[:-1]).any() or (self.pair[:1] < 0).any():
-            return "the keys in the tensor 'pair' must be non-negative and in ascending order"
-        if (self.pair[-1:] >= most).any():
-            return "a key in the tensor 'pair' has a relation or class that the model does not have"
-        if (self.relation_scenes < 0).any() or (self.pair_scenes < 1).any():
-            return "relation_scenes must be at least 0 and pair_scenes at least 1"
-        least = self.relation + self.subject.min(axis=1) + self.object.min(axis=1)
-        if (least[self.relation_scenes > 0, 3:] <= 0).any() or (self.pair_offset[:, 3:] <= 0).any():
-            return "variances and standard deviations must be positive"
-        return None
 
     def find(
         self, relation: Ints, subject: Ints, other: Ints
@@ -107,7 +92,5 @@ class Offsets(TensorGroup):
 
     @cached_property
     def tables(self) -> tuple[NDArray[Any], ...]:
-        """The arrays in the order that `look_up` expects."""
-        by_relation = self.relation, self.relation_scenes, self.subject, self.object
-        by_pair = self.pair, self.pair_offset, self.pair_scenes
-        return by_relation + by_pair
+        """The arrays in the order that `look_up_offsets` expects."""
+        return tuple(self.tensors().values())

@@ -21,13 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.kernels import triple_counts
-from app.registry.errors import ArtifactError
 from app.registry.fields import TensorGroup
 from app.scene.relations import CANONICAL, SUPPORTS
 from app.scene.roles import IN, ON, UNDER, RoleCounts, role_counts
-
-PREFIX: Final = "places."
-"""Prefix of the names of these tensors. They are in the same file as the machine's tensors."""
 
 _PLACE: Final = 10.0  # smoothing s, in scenes
 _RELATION: Final = 3.0  # smoothing m, in scenes
@@ -53,7 +49,7 @@ class Places(TensorGroup):
             on or in an object.
     """
 
-    prefix: ClassVar[str] = PREFIX
+    prefix: ClassVar[str] = "places."
 
     triple: NDArray[np.int32]
     held: NDArray[np.float32]
@@ -68,10 +64,9 @@ class Places(TensorGroup):
         """Build the counts of a machine with A relations and V classes from stored tensors.
 
         Raises:
-            ArtifactError: `wrong_shape` if a tensor is missing, unexpected or of a wrong shape;
-                `invalid_tensor` if a value is invalid.
+            ArtifactError: `wrong_shape` or `invalid_tensor`; see `TensorGroup.read`.
         """
-        N, P = (len(np.atleast_1d(tensors.get(PREFIX + n, ()))) for n in ("triple", "role_pair"))
+        N, P = cls.length(tensors, "triple"), cls.length(tensors, "role_pair")
         shapes = {
             "triple": (N,),
             "held": (N,),
@@ -81,24 +76,14 @@ class Places(TensorGroup):
             "role_anchor": (V, 3),
             "stands": (V, 3),
         }
-        places = cls.read(tensors, shapes)
-        if complaint := places._complaint(A * V * V, V * V):
-            raise ArtifactError("invalid_tensor", f"the place tensors are invalid: {complaint}")
+        places = cls.read(tensors, shapes, ("triple", "role_pair"))
+        places.require(N, "there must be at least one triple")
+        places.require_keys("triple", A * V * V)
+        places.require_keys("role_pair", V * V)
+        counts = places.held, places.role_counts, places.role_anchor, places.stands
+        is_right = all((array >= 0).all() for array in counts) and (places.frequency > 0).all()
+        places.require(is_right, "counts must be at least 0, and frequencies must be above 0")
         return places
-
-    def _complaint(self, triples: int, pairs: int) -> str | None:
-        for name, most in (("triple", triples), ("role_pair", pairs)):
-            keys = getattr(self, name)
-            if not np.issubdtype(keys.dtype, np.integer):
-                return f"{name} must be integers"
-            if (keys[1:] <= keys[:-1]).any() or (keys[:1] < 0).any() or (keys[-1:] >= most).any():
-                return f"the keys in {name} must be ascending and in the range of the classes"
-        if not len(self.triple):
-            return "there must be at least one triple"
-        numbers = self.held, self.role_counts, self.role_anchor, self.stands
-        if any((array < 0).any() for array in numbers) or (self.frequency <= 0).any():
-            return "counts must be at least 0, and frequencies must be above 0"
-        return None
 
     @cached_property
     def roles(self) -> RoleCounts:
@@ -121,6 +106,14 @@ class Places(TensorGroup):
         ratio: Floats = np.log(held / ((counts[begin:end].sum() + _PLACE) * self.frequency))
         return ratio
 
+    def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
+        """Return whether training shows the relation from each subject to each other class, (N, M).
+
+        A single scene may be an error, so two scenes are needed. The class indices are (N,) and
+        (M,).
+        """
+        return self._held(relation, subject, other) >= _SHOWN
+
     def supporters(self, subject: Indices, other: Indices) -> Floats:
         """Return the share of each other class among the supporters of each subject, (N, M).
 
@@ -128,11 +121,8 @@ class Places(TensorGroup):
         The counts of a subject are smoothed by `_SUPPORTER` supporters of all classes.
         """
         total, share = self._supporters
-        held = np.zeros((len(subject), len(other)))
-        for relation in SUPPORTS:
-            held += self._held(relation, subject, other)
-        shares: Floats = (held + _SUPPORTER * share[other]) / (total[subject, None] + _SUPPORTER)
-        return shares
+        held = sum(self._held(relation, subject, other) for relation in SUPPORTS)
+        return (held + _SUPPORTER * share[other]) / (total[subject, None] + _SUPPORTER)
 
     @cached_property
     def _supporters(self) -> tuple[Floats, Floats]:
@@ -149,15 +139,6 @@ class Places(TensorGroup):
         V = len(self.frequency)
         held: Floats = triple_counts(self.triple, self.held, V, relation, subject, other)
         return held
-
-    def shows(self, relation: int, subject: Indices, other: Indices) -> NDArray[np.bool_]:
-        """Return whether training shows the relation from each subject to each other class, (N, M).
-
-        A single scene may be an error, so two scenes are needed. The class indices are (N,) and
-        (M,).
-        """
-        shown: NDArray[np.bool_] = self._held(relation, subject, other) >= _SHOWN
-        return shown
 
     def under_evidence(self, upper: int, lower: int) -> float:
         """Return log(n · n / m), with n scenes that show the lower class under the upper.

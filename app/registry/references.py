@@ -28,31 +28,26 @@ _VERSION = re.compile(r"(?:0|[1-9][0-9]{0,8})(?:\.(?:0|[1-9][0-9]{0,8})){2}")
 
 
 def is_name(text: str) -> bool:
-    """Return whether text is a valid name of a model or alias.
-
-    A valid name has 1 to 64 characters a-z, 0-9, `_` or `-`. It starts and ends with a-z or 0-9.
-    """
+    """Return whether text is a valid name of a model or alias."""
     return _NAME.fullmatch(text) is not None
 
 
 def is_version(text: str) -> bool:
-    """Return whether text is MAJOR.MINOR.PATCH: three decimal numbers without leading zeros."""
+    """Return whether text is a valid version: three decimal numbers without leading zeros."""
     return _VERSION.fullmatch(text) is not None
 
 
 def _require_name(text: str) -> str:
-    if not is_name(text):
-        raise ValueError(
-            "must have 1 to 64 characters a-z, 0-9, '_' or '-', and must start and end with a-z "
-            "or 0-9"
-        )
-    return text
+    if is_name(text):
+        return text
+    characters = "1 to 64 characters a-z, 0-9, '_' or '-'"
+    raise ValueError(f"must have {characters}, and must start and end with a-z or 0-9")
 
 
 def _require_version(text: str) -> str:
-    if not is_version(text):
-        raise ValueError("must be MAJOR.MINOR.PATCH without leading zeros, for example 1.0.0")
-    return text
+    if is_version(text):
+        return text
+    raise ValueError("must be MAJOR.MINOR.PATCH without leading zeros, for example 1.0.0")
 
 
 ModelName = Annotated[str, AfterValidator(_require_name)]
@@ -108,20 +103,16 @@ def version_key(version: str) -> tuple[int, ...]:
 def resolve_reference(
     reference: str, aliases: Mapping[str, AliasTarget], versions: Callable[[str], Sequence[str]]
 ) -> tuple[str, str]:
-    """Return the (name, version) that a reference points at.
+    """Return the (name, version) that an alias, `name` or `name@version` points at.
 
     Args:
-        reference: alias, `name`, or `name@version`.
-        aliases: maps each alias to its target. An alias takes precedence over a model of the same
-            name.
-        versions: function that returns the versions of a model. A reference without a version
-            points at the last of them. For an unknown model, the function returns an empty
-            sequence.
+        aliases: the target of each alias. An alias takes precedence over a model of its name.
+        versions: returns the versions of a model, and an empty sequence for an unknown model. A
+            reference without a version points at the last of them.
 
     Raises:
-        StoreError: the reference does not resolve. The code is `invalid_reference`,
-            `unknown_model`, `unknown_version`, or `dangling_alias` if the target of an alias does
-            not exist.
+        StoreError: `invalid_reference`, `unknown_model`, `unknown_version`, or `dangling_alias` if
+            the target of an alias does not exist.
     """
     name, at, version = reference.partition("@")
     check_name(name)
@@ -132,9 +123,8 @@ def resolve_reference(
     try:
         return _pick(target, versions)
     except StoreError as error:
-        raise StoreError(
-            "dangling_alias", f"the target of alias '{name}' does not exist: {error.reason}"
-        ) from None
+        reason = f"the target of alias '{name}' does not exist: {error.reason}"
+        raise StoreError("dangling_alias", reason) from None
 
 
 def _pick(target: AliasTarget, versions: Callable[[str], Sequence[str]]) -> tuple[str, str]:
@@ -143,9 +133,8 @@ def _pick(target: AliasTarget, versions: Callable[[str], Sequence[str]]) -> tupl
     if target.version is None:
         return target.name, published[-1]
     if target.version not in published:
-        raise StoreError(
-            "unknown_version", f"model '{target.name}' does not have version {target.version}"
-        )
+        reason = f"model '{target.name}' does not have version {target.version}"
+        raise StoreError("unknown_version", reason)
     return target.name, target.version
 
 
@@ -160,10 +149,8 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
         with os.fdopen(descriptor, "rb") as file:
             text = file.read(MAX_ALIASES_BYTES + 1)
         if len(text) > MAX_ALIASES_BYTES:
-            raise StoreError(
-                "invalid_aliases",
-                f"{path.name} has more than the maximum of {MAX_ALIASES_BYTES} bytes",
-            )
+            reason = f"{path.name} has more than the maximum of {MAX_ALIASES_BYTES} bytes"
+            raise StoreError("invalid_aliases", reason)
         return _TABLE.validate_json(text)
     except FileNotFoundError:
         return {}
@@ -171,9 +158,8 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
         raise StoreError("invalid_aliases", f"{path.name} cannot be read: {cause(error)}") from None
     except ValidationError as error:
         detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        raise StoreError(
-            "invalid_aliases", f"{path.name} is not a valid table of aliases: {detail['msg']}"
-        ) from None
+        reason = f"{path.name} is not a valid table of aliases: {detail['msg']}"
+        raise StoreError("invalid_aliases", reason) from None
 
 
 def aliases_to_bytes(aliases: Mapping[str, AliasTarget]) -> bytes:
@@ -184,9 +170,6 @@ def aliases_to_bytes(aliases: Mapping[str, AliasTarget]) -> bytes:
     """
     text = _TABLE.dump_json(dict(sorted(aliases.items())), indent=2) + b"\n"
     if len(text) > MAX_ALIASES_BYTES:
-        raise StoreError(
-            "not_writable",
-            f"the table of aliases would have more than the maximum of {MAX_ALIASES_BYTES} bytes; "
-            "remove an alias first",
-        )
+        limit = f"the maximum of {MAX_ALIASES_BYTES} bytes; remove an alias first"
+        raise StoreError("not_writable", f"the table of aliases would have more than {limit}")
     return text

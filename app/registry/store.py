@@ -53,8 +53,8 @@ class Store:
 
     Args:
         root: directory of the store. The first publication creates it.
-        lock_timeout: time in seconds that a writer waits for another writer.
-        max_weights_bytes: maximum size in bytes of the weights file of a version.
+        lock_timeout: seconds that a writer waits for another writer.
+        max_weights_bytes: maximum size of a version's weights file.
     """
 
     def __init__(
@@ -68,13 +68,21 @@ class Store:
         self._lock_timeout = lock_timeout
         self._max_weights_bytes = max_weights_bytes
 
-    def names(self) -> tuple[str, ...]:
-        """Return the sorted names of models that have a version or an unreadable folder.
+    def published(self) -> dict[str, tuple[str, ...] | StoreError]:
+        """Return the versions of each model, or the error of an unreadable folder, by sorted name.
 
         Raises:
             StoreError: `unreadable` if the root is not a readable directory.
         """
-        return tuple(name for name in self._folders() if self._may_hold_versions(name))
+        models: dict[str, tuple[str, ...] | StoreError] = {}
+        for name in self._folders():
+            try:
+                versions = self.versions(name)
+            except StoreError as error:
+                models[name] = StoreError(error.code, error.reason)
+            else:
+                models |= {name: versions} if versions else {}
+        return models
 
     def versions(self, name: str) -> tuple[str, ...]:
         """Return the published versions of a model in ascending order. The result may be empty.
@@ -92,9 +100,8 @@ class Store:
         try:
             entries = [entry.name for entry in folder.iterdir() if not _is_unfinished(entry)]
         except OSError as error:
-            raise StoreError(
-                "unreadable", f"the folder of model '{name}' cannot be read: {cause(error)}"
-            ) from None
+            reason = f"the folder of model '{name}' cannot be read: {cause(error)}"
+            raise StoreError("unreadable", reason) from None
         return tuple(sorted(filter(is_version, entries), key=version_key))
 
     def aliases(self) -> Mapping[str, AliasTarget]:
@@ -115,11 +122,7 @@ class Store:
         return resolve_reference(reference, self.aliases(), self.versions)
 
     def load(self, name: str, version: str, previous: Artifact | None = None) -> Artifact:
-        """Load and verify one version.
-
-        Args:
-            name, version: name and version of the model in the store.
-            previous: an artifact that was loaded earlier; see `load_artifact`.
+        """Load and verify one version; see `load_artifact`.
 
         Raises:
             ArtifactError: the artifact is not valid. The code is `wrong_place` if the manifest has
@@ -131,13 +134,10 @@ class Store:
         if not exists or _is_unfinished(folder):
             raise StoreError("unknown_version", f"model '{name}' does not have version {version}")
         artifact = load_artifact(folder, previous, self._max_weights_bytes)
-        manifest = artifact.manifest
-        if (manifest.name, manifest.version) != (name, version):
-            raise ArtifactError(
-                "wrong_place",
-                f"the folder of {name}@{version} contains the manifest of "
-                f"{manifest.name}@{manifest.version}",
-            )
+        stored = f"{artifact.manifest.name}@{artifact.manifest.version}"
+        if stored != f"{name}@{version}":
+            reason = f"the folder of {name}@{version} contains the manifest of {stored}"
+            raise ArtifactError("wrong_place", reason)
         return artifact
 
     def state(self) -> StoreState:
@@ -147,8 +147,8 @@ class Store:
         """
         files = [self.root / ALIASES]
         with suppress(StoreError):
-            for name in self.names():
-                for version in self.versions(name):
+            for name, versions in self.published().items():
+                for version in () if isinstance(versions, StoreError) else versions:
                     folder = self.root / name / version
                     files += [folder / file for file in (MANIFEST, WEIGHTS, CARD)]
         return tuple((str(file), *_file_state(file)) for file in files)
@@ -164,16 +164,12 @@ class Store:
         """
         check_version(version)
         if name == alias or name in self.aliases():
-            raise StoreError(
-                "name_conflict",
-                f"'{name}' is the name of an alias, so it cannot be the name of a model",
-            )
+            reason = f"'{name}' is the name of an alias, so it cannot be the name of a model"
+            raise StoreError("name_conflict", reason)
         if version in (published := self.versions(name)):
-            raise StoreError(
-                "version_exists",
-                f"{name}@{version} is already published, and a version never changes. Choose a "
-                f"new number; the newest version is {published[-1]}",
-            )
+            advice = f"Choose a new number; the newest version is {published[-1]}"
+            reason = f"{name}@{version} is already published, and a version never changes. {advice}"
+            raise StoreError("version_exists", reason)
 
     def publish(
         self,
@@ -187,17 +183,12 @@ class Store:
 
         The method writes the artifact to a temporary folder and loads it from there. So it never
         publishes a version that the service would refuse. Then it renames the folder and changes
-        the alias.
-
-        Args:
-            description, state, storage_dtype: contents of the artifact; see `write_artifact`.
-            alias: name of an alias to point at this version. None means that no alias changes.
+        the alias. See `write_artifact` for the other arguments.
 
         Raises:
             ArtifactError: the artifact is not valid.
-            StoreError: the store refused the version. The code is `version_exists`,
-                `name_conflict`, `invalid_reference`, `invalid_aliases`, `unsafe_path`, `locked`, or
-                `not_writable`.
+            StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
+                `unsafe_path`, `locked`, or `not_writable`.
         """
         name, version = description.name, description.version
         if alias is not None:
@@ -208,14 +199,15 @@ class Store:
             if alias is not None:
                 self._require_no_model(alias)
                 table = self._changed_table(alias, AliasTarget(name=name, version=version))
-            folder = self._prepare_folder(name)
+            folder = self.root / name
+            if os.path.lexists(folder) and not _is_directory(folder):
+                raise StoreError("unsafe_path", f"the path of model '{name}' is not a directory")
+            make_directory(folder)
             path = folder / version
             if os.path.lexists(path):
-                raise StoreError(
-                    "version_exists",
-                    f"{name}/{version} is a folder without a manifest. Choose a new number, or "
-                    "remove the folder",
-                )
+                advice = "Choose a new number, or remove the folder"
+                reason = f"{name}/{version} is a folder without a manifest. {advice}"
+                raise StoreError("version_exists", reason)
             temporary = folder / f"{TEMPORARY}{version}-{token_hex(8)}"
             try:
                 write_artifact(temporary, description, state, storage_dtype=storage_dtype)
@@ -243,24 +235,22 @@ class Store:
                 must not exist. "any" accepts every target.
 
         Raises:
-            StoreError: the code is `alias_conflict` if the current target is not ``expected``.
-                Other codes are `unknown_model`, `unknown_version`, `name_conflict`,
-                `invalid_reference`, `invalid_aliases`, `locked`, and `not_writable`.
+            StoreError: `alias_conflict` if the current target is not ``expected``; `not_writable`,
+                also if the table of aliases would be too large for readers; `unknown_model`;
+                `unknown_version`; `name_conflict`; `invalid_reference`; `invalid_aliases`; `locked`
         """
         check_name(alias, "alias")
         with self._writing():
             self._require_no_model(alias)
-            self._require_expected(alias, expected)
+            current = self.aliases().get(alias)  # None for a missing alias
+            if expected not in ("any", current):
+                targets = f"{current or 'nothing'}, not at {expected or 'nothing'}"
+                raise StoreError("alias_conflict", f"alias '{alias}' points at {targets}")
             resolve_reference(str(target), {}, self.versions)
             self._replace_table(self._changed_table(alias, target))
 
     def remove_alias(self, alias: str) -> None:
-        """Remove an alias.
-
-        Raises:
-            StoreError: `unknown_model` if the alias does not exist. For other codes, see
-                `set_alias`.
-        """
+        """Remove an alias. The errors are those of `set_alias`."""
         check_name(alias, "alias")
         with self._writing():
             if alias not in self.aliases():
@@ -273,44 +263,18 @@ class Store:
         except OSError as error:
             raise StoreError("unreadable", f"the store cannot be read: {cause(error)}") from None
 
-    def _may_hold_versions(self, name: str) -> bool:
-        try:
-            return bool(self.versions(name))
-        except StoreError:
-            return True
-
-    def _prepare_folder(self, name: str) -> Path:
-        folder = self.root / name
-        if os.path.lexists(folder) and not _is_directory(folder):
-            raise StoreError("unsafe_path", f"the path of model '{name}' is not a directory")
-        make_directory(folder)
-        return folder
-
     def _changed_table(self, alias: str, target: AliasTarget | None) -> bytes:
         """Return the new alias file, with another target of one alias. None removes the alias."""
         table = {name: entry for name, entry in self.aliases().items() if name != alias}
-        if target is not None:
-            table[alias] = target
-        return aliases_to_bytes(table)
-
-    def _replace_table(self, table: bytes) -> None:
-        replace_file(self.root / ALIASES, table, prefix=TEMPORARY)
+        return aliases_to_bytes(table if target is None else {**table, alias: target})
 
     def _require_no_model(self, alias: str) -> None:
         if self.versions(alias):
-            raise StoreError(
-                "name_conflict",
-                f"'{alias}' is the name of a model, so it cannot be the name of an alias",
-            )
+            reason = f"'{alias}' is the name of a model, so it cannot be the name of an alias"
+            raise StoreError("name_conflict", reason)
 
-    def _require_expected(self, alias: str, expected: AliasTarget | Literal["any"] | None) -> None:
-        """Raise StoreError if the alias has another target than ``expected``; see `set_alias`."""
-        current = self.aliases().get(alias)  # None for a missing alias
-        if expected != "any" and expected != current:
-            raise StoreError(
-                "alias_conflict",
-                f"alias '{alias}' points at {current or 'nothing'}, not at {expected or 'nothing'}",
-            )
+    def _replace_table(self, table: bytes) -> None:
+        replace_file(self.root / ALIASES, table, prefix=TEMPORARY)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -321,9 +285,8 @@ class Store:
                 self._clear_leftovers()
                 yield
         except OSError as error:
-            raise StoreError(
-                "not_writable", f"the store cannot be written: {cause(error)}"
-            ) from error
+            reason = f"the store cannot be written: {cause(error)}"
+            raise StoreError("not_writable", reason) from error
 
     def _clear_leftovers(self) -> None:
         folders = [self.root, *(self.root / name for name in self._folders())]

@@ -27,7 +27,7 @@ from app.errors import (
 from app.questions import QUESTIONS
 from app.questions.answer import written
 from app.questions.contexts import contexts
-from app.registry import AliasTarget, Artifact, ArtifactError, ArtifactFailure, ModelSet, StoreError
+from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
 from app.registry.model_set import EMPTY
 from app.scene.nearest import spelt_alike
 from app.scene.scene import Scene, SceneObject, observe
@@ -173,7 +173,7 @@ class ServedModels:
     @cached_property
     def failures(self) -> Mapping[str, Failure]:
         """Maps each unusable entry (``name@version``, an alias or "store") to its failure."""
-        causes: dict[str, ArtifactFailure | ArtifactError | StoreError] = {
+        causes: dict[str, ArtifactError | StoreError] = {
             "@".join(key): failure for key, failure in self.store.failures.items()
         }
         for alias in sorted({DEFAULT, *self.store.aliases}):
@@ -212,7 +212,7 @@ def prepare(store: ModelSet, previous: ServedModels) -> ServedModels:
         except Exception:
             # A broken model may raise any exception. The service must still serve other models.
             _logger.exception("the warm-up of model %s failed", "@".join(key))
-            entries[key] = ArtifactFailure(
+            entries[key] = ArtifactError(
                 "warm_up_failed", "the files are valid, but the model could not answer a question"
             )
         else:

@@ -55,15 +55,6 @@ def test_flat_boxes_and_numbers_that_json_lacks_are_read(open_board: OpenBoard) 
     assert thing["size"]["x"] > 0.1
 
 
-def test_supports_are_read_as_relations(open_board: OpenBoard) -> None:
-    board = open_board()
-    objects = [{"id": 0, "label": "table"}, {"id": 1, "label": "mug", "supported_by": 0}]
-    stated = {"subject": "mug", "relation": "on-top", "object": "table"}
-    for relations in ([], [[1, "on-top", 0]]):
-        board.put(json.dumps({"scene_id": "one", "objects": objects, "relations": relations}))
-        assert board.scene["relations"] == [stated]
-
-
 def test_objects_with_foreign_ids_are_named_by_their_class(open_board: OpenBoard) -> None:
     board = open_board()
     things = {"track_3": "desk", "track_4": "bathtub", "desk_2": "desk"}
@@ -75,7 +66,7 @@ def test_objects_with_foreign_ids_are_named_by_their_class(open_board: OpenBoard
     assert any(row.startswith("bathtub (track_4) ") for row in board.rows("outliers"))
 
 
-def test_labels_and_flat_detections_are_read(open_board: OpenBoard) -> None:
+def test_labels_supports_and_flat_detections_are_read(open_board: OpenBoard) -> None:
     board = open_board()
     for text in ("bed, lamp, mug", "bed\nlamp\nmug\n"):
         board.put(text)
@@ -84,6 +75,12 @@ def test_labels_and_flat_detections_are_read(open_board: OpenBoard) -> None:
     assert board.things == ["bed", "lamp_1", "lamp_2"]
     board.put('{"objects": ["desk", "lamp"], "relations": [["lamp", "on-top", "desk"]]}')
     assert board.scene["relations"] == [{"subject": "lamp", "relation": "on-top", "object": "desk"}]
+    # Supports are relations.
+    objects = [{"id": 0, "label": "table"}, {"id": 1, "label": "mug", "supported_by": 0}]
+    for relations in ([], [[1, "on-top", 0]]):
+        board.put(json.dumps({"scene_id": "one", "objects": objects, "relations": relations}))
+        stated = {"subject": "mug", "relation": "on-top", "object": "table"}
+        assert board.scene["relations"] == [stated]
     seen = {"results": [{"hypothesis": {"class_id": "mug", "score": 0.5}}], "bbox": {"size_x": 9}}
     board.put(json.dumps({"detections": [seen, seen]}))
     assert board.scene["objects"] == [

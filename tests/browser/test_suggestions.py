@@ -37,15 +37,8 @@ STANDING = """async (cases) => {
 
 
 def box(name: str, x: float, y: float, z: float, size: tuple[float, float, float]) -> Box:
-    return {
-        "id": name,
-        "label": name,
-        "x": x,
-        "y": y,
-        "z": z,
-        "yaw": 0.0,
-        "size": dict(zip("xyz", size, strict=True)),
-    }
+    extent = dict(zip("xyz", size, strict=True))
+    return {"id": name, "label": name, "x": x, "y": y, "z": z, "yaw": 0.0, "size": extent}
 
 
 def room(random: Random) -> dict[str, Any]:
@@ -60,22 +53,17 @@ def room(random: Random) -> dict[str, Any]:
             top = made["z"] + size[2]
             boxes.append(box(f"item {number}", made["x"], made["y"], top, (0.15, 0.2, 0.2)))
     labels = [f"class {number}" for number in range(8)]
+    limits = {"x": 0.9, "y": 0.9, "z": 1}
     sizes = {
-        label: {
-            axis: random.uniform(0.1, limit)
-            for axis, limit in zip("xyz", (0.9, 0.9, 1), strict=True)
-        }
+        label: {axis: random.uniform(0.1, limit) for axis, limit in limits.items()}
         for label in labels
     }
+    placements = [[placement(random, random.choice(boxes[2:])) for _ in range(3)] for _ in labels]
     return {
         "boxes": boxes,
         "missing": [
-            {
-                "label": label,
-                "probability": 0.5,
-                "placements": [placement(random, random.choice(boxes[2:])) for _ in range(3)],
-            }
-            for label in labels
+            {"label": label, "probability": 0.5, "placements": places}
+            for label, places in zip(labels, placements, strict=True)
         ],
         "viewer": {"x": 0.0, "y": 0.0, "yaw": random.choice([0.0, 0.4, -0.4])},
         "sizes": sizes,
@@ -209,7 +197,7 @@ def ghost_at(
     return dict(ghost)
 
 
-def test_contents_stand_in_the_footprint_of_their_container(open_board: OpenBoard) -> None:
+def test_contents_and_low_objects_stand_in_a_footprint(open_board: OpenBoard) -> None:
     fridge = box("fridge", 3, 1, 0, (0.7, 0.8, 1.8))
     milk = box("milk", 3, 1, 0.5, (0.1, 0.1, 0.25))
     board = open_board()
@@ -221,39 +209,31 @@ def test_contents_stand_in_the_footprint_of_their_container(open_board: OpenBoar
     assert (ghost["x"], ghost["y"]) == pytest.approx((3.2, 0.9))
     assert ghost["z"] == 0
     assert top(ghost) > top(milk)
-
-
-def test_a_low_object_stands_between_the_legs_of_a_table(open_board: OpenBoard) -> None:
+    # A low object stands between the legs of a desk.
     desk = box("desk", 3, 0, 0, (0.8, 1.6, 0.74))
-    ghost = ghost_at(open_board(), "under", desk, (0.3, 0.3, 0.4), offset=(0.2, -0.5, -0.17))
+    ghost = ghost_at(board, "under", desk, (0.3, 0.3, 0.4), offset=(0.2, -0.5, -0.17))
     assert (ghost["x"], ghost["y"], ghost["z"]) == pytest.approx((3.2, -0.5, 0))
 
 
-@pytest.mark.parametrize(
-    ("relation", "offset"),
-    [
+def test_a_ghost_stands_where_the_answer_says(open_board: OpenBoard) -> None:
+    bed, size, board = box("bed", 3, 0, 0, (2, 1.6, 0.5)), (0.4, 0.4, 0.2), open_board()
+    for relation, offset in (
         # The first overhangs the bed a little, the second is close to the anchor.
         ("on-top", (0.85, 0.65, 0.4)),
         ("left", (0.1, 1.01, 0)),
         ("behind", (1.4, -1.3, 0)),
-    ],
-)
-def test_a_ghost_stands_where_the_answer_says(
-    open_board: OpenBoard, relation: str, offset: tuple[float, float, float]
-) -> None:
-    bed = box("bed", 3, 0, 0, (2, 1.6, 0.5))
-    board = open_board()
-    ghost = ghost_at(board, relation, bed, (0.4, 0.4, 0.2), offset=offset)
-    assert (ghost["x"], ghost["y"]) == pytest.approx((3 + offset[0], offset[1]))
-    assert not ghost["shifted"]
-    taken = box("box", 3 + offset[0], offset[1], 0, (0.3, 0.3, 1))
-    moved = ghost_at(board, relation, bed, (0.4, 0.4, 0.2), offset=offset, boxes=[taken])
-    assert share(moved, taken) == 0
-    assert moved["shifted"]
-    assert not ghost_at(board, relation, bed, (0.4, 0.4, 0.2))["shifted"], "no offset to keep"
+    ):
+        ghost = ghost_at(board, relation, bed, size, offset=offset)
+        assert (ghost["x"], ghost["y"]) == pytest.approx((3 + offset[0], offset[1]))
+        assert not ghost["shifted"]
+        taken = box("box", 3 + offset[0], offset[1], 0, (0.3, 0.3, 1))
+        moved = ghost_at(board, relation, bed, size, offset=offset, boxes=[taken])
+        assert share(moved, taken) == 0
+        assert moved["shifted"]
+        assert not ghost_at(board, relation, bed, size)["shifted"], "no offset to keep"
 
 
-def test_a_suggestion_at_another_place_says_so(open_board: OpenBoard) -> None:
+def test_a_suggestion_at_another_place_or_none_says_so(open_board: OpenBoard) -> None:
     far = {"mean": {"x": 9.0, "y": 0.0, "z": 0.5}, "std": dict.fromkeys("xyz", 0.2), "scenes": 9}
     place = {"relation": "on-top", "object": "desk", "probability": 0.9, "offset": far}
     board = open_board()
@@ -271,6 +251,13 @@ def test_a_suggestion_at_another_place_says_so(open_board: OpenBoard) -> None:
     board.add("lamp")
     assert board.ghosts == ["cup"]
     assert "nearest free place" not in board.rows("missing")[0]
+    # Below the desk, there is no free place.
+    place["relation"] = "below"
+    del place["offset"]
+    board.add("mug")
+    assert board.ghosts == []
+    assert "no free place on the board" in board.rows("missing")[0]
+    assert board.column("missing").get_by_role("button", name="Put ").count() == 0
 
 
 LAY_OUT = """async ([boxes, relations]) => {
@@ -279,7 +266,13 @@ LAY_OUT = """async ([boxes, relations]) => {
 }"""
 
 
-def test_a_layout_puts_contents_into_their_container(open_board: OpenBoard) -> None:
+MOVED = """async (things) => {
+  const { moved } = await import('./static/board/geometry.js');
+  return moved(things, 'fridge', 5, 5, (thing) => thing);
+}"""
+
+
+def test_a_layout_keeps_contents_in_their_container(open_board: OpenBoard) -> None:
     boxes = [
         box("milk", 0, 0, 0, (0.1, 0.1, 0.25)),
         box("juice", 0, 0, 0, (0.3, 0.3, 0.25)),
@@ -291,7 +284,8 @@ def test_a_layout_puts_contents_into_their_container(open_board: OpenBoard) -> N
         {"subject": "fridge", "relation": "contains", "object": "juice"},
         {"subject": "magnet", "relation": "on-top", "object": "fridge"},
     ]
-    placed = open_board().page.evaluate(LAY_OUT, [boxes, relations])
+    page = open_board().page
+    placed = page.evaluate(LAY_OUT, [boxes, relations])
     milk, juice, fridge, magnet = placed
     for one in (milk, juice):
         for axis in "xy":
@@ -300,39 +294,15 @@ def test_a_layout_puts_contents_into_their_container(open_board: OpenBoard) -> N
         assert one["z"] == fridge["z"]
     assert (milk["x"], milk["y"]) != (juice["x"], juice["y"])
     assert magnet["z"] == top(fridge)
-
-
-def test_contents_move_with_their_container(open_board: OpenBoard) -> None:
-    board = open_board({"objects": ["fridge"]})
-    after = board.page.evaluate(
-        """async (things) => {
-          const { moved } = await import('./static/board/geometry.js');
-          return moved(things, 'fridge', 5, 5, (thing) => thing);
-        }""",
-        [
-            box("fridge", 1, 1, 0, (0.7, 0.8, 1.8)),
-            box("milk", 1.1, 1, 0.5, (0.1, 0.1, 0.25)),
-            box("chair", 1.4, 1, 0, (0.5, 0.5, 0.9)),
-        ],
-    )
-    assert [(one["x"], one["y"], one["z"]) for one in after] == [
-        (5, 5, 0),
-        (5.1, 5, 0.5),
-        (1.4, 1, 0),
+    # Contents move with their container.
+    boxes = [
+        box("fridge", 1, 1, 0, (0.7, 0.8, 1.8)),
+        box("milk", 1.1, 1, 0.5, (0.1, 0.1, 0.25)),
+        box("chair", 1.4, 1, 0, (0.5, 0.5, 0.9)),
     ]
-
-
-def test_a_suggestion_without_a_place_says_so(open_board: OpenBoard) -> None:
-    placements = [{"relation": "below", "object": "desk", "probability": 0.9}]
-    board = open_board()
-    board.alter(
-        "missing",
-        lambda answer: answer | {"missing": [answer["missing"][0] | {"placements": placements}]},
-    )
-    board.add("laptop")
-    assert board.ghosts == []
-    assert "no free place on the board" in board.rows("missing")[0]
-    assert board.column("missing").get_by_role("button", name="Put ").count() == 0
+    after = page.evaluate(MOVED, boxes)
+    places = [(one["x"], one["y"], one["z"]) for one in after]
+    assert places == [(5, 5, 0), (5.1, 5, 0.5), (1.4, 1, 0)]
 
 
 def test_improbable_objects_and_places_are_left_out(open_board: OpenBoard) -> None:

@@ -50,27 +50,20 @@ def test_the_largest_scene_is_drawn_and_answered(open_board: OpenBoard, api: htt
 @pytest.mark.slow
 def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
     board = open_board()
-    posted: list[str] = []
-    dropped: list[str] = []
-    board.page.on(
-        "request", lambda one: posted.append(one.url) if one.url.endswith("/missing") else None
-    )
-    board.page.on(
-        "requestfailed",
-        lambda one: dropped.append(one.url) if one.url.endswith("/missing") else None,
-    )
-    held: list[Route] = []
+    every, failed, held = list[str](), list[str](), list[Route]()
+    board.page.on("request", lambda one: every.append(one.url.rpartition("/")[2]))
+    board.page.on("requestfailed", lambda one: failed.append(one.url.rpartition("/")[2]))
     board.page.route("**/missing", lambda route: held.append(route))
     board.thing("chair").focus()
     for _ in range(8):
         board.page.keyboard.press("ArrowUp")
     board.page.wait_for_timeout(500)
-    assert len(posted) < 8
-    asked = len(posted)
+    asked = every.count("missing")
+    assert asked < 8
     board.page.keyboard.press("ArrowUp")
     board.page.wait_for_timeout(500)
-    assert len(posted) == asked + 1
-    assert len(dropped) == asked
+    assert every.count("missing") == asked + 1
+    assert failed.count("missing") == asked
     held[-1].continue_()
     board.settle()
     assert board.scene["objects"][1]["position"]["x"] == pytest.approx(1.9)
@@ -87,19 +80,15 @@ def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> No
             route.continue_()
             return
         refusals.append(route)
-        problem = {
-            "type": "/problems/overloaded",
-            "title": "Overloaded",
-            "status": 429,
-            "detail": "The line is full.",
-            "request_id": "r",
-        }
+        problem = {"type": "/problems/queue-full", "title": "Queue full", "status": 429}
+        problem |= {"detail": "The queue is full.", "request_id": "r"}
         route.fulfill(status=429, json=problem, headers={"Retry-After": "1"})
 
     board.page.route("**/missing", refuse_once)
     board.add("laptop")
-    expect(board.column("missing").get_by_role("alert")).to_contain_text("The line is full")
-    expect(board.column("missing").get_by_role("alert")).to_be_hidden(timeout=5000)
+    alert = board.column("missing").get_by_role("alert")
+    expect(alert).to_contain_text("The queue is full")
+    expect(alert).to_be_hidden(timeout=5000)
     board.settle()
     assert board.rows("missing")
 

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,37 +17,25 @@ from scene_client.schemas import Problem
 from tests.chaos.corpus import MARKER, NUMBER, Hostile
 from tests.services import ADMIN_KEY
 
-_LEAKS = (
-    MARKER,
-    json.dumps(MARKER)[1:-1],
-    MARKER.split()[0],
-    NUMBER,
-    "Traceback",
-    "site-packages",
-    ".py",
-    str(Path.cwd()),
-)
+_INPUT = (MARKER, json.dumps(MARKER)[1:-1], MARKER.split()[0], NUMBER)
+_LEAKS = (*_INPUT, "Traceback", "site-packages", ".py", str(Path.cwd()))
 
 
 @dataclass
 class Report:
-    """What became of an attack.
-
-    Attributes:
-        faults: in words, one for every answer that is not as it must be.
-    """
+    """The statuses of the answers, and a text for each answer that is not as it must be."""
 
     statuses: Counter[int] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)
 
     @property
     def total(self) -> int:
-        """How many requests were answered."""
-        return sum(self.statuses.values())
+        """Number of answered requests."""
+        return self.statuses.total()
 
 
 def faults_of_problem(document: Any, status: int) -> list[str]:
-    """What is wrong with a problem document, if anything."""
+    """Return what is wrong with a problem document."""
     try:
         Problem.model_validate(document, extra="forbid")
     except ValueError as error:
@@ -55,28 +44,23 @@ def faults_of_problem(document: Any, status: int) -> list[str]:
     kind = ERRORS.get(document["type"].removeprefix("/problems/"))
     if kind is None or not kind.status == document["status"] == status:
         faults.append(f"status {status} with type {document['type']}, {document['status']}")
-    # A request id of the right form is the one thing that is repeated.
+    # A problem repeats only a request id of the right form.
     text = json.dumps(document, ensure_ascii=False).replace(document["request_id"], "")
-    faults += [f"repeats or leaks {leak!r}: {text}" for leak in _LEAKS if leak in text]
-    return faults
+    return faults + [f"repeats or leaks {leak!r}: {text}" for leak in _LEAKS if leak in text]
 
 
 def faults_of_answer(status: int, headers: Mapping[str, str], body: bytes) -> list[str]:
-    """What is wrong with an answer, whatever was asked."""
+    """Return what is wrong with the answer to any request."""
     if status >= 500:
         return [f"status {status}: {body[:300]!r}"]
+    kind = headers.get("content-type", "")
     if status < 400:
-        if not headers.get("content-type", "").startswith("application/json"):
-            return []
-        results = json.loads(body).get("results", ())
-        return [
-            fault
-            for entry in results
-            if entry["status"] != 200
-            for fault in faults_of_problem(entry["problem"], entry["status"])
-        ]
-    if headers.get("content-type") != "application/problem+json":
-        return [f"status {status} is no problem document but {headers.get('content-type')}"]
+        results = json.loads(body).get("results", ()) if kind.startswith("application/json") else ()
+        failed = (entry for entry in results if entry["status"] != 200)
+        problems = (faults_of_problem(entry["problem"], entry["status"]) for entry in failed)
+        return [*chain.from_iterable(problems)]
+    if kind != "application/problem+json":
+        return [f"status {status} is no problem document but {kind}"]
     document = json.loads(body)
     faults = faults_of_problem(document, status)
     if document.get("request_id") != headers.get("x-request-id"):
@@ -90,7 +74,7 @@ def attack(port: int, requests: Iterable[Hostile]) -> Report:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     headers = {"Content-Type": "application/json", "X-Admin-Key": ADMIN_KEY}
     for request in requests:
-        # Refused before all of it was sent: the answer is there all the same.
+        # The service may refuse a request before all of it was sent, and still answer.
         with suppress(BrokenPipeError, ConnectionResetError):
             connection.request(request.method, request.path, request.body, headers)
         try:

@@ -1,4 +1,4 @@
-"""Requests under way on many connections while something else happens to the service."""
+"""Requests in progress on many connections while something else happens to the service."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
-from types import TracebackType
 from typing import Any
+
+import numpy as np
+from scipy.stats import linregress
 
 from benchmarks.load.connections import Connection, connect
 
 
 @dataclass
 class Tally:
-    """What came back.
+    """The answers.
 
     Attributes:
-        sent: how many requests.
-        statuses: of the answers; 0 stands for a connection that broke.
-        seconds: what each answer took, by its status.
-        faults: what the judge said, as far as it said anything.
+        sent: number of requests.
+        statuses: statuses of the answers; 0 stands for a connection that broke.
+        seconds: durations of the answers, by status.
+        faults: the complaints of the judge.
     """
 
     sent: int = 0
@@ -31,14 +33,19 @@ class Tally:
     seconds: dict[int, list[float]] = field(default_factory=lambda: defaultdict(list))
     faults: list[str] = field(default_factory=list)
 
+    def check(self) -> None:
+        """Assert that each request has an answer, and that the judge has no complaint."""
+        assert self.faults == []
+        assert self.statuses.total() == self.sent
+
 
 class ConstantLoad:
-    """So many connections, in a thread of their own, each of which always has a request under way.
+    """Connections that always have a request in progress, in a thread of their own.
 
     Args:
-        port: of the service.
+        port: port of the service.
         requests: sent in turn.
-        judge: called with (number of the request, status, answer); says what is wrong, or nothing.
+        judge: called with (number of the request, status, answer); returns a complaint or None.
     """
 
     def __init__(
@@ -49,48 +56,49 @@ class ConstantLoad:
         connections: int = 8,
     ) -> None:
         self.tally = Tally()
-        self._port = port
-        self._requests = requests
-        self._judge = judge
-        self._connections = connections
+        self._arguments = port, requests, judge, connections
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()))
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run(*self._arguments)))
 
     def __enter__(self) -> ConstantLoad:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, _: BaseException | None, __: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._ending.set()
         self._thread.join(timeout=60)
         assert kind is not None or not self._thread.is_alive(), "an answer is lost"
 
-    async def _run(self) -> None:
+    async def _run(self, port: int, requests: Any, judge: Any, connections: int) -> None:
         asked: dict[Connection, tuple[int, float]] = {}
         finished = asyncio.Event()
 
         def send(connection: Connection) -> None:
-            number = self.tally.sent % len(self._requests)
+            number = self.tally.sent % len(requests)
             asked[connection] = number, perf_counter()
             self.tally.sent += 1
-            connection.send(self._requests[number])
+            connection.send(requests[number])
 
         def answered(connection: Connection, status: int, body: bytes) -> None:
             number, began = asked.pop(connection)
             self.tally.statuses[status] += 1
             self.tally.seconds[status].append(perf_counter() - began)
-            if fault := self._judge(number, status, json.loads(body) if body else None):
+            if fault := judge(number, status, json.loads(body) if body else None):
                 self.tally.faults.append(fault)
             if status and not self._ending.is_set():
                 send(connection)
             elif not asked:
                 finished.set()
 
-        pool = await connect(self._port, self._connections, answered)
+        pool = await connect(port, connections, answered)
         for connection in pool:
             send(connection)
         await finished.wait()
         for connection in pool:
             connection.close()
+
+
+def check_growth(readings: Sequence[int]) -> None:
+    """Assert that memory grows by less than 4 MiB or twice the standard error of the growth."""
+    line = linregress(np.linspace(0, 1, len(readings)), readings)
+    assert line.slope < max(4 * 2**20, 2 * line.stderr), line

@@ -1,4 +1,4 @@
-"""Ten times what the service can do: it refuses what is too much, and is well at once after."""
+"""Overload by ten times the sustainable rate: refusals, deadlines, and the state afterwards."""
 
 from __future__ import annotations
 
@@ -66,7 +66,6 @@ def test_accepted_requests_keep_their_deadline(service: LiveService) -> None:
     # Many more at once than are answered within a deadline; each has its own clock.
     with ConstantLoad(service.port, REQUESTS, judge, connections=1024) as load:
         time.sleep(SECONDS / 3)
-    assert load.tally.faults == []
-    assert sum(load.tally.statuses.values()) == load.tally.sent
+    load.tally.check()
     assert load.tally.statuses[200] > 0
     assert np.quantile(load.tally.seconds[200], 0.99) < DEADLINE

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.chaos.wire import BODY, LIVE, Answer, Wire, exchange
-from tests.http.stores import make_store
+from tests.chaos.wire import BODY, LIVE, Wire, exchange
 from tests.http.test_problems import problem
 from tests.services import LiveService, launch, live_service, wait_until
 
@@ -21,6 +20,10 @@ HEAD = (
     b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     b"Content-Length: %d\r\n\r\n"
 )
+
+
+BATCH_BODY = json.dumps({"scenes": [json.loads(BODY)] * 256}).encode()
+BATCH = HEAD.replace(b"outliers", b"missing/batch") % len(BATCH_BODY) + BATCH_BODY
 
 
 service = live_service(SCENE_CLIENT_TIMEOUT="1", logs_errors=True)
@@ -37,13 +40,9 @@ def connect(service: LiveService) -> socket.socket:
 )
 def test_an_unfinished_body_gets_408(service: LiveService, part: bytes) -> None:
     (answer,), closed = exchange(service.port, Wire("", [part], None))
-    is_problem(answer, 408, "request-timeout")
+    slug = json.loads(answer.body)["type"].removeprefix("/problems/")
+    assert (answer.status, slug) == (408, "request-timeout")
     assert closed
-
-
-def is_problem(answer: Answer, status: int, slug: str) -> None:
-    assert answer.status == status
-    assert json.loads(answer.body)["type"] == f"/problems/{slug}"
 
 
 @pytest.mark.parametrize(
@@ -102,23 +101,19 @@ def test_closed_connections_free_their_sockets(service: LiveService) -> None:
     for end in range(0, len(request) + 1, 7):
         with connect(service) as connection:
             connection.sendall(request[:end])
-    body = json.dumps({"scenes": [json.loads(BODY)] * 256}).encode()
-    batch = HEAD.replace(b"outliers", b"missing/batch") % len(body) + body
     for _ in range(5):
         with connect(service) as connection:
-            connection.sendall(batch)
+            connection.sendall(BATCH)
             connection.recv(1)  # in the middle of the answer
     assert service.control() == before
     assert "Traceback" not in service.log.read_text()
-    wait_for_descriptors(service, files)
+    wait_until(lambda: service.descriptors <= files + 2)
 
 
 def test_a_client_that_does_not_read_is_disconnected(service: LiveService) -> None:
     """The system ends the connection, some retransmissions after SCENE_CLIENT_TIMEOUT."""
     before = service.control()
     files = service.descriptors
-    body = json.dumps({"scenes": [json.loads(BODY)] * 256}).encode()
-    batch = HEAD.replace(b"outliers", b"missing/batch") % len(body) + body
     unread = []
     for _ in range(3):
         connection = socket.socket()
@@ -126,25 +121,20 @@ def test_a_client_that_does_not_read_is_disconnected(service: LiveService) -> No
         connection.settimeout(0.5)
         connection.connect(("127.0.0.1", service.port))
         with suppress(OSError):
-            connection.sendall(batch * 20)
+            connection.sendall(BATCH * 20)
         unread.append(connection)
     assert service.control() == before
-    wait_for_descriptors(service, files)
+    wait_until(lambda: service.descriptors <= files + 2)
     for connection in unread:
         connection.close()
 
 
-def wait_for_descriptors(service: LiveService, files: int) -> None:
-    wait_until(lambda: service.descriptors <= files + 2)
-
-
 @pytest.mark.slow
-def test_unfinished_bodies_use_bounded_memory(tmp_path: Path) -> None:
+def test_unfinished_bodies_use_bounded_memory(shared_store: Path, tmp_path: Path) -> None:
     """Sixty bodies of 2 MiB less one byte: the service holds as many as its budget allows."""
-    store = make_store(tmp_path / "store")
     settings = {"SCENE_CLIENT_TIMEOUT": "60", "SCENE_HELD_BODY_BYTES": str(8 * 2**20)}
     size = 2 * 2**20
-    with launch(store, tmp_path / "log", **settings) as service, ExitStack() as held:
+    with launch(shared_store, tmp_path / "log", **settings) as service, ExitStack() as held:
         before, answers = service.memory, service.control()
         refused, head = 0, HEAD.replace(b"outliers", b"missing/batch") % size
         for _ in range(60):
@@ -167,9 +157,9 @@ def test_unfinished_bodies_use_bounded_memory(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_connections_over_the_limit_get_a_plain_503(tmp_path: Path) -> None:
-    store = make_store(tmp_path / "store")
-    with launch(store, tmp_path / "log", SCENE_MAX_CONNECTIONS="8") as service, ExitStack() as held:
+def test_connections_over_the_limit_get_a_plain_503(shared_store: Path, tmp_path: Path) -> None:
+    limit, log = {"SCENE_MAX_CONNECTIONS": "8"}, tmp_path / "log"
+    with launch(shared_store, log, **limit) as service, ExitStack() as held:
         for _ in range(8):
             held.enter_context(connect(service))
         (answer,), closed = exchange(service.port, Wire("", [LIVE], (503,), closes=True))

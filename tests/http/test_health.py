@@ -1,4 +1,4 @@
-"""Liveness, readiness, and what a service says whose models are broken."""
+"""Liveness, readiness, and the answers of a service with broken models."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
+from app import __version__
 from app.main import create_app
 from app.registry import AliasTarget, Store
 from app.settings import Settings
@@ -45,11 +46,10 @@ def test_head_answers_like_get_without_a_body(live: LiveService, path: str) -> N
 
 async def test_protocol_metadata(client: httpx.AsyncClient) -> None:
     server = (await client.get("/v2")).json()
-    assert set(server) == {"name", "version", "extensions"}
+    assert server == {"name": "scene-boltzmann", "version": __version__, "extensions": []}
     model = (await client.get("/v2/models/default")).json()
-    assert model["name"] == "home"
-    assert model["versions"] == ["1.0.0", "1.1.0"]
-    assert model["platform"] == "numpy_triway"
+    described = {"name": "home", "versions": ["1.0.0", "1.1.0"], "platform": "numpy_triway"}
+    assert model == described | {"inputs": [], "outputs": []}
 
 
 async def test_before_its_start_a_service_is_live_and_not_ready(shared_store: Path) -> None:
@@ -72,7 +72,7 @@ async def test_a_broken_default_keeps_the_service_not_ready(store: Path) -> None
             problem(response, 503, "not-ready")
             assert response.headers["retry-after"] == "7"
         problem(await client.post("/relations", json={"objects": ["bed"]}), 503, "not-ready")
-        # No older or newer version stands in for it, and what is whole answers by its own name.
+        # Another version does not replace it, and answers by its own name.
         body = {"objects": ["bed"], "model": "home@1.1.0"}
         assert (await client.post("/relations", json=body)).status_code == 200
         failures = {
@@ -85,24 +85,23 @@ async def test_a_broken_default_keeps_the_service_not_ready(store: Path) -> None
 
 async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
     corrupt(store, "plain", "1.0.0")
+    shutil.rmtree(store / "home" / "1.1.0")
     async with serve(store) as client:
+        # An alias to a removed version is unavailable and not unknown.
+        body = {"objects": ["bed"], "model": "candidate"}
+        problem(await client.post("/relations", json=body), 503, "model-unavailable")
         for path in READY:
             assert (await client.get(path)).status_code == 200
         (version,) = (await client.get("/models/plain")).json()["versions"]
-        assert version["status"] == "refused"
+        details = (await client.get("/models/plain/versions/1.0.0")).json()
+        assert version["status"] == details["status"] == "refused"
         assert version["reason"]
         assert version["detail"]
-        details = (await client.get("/models/plain/versions/1.0.0")).json()
-        assert details["status"] == "refused"
         assert "card" not in details
         body = {"objects": ["bed"], "model": "plain"}
         problem(await client.post("/relations", json=body), 503, "model-unavailable")
-        for path in (
-            "/models/plain/vocabulary",
-            "/models/plain/contexts",
-            "/v2/models/plain/ready",
-        ):
-            problem(await client.get(path), 503, "model-unavailable")
+        for path in ("models/plain/vocabulary", "models/plain/contexts", "v2/models/plain/ready"):
+            problem(await client.get(f"/{path}"), 503, "model-unavailable")
 
 
 async def test_a_name_means_the_newest_usable_version(store: Path, replace: Replace) -> None:
@@ -130,13 +129,6 @@ async def test_a_name_means_the_newest_usable_version(store: Path, replace: Repl
         newest, other = (await client.get("/models/home")).json()["versions"]
         assert (newest["status"], newest["reason"]) == ("refused", "warm_up_failed")
         assert other["aliases"] == ["default", "newest"]
-
-
-async def test_an_alias_to_a_removed_version_is_unavailable_and_not_unknown(store: Path) -> None:
-    shutil.rmtree(store / "home" / "1.1.0")
-    async with serve(store) as client:
-        body = {"objects": ["bed"], "model": "candidate"}
-        problem(await client.post("/relations", json=body), 503, "model-unavailable")
 
 
 async def test_an_empty_store_is_not_ready(tmp_path: Path, admin: dict[str, str]) -> None:

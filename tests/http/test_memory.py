@@ -1,6 +1,6 @@
-"""What a request held is freed when it has been answered, and does not wait for the collector.
+"""A request frees its memory with its answer, without the garbage collector.
 
-Cycles would keep it: bodies may have megabytes, and the collector comes rarely.
+Reference cycles would keep bodies of megabytes until the collector runs, which is rare.
 """
 
 from __future__ import annotations
@@ -42,21 +42,9 @@ CASES: dict[str, tuple[str, Any, int]] = {
 
 async def status(app: Any, path: str, body: bytes) -> int:
     """Of an answer, by the ASGI protocol itself: clients leave cycles of their own."""
-    scope = {
-        "type": "http",
-        "asgi": {"version": "3.0"},
-        "http_version": "1.1",
-        "method": "POST",
-        "scheme": "http",
-        "path": path,
-        "raw_path": path.encode(),
-        "root_path": "",
-        "query_string": b"",
-        "headers": [(b"host", b"service"), (b"content-type", b"application/json")],
-        "server": ("service", 80),
-        "client": ("127.0.0.1", 1),
-        "state": {},
-    }
+    headers = [(b"host", b"service"), (b"content-type", b"application/json")]
+    scope = {"type": "http", "method": "POST", "path": path, "query_string": b"", "state": {}}
+    scope |= {"headers": headers, "client": ("127.0.0.1", 1), "root_path": ""}
     events = [{"type": "http.request", "body": body, "more_body": False}]
     found: list[int] = []
 
@@ -78,7 +66,7 @@ async def test_no_cycle_keeps_a_request(client: httpx.AsyncClient, case: str) ->
     path, content, expected = CASES[case]
     body = content if isinstance(content, bytes) else json.dumps(content).encode()
     app: Any = client.app  # type: ignore[attr-defined]
-    # What is made once, at the first request of a kind, may be made in any way.
+    # The first request of a kind makes objects that stay.
     assert await status(app, path, body) == expected
     gc.collect()
     gc.disable()

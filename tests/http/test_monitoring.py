@@ -1,4 +1,4 @@
-"""``GET /metrics`` and the access log: what the service tells of itself, and what it keeps."""
+"""``GET /metrics`` and the access log."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import json
 import re
 import shutil
-import time
 import uuid
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.conftest import REPOSITORY
 from tests.http.stores import corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import Hold, LiveService, Replace, defect, serve
+from tests.services import Hold, LiveService, Replace, defect, serve, wait_until
 
 SCENE = {"objects": ["bed", "lamp"]}
+QUESTIONS = ("relations", "missing", "outliers", "rooms", "generate")
 OPERATIONS = (REPOSITORY / "docs" / "operations.md").read_text("utf-8")
 
 
@@ -63,7 +63,7 @@ async def test_the_documented_example_is_of_this_service(shared_store: Path) -> 
         await client.post("/missing", json=SCENE)
         await client.post("/missing", json={"objects": ["nosuchthing"]})
         text = (await client.get("/metrics")).text
-    # Line by line the same, but for the counts.
+    # The lines are the same, except the counts.
     for line in ok["example"].splitlines():
         assert line.rpartition(" ")[0] in text if line[0] != "#" else line in text
 
@@ -107,14 +107,10 @@ async def test_requests_are_counted_by_route_method_and_outcome(
     assert found["scene_request_duration_seconds_count", "/missing"] == 5
 
 
-async def test_unknown_paths_and_methods_add_no_metrics(
-    client: httpx.AsyncClient,
-) -> None:
+async def test_unknown_paths_and_methods_add_no_metrics(client: httpx.AsyncClient) -> None:
     async def ask(number: int) -> None:
-        await client.get(f"/nowhere/{number}")
-        await client.get(f"/models/m{number}")
-        await client.get(f"/problems/p{number}")
-        await client.get(f"/static/s{number}")
+        for folder in ("nowhere", "models", "problems", "static"):
+            await client.get(f"/{folder}/m{number}")
         await client.request(f"METHOD{number}", f"/models/m{number}")
         await client.post("/missing", json={**SCENE, "model": f"m{number}"})
 
@@ -128,15 +124,14 @@ async def test_unknown_paths_and_methods_add_no_metrics(
 
 async def test_work_is_measured_by_model_and_question(shared_store: Path) -> None:
     async with serve(shared_store) as client:
-        for path in ("relations", "missing", "outliers", "rooms", "generate"):
-            body = {**SCENE, "model": "plain", "seed": 1} | (
-                {"steps": 1} if path == "generate" else {}
-            )
+        for path in QUESTIONS:
+            body = {**SCENE, "model": "plain", "seed": 1}
+            body |= {"steps": 1} if path == "generate" else {}
             assert (await client.post(f"/{path}", json=body)).status_code == 200
         batch = {"scenes": [SCENE, {"objects": ["nosuchthing"]}, SCENE]}
         assert (await client.post("/missing/batch", json=batch)).status_code == 200
         found = await samples(client)
-    for question in ("relations", "missing", "outliers", "rooms", "generate"):
+    for question in QUESTIONS:
         label = ("plain", question, "1.0.0")
         assert found["scene_compute_duration_seconds_count", *label] == 1
         assert found["scene_compute_duration_seconds_sum", *label] > 0
@@ -148,35 +143,29 @@ async def test_work_is_measured_by_model_and_question(shared_store: Path) -> Non
     assert found["scene_serialisation_duration_seconds_sum",] > 0
 
 
-async def test_reloads_are_counted_by_outcome(store: Path, admin: dict[str, str]) -> None:
-    async with serve(store) as client:
+async def test_reloads_are_counted_by_outcome(own: httpx.AsyncClient, store: Path) -> None:
 
-        async def refresh() -> int:
-            return (await client.post("/models/refresh", headers=admin)).status_code
+    async def refresh() -> int:
+        return (await own.post("/models/refresh")).status_code
 
-        async def move(model: str) -> int:
-            url = "/models/aliases/default"
-            return (await client.put(url, json={"model": model}, headers=admin)).status_code
+    async def move(model: str) -> int:
+        url = "/models/aliases/default"
+        return (await own.put(url, json={"model": model})).status_code
 
-        assert await refresh() == 200
-        assert await move("home@1.1.0") == 200
-        assert await move("home@7.0.0") == 404
-        publish(store, "home", "2.0.0", seed=2)
-        corrupt(store, "home", "2.0.0")
-        assert await refresh() == 409
-        found = await samples(client)
-        led = [key[5] for key in found if key[:2] == ("scene_model_info", "default")]
+    assert await refresh() == 200
+    assert await move("home@1.1.0") == 200
+    assert await move("home@7.0.0") == 404
+    publish(store, "home", "2.0.0", seed=2)
+    corrupt(store, "home", "2.0.0")
+    assert await refresh() == 409
+    found = await samples(own)
+    led = [key[5] for key in found if key[:2] == ("scene_model_info", "default")]
     assert led == ["1.1.0"]
-    assert {key[1:]: n for key, n in found.items() if key[0] == "scene_reloads_total"} == {
-        ("poll", "success"): 0,
-        ("poll", "refused"): 0,
-        ("poll", "failed"): 0,
-        ("refresh", "success"): 1,
-        ("refresh", "refused"): 1,
-        ("refresh", "failed"): 0,
-        ("alias", "success"): 1,
-        ("alias", "refused"): 1,
-        ("alias", "failed"): 0,
+    reloads = {key[1:]: n for key, n in found.items() if key[0] == "scene_reloads_total"}
+    assert reloads == {
+        (change, outcome): float(change != "poll" and outcome != "failed")
+        for change in ("poll", "refresh", "alias")
+        for outcome in ("success", "refused", "failed")
     }
     assert found["scene_ready_time_seconds",] >= found["scene_start_time_seconds",] > 0
 
@@ -191,54 +180,52 @@ async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
 # ------------------------------------------------------------------------------- the models
 
 
-async def test_model_info_has_every_alias(store: Path, admin: dict[str, str]) -> None:
-    async with serve(store) as client:
-        await client.put("/models/aliases/night", json={"model": "home"}, headers=admin)
-        infos = {key[1:] for key in await samples(client) if key[0] == "scene_model_info"}
-        expected = set()
-        for alias, name, variant, version in (
-            ("default", "home", "triway", "1.0.0"),
-            ("candidate", "home", "triway", "1.1.0"),
-            ("night", "home", "triway", "1.1.0"),
-            ("", "plain", "rbm", "1.0.0"),
-            ("", "deep", "gbm", "0.1.0"),
-        ):
-            listed = (await client.get(f"/models/{name}/versions/{version}")).json()
-            expected.add((alias, listed["digest"], name, variant, version))
+async def test_model_info_has_every_alias(own: httpx.AsyncClient) -> None:
+    await own.put("/models/aliases/night", json={"model": "home"})
+    infos = {key[1:] for key in await samples(own) if key[0] == "scene_model_info"}
+    expected = set()
+    for alias, name, variant, version in (
+        ("default", "home", "triway", "1.0.0"),
+        ("candidate", "home", "triway", "1.1.0"),
+        ("night", "home", "triway", "1.1.0"),
+        ("", "plain", "rbm", "1.0.0"),
+        ("", "deep", "gbm", "0.1.0"),
+    ):
+        listed = (await own.get(f"/models/{name}/versions/{version}")).json()
+        expected.add((alias, listed["digest"], name, variant, version))
     assert infos == expected
 
 
 async def test_metrics_of_a_removed_model_disappear(
-    store: Path, admin: dict[str, str], hold: Hold
+    own: httpx.AsyncClient, store: Path, hold: Hold
 ) -> None:
-    async with serve(store) as client:
 
-        async def names(of: str) -> set[str]:
-            return {key[0] for key in await samples(client) if of in key}
+    async def names(of: str) -> set[str]:
+        return {key[0] for key in await samples(own) if of in key}
 
-        async def ask(model: str, objects: int = 2) -> int:
-            body = {"objects": ["bed"] * objects, "model": model}
-            return (await client.post("/missing", json=body)).status_code
+    async def ask(model: str, objects: int = 2) -> int:
+        body = {"objects": ["bed"] * objects, "model": model}
+        return (await own.post("/missing", json=body)).status_code
 
-        assert await ask("plain") == await ask("home@1.0.0") == 200
-        everything = await names("home")
-        assert {"scene_batch_rows_sum", "scene_model_info"} <= everything
-        assert await names("plain") == everything
-        # A request that still holds the old snapshot reports late.
-        held = hold("missing", lambda manifest: manifest.name == "plain")
-        late = asyncio.ensure_future(ask("plain", 33))  # on a thread
-        assert await asyncio.to_thread(held.started.wait, 30)
-        shutil.rmtree(store / "plain")
-        await client.post("/models/refresh", headers=admin)
-        assert await names("plain") == set()
-        assert await names("home") == everything
-        held.release.set()
-        assert await late == 200
-        assert await names("plain") == set()
-        publish(store, "plain", "1.0.0", variant="rbm")
-        await client.post("/models/refresh", headers=admin)
-        assert await ask("plain") == 200
-        assert (await samples(client))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
+    assert await ask("plain") == await ask("home@1.0.0") == 200
+    everything = await names("home")
+    assert {"scene_batch_rows_sum", "scene_model_info"} <= everything
+    assert await names("plain") == everything
+    # A request that still holds the old snapshot reports late.
+    held = hold("missing", lambda manifest: manifest.name == "plain")
+    late = asyncio.ensure_future(ask("plain", 33))  # on a thread
+    assert await asyncio.to_thread(held.started.wait, 30)
+    shutil.rmtree(store / "plain")
+    await own.post("/models/refresh")
+    assert await names("plain") == set()
+    assert await names("home") == everything
+    held.release.set()
+    assert await late == 200
+    assert await names("plain") == set()
+    publish(store, "plain", "1.0.0", variant="rbm")
+    await own.post("/models/refresh")
+    assert await ask("plain") == 200
+    assert (await samples(own))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
 
 
 async def test_a_process_without_a_default_is_not_ready(
@@ -277,17 +264,14 @@ def test_the_documentation_lists_every_metric(live: LiveService) -> None:
 
 
 def line(service: LiveService, method: str, path: str, **arguments: Any) -> dict[str, Any]:
-    """What the log tells of one request, in one line."""
+    """Send a request, and return its line of the log."""
     identity = uuid.uuid4().hex
     headers = {"X-Request-Id": identity}
     service.client.request(method, path, headers=headers, **arguments)
-    # It is written after the answer.
-    for _ in range(500):
-        lines = map(json.loads, service.log.read_text().splitlines())
-        if found := [entry for entry in lines if entry.get("request_id") == identity]:
-            break
-        time.sleep(0.01)
-    (entry,) = found
+    # The service writes the line after the answer.
+    wait_until(lambda: f'"{identity}"' in service.log.read_text(), service.log)
+    lines = map(json.loads, service.log.read_text().splitlines())
+    (entry,) = (entry for entry in lines if entry.get("request_id") == identity)
     assert entry.pop("process") == service.process.pid
     for name in ("time", "message", "request_id"):
         assert entry.pop(name)
@@ -300,26 +284,13 @@ def test_a_request_is_one_line(live: LiveService) -> None:
     answered = line(live, "POST", "/missing", json=SCENE)
     assert answered.pop("latency_ms") >= answered.pop("compute_ms") > 0
     assert answered.pop("queue_ms") >= 0
-    assert answered == {
-        "level": "info",
-        "logger": "app.access",
-        "method": "POST",
-        "route": "/missing",
-        "status": 200,
-        "outcome": "success",
-        "model": "home",
-        "version": "1.0.0",
-    }
+    common = {"level": "info", "logger": "app.access"}
+    expected = {"method": "POST", "route": "/missing", "status": 200, "outcome": "success"}
+    assert answered == common | expected | {"model": "home", "version": "1.0.0"}
     refused = line(live, "GET", "/nowhere?key=secret")
     assert refused.pop("latency_ms") > 0
-    assert refused == {
-        "level": "info",
-        "logger": "app.access",
-        "method": "GET",
-        "route": "-",
-        "status": 404,
-        "outcome": "not-found",
-    }
+    expected = {"method": "GET", "route": "-", "status": 404, "outcome": "not-found"}
+    assert refused == common | expected
 
 
 @pytest.mark.system

@@ -15,7 +15,7 @@ from app.registry import Store
 from app.scene import Scene, SceneObject
 from app.scene.relations import CANONICAL, opposite
 from tests.http.stores import PROFILES, VOCABULARY, publish
-from tests.http.test_problems import problem
+from tests.http.test_problems import pointers, problem
 from tests.services import serve
 
 
@@ -30,12 +30,14 @@ SCENE: dict[str, Any] = {
     "room_type": "bedroom",
 }
 LAMP_ON_DESK: list[dict[str, Any]] = [
-    {"id": id_, "label": label, "position": at(*position), "size": at(*size)}
-    for id_, label, position, size in (
-        ("d", "desk", (2, 0, 0.4), (0.7, 1.4, 0.8)), ("l", "lamp", (2, 0.5, 1), (0.2, 0.2, 0.4)),
-    )
-]  # fmt: skip
+    {"id": "d", "label": "desk", "position": at(2, 0, 0.4), "size": at(0.7, 1.4, 0.8)},
+    {"id": "l", "label": "lamp", "position": at(2, 0.5, 1), "size": at(0.2, 0.2, 0.4)},
+]
 MODELS = ["home", "home@1.1.0", "candidate", "plain", "deep@0.1.0"]
+
+
+def triples(listed: list[dict[str, Any]]) -> set[tuple[str, str, str]]:
+    return {(entry["subject"], entry["relation"], entry["object"]) for entry in listed}
 
 
 async def ask(client: httpx.AsyncClient, question: str, **request: Any) -> dict[str, Any]:
@@ -60,9 +62,10 @@ async def test_every_model_answers_every_question(
     used = answer["model"]
     assert f"{used['name']}@{used['version']}" == (name or model)
     assert len(used["digest"]) == 64
-    assert answer["frame_id"] == "map"
-    assert answer["stamp"] == stamp
-    assert answer["ignored"] == []
+    assert (answer["frame_id"], answer["stamp"]) == ("map", stamp)
+    assert answer["ignored"] == answer["mapped"] == answer["warnings"] == []
+    for number in _numbers(answer):
+        assert number == float(f"{number:.6g}"), "six significant digits"
 
 
 @pytest.mark.parametrize("question", ANSWERS)
@@ -70,6 +73,9 @@ async def test_observed_relations_are_returned(client: httpx.AsyncClient, questi
     answer = await ask(client, question, objects=LAMP_ON_DESK)
     assert answer["observed_relations"] == [{"subject": "l", "relation": "on-top", "object": "d"}]
     assert "observed_relations" not in await ask(client, question, objects=["desk", "lamp"])
+    odd = {"label": "lamp", "size": at(200, 200, 400)}
+    (warning,) = (await ask(client, question, objects=["bed", odd]))["warnings"]
+    assert (warning["code"], warning["objects"]) == ("implausible-size", ["lamp"])
 
 
 # --------------------------------------------------------------------------------- relations
@@ -82,9 +88,7 @@ async def test_relations_of_chosen_pairs(client: httpx.AsyncClient) -> None:
     assert ends == {("chair_2", "l"), ("bed", "chair_1")}
 
 
-async def test_disagreements_name_the_pairs_as_they_were_stated(
-    client: httpx.AsyncClient,
-) -> None:
+async def test_disagreements_name_the_pairs_as_stated(client: httpx.AsyncClient) -> None:
     """Whatever is stated of a pair, the same is expected of it."""
     objects = ["bed", "chair", {"id": "l", "label": "nightstand"}]
     expected: list[str] = []
@@ -130,8 +134,6 @@ async def test_scores_are_the_answer_without_details(
         for entry in entries["full"]
     ]
     assert all(details <= entry.keys() for entry in entries["full"])
-    response = await client.post(f"/{question}", json={**SCENE, "detail": "all"})
-    assert response.json()["errors"][0]["message"] == "must be `scores` or `full`"
 
 
 # ------------------------------------------------------------------------------------- rooms
@@ -231,15 +233,12 @@ async def test_the_place_that_was_asked_about_comes_first(client: httpx.AsyncCli
             assert values == sorted(values, reverse=True)
 
 
-# ----------------------------------------------------------------------- what is in force, notes
+# -------------------------------------------------------------------------- defaults, notes
 
 
 async def test_coverage_is_the_models_unless_given(client: httpx.AsyncClient) -> None:
     assert (await ask(client, "missing", **SCENE))["coverage"] == 0.5
     assert (await ask(client, "missing", **SCENE, coverage=0.125))["coverage"] == 0.125
-    for wrong in (-0.1, 1.5, "0.5", True):
-        response = await client.post("/missing", json=SCENE | {"coverage": wrong})
-        assert response.status_code == 422
 
 
 async def test_a_profile_changes_base_rates_only(client: httpx.AsyncClient) -> None:
@@ -269,14 +268,6 @@ async def test_a_profile_changes_base_rates_only(client: httpx.AsyncClient) -> N
     assert drawn[0] != drawn[1] != drawn[2]
 
 
-async def test_a_model_without_profiles_refuses_a_profile(client: httpx.AsyncClient) -> None:
-    body = {"objects": ["bed"], "model": "plain", "profile": "homes"}
-    response = await client.post("/missing", json=body)
-    (error,) = response.json()["errors"]
-    assert (response.status_code, error["pointer"]) == (422, "#/profile")
-    assert not error.get("suggestions")
-
-
 async def test_sensitivity_is_medium_unless_given(client: httpx.AsyncClient) -> None:
     plain = await ask(client, "outliers", **SCENE)
     assert plain["threshold"] == 0.5
@@ -284,42 +275,20 @@ async def test_sensitivity_is_medium_unless_given(client: httpx.AsyncClient) -> 
     assert medium | {"request_id": ""} == plain | {"request_id": ""}
     own = await ask(client, "outliers", **SCENE, sensitivity="low", threshold=0.25)
     assert own["threshold"] == 0.25
-    response = await client.post("/outliers", json=SCENE | {"sensitivity": "utmost"})
-    assert response.status_code == 422
 
 
-async def test_misplaced_relations_are_spelled_as_in_the_request(
-    client: httpx.AsyncClient,
-) -> None:
-    given = [
-        {"subject": "lamp", "relation": "under", "object": "bed"},
-        {"subject": "lamp", "relation": "left", "object": "bed"},
-        {"subject": "desk", "relation": "behind", "object": "lamp"},
-    ]
-    answer = await ask(client, "outliers", objects=["bed", "lamp", "desk"], relations=given)
-    found = [
-        {name: one[name] for name in ("subject", "relation", "object")}
-        for one in answer["misplaced"]
-    ]
-    assert sorted(found, key=str) == sorted(given, key=str)
+async def test_misplaced_relations_are_spelled_as_stated(client: httpx.AsyncClient) -> None:
+    stated = [("lamp", "under", "bed"), ("lamp", "left", "bed"), ("desk", "behind", "lamp")]
+    answer = await ask(client, "outliers", objects=["bed", "lamp", "desk"], relations=stated)
+    assert triples(answer["misplaced"]) == {*stated}
+    assert len(answer["misplaced"]) == 3
     assert all(type(one["is_misplaced"]) is bool for one in answer["misplaced"])
 
 
 async def test_observed_relations_are_marked_from_either_end(client: httpx.AsyncClient) -> None:
-    given = [{"subject": "bed", "relation": "right", "object": "lamp"}]
-    answer = await ask(
-        client,
-        "relations",
-        objects=["bed", "lamp", "desk"],
-        relations=given,
-        include_opposites=True,
-        top_k=4096,
-    )
-    marked = {
-        (one["subject"], one["relation"], one["object"])
-        for one in answer["relations"]
-        if one["observed"]
-    }
+    scene = {"objects": ["bed", "lamp", "desk"], "relations": [("bed", "right", "lamp")]}
+    answer = await ask(client, "relations", **scene, include_opposites=True, top_k=4096)
+    marked = triples([one for one in answer["relations"] if one["observed"]])
     assert marked == {("bed", "right", "lamp"), ("lamp", "left", "bed")}
 
 
@@ -334,31 +303,9 @@ async def test_mapped_labels_are_reported_with_their_class(client: httpx.AsyncCl
     mapped = [(one["label"], one["class"]) for one in answer["mapped"]]
     assert mapped == [("nigthstand", "nightstand"), ("big lamp", "lamp")]
     assert {one["label"] for one in answer["missing"]} == {"television", "lamp"}
-    response = await client.post(
-        "/missing", json={"objects": ["bed"], "candidates": ["droid"], "unknown_labels": "nearest"}
-    )
-    assert response.status_code == 422
-    assert response.json()["errors"][0]["pointer"] == "#/candidates/0"
-
-
-async def test_every_answer_has_its_notes(client: httpx.AsyncClient) -> None:
-    for question in ANSWERS:
-        answer = await ask(client, question, objects=["bed", "lamp"])
-        assert (answer["ignored"], answer["mapped"], answer["warnings"]) == ([], [], [])
-        odd = {"label": "lamp", "size": {"x": 200.0, "y": 200.0, "z": 400.0}}
-        (warning,) = (await ask(client, question, objects=["bed", odd]))["warnings"]
-        assert warning["code"] == "implausible-size"
-        assert warning["objects"] == ["lamp"]
-        assert warning["message"]
-
-
-@pytest.mark.parametrize("question", ANSWERS)
-async def test_numbers_have_six_significant_digits(
-    client: httpx.AsyncClient, question: str
-) -> None:
-    answer = await ask(client, question, **SCENE)
-    for number in _numbers(answer):
-        assert number == float(f"{number:.6g}")
+    body = {"objects": ["bed"], "candidates": ["droid"], "unknown_labels": "nearest"}
+    response = await client.post("/missing", json=body)
+    assert pointers(response, "unknown-labels") == ["#/candidates/0"]
 
 
 def _numbers(value: Any) -> list[float]:

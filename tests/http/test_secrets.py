@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,7 @@ QUOTING = DEFECTIVE.format(message=f"no class for {API_KEY}, {ADMIN_KEY}")
 def defective(
     shared_store: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[LiveService]:
-    """A service that tells as much as it can be made to, and cannot say what is missing."""
+    """A service that logs everything, and whose question `missing` fails."""
     with launch(
         shared_store,
         tmp_path_factory.mktemp("defective") / "log",
@@ -39,7 +40,7 @@ def defective(
 
 
 def test_keys_and_payloads_are_not_in_the_log(defective: LiveService) -> None:
-    client = defective.client
+    client, statuses = defective.client, set()
     sent = [
         {},
         {"X-API-Key": API_KEY},
@@ -51,26 +52,23 @@ def test_keys_and_payloads_are_not_in_the_log(defective: LiveService) -> None:
         {"Cookie": f"key={MISTAKEN}"},
         {"X-Request-Id": f"{MISTAKEN} {API_KEY}", "X-API-Key": API_KEY},
     ]
-    statuses = set()
-    for headers in sent:
-        for key in SECRETS:
-            for method, path, body in (
-                ("GET", "/health/live", None),
-                ("GET", f"/{key}", None),
-                ("GET", f"/models/{key}?key={key}", None),
-                ("POST", f"/relations?api_key={key}", {"objects": [key], "model": key}),
-                ("POST", "/relations", {"objects": ["bed"], key: key}),
-                ("POST", "/relations", {"objects": [{"id": key, "label": "bed"}]}),
-                ("POST", "/missing", {"objects": [{"id": key, "label": "bed"}], **ROOM}),
-                ("POST", "/models/refresh", None),
-                ("PUT", f"/models/aliases/{key}", {"model": key}),
-                ("DELETE", f"/relations?{key}", None),
-            ):
-                response = client.request(method, path, json=body, headers=headers)
-                statuses.add(response.status_code)
+    for headers, key in product(sent, SECRETS):
+        for method, path, body in (
+            ("GET", "/health/live", None),
+            ("GET", f"/{key}", None),
+            ("GET", f"/models/{key}?key={key}", None),
+            ("POST", f"/relations?api_key={key}", {"objects": [key], "model": key}),
+            ("POST", "/relations", {"objects": ["bed"], key: key}),
+            ("POST", "/relations", {"objects": [{"id": key, "label": "bed"}]}),
+            ("POST", "/missing", {"objects": [{"id": key, "label": "bed"}], **ROOM}),
+            ("POST", "/models/refresh", None),
+            ("PUT", f"/models/aliases/{key}", {"model": key}),
+            ("DELETE", f"/relations?{key}", None),
+        ):
+            statuses.add(client.request(method, path, json=body, headers=headers).status_code)
     assert {200, 401, 404, 405, 422, 500} <= statuses
 
-    # What the server itself has a word about: handshakes, broken HTTP, clients that leave.
+    # The server itself logs handshakes, broken HTTP and clients that leave.
     handshake = (
         "GET /{key}?key={key} HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
         "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
@@ -81,24 +79,24 @@ def test_keys_and_payloads_are_not_in_the_log(defective: LiveService) -> None:
         "POST /relations HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
         "{header}{key}\r\nContent-Length: 99\r\n\r\n{key}"
     )
-    for text in (handshake, broken, left):
-        for header, key in (
-            ("X-API-Key: ", API_KEY),
-            ("X-Admin-Key: ", ADMIN_KEY),
-            ("X-API-Key: ", MISTAKEN),
-            ("Authorization: Bearer ", MISTAKEN),
-        ):
-            with socket.create_connection(("127.0.0.1", defective.port), timeout=10) as connection:
-                connection.sendall(text.format(key=key, header=header).encode())
-                if text is not broken:
-                    connection.shutdown(socket.SHUT_WR)
-                with suppress(ConnectionError):
-                    while connection.recv(65536):
-                        pass
+    fields = [
+        ("X-API-Key: ", API_KEY),
+        ("X-Admin-Key: ", ADMIN_KEY),
+        ("X-API-Key: ", MISTAKEN),
+        ("Authorization: Bearer ", MISTAKEN),
+    ]
+    for text, (header, key) in product((handshake, broken, left), fields):
+        with socket.create_connection(("127.0.0.1", defective.port), timeout=10) as connection:
+            connection.sendall(text.format(key=key, header=header).encode())
+            if text is not broken:
+                connection.shutdown(socket.SHUT_WR)
+            with suppress(ConnectionError):
+                while connection.recv(65536):
+                    pass
     assert client.get("/health/live").status_code == 200
 
     log = defective.stop()
-    # It did tell of the defect, and of requests: there was something to find a key in.
+    # The log has the defect and the requests.
     assert "ZeroDivisionError: no class for **********, **********" in log
     assert "GET /health/live 200" in log
     for secret in SECRETS:

@@ -7,8 +7,7 @@ import re
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import httpx
@@ -18,6 +17,7 @@ from tests.services import LiveService, begin, free_port, wait_until
 
 pytestmark = pytest.mark.system
 
+Start = Callable[..., subprocess.Popen[str]]
 IN_USE = "SCENE_PORT: another program uses 127.0.0.1:{}; set SCENE_PORT to a free port\n"
 
 
@@ -30,12 +30,23 @@ def wait_for(text: str, log: Path, process: subprocess.Popen[str]) -> None:
     assert process.poll() is None, log.read_text()
 
 
-@contextmanager
-def starting(store: Path, log: Path, **variables: str) -> Iterator[subprocess.Popen[str]]:
-    process = begin(store, log, **variables)
-    try:
-        yield process
-    finally:
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return tmp_path / "log"
+
+
+@pytest.fixture
+def starting(shared_store: Path, log: Path) -> Iterator[Start]:
+    """Return a function that starts the service, which the end of the test kills."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(**variables: object) -> subprocess.Popen[str]:
+        settings = {f"SCENE_{name}": str(value) for name, value in variables.items()}
+        started.append(begin(shared_store, log, **settings))
+        return started[-1]
+
+    yield start
+    for process in started:
         process.kill()
         process.wait(timeout=30)
 
@@ -50,72 +61,59 @@ def taken() -> Iterator[socket.socket]:
 
 
 def test_a_used_port_ends_the_start_before_models_are_loaded(
-    shared_store: Path, tmp_path: Path, taken: socket.socket
+    starting: Start, log: Path, taken: socket.socket
 ) -> None:
     taken.listen()
     port = taken.getsockname()[1]
-    with starting(shared_store, tmp_path / "log", SCENE_PORT=str(port)) as process:
-        assert process.wait(timeout=30) == 3
-    assert (tmp_path / "log").read_text() == IN_USE.format(port)
+    assert starting(PORT=port).wait(timeout=30) == 3
+    assert log.read_text() == IN_USE.format(port)
 
 
 def test_a_port_taken_during_the_start_ends_the_start(
-    shared_store: Path, tmp_path: Path, taken: socket.socket
+    starting: Start, log: Path, taken: socket.socket
 ) -> None:
     port = taken.getsockname()[1]
-    log = tmp_path / "log"
-    with starting(shared_store, log, SCENE_PORT=str(port)) as process:
-        wait_for("Waiting for application startup", log, process)
-        taken.listen()
-        assert process.wait(timeout=60) == 3
+    process = starting(PORT=port)
+    wait_for("Waiting for application startup", log, process)
+    taken.listen()
+    assert process.wait(timeout=60) == 3
     assert log.read_text().endswith(IN_USE.format(port))
     assert "Traceback" not in log.read_text()
 
 
 @pytest.mark.parametrize("host", ["203.0.113.1", "no-such-host.invalid"])
-def test_an_address_that_the_machine_does_not_have(
-    shared_store: Path, tmp_path: Path, host: str
-) -> None:
-    log = tmp_path / "log"
-    with starting(shared_store, log, SCENE_HOST=host, SCENE_PORT="0") as process:
-        assert process.wait(timeout=60) == 3
+def test_an_address_that_the_machine_does_not_have(starting: Start, log: Path, host: str) -> None:
+    assert starting(HOST=host, PORT=0).wait(timeout=60) == 3
     (line,) = log.read_text().splitlines()
     assert line.startswith(f"SCENE_HOST: the service cannot listen on {host}:0: ")
 
 
-def test_connections_are_refused_until_the_service_is_ready(
-    shared_store: Path, tmp_path: Path
-) -> None:
-    port = free_port()
-    log = tmp_path / "log"
-    with starting(shared_store, log, SCENE_PORT=str(port)) as process:
-        wait_for("Waiting for application startup", log, process)
-        with socket.socket() as other, pytest.raises(OSError, match="in use"):
-            other.bind(("127.0.0.1", port))
-        refused = 0
-        while True:
-            try:
-                socket.create_connection(("127.0.0.1", port), timeout=5).close()
-            except ConnectionRefusedError:
-                refused += 1
-                assert process.poll() is None
-                time.sleep(0.01)
-            else:
-                break
-        assert refused
-        assert httpx.get(f"http://127.0.0.1:{port}/health/ready").status_code == 200
+def test_connections_are_refused_until_the_service_is_ready(starting: Start, log: Path) -> None:
+    port, refused = free_port(), 0
+    process = starting(PORT=port)
+    wait_for("Waiting for application startup", log, process)
+    with socket.socket() as other, pytest.raises(OSError, match="in use"):
+        other.bind(("127.0.0.1", port))
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=5).close()
+            break
+        except ConnectionRefusedError:
+            refused += 1
+            assert process.poll() is None
+            time.sleep(0.01)
+    assert refused
+    assert httpx.get(f"http://127.0.0.1:{port}/health/ready").status_code == 200
 
 
-def test_the_log_names_the_page(live: LiveService, shared_store: Path, tmp_path: Path) -> None:
+def test_the_log_names_the_page(live: LiveService, starting: Start, log: Path) -> None:
     assert any(f"http://127.0.0.1:{live.port}/ (" in line for line in messages(live.log))
-    log = tmp_path / "log"
     # `live` has compiled every loop.
-    with starting(shared_store, log, SCENE_PORT="0", SCENE_HOST="0.0.0.0") as process:
-        wait_for("ready: ", log, process)
-        (line,) = [line for line in messages(log) if line.startswith("ready: ")]
-        found = re.fullmatch(r"ready: (http://127\.0\.0\.1:\d+/) \(\d+ models?, \d+\.\d s\)", line)
-        assert found is not None, line
-        assert "<html" in httpx.get(found[1]).text
+    wait_for("ready: ", log, starting(PORT=0, HOST="0.0.0.0"))
+    (line,) = [line for line in messages(log) if line.startswith("ready: ")]
+    page = re.fullmatch(r"ready: (http://127\.0\.0\.1:\d+/) \(\d+ models?, \d+\.\d s\)", line)
+    assert page is not None, line
+    assert "<html" in httpx.get(page[1]).text
     assert not any("compil" in line for line in messages(log))
     assert any("SCENE_API_KEY is not set" in line for line in messages(log))
     assert not any("SCENE_API_KEY is not set" in line for line in messages(live.log))

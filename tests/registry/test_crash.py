@@ -3,105 +3,114 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import shutil
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from app.registry import ModelSet, Store, load_model_set
-from tests.registry.publishers import KILLED
+from app.registry import ModelSet, Store, StoreError, load_model_set
 from tests.registry.small_artifacts import description, state
 
 pytestmark = pytest.mark.system
 
-
-class Publishers:
-    """The process of `publishers`, asked for children."""
-
-    def __init__(self, repository: Path) -> None:
-        command = [sys.executable, "-m", "tests.registry.publishers"]
-        pipe = subprocess.PIPE
-        self.process = subprocess.Popen(command, cwd=repository, stdin=pipe, stdout=pipe, text=True)
-
-    def _ask(self, **request: Any) -> Any:
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        print(json.dumps(request), file=self.process.stdin, flush=True)
-        return json.loads(self.process.stdout.readline())
-
-    def start(self, task: str, **arguments: Any) -> int:
-        return int(self._ask(task=task, **arguments))
-
-    def wait(self, child: int) -> dict[str, int | None]:
-        return dict(self._ask(wait=child))
-
-    def close(self) -> None:
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.close()
-        self.process.stdout.close()
-        self.process.wait(30)
+KILLED, WEIGHTS = 9, state()
+# A process forks the publishers, which then have their imports done. The process of the tests has
+# threads, so it must not fork.
+PUBLISHERS = multiprocessing.get_context("forkserver")
+PUBLISHERS.set_forkserver_preload([__name__])
 
 
-@pytest.fixture(scope="module")
-def publishers(repository: Path) -> Iterator[Publishers]:
-    running = Publishers(repository)
-    yield running
-    running.close()
+def publish_until(root: Path, steps: int) -> None:
+    """Publish one version, but die before the given step that touches the file system."""
+    left = steps
+    writing = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+    changing = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "fcntl.flock", "os.scandir"}
+    store, fsync = Store(root), os.fsync
+
+    def step() -> None:
+        nonlocal left
+        if left == 0:
+            os._exit(KILLED)
+        left -= 1
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        if event in changing or (event == "open" and arguments[2] & writing):
+            step()
+
+    def watched(descriptor: int) -> None:
+        step()
+        fsync(descriptor)
+
+    sys.addaudithook(hook)
+    os.fsync = watched
+    store.publish(description(version="2.0.0"), WEIGHTS, alias="default")
+    os._exit(0)
 
 
-@pytest.fixture
-def published(tmp_path: Path) -> Path:
-    """A store that holds tiny@1.0.0 as its default."""
-    root = tmp_path / "published"
-    Store(root).publish(description(), state(), alias="default")
-    return root
+def race(root: Path, results: Path, versions: int) -> None:
+    """Try to publish 1.0.0, 2.0.0 … beside others, and write down the successes."""
+    store, won = Store(root), []
+    for major in range(1, versions + 1):
+        try:
+            store.publish(description(version=f"{major}.0.0"), WEIGHTS, alias="default")
+        except StoreError as error:
+            if error.code != "version_exists":
+                raise
+        else:
+            won.append(major)
+    results.write_text(json.dumps(won))
+
+
+def start(target: Any, *arguments: Any) -> BaseProcess:
+    process = PUBLISHERS.Process(target=target, args=arguments)
+    process.start()
+    return process
+
+
+def exit_code(process: BaseProcess) -> int | None:
+    process.join(60)
+    return process.exitcode
 
 
 def leftovers(root: Path) -> list[Path]:
     return [*root.glob(".publishing-*"), *root.glob("*/.publishing-*")]
 
 
-def check_survivor(root: Path) -> ModelSet:
-    """Everything visible verifies, and the alias is at the latest version or the one before."""
-    models = load_model_set(Store(root))
+def check_survivor(root: Path) -> tuple[str, str, bool]:
+    """Check that all visible versions verify, and that the next publication works and clears up.
+
+    Returns:
+        The newest version, the version of the alias, and whether a temporary file was left over.
+    """
+    models, left = load_model_set(Store(root)), bool(leftovers(root))
     assert models.failure is None
     assert not models.failures
-    models.resolve("default")
-    default = models.resolve("default").manifest.version
-    assert default in models.versions["tiny"][-2:]
-    return models
-
-
-def check_next_publication(root: Path) -> None:
-    """The next publication works, and clears up."""
+    newest, default = models.versions["tiny"][-1], models.resolve("default").manifest.version
     store = Store(root, lock_timeout=5)
-    version = f"{int(store.versions('tiny')[-1].split('.')[0]) + 1}.0.0"
-    store.publish(description(version=version), state(), alias="default")
+    store.publish(description(version="3.0.0"), WEIGHTS, alias="default")
     assert not leftovers(root)
-    assert load_model_set(store).resolve("default").manifest.version == version
+    assert load_model_set(store).resolve("default").manifest.version == "3.0.0"
+    return newest, default, left
 
 
-def test_a_publisher_may_stop_before_any_step(
-    publishers: Publishers, published: Path, tmp_path: Path
-) -> None:
-    seen = set()
+def test_a_publisher_may_stop_before_any_step(tmp_path: Path) -> None:
+    published = tmp_path / "published"
+    Store(published).publish(description(), WEIGHTS, alias="default")
+    seen, ended = set(), None
     for steps in range(200):
         root = tmp_path / str(steps)
         shutil.copytree(published, root)
-        ended = publishers.wait(publishers.start("publish_until", root=str(root), steps=steps))
-        models = check_survivor(root)
-        latest = models.versions["tiny"][-1]
-        seen.add((latest, models.resolve("default").manifest.version, bool(leftovers(root))))
-        check_next_publication(root)
-        if ended != {"code": KILLED, "signal": None}:
+        ended = exit_code(start(publish_until, root, steps))
+        seen.add(check_survivor(root))
+        if ended != KILLED:
             break
-    assert ended == {"code": 0, "signal": None}, "the last run came to its end"
+    assert ended == 0, "the last run came to its end"
     assert steps > 15
     assert seen == {
         ("1.0.0", "1.0.0", False),  # before the first file
@@ -112,24 +121,20 @@ def test_a_publisher_may_stop_before_any_step(
     }
 
 
-def test_concurrent_publishers_and_readers(publishers: Publishers, tmp_path: Path) -> None:
+def test_concurrent_publishers_and_readers(tmp_path: Path) -> None:
     root, versions = tmp_path / "store", 12
     results = [tmp_path / f"{n}.json" for n in range(4)]
-    children = [
-        publishers.start("race", root=str(root), results=str(path), versions=versions)
-        for path in results
-    ]
-    models, highest = ModelSet({}, {}), 0
-    deadline = time.monotonic() + 60
-    while not all(path.exists() for path in results):
+    publishers = [start(race, root, path, versions) for path in results]
+    models, highest, deadline = ModelSet({}, {}), 0, time.monotonic() + 60
+    while any(process.is_alive() for process in publishers):
         assert time.monotonic() < deadline
         models = load_model_set(Store(root), models)
         assert not models.failures
         if "default" in models.aliases:
-            now = int(models.resolve("default").manifest.version.split(".")[0])
-            assert now >= highest
-            highest = now
-    assert [publishers.wait(child) for child in children] == [{"code": 0, "signal": None}] * 4
+            version = int(models.resolve("default").manifest.version.split(".")[0])
+            assert version >= highest
+            highest = version
+    assert [exit_code(process) for process in publishers] == [0] * 4
     won = sorted(major for path in results for major in json.loads(path.read_text()))
     assert won == list(range(1, versions + 1)), "each version was published once"
     assert not leftovers(root)

@@ -1,19 +1,25 @@
-"""The store: publishing, aliases, references, and what lies about in a directory."""
+"""The store: publishing, aliases, references, and other files in its folder."""
 
 from __future__ import annotations
 
 import os
 import threading
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from app.registry import AliasTarget, ArtifactError, Store, StoreError
+from app.registry import AliasTarget, ArtifactError, Store, StoreError, load_model_set
 from app.registry.__main__ import main
 from app.registry.durable import exclusive
+from app.registry.references import MAX_ALIASES_BYTES, aliases_to_bytes
 from app.settings import Settings
 from tests.registry.small_artifacts import description, refused, state
+
+NO_NAMES = ("", "../up", "a/b", ".hidden", "tiny@1.0.0", "Default")
 
 
 @pytest.fixture
@@ -55,8 +61,10 @@ def test_lists_names_and_versions_in_order(store: Store) -> None:
     for version in ("1.10.0", "1.9.0", "0.2.0"):
         publish(store, version)
     publish(store, name="another")
-    assert store.names() == ("another", "tiny")
-    assert store.versions("tiny") == ("0.2.0", "1.9.0", "1.10.0")
+    assert [*store.published().items()] == [
+        ("another", ("1.0.0",)),
+        ("tiny", ("0.2.0", "1.9.0", "1.10.0")),
+    ]
     assert store.resolve("tiny") == ("tiny", "1.10.0")
     assert store.resolve("tiny@0.2.0") == ("tiny", "0.2.0")
     assert store.versions("nothing") == ()
@@ -116,9 +124,9 @@ def test_waits_for_another_writer_but_not_for_ever(tmp_path: Path) -> None:
         thread.start()
         thread.join(0.1)
         assert thread.is_alive()
-        assert store.names() == (), "readers do not wait"
+        assert store.published() == {}, "readers do not wait"
     thread.join(30)
-    assert store.names() == ("tiny",)
+    assert store.published() == {"tiny": ("1.0.0",)}
 
 
 def test_everything_is_on_disk_before_it_is_pointed_at(
@@ -165,14 +173,10 @@ def test_an_alias_follows_the_latest_or_stays(store: Store) -> None:
     assert store.resolve("stable") == ("tiny", "1.0.0")
     store.remove_alias("stable")
     assert dict(store.aliases()) == {"default": AliasTarget(name="tiny")}
-    with refused("unknown_model"):
-        store.resolve("stable")
-    with refused("unknown_model"):
-        store.remove_alias("stable")
-
-
-def test_publishing_moves_the_alias_to_that_very_version(store: Store) -> None:
-    store.publish(description(version="2.0.0"), state(), alias="default")
+    for use in (store.resolve, store.remove_alias):
+        with refused("unknown_model"):
+            use("stable")
+    # A publication moves the alias to its version, which need not be the newest.
     store.publish(description(version="1.5.0"), state(), alias="default")
     assert store.resolve("default") == ("tiny", "1.5.0")
 
@@ -195,25 +199,47 @@ def test_an_alias_moves_only_from_where_it_was_expected(store: Store) -> None:
 
 def test_an_alias_needs_a_target_and_a_name_of_its_own(store: Store) -> None:
     publish(store)
-    with refused("unknown_model"):
-        store.set_alias("default", AliasTarget(name="nothing"))
-    with refused("unknown_version"):
-        store.set_alias("default", AliasTarget(name="tiny", version="9.0.0"))
-    with refused("name_conflict"):
-        store.set_alias("tiny", AliasTarget(name="tiny"))
-    with refused("name_conflict"):
-        store.publish(description(name="new"), state(), alias="new")
-    with refused("name_conflict"):
-        store.publish(description(version="2.0.0"), state(), alias="tiny")
-    store.set_alias("default", AliasTarget(name="tiny"))
-    with refused("name_conflict"):
-        publish(store, name="default")
-    for alias in ("", "../up", "a/b", ".hidden", "tiny@1.0.0", "Default"):
-        with refused("invalid_reference"):
-            store.set_alias(alias, AliasTarget(name="tiny"))
-        with refused("invalid_reference"):
-            store.publish(description(version="2.0.0"), state(), alias=alias)
-    assert (store.names(), store.versions("tiny")) == (("tiny",), ("1.0.0",))
+    store.set_alias("taken", AliasTarget(name="tiny"))
+    for code, alias, target in (
+        ("unknown_model", "default", "nothing"),
+        ("unknown_version", "default", "tiny@9.0.0"),
+        ("name_conflict", "tiny", "tiny"),
+        *(("invalid_reference", alias, "tiny") for alias in NO_NAMES),
+    ):
+        with refused(code):
+            store.set_alias(alias, AliasTarget.of(target))
+    for code, name, alias in (
+        ("name_conflict", "new", "new"),
+        ("name_conflict", "other", "tiny"),
+        ("name_conflict", "taken", None),
+        *(("invalid_reference", "tiny", alias) for alias in NO_NAMES),
+    ):
+        with refused(code):
+            store.publish(description(name, "2.0.0"), state(), alias=alias)
+    assert store.published() == {"tiny": ("1.0.0",)}
+
+
+def test_the_writer_of_aliases_applies_the_limits_of_the_reader(store: Store) -> None:
+    publish(store)
+    target = AliasTarget(name="tiny")
+    names = [f"a{number:063}" for number in range(3000)]
+    one, two = (len(aliases_to_bytes(dict.fromkeys(names[:n], target))) for n in (1, 2))
+    number = 1 + (MAX_ALIASES_BYTES - one) // (two - one)
+    with refused("not_writable"):
+        aliases_to_bytes(dict.fromkeys(names[: number + 1], target))
+    table = dict.fromkeys(names[:number], target)
+    text = aliases_to_bytes(table)
+    (store.root / "aliases.json").write_bytes(text)
+    assert store.aliases() == table, "the largest table that can be written can be read"
+    with refused("not_writable"):
+        store.set_alias("b" * 64, target)
+    with refused("not_writable"):
+        store.publish(description(version="2.0.0"), state(), alias="b" * 64)
+    assert (store.root / "aliases.json").read_bytes() == text
+    assert store.versions("tiny") == ("1.0.0",)
+    store.remove_alias(table.popitem()[0])
+    store.set_alias("b" * 64, target)
+    assert store.aliases() == table | {"b" * 64: target}
 
 
 @pytest.mark.parametrize(
@@ -233,11 +259,10 @@ def test_an_alias_needs_a_target_and_a_name_of_its_own(store: Store) -> None:
 def test_an_invalid_alias_table_is_refused_and_kept(text: str, store: Store) -> None:
     publish(store)
     (store.root / "aliases.json").write_text(text)
-    target = AliasTarget(name="tiny")
     for use in (
         store.aliases,
         lambda: store.resolve("default"),
-        lambda: store.set_alias("default", target),
+        lambda: store.set_alias("default", AliasTarget(name="tiny")),
         lambda: store.remove_alias("default"),
         lambda: store.publish(description(version="2.0.0"), state(), alias="default"),
     ):
@@ -247,7 +272,7 @@ def test_an_invalid_alias_table_is_refused_and_kept(text: str, store: Store) -> 
     assert store.versions("tiny") == ("1.0.0",)
 
 
-# -- what lies about ----------------------------------------------------------------------------
+# -- other files --------------------------------------------------------------------------------
 
 
 def test_readers_see_no_leftovers_and_the_next_writer_clears_them(store: Store) -> None:
@@ -259,10 +284,16 @@ def test_readers_see_no_leftovers_and_the_next_writer_clears_them(store: Store) 
     only.mkdir(parents=True)
     table = store.root / ".publishing-dead"
     table.write_bytes(b"{")
-    assert (store.names(), store.versions("tiny")) == (("tiny",), ("1.0.0",))
+    # Other files are left alone.
+    (store.root / "README.md").write_text("about")
+    (store.root / "plain").write_text("a file")
+    (store.root / "lost+found").mkdir()
+    (store.root / "tiny" / "notes").mkdir()
+    assert store.published() == {"tiny": ("1.0.0",)}
     publish(store, "2.0.0")
     assert not any(leftover.exists() for leftover in (half, only, table))
-    assert store.versions("tiny") == ("1.0.0", "2.0.0")
+    assert store.published() == {"tiny": ("1.0.0", "2.0.0")}
+    assert (store.root / "README.md").read_text() == "about"
 
 
 def test_clearing_does_not_follow_links(store: Store, tmp_path: Path) -> None:
@@ -276,28 +307,43 @@ def test_clearing_does_not_follow_links(store: Store, tmp_path: Path) -> None:
     assert not os.path.lexists(store.root / "tiny" / ".publishing-link")
 
 
+def test_a_refresh_is_linear_in_the_number_of_junk_versions(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish(store)
+    for number in range(800):
+        junk = store.root / "tiny" / f"9.0.{number}"
+        junk.mkdir()
+        (junk / "manifest.json").write_bytes(b"{}")
+    calls = Counter[str]()
+
+    def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            calls[name] += 1
+            return function(*arguments, **options)
+
+        return call
+
+    for name in ("stat", "lstat", "open", "listdir", "scandir"):
+        monkeypatch.setattr(os, name, counted(name, getattr(os, name)))
+    store.state()
+    models = load_model_set(store)
+    assert len(models.failures) == 800
+    assert models.resolve("tiny").manifest.version == "1.0.0"
+    assert calls.total() < 20 * 800
+
+
 def test_a_model_outside_the_root_is_no_model(store: Store, tmp_path: Path) -> None:
     publish(store)
     outside = Store(tmp_path / "outside")
     publish(outside, name="foreign")
     (store.root / "foreign").symlink_to(outside.root / "foreign")
-    assert store.names() == ("tiny",)
+    assert store.published() == {"tiny": ("1.0.0",)}
     with refused("unknown_model"):
         store.resolve("foreign")
     with refused("unsafe_path"):
         publish(store, "2.0.0", name="foreign")
     assert outside.versions("foreign") == ("1.0.0",)
-
-
-def test_other_files_in_the_store_are_ignored(store: Store) -> None:
-    publish(store)
-    (store.root / "README.md").write_text("about")
-    (store.root / "plain").write_text("a file")
-    (store.root / "lost+found").mkdir()
-    (store.root / "tiny" / "notes").mkdir()
-    publish(store, "2.0.0")
-    assert (store.names(), store.versions("tiny")) == (("tiny",), ("1.0.0", "2.0.0"))
-    assert (store.root / "README.md").read_text() == "about"
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../tiny", "tiny/1.0.0", "/etc", "tiny\0"])
@@ -313,9 +359,9 @@ def test_no_name_leads_out_of_the_root(name: str, store: Store) -> None:
 
 def test_a_missing_store_is_an_error_and_an_empty_one_is_not(store: Store) -> None:
     with refused("unreadable"):
-        store.names()
+        store.published()
     store.root.mkdir()
-    assert (store.names(), dict(store.aliases())) == ((), {})
+    assert store.published() == store.aliases() == {}
 
 
 # -- the command --------------------------------------------------------------------------------

@@ -1,21 +1,36 @@
-"""Counts and offsets in an artifact: they come back as written, and invalid tensors are refused."""
+"""Counts, offsets and places in an artifact: they are stored, checked, and looked up."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from app.registry import Artifact, ArtifactError, Counts, Offsets, load_artifact, write_artifact
+from app.registry import (
+    Artifact,
+    ArtifactError,
+    Counts,
+    Offsets,
+    Places,
+    load_artifact,
+    write_artifact,
+)
+from app.registry.fields import TensorGroup
+from app.scene.roles import role_counts
 from tests.registry.small_artifacts import description, refused, state
 
 A, V, C, M = 5, 3, 2, 4  # A, V and C as in `small_artifacts`
+LEFT, FRONT, ON_TOP = 0, 1, 2
 BESIDE, ON_IT = (0, 1, 0.5, 0.5, 0.5, 0.25), (0, 0, 0.75, 0.5, 0.25, 0.125)
+HELD = {(LEFT, 0, 1): 4.0, (ON_TOP, 1, 0): 9.0, (ON_TOP, 1, 2): 2.0, (ON_TOP, 2, 0): 1.0}
+FREQUENCY = (0.5, 0.3, 0.1)
+CLASSES = np.arange(V)
 
 
-def counts(**changes: np.ndarray) -> Counts:
-    """Of the classes bed and lamp."""
+def counts(**changes: Any) -> Counts:
+    """Counts of the classes bed and lamp."""
     weights = np.full((2, 2, 3 + C + V), 0.25, np.float32)
     weights[0, :, 3 + C] = weights[1, :, 4 + C] = 0
     values = {
@@ -27,8 +42,8 @@ def counts(**changes: np.ndarray) -> Counts:
     return Counts(**(values | changes))
 
 
-def offsets(**changes: np.ndarray) -> Offsets:
-    """Of two relations; a lamp (1) on a bed (0) was seen in 12 scenes, a lamp beside it in one."""
+def offsets(**changes: Any) -> Offsets:
+    """Offsets of a lamp (1) on a bed (0) in 12 scenes, and of a lamp beside it in one."""
     relation = np.zeros((A, 6), np.float32)
     relation[0], relation[2] = (0, 0.75, 0, 0.25, 0.25, 0.25), (0, 0, 0.5, 0.25, 0.25, 0.0625)
     subject, other = np.zeros((A, V, 6), np.float32), np.zeros((A, V, 6), np.float32)
@@ -46,135 +61,256 @@ def offsets(**changes: np.ndarray) -> Offsets:
     return Offsets(**(values | changes))
 
 
-def written(directory: Path, table: Counts | Offsets) -> Artifact:
-    tensors = state() | table.tensors()
+def places(**changes: Any) -> Places:
+    """Places of a lamp (1) on a bed (0) in nine scenes, and of three other triples."""
+    values = {
+        "triple": np.array([(a * V + i) * V + j for a, i, j in HELD], np.int32),
+        "held": np.array([*HELD.values()], np.float32),
+        "frequency": np.array(FREQUENCY, np.float32),
+        "role_pair": np.array([1 * V + 0, 2 * V + 0], np.int32),
+        "role_counts": np.array([(7, 1, 0), (0, 3, 0)], np.float32),
+        "role_anchor": np.array([(7, 4, 0), (0, 0, 0), (0, 0, 0)], np.float32),
+        "stands": np.array([(1, 0, 0), (0.25, 0.25, 0.5), (0.5, 0.5, 0)], np.float32),
+    }
+    return Places(**(values | changes))
+
+
+GROUPS: dict[Any, Any] = {counts: (V, C), offsets: (A, V), places: (A, V)}
+"""The sizes that each group needs to be read."""
+
+
+def written(directory: Path, group: TensorGroup) -> Artifact:
+    tensors = state() | group.tensors()
     write_artifact(directory, description(), tensors, storage_dtype="float16")
     return load_artifact(directory)
 
 
-@pytest.mark.parametrize(
-    ("table", "line"),
-    [
-        (counts(), "| Counts | of instances, for 2 classes |"),
-        (offsets(), "| Offsets | in metres, of 2 pairs of classes |"),
-    ],
-)
-def test_they_come_back_with_the_artifact(
-    tmp_path: Path, table: Counts | Offsets, line: str
-) -> None:
-    artifact = written(tmp_path / "a", table)
-    tables = {Counts: artifact.counts, Offsets: artifact.offsets}
-    loaded = tables.pop(type(table))
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_group_comes_back_with_the_artifact(tmp_path: Path, group: Any) -> None:
+    artifact = written(tmp_path / "a", group())
+    groups = {"counts": artifact.counts, "offsets": artifact.offsets, "places": artifact.places}
+    loaded = groups.pop(group.__name__)
     assert loaded is not None
-    assert [*tables.values()] == [None]
-    for name, tensor in table.tensors().items():
+    assert [*groups.values()] == [None, None]
+    for name, tensor in group().tensors().items():
         assert np.array_equal(loaded.tensors()[name], tensor)
     assert artifact.manifest.weights.keys() == state().keys()
-    assert line in artifact.card
+    lines = {
+        counts: "| Counts | of instances, for 2 classes |",
+        offsets: "| Offsets | in metres, of 2 pairs of classes |",
+    }
+    assert lines.get(group, "") in artifact.card
 
 
-INVALID_COUNTS = [
-    ({"weights": np.zeros((2, 2, 2 + C + V), "f4")}, "wrong_shape"),
-    ({"log_share": np.float32(-1)}, "wrong_shape"),
-    ({"classes": np.int64(0)}, "wrong_shape"),
-    ({"classes": np.array([0.0, 1.0], "f4")}, "invalid_tensor"),
-    ({"classes": np.array([1, 0])}, "invalid_tensor"),
+def full(value: float, *shape: int) -> Any:
+    return np.full(shape, value, "f4")
+
+
+def with_zero(array: Any) -> Any:
+    """A copy whose first variance or standard deviation is 0."""
+    array = array.copy()
+    array[0, 3] = 0
+    return array
+
+
+EMPTY = np.zeros(0, "i4")
+NO_CLASS = {"classes": EMPTY, "most": EMPTY, "log_share": full(-1, 0, M)}
+INVALID: list[tuple[Any, str, list[dict[str, Any]]]] = [
     (
-        {
-            "classes": np.zeros(0, np.int64),
-            "most": np.zeros(0, np.int64),
-            "log_share": np.zeros((0, M), "f4"),
-            "weights": np.zeros((0, 2, 3 + C + V), "f4"),
-        },
-        "invalid_tensor",
+        counts,
+        "wrong_shape",
+        [
+            {"weights": full(0, 2, 2, 2 + C + V)},
+            {"log_share": np.float32(-1)},
+            {"classes": np.int64(0)},
+        ],
     ),
-    ({"classes": np.array([0, 0])}, "invalid_tensor"),
-    ({"classes": np.array([-1, 1])}, "invalid_tensor"),
-    ({"classes": np.array([0, V])}, "invalid_tensor"),
-    ({"classes": np.array([0, -(2**63)])}, "invalid_tensor"),
-    ({"most": np.array([1.0, 2.0], "f4")}, "invalid_tensor"),
-    ({"most": np.array([0, 1])}, "invalid_tensor"),
-    ({"most": np.array([1, M])}, "invalid_tensor"),
-    ({"log_share": np.full((2, M), -1, "i4")}, "invalid_tensor"),
-    ({"weights": np.zeros((2, 2, 3 + C + V), "i4")}, "invalid_tensor"),
-    ({"log_share": np.full((2, 1), -1, "f4")}, "invalid_tensor"),
-    ({"log_share": np.full((2, 300), -1, "f4")}, "invalid_tensor"),
-    ({"log_share": np.full((2, M), 0.5, "f4")}, "invalid_tensor"),
-    ({"log_share": np.full((2, M), -1e4, "f4")}, "invalid_tensor"),
-    ({"weights": np.full((2, 2, 3 + C + V), 6e4, "f4")}, "invalid_tensor"),
-    ({"weights": np.full((2, 2, 3 + C + V), 0.5, "f4")}, "invalid_tensor"),
-    ({"weights": np.full((2, 2, 3 + C + V), np.nan, "f4")}, "not_finite"),
-]
-INVALID_OFFSETS = [
-    ({"relation": np.zeros((A, 5), "f4")}, "wrong_shape"),
-    ({"pair": np.int64(3)}, "wrong_shape"),
-    ({"pair": np.array([20, 3], np.int64)}, "invalid_tensor"),
-    ({"pair": np.array([3, 3], np.int64)}, "invalid_tensor"),
-    ({"pair": np.array([-1, 3], np.int64)}, "invalid_tensor"),
-    ({"pair": np.array([3, -(2**63)], np.int64)}, "invalid_tensor"),
-    ({"pair": np.array([3, A * V * V], np.int64)}, "invalid_tensor"),
-    ({"pair": np.array([3.0, 21.0], "f4")}, "invalid_tensor"),
-    ({"pair_scenes": np.array([0, 12], np.int32)}, "invalid_tensor"),
-    ({"relation_scenes": np.array([-1, 0, 0, 0, 0], np.int32)}, "invalid_tensor"),
-    ({"pair_offset": np.zeros((2, 6), "f4")}, "invalid_tensor"),
-    ({"relation": np.zeros((A, 6), "f4")}, "invalid_tensor"),
-    ({"subject": np.full((A, V, 6), -1, "f4")}, "invalid_tensor"),
-    ({"relation": np.full((A, 6), np.nan, "f4")}, "not_finite"),
+    (
+        counts,
+        "invalid_tensor",
+        [
+            *({"classes": np.array(c)} for c in ([1, 0], [0, 0], [-1, 1], [0, V], [0, -(2**63)])),
+            NO_CLASS | {"weights": full(0, 0, 2, 3 + C + V)},
+            {"classes": np.array([0, 1], "f4")},
+            {"most": np.array([1, 2], "f4")},
+            {"most": np.array([0, 1])},
+            {"most": np.array([1, M])},
+            {"log_share": np.full((2, M), -1, "i4")},
+            *({"log_share": full(-1, 2, columns)} for columns in (1, 300)),
+            *({"log_share": full(value, 2, M)} for value in (0.5, -1e4)),
+            {"weights": np.zeros((2, 2, 3 + C + V), "i4")},
+            {"weights": counts().weights * 1e5},
+            {"weights": full(0.5, 2, 2, 3 + C + V)},  # of a class on itself
+        ],
+    ),
+    (counts, "not_finite", [{"weights": full(np.nan, 2, 2, 3 + C + V)}]),
+    (offsets, "wrong_shape", [{"relation": full(0, A, 5)}, {"pair": np.int64(3)}]),
+    (
+        offsets,
+        "invalid_tensor",
+        [
+            *({"pair": np.array([3, key])} for key in (2, 3, -(2**63), A * V * V)),
+            {"pair": np.array([-1, 3])},
+            {"pair": np.array([3, 21], "f4")},
+            {"pair_scenes": np.array([0, 12], "i4")},
+            {"relation_scenes": np.array([-1, 0, 0, 0, 0], "i4")},
+            {"pair_offset": with_zero(offsets().pair_offset)},
+            {
+                "relation": with_zero(offsets().relation),
+                "relation_scenes": np.array([1, 0, 9, 0, 0]),
+            },
+            {"relation": full(0, A, 6)},
+            {"subject": full(-1, A, V, 6)},
+        ],
+    ),
+    (offsets, "not_finite", [{"relation": full(np.nan, A, 6)}]),
+    (
+        places,
+        "wrong_shape",
+        [
+            {"held": full(0, 3)},
+            {"frequency": full(1, 2)},
+            {"role_counts": full(0, 2, 2)},
+            {"role_anchor": full(0, 2, 3)},
+            {"stands": full(0, V, 2)},
+            {"triple": np.int32(3)},
+        ],
+    ),
+    (
+        places,
+        "invalid_tensor",
+        [
+            *({"triple": np.array([1, *keys, 4], "i4")} for keys in ((3, 2), (2, 2))),
+            {"triple": np.array([-1, 2, 3, 4], "i4")},
+            {"triple": np.array([1, 2, 3, A * V * V], "i4")},
+            {"triple": np.array([1, 2, 3, 4], "f4")},
+            {"triple": EMPTY, "held": full(0, 0)},
+            *({"role_pair": np.array([2, key], "i4")} for key in (V * V, 1)),
+            {"role_pair": np.array([1, 2], "f4")},
+            {"held": np.array([4, -1, 1, 2], "f4")},
+            {"frequency": np.array([0.5, 0, 0.1], "f4")},
+            {"role_counts": np.array([(7, 1, 0), (0, -3, 0)], "f4")},
+            *({name: full(-1, V, 3)} for name in ("role_anchor", "stands")),
+        ],
+    ),
+    (places, "not_finite", [{"stands": full(np.nan, V, 3)}]),
 ]
 
 
 @pytest.mark.parametrize(
-    ("table", "change", "code"),
-    [
-        *((counts, change, code) for change, code in INVALID_COUNTS),
-        *((offsets, change, code) for change, code in INVALID_OFFSETS),
-    ],
+    ("group", "code", "change"), [(group, code, c) for group, code, cs in INVALID for c in cs]
 )
-def test_invalid_tensors_are_refused(tmp_path: Path, table, change: dict, code: str) -> None:
-    with refused(code):
-        written(tmp_path / "a", table(**change))
-
-
-@pytest.mark.parametrize(("table", "sizes"), [(counts(), (V, C)), (offsets(), (A, V))])
-def test_a_tensor_too_few_or_too_many_is_refused(
-    table: Counts | Offsets, sizes: tuple[int, int]
+def test_invalid_tensors_are_refused(
+    tmp_path: Path, group: Any, code: str, change: dict[str, Any]
 ) -> None:
-    tensors = table.tensors()
-    more = next(iter(tensors)).partition(".")[0] + ".more"
-    with pytest.raises(ArtifactError) as raised:
-        table.from_tensors({**tensors, more: np.zeros(2)}, *sizes)
-    assert more in raised.value.reason
+    with refused(code):
+        written(tmp_path / "a", group(**change))
+
+
+@pytest.mark.parametrize(("group", "sizes"), GROUPS.items())
+def test_missing_and_unexpected_tensors_are_refused(group: Any, sizes: tuple[int, int]) -> None:
+    tensors, read = group().tensors(), type(group()).from_tensors
+    more = f"{group.__name__}.more"
+    with pytest.raises(ArtifactError, match=more):
+        read({**tensors, more: np.zeros(2)}, *sizes)
     for name in tensors:
         with pytest.raises(ArtifactError):
-            table.from_tensors({n: t for n, t in tensors.items() if n != name}, *sizes)
+            read({n: t for n, t in tensors.items() if n != name}, *sizes)
 
 
-# -- what offsets say ----------------------------------------------------------------------------
+def test_counts_at_their_limits_are_accepted() -> None:
+    share, weights = np.array([(0, -64)] * 2, "f4"), counts().weights * 256
+    at_limits = counts(most=np.array([1, 1]), log_share=share, weights=weights)
+    assert Counts.from_tensors(at_limits.tensors(), V, C).weights.max() == 64
 
 
-def offset_of(relation: int, subject: int, other: int) -> tuple[list[float], int]:
-    values, scenes = offsets().find(np.array([relation]), np.array([subject]), np.array([other]))
-    return values[0].tolist(), int(scenes[0])
+# -- offsets -------------------------------------------------------------------------------------
 
 
-def test_a_pair_that_was_seen_has_its_own_offset() -> None:
-    assert offset_of(2, 1, 0) == (list(ON_IT), 12)
-    assert offset_of(0, 1, 0) == (list(BESIDE), 1)
-
-
-def test_a_pair_never_seen_has_what_relation_and_classes_say_together() -> None:
-    assert offset_of(2, 2, 2) == ([0, 0, 0.5, 0.5, 0.5, 0.25], 0)
-    assert offset_of(2, 1, 2)[0] == pytest.approx([0, 0, 0.75, 0.5, 0.5, np.sqrt(0.03125)])
-    assert offset_of(2, 2, 0) == ([0, 0, 0.625, 0.25, 0.5, 0.25], 0)
-
-
-def test_a_relation_that_no_scene_showed_means_nothing() -> None:
-    assert offset_of(1, 1, 0)[1] == offset_of(3, 0, 2)[1] == -1
+@pytest.mark.parametrize(
+    ("triple", "offset", "scenes"),
+    [
+        ((2, 1, 0), ON_IT, 12),
+        ((0, 1, 0), BESIDE, 1),
+        # A pair without scenes has the sum of the terms of the relation and of both classes.
+        ((2, 2, 2), (0, 0, 0.5, 0.5, 0.5, 0.25), 0),
+        ((2, 1, 2), (0, 0, 0.75, 0.5, 0.5, np.sqrt(0.03125)), 0),
+        ((2, 2, 0), (0, 0, 0.625, 0.25, 0.5, 0.25), 0),
+        # Without scenes of the relation, the offset has no meaning.
+        ((1, 1, 0), None, -1),
+        ((3, 0, 2), None, -1),
+    ],
+)
+def test_offsets_are_those_of_the_pair_or_of_the_relation(
+    triple: tuple[int, int, int], offset: tuple[float, ...] | None, scenes: int
+) -> None:
+    values, numbers = offsets().find(*(np.array([index]) for index in triple))
+    assert numbers.tolist() == [scenes]
+    assert offset is None or values[0].tolist() == pytest.approx(offset)
 
 
 def test_without_a_pair_there_is_still_the_relation() -> None:
-    nothing = np.zeros(0, np.int64)
-    bare = offsets(pair=nothing, pair_offset=np.zeros((0, 6), "f4"), pair_scenes=nothing)
-    values, scenes = bare.find(np.array([2]), np.array([2]), np.array([2]))
+    bare = offsets(pair=EMPTY, pair_offset=full(0, 0, 6), pair_scenes=EMPTY)
+    values, scenes = bare.find(*[np.array([2])] * 3)
     assert (values[0].tolist(), scenes.tolist()) == ([0, 0, 0.5, 0.5, 0.5, 0.25], [0])
     assert Offsets.from_tensors(bare.tensors(), A, V).pair.shape == (0,)
+
+
+# -- places --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("relation", range(A))
+@pytest.mark.parametrize("anchor", range(V))
+@pytest.mark.parametrize("outgoing", [True, False])
+def test_the_ratio_of_a_place_is_that_of_smoothed_counts(
+    relation: int, anchor: int, outgoing: bool
+) -> None:
+    """Also for a relation without scenes: the place then changes nothing."""
+
+    def held(a: int, i: int, j: int) -> float:
+        return HELD.get((a, i, j) if outgoing else (a, j, i), 0.0)
+
+    ratio = places().log_ratio(relation, anchor, outgoing=outgoing)
+    of_relation = sum(held(relation, i, j) for i in range(V) for j in range(V))
+    at_anchor = sum(held(relation, i, anchor) for i in range(V))
+    for i in range(V):
+        of_class = sum(held(relation, i, j) for j in range(V))
+        back_off = (of_class + 3 * FREQUENCY[i] / sum(FREQUENCY)) / (of_relation + 3)
+        p = (held(relation, i, anchor) + 10 * back_off) / (at_anchor + 10)
+        assert ratio[i] == pytest.approx(np.log(p / FREQUENCY[i]), abs=1e-5)
+
+
+def test_two_scenes_show_a_relation() -> None:
+    for a in range(A):
+        expected = [[HELD.get((a, i, j), 0) >= 2 for j in range(V)] for i in range(V)]
+        assert places().shows(a, CLASSES, CLASSES).tolist() == expected
+
+
+def test_supporters_are_smoothed_counts_of_on_top_and_inside() -> None:
+    """A lamp (1) is on a bed (0) and on class 2, and class 2 is in a bed."""
+    table = places(
+        triple=np.array([(2 * V + 1) * V, (2 * V + 1) * V + 2, (4 * V + 2) * V], np.int32),
+        held=np.array([9, 2, 1], np.float32),
+    )
+    prior = np.array([10.5, 0.5, 2.5]) / 13.5
+    held = np.array([(0, 0, 0), (9, 0, 2), (1, 0, 0)])
+    expected = (held + 10 * prior) / (held.sum(1, keepdims=True) + 10)
+    assert table.supporters(CLASSES, CLASSES) == pytest.approx(expected)
+    assert table.supporters(np.array([1]), np.array([2])) == pytest.approx(expected[1:2, 2:])
+
+
+def test_the_roles_tell_under_from_on() -> None:
+    """Class 2 is under class 0 in three scenes; class 1 is on it in seven and under it in one."""
+    table = places()
+    assert role_counts(table.roles, 1, 0).tolist() == [7, 1, 0]
+    assert role_counts(table.roles, 0, 1).tolist() == [0, 0, 0]
+    assert table.under_evidence(0, 2) == pytest.approx(np.log(9 / 0.5))
+    assert table.under_evidence(0, 1) == pytest.approx(np.log(1 / 7.5))
+    assert table.under_evidence(1, 0) == -np.inf
+    assert table.means_under(0, 2)
+    assert not table.means_under(0, 1)  # one scene may be an error
+    assert not table.means_under(2, 0)
+    # Two scenes suffice, unless as many show the upper class on the lower.
+    two, pairs = np.array([(2, 0, 0), (7, 1, 0), (0, 2, 0)], "f4"), np.array([2, 3, 6], "i4")
+    assert places(role_counts=two[1:], role_pair=pairs[1:]).means_under(0, 2)
+    assert not places(role_counts=two, role_pair=pairs).means_under(0, 2)
