@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import httpx
 import numpy as np
 
 from benchmarks.load.connections import prepared
@@ -86,3 +87,10 @@ def _body(kind: str, labels: Sequence[str], rng: np.random.Generator) -> dict[st
             ],
         }
     raise ValueError(f"kind {kind!r} must be one of {KINDS}")
+
+
+def labels_of(port: int) -> list[str]:
+    """Return the labels of the default model of a service."""
+    url = f"http://127.0.0.1:{port}/models/default/vocabulary"
+    entries = httpx.get(url).raise_for_status().json()["objects"]
+    return [entry["label"] for entry in entries if not entry["structure"]]

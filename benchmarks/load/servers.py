@@ -14,8 +14,8 @@ from pathlib import Path
 
 import httpx
 
-_PATIENCE = 60.0
-_ROOT = Path(__file__).resolve().parents[2]
+_PATIENCE = 180.0
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class ServerError(RuntimeError):
@@ -53,17 +53,20 @@ def cores() -> tuple[set[int], set[int]]:
 
 
 @contextmanager
-def service(store: Path, **settings: str) -> Iterator[Server]:
+def service(store: Path, *, root: Path = ROOT, **settings: str) -> Iterator[Server]:
     """Run the service (``python -m app``).
 
     Args:
         store: folder of the model store.
+        root: folder of the sources.
         settings: further settings of the service. `name` sets the variable SCENE_NAME.
     """
     port = free_port()
     variables = {"SCENE_STORE": str(store.resolve()), "SCENE_PORT": str(port)}
     variables |= {f"SCENE_{name.upper()}": value for name, value in settings.items()}
-    with _running(["-m", "app"], port, variables) as server:
+    if root != ROOT:
+        variables["PYTHONPATH"] = os.pathsep.join((str(root), str(root / "clients" / "python")))
+    with _running(["-m", "app"], port, variables, root) as server:
         yield server
 
 
@@ -71,7 +74,7 @@ def service(store: Path, **settings: str) -> Iterator[Server]:
 def plain() -> Iterator[Server]:
     """Run the plain app (``python -m benchmarks.load.plain``)."""
     port = free_port()
-    with _running(["-m", "benchmarks.load.plain", str(port)], port, {}) as server:
+    with _running(["-m", "benchmarks.load.plain", str(port)], port, {}, ROOT) as server:
         yield server
 
 
@@ -84,13 +87,15 @@ def free_port() -> int:
 
 
 @contextmanager
-def _running(arguments: list[str], port: int, variables: dict[str, str]) -> Iterator[Server]:
+def _running(
+    arguments: list[str], port: int, variables: dict[str, str], root: Path
+) -> Iterator[Server]:
     # SCENE_* settings of this machine must not affect the benchmark.
     environment = {name: value for name, value in os.environ.items() if name[:6] != "SCENE_"}
     start = time.perf_counter()
     process = subprocess.Popen(
         [sys.executable, *arguments],
-        cwd=_ROOT,
+        cwd=root,
         env=environment | variables,
         stderr=subprocess.DEVNULL,
     )
