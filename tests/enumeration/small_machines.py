@@ -142,7 +142,7 @@ def enumerate_joint(machine: BoltzmannMachine, *rooms: int | None, source: int =
     """
     spec = machine.spec
     edges = machine.edges(torch.arange(spec.V).unsqueeze(0))
-    visible, E = binary(spec.V), edges.shape[-1]
+    visible, E = binary(spec.V), edges.valid.shape[1]
     t = torch.tensor([-1 if room is None else room for room in rooms or (-1,)])
     blocks = [visible, binary(E), unit_states(spec), binary(spec.H2)]
     index = torch.cartesian_prod(*(torch.arange(len(block)) for block in [*blocks, t]))
