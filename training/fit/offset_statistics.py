@@ -55,9 +55,8 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
         return None
     A = len(CANONICAL)
     relation, scenes_of = np.zeros((A, 6)), np.zeros(A, dtype=np.int32)
-    subject, other = np.zeros((A, V, 6)), np.zeros((A, V, 6))
-    pair = [np.zeros(0, dtype=np.int64)]
-    moments, counts = [np.zeros((0, 6))], [np.zeros(0, dtype=np.int32)]
+    subject, other = np.zeros((2, A, V, 6))
+    pair, moments, counts = [], [], []
     for a in range(A):
         offsets = observed.rows(observed.relation == a)
         if not len(offsets.offset):
@@ -76,7 +75,7 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     )
 
 
-class Pairs(NamedTuple):
+class _Pairs(NamedTuple):
     """Pairs of classes in one relation, with the moments of their offsets.
 
     Attributes:
@@ -95,24 +94,23 @@ class Pairs(NamedTuple):
     scatter: Floats
 
 
-def _pool_pairs(observed: ObservedOffsets) -> Pairs:
+def _pool_pairs(observed: ObservedOffsets) -> _Pairs:
     """Compute the moments of each pair of classes. Its offsets in a scene share the weight 1."""
-    classes = np.stack([observed.subject, observed.other], axis=1)
-    distinct, pair = np.unique(classes, axis=0, return_inverse=True)
-    pair = pair.reshape(-1)
+    classes = np.stack([observed.subject, observed.other])
+    distinct, pair = np.unique(classes, axis=1, return_inverse=True)
     # Group the offsets by scene and pair of classes.
-    key = np.stack([pair, observed.scene])
     _, first, group, size = np.unique(
-        key, axis=1, return_index=True, return_inverse=True, return_counts=True
-    )
-    weight = source_weights(observed.source, observed.scene) / size[group.reshape(-1)]
-    P, weights = len(distinct), weight[:, None]
+        np.stack([pair, observed.scene]),
+        axis=1, return_index=True, return_inverse=True, return_counts=True,
+    )  # fmt: skip
+    weight = source_weights(observed.source, observed.scene) / size[group]
+    P, weights = distinct.shape[1], weight[:, None]
     n = _sums(pair, weights, P)
     mean = _sums(pair, weights * observed.offset, P) / n
     squares = np.square(observed.offset - mean[pair]) + _RESOLUTION**2
     scenes = np.bincount(pair[first], minlength=P)
-    subject, other = distinct.T
-    return Pairs(subject, other, scenes, n, mean, _sums(pair, weights * squares, P))
+    subject, other = distinct
+    return _Pairs(subject, other, scenes, n, mean, _sums(pair, weights * squares, P))
 
 
 def _sums(group: Ints, values: Floats, groups: int) -> Floats:
@@ -151,11 +149,11 @@ class _Fit:
     doubt_u: Floats
     doubt_v: Floats
 
-    def expected(self, pairs: Pairs) -> Floats:
+    def expected(self, pairs: _Pairs) -> Floats:
         """Return the prior mean of the offset of each pair, (pairs, 3)."""
         return self.mu + self.u[pairs.subject] + self.v[pairs.other]
 
-    def predict(self, pairs: Pairs) -> tuple[Floats, Floats]:
+    def predict(self, pairs: _Pairs) -> tuple[Floats, Floats]:
         """Return mean and variance of a new offset of each pair, both (pairs, 3)."""
         kappa = self.kappa / (1 + self.doubt_u[pairs.subject] + self.doubt_v[pairs.other])
         prior = self.expected(pairs), kappa, self.alpha, self.beta
@@ -211,7 +209,7 @@ def _updated(prior: Prior, n: Floats, mean: Floats, scatter: Floats) -> tuple[An
     return after, alpha + n / 2, rate
 
 
-def _fit(pairs: Pairs, V: int) -> _Fit:
+def _fit(pairs: _Pairs, V: int) -> _Fit:
     """Fit the parameters of one relation, by alternation between the prior and class effects."""
     no_effect = np.zeros((V, 3))
     start = (pairs.n * pairs.mean).sum(axis=0) / pairs.n.sum()
@@ -225,7 +223,7 @@ def _fit(pairs: Pairs, V: int) -> _Fit:
     return fit
 
 
-def _fit_prior(pairs: Pairs, axis: int, expected: Floats) -> Floats:
+def _fit_prior(pairs: _Pairs, axis: int, expected: Floats) -> Floats:
     """Return kappa, alpha and beta of one axis, fitted by maximum likelihood."""
 
     def loss(logs: Floats) -> float:
@@ -236,7 +234,7 @@ def _fit_prior(pairs: Pairs, axis: int, expected: Floats) -> Floats:
     return np.exp(minimize(loss, np.log([1.0, 2.0, 0.1]), bounds=bounds).x)
 
 
-def _fit_effects(fit: _Fit, pairs: Pairs, V: int) -> None:
+def _fit_effects(fit: _Fit, pairs: _Pairs, V: int) -> None:
     """Fit mu and the effects u and v, shrunk towards 0, by alternation, in place."""
     # Precision of the mean offset of each pair as a measurement of u and v, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)

@@ -43,8 +43,7 @@ from torch.nn.utils.parametrize import cached
 
 from training.datasets.batches import Batch, SceneTensors, relation_units, subset
 from training.fit.configuration import RelationsConfig
-from training.fit.parts import means_of_parts
-from training.fit.residuals import lower_unseen_roles, with_counted_residuals
+from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
 from training.fit.sharing import bake_shared_weights
 from training.machines import BoltzmannMachine
 from training.machines.machine import OBJECT_WEIGHTS
@@ -55,11 +54,14 @@ _WITHOUT_PRIOR = frozenset({*OBJECT_WEIGHTS, "gamma", "B", "usual", "d"})
 _MAP_PRIOR = 0.1
 # Random change of the log of the number of classes by which scenes are sorted into batches.
 _MIXING = 0.5
-SHARED_ROWS, SHARED_COLUMNS = ("S", "O"), ("s", "o")
+# Weights that classes share; see `training.fit.sharing`.
+SHARED = ("S", "O", "s", "o")
 
 
 class RelationLikelihood(nn.Module):
     """The negative conditional log-likelihood of annotated relations, plus priors.
+
+    All scenes of `train` have annotated relations.
 
     Attributes:
         offsets: corrections of the logits for each data source, (sources, relations).
@@ -67,8 +69,7 @@ class RelationLikelihood(nn.Module):
 
     def __init__(self, config: RelationsConfig, machine: BoltzmannMachine, train: SceneTensors):
         super().__init__()
-        self.config, self.machine = config, machine
-        self.scenes = sum(bool(scene.evidence.observed.any()) for scene in train.scenes)
+        self.config, self.machine, self.scenes = config, machine, len(train)
         self.offsets = nn.Parameter(torch.zeros(len(train.source_names), machine.spec.A))
         weights = [config.source_weights.get(name, 1.0) for name in train.source_names]
         self.source_weights = torch.tensor(weights)
@@ -88,7 +89,9 @@ class RelationLikelihood(nn.Module):
 
     def _loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         machine = self.machine
-        batch = withhold_counts(batch, self.config.count_dropout, generator)
+        if self.config.count_dropout:
+            hidden = torch.rand(len(batch), 1, generator=generator) < self.config.count_dropout
+            batch = replace(batch, counts=batch.counts.masked_fill(hidden, 0))
         edges, r, observed = relation_units(machine, batch)
         h1 = means_of_parts(machine, batch, generator)
         offsets = self.offsets[batch.source]
@@ -96,12 +99,12 @@ class RelationLikelihood(nn.Module):
         logits = machine.relation_logits(edges, batch.v, h1)
         logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
         weight = observed * machine.gate(edges, batch.v) * weight
-        nll = bernoulli_nll(logits, r, weight).sum()
+        nll = _nll(logits, r, weight)
         if machine.spec.G:
             share = torch.rand(len(r), 1, generator=generator)
             condition = r * observed * (torch.rand(r.shape, generator=generator) < share)
             shifted = logits + machine.implied(edges, condition, h1)
-            nll = nll + bernoulli_nll(shifted, r, weight * (1 - condition)).sum()
+            nll = nll + _nll(shifted, r, weight * (1 - condition))
         return nll / len(batch) + self._prior() / max(self.scenes, 1)
 
     def _prior(self) -> Tensor:
@@ -116,23 +119,9 @@ class RelationLikelihood(nn.Module):
         return total
 
 
-def bernoulli_nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
-    """Return the weighted loss -weight log p(r) of each relation unit, shaped like `logits`."""
-    return (softplus(logits) - r * logits) * weight
-
-
-def withhold_counts(batch: Batch, share: float, generator: torch.Generator) -> Batch:
-    """Return the batch with unknown instance counts (0) in a random share of its scenes."""
-    if not share:
-        return batch
-    withheld = torch.rand(len(batch), 1, generator=generator) < share
-    return replace(batch, counts=batch.counts.masked_fill(withheld, 0))
-
-
-def with_annotations(scenes: SceneTensors) -> SceneTensors:
-    """Return the scenes with an annotated relation."""
-    annotated = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
-    return subset(scenes, torch.tensor(annotated, dtype=torch.int64))
+def _nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
+    """Return the sum of -weight log p(r) over all relation units."""
+    return ((softplus(logits) - r * logits) * weight).sum()
 
 
 class RelationFit:
@@ -140,35 +129,29 @@ class RelationFit:
 
     Attributes:
         epochs: number of finished epochs.
-        done: finished share of the fit, from 0 to 1.
     """
 
     def __init__(
         self, machine: BoltzmannMachine, train: SceneTensors, config: RelationsConfig, seed: int
     ) -> None:
         self.config, self.machine = config, machine
-        self.train = with_annotations(train)
+        annotated = [k for k, scene in enumerate(train.scenes) if scene.evidence.observed.any()]
+        self.train = subset(train, torch.tensor(annotated, dtype=torch.int64))
         sizes = [len(scene.evidence.classes) for scene in self.train.scenes]
         self._log_sizes = torch.tensor(sizes, dtype=torch.float32).clamp(min=1).log()
-        self.epochs = 0
+        self.epochs = self._updates = 0
         self._generator = torch.Generator().manual_seed(seed)
-        self.likelihood = RelationLikelihood(config, machine, train)
+        self.likelihood = RelationLikelihood(config, machine, self.train)
         self._weights = self.likelihood.weights()
         self._average = {name: w.detach().clone() for name, w in self._weights.items()}
-        self._updates = 0
         self._optimiser = torch.optim.Adam(
-            self._weights.values(), lr=self.config.learning_rate, fused=True
+            self._weights.values(), lr=config.learning_rate, fused=True
         )
 
     @property
     def finished(self) -> bool:
         """True after the last epoch, and if no scene has an annotated relation."""
         return self.epochs >= self.config.epochs or not len(self.train)
-
-    @property
-    def done(self) -> float:
-        """Finished share of the fit, from 0 to 1."""
-        return self.epochs / self.config.epochs
 
     def epoch(self, progress: Callable[[float, float], None]) -> float:
         """Run one epoch, and return its mean loss.
@@ -249,12 +232,11 @@ class RelationFit:
         """
         self._set(self._average)
         machine = self.machine
-        bake_shared_weights(machine, (*SHARED_ROWS, *SHARED_COLUMNS))
+        bake_shared_weights(machine, SHARED)
         if machine.has_residuals and len(self.train) and machine.residual.requires_grad:
-            likelihood = self.likelihood
-            offsets = likelihood.offsets.detach()
+            offsets, weights = self.likelihood.offsets.detach(), self.likelihood.source_weights
             lower_unseen_roles(machine, self.train, parents)
-            return with_counted_residuals(machine, self.train, offsets, likelihood.source_weights)
+            return with_counted_residuals(machine, self.train, offsets, weights)
         return machine
 
     def state(self) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from app.scene.relations import ABOVE, INSIDE, LATERAL, LEFT, ON_TOP, STACKED
 from tests.questions.artifacts import artifact_of, random_machine
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, A, rooms
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
+from tests.training.fit.test_objects import fit_objects
 from training.datasets.batches import TrainingData
 from training.datasets.cases import RIDGE, logistic
 from training.datasets.roles import count_roles
@@ -47,13 +48,7 @@ from training.fit.calibrate_objects import (
 )
 from training.fit.configuration import ObjectsConfig
 from training.fit.draft import draft_artifact
-from training.fit.objects import (
-    ObjectFit,
-    ObjectScenes,
-    fit_objects,
-    served_popularity,
-    start_objects,
-)
+from training.fit.objects import ObjectFit, ObjectScenes, served_popularity, start_objects
 from training.fit.place_statistics import fit_places
 from training.machines import MachineSpec, build
 
@@ -250,7 +245,7 @@ def scores_of(log_odds, intruder, popularity=None):
     )
 
 
-CLEAN = {3: scores_of(np.tile([0.1, 0.2, 0.3], (50, 1)), False)}
+CLEAN = scores_of(np.tile([0.1, 0.2, 0.3], (50, 1)), False)
 LAST = np.array([False, False, True])
 
 
@@ -261,15 +256,15 @@ def intruders(log_odds, popularity):
 
 def test_alpha_is_the_smallest_that_detects_most():
     """A popular intruder has the lowest score from .3 / 1 < alpha on."""
-    assert choose_alpha(CLEAN, {"popularity": intruders(0.3, 1.0)}) == 0.375
-    assert choose_alpha(CLEAN, {"uniform": intruders(-1.0, 0.0)}) == 0.0
+    assert choose_alpha([CLEAN], [intruders(0.3, 1.0)]) == 0.375
+    assert choose_alpha([CLEAN], [intruders(-1.0, 0.0)]) == 0.0
 
 
 def test_alpha_weighs_all_kinds_of_intruders_alike():
     """A large alpha hides rare intruders, and a small one popular intruders."""
     rare, popular = intruders(-0.2, -1.0), intruders(0.1, 1.0)
-    assert choose_alpha(CLEAN, {"uniform": rare, "popularity": popular, "more": popular}) == 0.125
-    assert choose_alpha(CLEAN, {"uniform": rare, "more": rare, "popularity": popular}) in (0, 0.125)
+    assert choose_alpha([CLEAN], [rare, popular, popular]) == 0.125
+    assert choose_alpha([CLEAN], [rare, rare, popular]) in (0, 0.125)
 
 
 @pytest.mark.parametrize("share", ALARMS.values())
@@ -296,7 +291,7 @@ def test_alarm_lines_keep_their_share_at_each_length(share):
 
 
 def test_one_length_has_a_line_without_slope():
-    line = fit_line(CLEAN, CountSlope(slope=-1.0), 0.0, 0.1)
+    line = fit_line({3: CLEAN}, CountSlope(slope=-1.0), 0.0, 0.1)
     assert (line.intercept, line.log_count) == (pytest.approx(-0.1), 0.0)
 
 

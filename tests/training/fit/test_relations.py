@@ -16,9 +16,8 @@ from tests.enumeration.small_machines import random_weights
 from tests.training.evaluation.scenes import V, scene, tensors, toy
 from training.datasets.batches import relation_units
 from training.fit.configuration import RelationsConfig
-from training.fit.parts import means_of_parts
-from training.fit.relations import SHARED_COLUMNS, SHARED_ROWS, RelationFit, RelationLikelihood
-from training.fit.residuals import lower_unseen_roles, with_counted_residuals
+from training.fit.relations import SHARED, RelationFit, RelationLikelihood
+from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
 from training.fit.sharing import bake_shared_weights, share_weights
 from training.machines import MachineSpec, build
 from training.machines.machine import OBJECT_WEIGHTS
@@ -235,7 +234,7 @@ def test_shared_weights_are_the_sum_of_their_parts(seed, dimensions):
     words = torch.randn(V, dimensions, generator=generator)
     parents = torch.randint(-1, V, (V,), generator=generator)
     own = {name: machine.get_parameter(name).clone() for name in ("W", "S", "s")}
-    share_weights(machine, words, parents, ["W", "S", "absent"], ["s"])
+    share_weights(machine, words, parents, ["W", "S", "absent", "s"])
     assert set(machine.state_dict()) != keys
     for name, deviation in own.items():
         sharing = machine.parametrizations[name][0]
@@ -271,7 +270,7 @@ def test_a_class_that_was_never_seen_behaves_like_its_neighbour(words, parents):
     differences = []
     for kind in ((NO_WORDS, NO_PARENTS), (words, parents)):
         machine = machine_of("triway")
-        share_weights(machine, *kind, SHARED_ROWS, SHARED_COLUMNS)
+        share_weights(machine, *kind, SHARED)
         final, _ = trained(machine, seen, weight_prior=1.0)
         differences.append(logit_of(final, 0, 3, 4) - logit_of(final, 0, 4, 3))
     without, informed = differences
