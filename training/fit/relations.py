@@ -58,77 +58,12 @@ _MIXING = 0.5
 SHARED = ("S", "O", "s", "o")
 
 
-class RelationLikelihood(nn.Module):
-    """The negative conditional log-likelihood of annotated relations, plus priors.
-
-    All scenes of `train` have annotated relations.
-
-    Attributes:
-        offsets: corrections of the logits for each data source, (sources, relations).
-    """
-
-    def __init__(self, config: RelationsConfig, machine: BoltzmannMachine, train: SceneTensors):
-        super().__init__()
-        self.config, self.machine, self.scenes = config, machine, len(train)
-        self.offsets = nn.Parameter(torch.zeros(len(train.source_names), machine.spec.A))
-        weights = [config.source_weights.get(name, 1.0) for name in train.source_names]
-        self.source_weights = torch.tensor(weights)
-
-    def weights(self) -> dict[str, nn.Parameter]:
-        """Return the trained parameters by name: those of relations, and the offsets."""
-        named = self.machine.named_parameters()
-        return {name: p for name, p in named if p.requires_grad} | {"offsets": self.offsets}
-
-    def forward(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the negative log-likelihood plus the negative log prior, divided by scenes.
-
-        The likelihood is divided by the scenes of the batch, and the prior by all training scenes.
-        """
-        with cached():
-            return self._loss(batch, generator)
-
-    def _loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        machine = self.machine
-        if self.config.count_dropout:
-            hidden = torch.rand(len(batch), 1, generator=generator) < self.config.count_dropout
-            batch = replace(batch, counts=batch.counts.masked_fill(hidden, 0))
-        edges, r, observed = relation_units(machine, batch)
-        h1 = means_of_parts(machine, batch, generator)
-        offsets = self.offsets[batch.source]
-        weight = self.source_weights[batch.source].unsqueeze(1)
-        logits = machine.relation_logits(edges, batch.v, h1)
-        logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
-        weight = observed * machine.gate(edges, batch.v) * weight
-        nll = _nll(logits, r, weight)
-        if machine.spec.G:
-            share = torch.rand(len(r), 1, generator=generator)
-            condition = r * observed * (torch.rand(r.shape, generator=generator) < share)
-            shifted = logits + machine.implied(edges, condition, h1)
-            nll = nll + _nll(shifted, r, weight * (1 - condition))
-        return nll / len(batch) + self._prior() / max(self.scenes, 1)
-
-    def _prior(self) -> Tensor:
-        """Return the negative log prior of weights and offsets, up to a constant."""
-        total = 0.5 * self.config.offset_prior * (self.offsets**2).sum()
-        half = 0.5 * self.config.weight_prior
-        for name, parameter in self.machine.named_parameters():
-            if name in _WITHOUT_PRIOR or not parameter.requires_grad:
-                continue
-            share = _MAP_PRIOR if name.endswith(".map") or name in ("R", "n") else 1.0
-            total = total + share * half * (parameter**2).sum()
-        return total
-
-
-def _nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
-    """Return the sum of -weight log p(r) over all relation units."""
-    return ((softplus(logits) - r * logits) * weight).sum()
-
-
 class RelationFit:
     """The fit of the relation weights of a machine: epochs over the scenes with annotations.
 
     Attributes:
         epochs: number of finished epochs.
+        offsets: corrections of the logits for each data source, (sources, relations).
     """
 
     def __init__(
@@ -141,12 +76,52 @@ class RelationFit:
         self._log_sizes = torch.tensor(sizes, dtype=torch.float32).clamp(min=1).log()
         self.epochs = self._updates = 0
         self._generator = torch.Generator().manual_seed(seed)
-        self.likelihood = RelationLikelihood(config, machine, self.train)
-        self._weights = self.likelihood.weights()
+        self.offsets = nn.Parameter(torch.zeros(len(train.source_names), machine.spec.A))
+        self._source_weights = torch.tensor(
+            [config.source_weights.get(name, 1.0) for name in train.source_names]
+        )
+        named = machine.named_parameters()
+        self._weights = {name: weight for name, weight in named if weight.requires_grad}
+        self._weights["offsets"] = self.offsets
         self._average = {name: w.detach().clone() for name, w in self._weights.items()}
         self._optimiser = torch.optim.Adam(
             self._weights.values(), lr=config.learning_rate, fused=True
         )
+
+    def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
+        """Return the negative log-likelihood plus the negative log prior, divided by scenes.
+
+        The likelihood is divided by the scenes of the batch, and the prior by all training scenes.
+        """
+        machine = self.machine
+        if self.config.count_dropout:
+            hidden = torch.rand(len(batch), 1, generator=generator) < self.config.count_dropout
+            batch = replace(batch, counts=batch.counts.masked_fill(hidden, 0))
+        edges, r, observed = relation_units(machine, batch)
+        h1 = means_of_parts(machine, batch, generator)
+        offsets = self.offsets[batch.source]
+        logits = machine.relation_logits(edges, batch.v, h1)
+        logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
+        weight = self._source_weights[batch.source].unsqueeze(1)
+        weight = observed * machine.gate(edges, batch.v) * weight
+        nll = _nll(logits, r, weight)
+        if machine.spec.G:
+            share = torch.rand(len(r), 1, generator=generator)
+            condition = r * observed * (torch.rand(r.shape, generator=generator) < share)
+            shifted = logits + machine.implied(edges, condition, h1)
+            nll = nll + _nll(shifted, r, weight * (1 - condition))
+        return nll / len(batch) + self._prior() / max(len(self.train), 1)
+
+    def _prior(self) -> Tensor:
+        """Return the negative log prior of weights and offsets, up to a constant."""
+        total = 0.5 * self.config.offset_prior * (self.offsets**2).sum()
+        half = 0.5 * self.config.weight_prior
+        for name, parameter in self.machine.named_parameters():
+            if name in _WITHOUT_PRIOR or not parameter.requires_grad:
+                continue
+            share = _MAP_PRIOR if name.endswith(".map") or name in ("R", "n") else 1.0
+            total = total + share * half * (parameter**2).sum()
+        return total
 
     @property
     def finished(self) -> bool:
@@ -188,7 +163,8 @@ class RelationFit:
         return [batches[k] for k in turn]
 
     def _update(self, index: Tensor, total: int) -> float:
-        loss = self.likelihood(self.train.batch(index), self._generator)
+        with cached():
+            loss = self.loss(self.train.batch(index), self._generator)
         for group in self._optimiser.param_groups:
             group["lr"] = self.config.learning_rate * self._schedule(total)
         self._optimiser.zero_grad()
@@ -234,9 +210,9 @@ class RelationFit:
         machine = self.machine
         bake_shared_weights(machine, SHARED)
         if machine.has_residuals and len(self.train) and machine.residual.requires_grad:
-            offsets, weights = self.likelihood.offsets.detach(), self.likelihood.source_weights
             lower_unseen_roles(machine, self.train, parents)
-            return with_counted_residuals(machine, self.train, offsets, weights)
+            offsets = self.offsets.detach()
+            return with_counted_residuals(machine, self.train, offsets, self._source_weights)
         return machine
 
     def state(self) -> dict[str, Any]:
@@ -244,7 +220,7 @@ class RelationFit:
         return {
             "epochs": self.epochs,
             "updates": self._updates,
-            "offsets": self.likelihood.offsets.detach(),
+            "offsets": self.offsets.detach(),
             "average": self._average,
             "optimiser": self._optimiser.state_dict(),
             "generator": self._generator.get_state(),
@@ -254,7 +230,12 @@ class RelationFit:
         """Continue from the state of a checkpoint."""
         self.epochs, self._updates = state["epochs"], state["updates"]
         with torch.no_grad():
-            self.likelihood.offsets.copy_(state["offsets"])
+            self.offsets.copy_(state["offsets"])
         self._average = state["average"]
         self._optimiser.load_state_dict(state["optimiser"])
         self._generator.set_state(state["generator"])
+
+
+def _nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
+    """Return the sum of -weight log p(r) over all relation units."""
+    return ((softplus(logits) - r * logits) * weight).sum()

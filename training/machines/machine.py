@@ -158,9 +158,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
         The room type t of a scene is its entry of `room`, (scenes,) int64. -1 means unknown.
         """
-        if room is None or not self.spec.C:
-            return self.c1.unsqueeze(0)
-        return self.c1 + self.Q[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
+        return self.c1 + _rows(self.Q, room)
 
     def second_layer_logits(self, h1: Tensor) -> Tensor:
         """Return the logits c2 + h1'J of p(h2 = 1 | h1), (..., scenes, units of h2)."""
@@ -200,8 +198,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """
         if source is None or not self.spec.profiles:
             return (self.b + self.u[-1]).unsqueeze(0)
-        change = self.a[source.clamp(min=0)] * (source >= 0).unsqueeze(-1)
-        return self.b + change + self.u[source]
+        return self.b + _rows(self.a, source) + self.u[source]
 
     def source_weights(self, v: Tensor, source: Tensor | None) -> Tensor:
         """Return p(q | v, source) of each data source q, (scenes, sources).
@@ -240,9 +237,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     def room_bias(self, room: Tensor | None) -> Tensor:
         """Return the couplings Y[t] of the room type t to the classes, (scenes or 1, classes)."""
-        if room is None or not self.spec.C or not self.spec.coupled:
-            return torch.zeros(1, self.spec.V)
-        return self.Y[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
+        return _rows(self.Y, room) if self.spec.coupled else torch.zeros(1, self.spec.V)
 
     def room_rate(self, room: Tensor | None, source: Tensor | None) -> Tensor:
         """Return the bias e_t + y_qt of the room type of each scene, (scenes or 1,)."""
@@ -392,3 +387,10 @@ class BoltzmannMachine(nn.Module, ABC):
 def sums(v: Tensor, weights: Tensor) -> Tensor:
     """Return v @ weights for presence v, (scenes, classes). Most classes of a scene are absent."""
     return torch.sparse.mm(v.to_sparse(), weights)
+
+
+def _rows(table: Tensor, index: Tensor | None) -> Tensor:
+    """Return the rows of a table at the indices, (scenes or 1, columns); 0 for -1 and None."""
+    if index is None or not len(table):
+        return table.new_zeros(1, table.shape[1])
+    return table[index.clamp(min=0)] * (index >= 0).unsqueeze(-1)

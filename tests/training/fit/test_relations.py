@@ -16,7 +16,7 @@ from tests.enumeration.small_machines import random_weights
 from tests.training.evaluation.scenes import V, scene, tensors, toy
 from training.datasets.batches import relation_units
 from training.fit.configuration import RelationsConfig
-from training.fit.relations import SHARED, RelationFit, RelationLikelihood
+from training.fit.relations import SHARED, RelationFit
 from training.fit.residuals import lower_unseen_roles, means_of_parts, with_counted_residuals
 from training.fit.sharing import bake_shared_weights, share_weights
 from training.machines import MachineSpec, build
@@ -93,8 +93,8 @@ def logit_of(machine, a, i, j):
 
 
 def loss_of(machine, batch, scenes, config=CONFIG):
-    likelihood = RelationLikelihood(config, machine, scenes)
-    return likelihood(batch, torch.Generator().manual_seed(3)).item()
+    fit = RelationFit(machine, scenes, config, seed=0)
+    return fit.loss(batch, torch.Generator().manual_seed(3)).item()
 
 
 # -- offsets and observed units ----------------------------------------------------------------
@@ -108,7 +108,7 @@ def test_offsets_absorb_how_often_a_source_lists_a_relation(machine):
         name: machine.get_parameter(name).clone() for name in OBJECT_WEIGHTS if name not in "LY"
     }
     final, fit = trained(machine, scenes_of({"captions": 0.8, "rooms": 0.2}))
-    offset = fit.likelihood.offsets.detach()
+    offset = fit.offsets.detach()
     assert float(offset[0, 0] - offset[1, 0]) == pytest.approx(2 * math.log(4), abs=0.3)
     assert abs(logit_of(final, 0, 1, 2)) < 1.0
     assert set(final.state_dict()) == keys
@@ -118,13 +118,13 @@ def test_offsets_absorb_how_often_a_source_lists_a_relation(machine):
 def test_the_prior_holds_offsets_small():
     scenes = scenes_of({"captions": 0.8, "rooms": 0.2})
     _, fit = trained(machine_of("triway"), scenes, offset_prior=1e4)
-    assert float(fit.likelihood.offsets.detach().abs().max()) < 0.1
+    assert float(fit.offsets.detach().abs().max()) < 0.1
 
 
 def test_a_source_without_weight_teaches_nothing():
     scenes = scenes_of({"captions": 1.0, "rooms": 0.2})
     final, fit = trained(machine_of("triway"), scenes, source_weights={"captions": 0.0})
-    offsets = fit.likelihood.offsets.detach()
+    offsets = fit.offsets.detach()
     assert float(offsets[0].abs().max()) < 1e-3
     p = 1 / (1 + math.exp(-logit_of(final, 0, 1, 2) - float(offsets[1, 0])))
     assert p == pytest.approx(0.2, abs=0.07)
