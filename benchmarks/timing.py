@@ -56,10 +56,7 @@ class Timings:
 
 
 def interleave(
-    contenders: Mapping[str, Callable[[], object]],
-    *,
-    rounds: int,
-    slice_seconds: float = 0.02,
+    contenders: Mapping[str, Callable[[], object]], *, rounds: int, slice_seconds: float = 0.02
 ) -> Timings:
     """Time every implementation in every round, on one thread and without garbage collection.
 

@@ -54,11 +54,7 @@ def training_step(
         sources=("random",),
     )
     config = ObjectsConfig(
-        batch_size=scenes,
-        generative_weight=0,
-        weight_prior=0,
-        coupling_prior=0,
-        rate_prior=0,
+        batch_size=scenes, generative_weight=0, weight_prior=0, coupling_prior=0, rate_prior=0
     )
     spec = MachineSpec(
         "triway", V=V, A=1, units=units, states=states, K=1, profiles=1, coupled=True

@@ -170,4 +170,3 @@ def test_certain_states_have_the_logits_of_the_machine():
     expected = machine.relation_logits(machine.edges(torch.arange(V)[None]), torch.ones(1, V), h1)
     np.testing.assert_allclose(mean.ravel(), expected[0], rtol=1e-4, atol=1e-4)
     assert not spread.any()
-

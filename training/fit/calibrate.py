@@ -171,10 +171,7 @@ def fit_with_observed(
 
 
 def _posterior(
-    artifact: Artifact,
-    encoded: EncodedScene,
-    kept: Sequence[int],
-    observed: Sequence[Triple] = (),
+    artifact: Artifact, encoded: EncodedScene, kept: Sequence[int], observed: Sequence[Triple] = ()
 ) -> Posterior:
     """Return the posterior given some instances of a scene, without its room type."""
     return Posterior(artifact, replace(scene_of(encoded, kept, observed), room_type=None))

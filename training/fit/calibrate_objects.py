@@ -126,10 +126,7 @@ def served_scenes(scenes: SceneTensors, served: Mapping[str, float]) -> SceneTen
 
 
 def fit_missing(
-    artifact: Artifact,
-    scenes: SceneTensors,
-    structure: Tensor,
-    chosen: Calibration | None = None,
+    artifact: Artifact, scenes: SceneTensors, structure: Tensor, chosen: Calibration | None = None
 ) -> dict[str, Any]:
     """Fit the entries `coverage` and `missing` of the calibration."""
     parts = [draw_parts(scenes, structure, exactly(n)) for n in LENGTHS]
@@ -237,11 +234,7 @@ def fit_outliers(
     alpha = chosen.popularity_weight if chosen else choose_alpha(untouched.values(), altered)
     entry = _fit_intruders(untouched.values(), altered, alpha)
     lines = {name: fit_line(untouched, entry, alpha, share) for name, share in ALARMS.items()}
-    return {
-        "popularity_weight": alpha,
-        "outlier": entry,
-        "outlier_lines": AlarmLines(**lines),
-    }
+    return {"popularity_weight": alpha, "outlier": entry, "outlier_lines": AlarmLines(**lines)}
 
 
 def judged_classes(artifact: Artifact) -> Flags:
