@@ -54,8 +54,8 @@ def exact(law: tuple[float, ...], listed: int) -> float:
 
 
 def test_the_scene_moves_the_expected_number():
-    """2,000 scenes. With four other seeds, the largest error is 0.08."""
-    counts = fit_counts(furnished(2000, 0), WORDS)
+    """1,000 scenes. With three other seeds, the largest error is 0.13."""
+    counts = fit_counts(furnished(1000, 1), WORDS)
     assert counts.classes.tolist() == [CHAIR]
     for anchor, law in ((DESK, FEW), (TABLE, MANY)):
         for listed in (1, 2):

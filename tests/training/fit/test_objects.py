@@ -373,7 +373,7 @@ def test_the_generative_share_brings_samples_near_the_scenes(name):
     assert divergence(2.0) < 0.6 * divergence(0.0)
 
 
-def test_only_object_weights_are_trained_and_divergence_is_an_error():
+def test_only_object_weights_are_trained():
     machine = machine_of("coupled", scale=0.3)
     before = {name: w.detach().clone() for name, w in machine.named_parameters()}
     fit = ObjectFit(machine, scenes_of(ALL), CONFIG, seed=0)
@@ -381,11 +381,6 @@ def test_only_object_weights_are_trained_and_divergence_is_an_error():
     for name, weight in machine.named_parameters():
         is_changed = not torch.equal(weight, before[name])
         assert is_changed == (name in objects.OBJECT_WEIGHTS and weight.numel() > 0), name
-    fit = ObjectFit(
-        machine, scenes_of(ALL), CONFIG.model_copy(update={"learning_rate": 1e30}), seed=0
-    )
-    with pytest.raises(FloatingPointError, match=r"objects\.learning_rate"):
-        fit_objects(fit)
 
 
 # -- the served mix ----------------------------------------------------------------------------
