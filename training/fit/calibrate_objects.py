@@ -21,7 +21,7 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -134,22 +134,22 @@ def fit_missing(
     if not len(v):
         return {}
     coverages = COVERAGES if chosen is None else (chosen.coverage,)
-    log_odds = {c: unlisted_log_odds(artifact, v, c) for c in coverages}
+    log_odds = unlisted_log_odds(artifact, v, coverages)
     masks = ((v == 0) & ~structure).numpy(), hidden.numpy()
-    coverage = max(coverages, key=lambda c: _mean_rank(log_odds[c], *masks))
-    features, truth = _first_classes(log_odds[coverage], *masks, v.sum(1).numpy())
+    best = int(np.argmax([_mean_rank(z, *masks) for z in log_odds]))
+    features, truth = _first_classes(log_odds[best], *masks, v.sum(1).numpy())
     entry = CountSlope()
     if len(np.unique(truth)) == 2:
         slope, count, intercept = logistic(features, truth, C=RIDGE)
         entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
-    return {"coverage": coverage, "missing": entry}
+    return {"coverage": coverages[best], "missing": entry}
 
 
-def unlisted_log_odds(artifact: Artifact, v: Tensor, coverage: float) -> Floats:
-    """Return the log-odds of every class for lists v, (lists, classes)."""
-    every = np.arange(artifact.spec.V)
-    rows = [posterior_of(artifact, row) for row in v]
-    return np.stack([posterior.absent_log_odds(every, coverage) for posterior in rows])
+def unlisted_log_odds(artifact: Artifact, v: Tensor, coverages: Sequence[float]) -> Floats:
+    """Return the log-odds of every class for lists v, (coverages, lists, classes)."""
+    every, posteriors = np.arange(artifact.spec.V), (posterior_of(artifact, row) for row in v)
+    rows = [[posterior.absent_log_odds(every, c) for c in coverages] for posterior in posteriors]
+    return np.stack(rows, 1)
 
 
 def _mean_rank(z: Floats, candidates: Flags, hidden: Flags) -> float:

@@ -77,7 +77,7 @@ def data_of(validation) -> TrainingData:
 
 @pytest.fixture(scope="module")
 def fitted(model):
-    return calibrate(model, data_of(rooms(300, 1)), CONFIG)
+    return calibrate(model, data_of(rooms(200, 1)), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_chosen_values_are_copied(model, fitted):
 
 @pytest.mark.slow
 def test_a_seed_gives_the_same_calibration(model, fitted):
-    assert calibrate(model, data_of(rooms(300, 1)), CONFIG) == fitted
+    assert calibrate(model, data_of(rooms(200, 1)), CONFIG) == fitted
 
 
 # ------------------------------------------------------------------------------- scenes of the fits
@@ -174,9 +174,10 @@ def test_the_coverage_that_ranks_best_is_chosen(monkeypatch):
     scenes = lists_with_hidden()
     rng = np.random.default_rng(0)
 
-    def log_odds(artifact, v, coverage):
+    def log_odds(artifact, v, coverages):
         hidden = hidden_of(scenes, v)
-        return hidden / (1 + 4 * abs(coverage - 0.45)) + rng.normal(0, 0.5, hidden.shape)
+        ranked = [hidden / (1 + 4 * abs(c - 0.45)) for c in coverages]
+        return ranked + rng.normal(0, 0.5, (len(coverages), *hidden.shape))
 
     monkeypatch.setattr(of_objects, "unlisted_log_odds", log_odds)
     assert fit_missing(None, scenes, BARE)["coverage"] == 0.45
@@ -199,7 +200,7 @@ def test_missing_classes_are_fitted_to_the_number_of_listed_classes(monkeypatch)
     scenes = lists_with_hidden(600)
     rng = np.random.default_rng(0)
 
-    def log_odds(artifact, v, coverage):
+    def log_odds(artifact, v, coverages):
         hidden, n = hidden_of(scenes, v), v.sum(1, keepdim=True).numpy()
         # Given the truth y, z is N(m_y, s²); then the log-odds of y are linear in z.
         share = (7 - n) / (WIDE - n)
@@ -207,7 +208,8 @@ def test_missing_classes_are_fitted_to_the_number_of_listed_classes(monkeypatch)
         # Slope (m_1 - m_0) / s² = 2, intercept prior - (m_1² - m_0²) / 2s² = 1 - log n.
         gap = 2 * s**2
         middle = (prior - 1 + np.log(n)) / 2
-        return middle + gap * (hidden - 0.5) + rng.normal(0, s, hidden.shape)
+        z = middle + gap * (hidden - 0.5) + rng.normal(0, s, hidden.shape)
+        return np.broadcast_to(z, (len(coverages), *z.shape))
 
     monkeypatch.setattr(of_objects, "unlisted_log_odds", log_odds)
     monkeypatch.setattr(of_objects, "_LISTED", WIDE)
