@@ -56,10 +56,7 @@ def scaling(
 
     Args:
         classes: vocabulary sizes in increasing order. The first size is the reference.
-        units: number of hidden units.
-        states: number of states of a hidden unit.
-        K: rank of the relation weights.
-        N: number of stored samples for the generation of scenes.
+        units, states, K, N: sizes of the machine; see `MachineSpec`.
         objects: number of objects in the scene, equal for all sizes.
         rounds: number of rounds; each round times every size.
     """
@@ -79,28 +76,25 @@ def scaling(
         memory = {V: _memory(paths[classes[0]], paths[V], scene) for V in classes}
         files = {V: sum(file.stat().st_size for file in paths[V].iterdir()) for V in classes}
         artifacts = {V: load_artifact(path) for V, path in paths.items()}
+    names = {V: f"{V:,} classes" for V in classes}
     facts: dict[str, Fact] = {}
-    for V in classes:
-        facts[f"{_name(V)}, artifact in MB"] = files[V] / _MEGABYTE
-        facts[f"{_name(V)}, loaded and asked everything, resident MB"] = memory[V] / _MEGABYTE
-        facts[f"{_name(V)}, resident kB a class"] = memory[V] / V / 1e3
+    for V, name in names.items():
+        facts[f"{name}, artifact in MB"] = files[V] / _MEGABYTE
+        facts[f"{name}, loaded and asked everything, resident MB"] = memory[V] / _MEGABYTE
+        facts[f"{name}, resident kB a class"] = memory[V] / V / 1e3
     results: list[Result] = []
     for question, ask in QUESTIONS.items():
-        calls = {_name(V): partial(ask, artifact, scene) for V, artifact in artifacts.items()}
+        calls = {names[V]: partial(ask, artifact, scene) for V, artifact in artifacts.items()}
         results.append(
             Result(
                 name=f"scaling {question}",
-                title=f"/{question}: latency relative to {_name(classes[0])}",
-                subject=_name(classes[0]),
+                title=f"/{question}: latency relative to {names[classes[0]]}",
+                subject=names[classes[0]],
                 timings=interleave(calls, rounds=rounds),
                 facts={} if results else facts,
             )
         )
     return results
-
-
-def _name(V: int) -> str:
-    return f"{V:,} classes"
 
 
 QUESTIONS: Mapping[str, Callable[[Artifact, Scene], object]] = {

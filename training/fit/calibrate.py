@@ -27,7 +27,7 @@ from app.inference.relations import NO_UNIT
 from app.questions.placements import PLACES
 from app.questions.posterior import Posterior
 from app.registry import Artifact, Calibration, CountSlope
-from app.scene.relations import LATERAL, ON_TOP, STACKED
+from app.scene.relations import CANONICAL, LATERAL, ON_TOP, STACKED
 from training.datasets import EncodedScene
 from training.datasets.array_types import Flags, Floats, Rng
 from training.datasets.batches import TrainingData, subset
@@ -54,9 +54,6 @@ _SHIFTS = (0.0, -0.4, -0.8, -1.2)  # changes of the log-odds of left and front
 _ROUNDS = 3
 # Column indices of the table of examples. Column 0 is the scene.
 _RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 4, 5
-# The weight of an example is the number of likely examples of its source, to the power -_POWER. So
-# the rooms of one generator do not outweigh the real rooms and people's sentences.
-_POWER = 1.0
 _UNKNOWN = -1.0  # truth of an example whose data source does not annotate the relation
 # Number of objects that are removed from each scene in turn to fit placements. With one removed
 # object, the fit depends too much on chance.
@@ -105,7 +102,7 @@ def fit_relations(
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     parts = [_part_of(encoded, structure, rng) for encoded in scenes]
-    return _fit_possible(_examples_of_pairs(artifact, [*scenes, *parts]), artifact.spec.A)
+    return _fit_possible(_examples_of_pairs(artifact, [*scenes, *parts]))
 
 
 def with_lower_lateral(
@@ -133,8 +130,7 @@ def with_lower_lateral(
         table = np.array([(s.intercept, s.slope, s.log_count) for s in slopes])[:, :, None, None]
         logits = table[:, 0] + table[:, 1] * log_odds + table[:, 2] * (logs[:, None] + logs)
         both = np.concatenate([logits[:, i, j], logits[:, j, i]]).T
-        holds = evidence.holds[: len(slopes)]
-        listed = np.concatenate([holds[:, i, j], holds[:, j, i]]).T
+        listed = np.concatenate([evidence.holds[:, i, j], evidence.holds[:, j, i]]).T
         is_lateral = np.isin(np.arange(both.shape[1]) % len(slopes), LATERAL)
         shifted = both + np.where(is_lateral, np.array(_SHIFTS)[:, None, None], 0.0)
         best = shifted.argmax(2)
@@ -167,7 +163,7 @@ def fit_with_observed(
     The fit examines the other half of the pairs.
     """
     rng = np.random.default_rng(seed)
-    return _fit_possible(_examples_of_pairs(artifact, scenes, rng), artifact.spec.A)
+    return _fit_possible(_examples_of_pairs(artifact, scenes, rng))
 
 
 def _posterior(
@@ -201,14 +197,14 @@ def _examples_of_pairs(
         log_odds = values[:, index[:, None], index]
         is_thing = ~structure[encoded.instance_classes]
         pairs = pairs & is_thing[:, None] & is_thing & ~np.eye(n, dtype=np.bool_)
-        annotated = annotated_relations(encoded)[: len(values)]
+        annotated = annotated_relations(encoded)
         # The smallest of the `_LISTED` largest values of each relation.
         few = pairs.sum() <= _LISTED
         least = [-np.inf if few else np.partition(v[pairs], -_LISTED)[-_LISTED] for v in log_odds]
         examples = pairs & (annotated | (log_odds >= np.array(least)[:, None, None]))
         relation, i, j = np.nonzero(examples)
         logs = np.log(encoded.evidence.counts[index])
-        truth = np.where(annotated, encoded.instance_holds[: len(values)], _UNKNOWN)[examples]
+        truth = np.where(annotated, encoded.instance_holds, _UNKNOWN)[examples]
         columns = number, relation, log_odds[examples], logs[i] + logs[j], truth
         blocks.append(_table(*columns, sources.index(encoded.source)))
     return _examples(blocks)
@@ -249,7 +245,7 @@ def fit_placements(
             count = np.log(present.counts[anchors])[anchor]
             columns = number, a, values[0].ravel(), count, truth.ravel()
             blocks.append(_table(*columns, sources.index(encoded.source)))
-    return _fit_listed(_examples(blocks), artifact.spec.A, PLACES)
+    return _fit_listed(_examples(blocks), PLACES)
 
 
 def _table(*columns: Any) -> Floats:
@@ -263,7 +259,7 @@ def _examples(blocks: list[Floats]) -> Floats:
     return examples[examples[:, _LOGIT] > NO_UNIT]
 
 
-def _fit_possible(examples: Floats, relations: int) -> tuple[CountSlope, ...]:
+def _fit_possible(examples: Floats) -> tuple[CountSlope, ...]:
     """Fit the slopes to the examples with log-odds of at least `_POSSIBLE`.
 
     Most pairs of objects have no relation, and their log-odds are far lower. They would determine
@@ -272,10 +268,10 @@ def _fit_possible(examples: Floats, relations: int) -> tuple[CountSlope, ...]:
     examples = examples[examples[:, _TRUTH] != _UNKNOWN]
     is_possible = examples[:, _LOGIT] >= _POSSIBLE
     weight = np.where(is_possible, 1.0, _OF_THE_REST)
-    return _fit_by_kind(examples, relations, weight * _source_weights(examples, is_possible))
+    return _fit_by_kind(examples, weight * _source_weights(examples, is_possible))
 
 
-def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[CountSlope, ...]:
+def _fit_listed(examples: Floats, listed: int) -> tuple[CountSlope, ...]:
     """Fit the slopes, mainly to the `listed` likeliest examples of each scene.
 
     An answer lists only these examples. Selection by high log-odds also selects errors, so listed
@@ -283,21 +279,24 @@ def _fit_listed(examples: Floats, relations: int, listed: int) -> tuple[CountSlo
     list have a small weight. Examples without annotation take part only in the ranking.
     """
     annotated = examples[:, _TRUTH] != _UNKNOWN
-    slopes = _fit_by_kind(examples[annotated], relations, np.ones(annotated.sum()))
+    slopes = _fit_by_kind(examples[annotated], np.ones(annotated.sum()))
     for _ in range(_ROUNDS):
         is_listed = _is_listed(examples, slopes, listed)[annotated]
         weight = np.where(is_listed, 1.0, _OF_THE_REST)
         weight *= _source_weights(examples[annotated], is_listed)
-        slopes = _fit_by_kind(examples[annotated], relations, weight)
+        slopes = _fit_by_kind(examples[annotated], weight)
     return slopes
 
 
 def _source_weights(examples: Floats, is_listed: Flags) -> Floats:
-    """Return the weight of each example, (examples,), see `_POWER`."""
+    """Return weights that give each source the same total weight of listed examples, (examples,).
+
+    So the rooms of one generator do not outweigh the real rooms and people's sentences.
+    """
     relation, source = examples[:, [_RELATION, _SOURCE]].astype(int).T
     key = relation * (source.max(initial=0) + 1) + source
     counts = np.bincount(key[is_listed], minlength=int(key.max(initial=-1)) + 1)
-    return (np.maximum(counts, 1.0) ** -_POWER)[key]
+    return (1 / np.maximum(counts, 1.0))[key]
 
 
 def _is_listed(examples: Floats, slopes: tuple[CountSlope, ...], listed: int) -> Flags:
@@ -313,13 +312,13 @@ def _is_listed(examples: Floats, slopes: tuple[CountSlope, ...], listed: int) ->
     return is_listed
 
 
-def _fit_by_kind(examples: Floats, relations: int, weight: Floats) -> tuple[CountSlope, ...]:
+def _fit_by_kind(examples: Floats, weight: Floats) -> tuple[CountSlope, ...]:
     """Fit one slope to left and front, and one to on-top for all relations of stacked objects.
 
     Complete sources show hundreds of times more pairs with on-top than with inside, and no pairs
     with above. A kind with one truth value keeps its log-odds.
     """
-    entries = [CountSlope()] * relations
+    entries = [CountSlope()] * len(CANONICAL)
     for fitted, kind in ((LATERAL, LATERAL), ((ON_TOP,), STACKED)):
         rows = np.isin(examples[:, _RELATION], fitted)
         truth = examples[rows, _TRUTH] > 0
@@ -329,6 +328,5 @@ def _fit_by_kind(examples: Floats, relations: int, weight: Floats) -> tuple[Coun
         slope, count, intercept = logistic(features, truth, weight[rows])
         entry = CountSlope(intercept=intercept, slope=slope, log_count=count)
         for a in kind:
-            if a < relations:
-                entries[a] = entry
+            entries[a] = entry
     return tuple(entries)

@@ -43,10 +43,9 @@ def fit_at(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> tuple[Pla
     """Return the entry of each relation. Relations without questions keep the default entry."""
     entries = [PlaceFit()] * artifact.spec.A
     for kind in (LATERAL, STACKED):
-        relations = [a for a in kind if a < artifact.spec.A]
-        weights = _fit_weights(artifact, scenes, relations, seed)
-        entry = _fit_scale(artifact, scenes.scenes, relations, weights, seed)
-        for a in relations:
+        weights = _fit_weights(artifact, scenes, kind, seed)
+        entry = _fit_scale(artifact, scenes.scenes, kind, weights, seed)
+        for a in kind:
             entries[a] = entry
     return tuple(entries)
 

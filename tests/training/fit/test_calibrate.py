@@ -120,21 +120,19 @@ def test_a_seed_gives_the_same_calibration(model, fitted):
 
 
 def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
-    """Of 300 scenes of weight 1/3 about 100 are kept: outside 60 to 140 with p < 1e-6."""
+    """Of 300 scenes of weight 1/3 about 100 are kept: outside 60 to 140 with p < 1e-6.
+
+    If no scene lists all of its objects, as in photographs, all scenes count.
+    """
     scenes = [scene([0, 1]) for _ in range(20)]
-    scenes += [replace(scene([2, 3]), complete=False) for _ in range(20)]
+    cut = [replace(scene([2, 3]), complete=False) for _ in range(20)]
     scenes += [replace(scene([4, 5]), weight=1 / 3) for _ in range(300)]
-    kept = complete_scenes(tensors(scenes, WIDE))
+    kept = complete_scenes(tensors([*scenes, *cut], WIDE))
     first = [int(one.evidence.classes[0]) for one in kept.scenes]
     assert first.count(0) == 20
     assert first.count(2) == 0
     assert 60 <= first.count(4) <= 140
-
-
-def test_photographs_alone_are_calibrated_on_photographs():
-    """There no scene lists all of its objects."""
-    cut = tensors([replace(scene([0, 1]), complete=False) for _ in range(20)], WIDE)
-    assert len(complete_scenes(cut)) == 20
+    assert len(complete_scenes(tensors(cut, WIDE))) == 20
 
 
 def test_real_rooms_come_before_generated_ones():
