@@ -149,8 +149,7 @@ class Parts(NamedTuple):
 def random_parts(v: Tensor, leave_one_out: float, generator: torch.Generator) -> Parts:
     """List a random part of each scene, (scenes, classes), with at least one class hidden.
 
-    Args:
-        leave_one_out: share of the scenes that hide one class.
+    A share `leave_one_out` of the scenes hides one class.
     """
     n = v.sum(1)
     hides_one = torch.rand(len(v), generator=generator) < leave_one_out

@@ -131,8 +131,7 @@ class RelationFit:
     def epoch(self, progress: Callable[[float, float], None]) -> float:
         """Run one epoch, and return its mean loss.
 
-        Args:
-            progress: function that is called with the finished share of the fit and the mean loss.
+        It calls `progress` with the finished share of the fit and the mean loss.
 
         Raises:
             FloatingPointError: the loss is infinite or NaN.
@@ -203,13 +202,12 @@ class RelationFit:
     def finish(self, parents: Tensor) -> BoltzmannMachine:
         """Return the machine for storage, with averaged weights and counted residuals.
 
-        Args:
-            parents: (classes,) index of the parent of each class, -1 without a parent.
+        `parents` are the indices of the parents of the classes, (classes,); -1 without a parent.
         """
         self._set(self._average)
         machine = self.machine
         bake_shared_weights(machine, SHARED)
-        if machine.has_residuals and len(self.train) and machine.residual.requires_grad:
+        if len(self.train) and "residual" in self._weights:
             lower_unseen_roles(machine, self.train, parents)
             offsets = self.offsets.detach()
             return with_counted_residuals(machine, self.train, offsets, self._source_weights)

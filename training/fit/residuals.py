@@ -48,10 +48,8 @@ def lower_unseen_roles(machine: BoltzmannMachine, train: SceneTensors, parents: 
 
     Factors extrapolate: they put windows on tables. A class has a role, as the subject or as the
     object of a stacked relation, if a scene shows it, its parent or one of its kinds in this role.
-    Classes with few annotated relations keep their weights.
-
-    Args:
-        parents: (classes,) index of the parent of each class, -1 without a parent.
+    Classes with few annotated relations keep their weights. `RelationFit.finish` describes the
+    parents.
     """
     seen = np.zeros((2, machine.spec.A, machine.spec.V), dtype=np.bool_)
     chances = np.zeros(seen.shape, dtype=np.int64)

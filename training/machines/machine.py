@@ -51,8 +51,9 @@ class BoltzmannMachine(nn.Module, ABC):
     Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
     """
 
-    # True if single triples have residual weights besides the shared weights.
-    has_residuals = False
+    triples: Tensor
+    fantasies: Tensor
+    fantasy_rooms: Tensor
 
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__()
@@ -73,19 +74,16 @@ class BoltzmannMachine(nn.Module, ABC):
             self.L = nn.Parameter(torch.zeros(spec.V, spec.V))
             self.Y = nn.Parameter(torch.zeros(spec.C, spec.V))
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
-        self.triples: Tensor
         if spec.N:
             # Stored chain samples as bits, (samples, words of 32 classes), and their room types. A
             # room type of -1 is unknown.
             empty = torch.zeros(spec.N, -(-spec.V // 32), dtype=torch.int32)
             self.register_buffer("fantasies", empty)
             self.register_buffer("fantasy_rooms", torch.full((spec.N,), -1, dtype=torch.int32))
-        self.fantasies: Tensor
-        self.fantasy_rooms: Tensor
+        self.triple_keys = torch.zeros(spec.T, dtype=torch.int64)
         self.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
             lambda module, _: module.index_triples()
         )
-        self.triple_keys = torch.zeros(spec.T, dtype=torch.int64)
 
     def index_triples(self) -> None:
         """Check the table of triples and build its search keys."""
@@ -300,10 +298,9 @@ class BoltzmannMachine(nn.Module, ABC):
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
         """Set relation biases to log-odds of the training data.
 
-        Args:
-            by_relation: log-odds that an observed relation holds, (relations,).
-            by_unit: log-odds that a triple holds in a scene with annotated relations, (triples,).
-            usual: mean log number of instances of each class, (classes,).
+        They are the log-odds that an observed relation holds, (relations,), and that a triple holds
+        in a scene with annotated relations, (triples,). `usual` is the mean log number of instances
+        of each class, (classes,).
         """
 
     @abstractmethod
@@ -321,12 +318,8 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the relations between classes in the layout of this machine: edges, r, observed.
 
         In an RBM or GBM, the units of absent classes are 0. They count as observed if the scene has
-        any annotated relation.
-
-        Args:
-            classes, counts: class indices and numbers of instances, (scenes, n), as in `edges`.
-            holds, observed: value of each relation between the classes, and True where it is
-                observed, (scenes, relations, n, n).
+        any annotated relation. `edges` describes classes and counts. `holds` are the values of the
+        relations, and `observed` is True where they are observed, (scenes, relations, n, n).
         """
 
     @abstractmethod
@@ -344,11 +337,8 @@ class BoltzmannMachine(nn.Module, ABC):
     def implied(self, edges: Edges, observed: Tensor, h1: Tensor) -> Tensor:
         """Return the change of each relation logit due to observed relations, (scenes, units).
 
-        The change is zero in a machine without implication weights (`training.machines.triway`).
-
-        Args:
-            observed: observed relations, (scenes, units). 1 means that the relation holds.
-            h1: means of the hidden units given the objects, (scenes, H1).
+        `observed` is 1 for relations that are observed to hold, (scenes, units), and h1 are means
+        given the objects, (scenes, H1). Without implication weights, the change is zero.
         """
         del edges, h1
         return torch.zeros_like(observed)

@@ -49,8 +49,6 @@ _MOST = 3.0
 class Triway(BoltzmannMachine):
     """A machine whose relation units connect two present objects and the hidden units."""
 
-    has_residuals = True
-
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__(spec)
         V, A, K, H1 = spec.V, spec.A, spec.K, spec.H1

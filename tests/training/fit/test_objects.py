@@ -308,23 +308,14 @@ def masked_divergence(log_odds):
     Class j is present beside the list x with the mass p(x + j), as its weight is the number of
     classes, and absent with the mass sum_{i != j} p(x + i) / n(x + i).
     """
-    code = EVERY @ torch.tensor([1.0, 2, 4, 8]).double()
-    p = TARGET[code.argsort()]
-    total, alone = 0.0, torch.zeros(V, 2).double()
-    for x in EVERY[EVERY.sum(1) <= V - 1]:
-        mass = [
-            0.0 if x[i] else float(p[int(x @ (2.0 ** torch.arange(V)).double()) + 2**i])
-            for i in range(V)
-        ]
-        for j in range(V):
-            if x[j] or not x.any():
-                continue
-            on, off = mass[j], sum(mass[i] for i in range(V) if i != j) / (float(x.sum()) + 1)
-            alone[j] += torch.tensor([on, off])
-            if on and off:
-                best = math.log(on / off)
-                total -= loss(on, off, best)
+    total = 0.0
+    for code, x in list(enumerate(EVERY))[1:-1]:
+        mass = {i: float(TARGET[code + 2**i]) for i in range(V) if not x[i]}
+        for j, on in mass.items():
+            off = (sum(mass.values()) - on) / (float(x.sum()) + 1)
             total += loss(on, off, float(log_odds(x)[j]))
+            if on and off > 1e-12:
+                total -= loss(on, off, math.log(on / off))
     return total
 
 
