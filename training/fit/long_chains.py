@@ -23,10 +23,6 @@ from training.fit.objects import ObjectScenes, served_weights
 RECORDED: Final = 5
 """Number of sweeps between two recorded states."""
 
-TASK: Final = "Long chains"
-SIZE: Final = "change of the number of classes"
-SHARE: Final = "largest change of a class"
-
 _CHAINS, _SWEEPS = 256, 3000
 _SETTLED = 2000  # sweeps before the first recorded state of the test
 _COMMONEST = 50
@@ -154,10 +150,13 @@ class Drift:
 
     def metrics(self) -> list[Metric]:
         """Return the metrics for the model card, with intervals of two standard errors."""
-        values = ((SIZE, self.size, self.size_error), (SHARE, self.share, self.share_error))
+        values = (
+            ("change of the number of classes", self.size, self.size_error),
+            ("largest change of a class", self.share, self.share_error),
+        )
         return [
             Metric(
-                task=TASK, source=self.source, metric=name, value=round(value, 4),
+                task="Long chains", source=self.source, metric=name, value=round(value, 4),
                 low=round(value - 2 * error, 4), high=round(value + 2 * error, 4), n=_CHAINS,
             )
             for name, value, error in values
